@@ -1,0 +1,23 @@
+"""orthocas: joint-space coordinates that a redundant robot's task does not disturb, with CasADi."""
+
+from pathlib import Path as _Path
+
+# In a checkout, problems/ and solvers/ lie beside this folder, not inside it. Looking one level up keeps
+# `orthocas.problems` importable there, whether or not an installed copy exists; a wheel does not take this line.
+if not (_Path(__file__).parent / "problems").is_dir():
+    __path__.append(str(_Path(__file__).parent.parent))
+
+from orthocas import problems, solvers
+from orthocas.api import fit, load
+from orthocas.chart import Chart
+
+from orthocas.domains import Box, Torus, contains
+from orthocas.parametrisations import MLP, Fourier, Linear, Polynomial
+from orthocas.problem import Problem, check
+from orthocas.quality import Report, evaluate
+from orthocas.robots import Robot
+from orthocas.tasks import Task
+
+__version__ = "0.1.0"
+__all__ = ["MLP", "Box", "Chart", "Fourier", "Linear", "Polynomial", "Problem", "Report", "Robot", "Task", "Torus",
+ "check", "contains", "evaluate", "fit", "load", "problems", "solvers"]

@@ -1,0 +1,55 @@
+"""The front door: fit, with a default parametrisation and solver, and load."""
+
+from pathlib import Path
+
+from orthocas.chart import Chart
+from orthocas.fitting import Fit, fit_chart
+from orthocas.loss import DEFAULT_WEIGHTS, Weights
+from orthocas.objective import Monitor, Solver, silent
+from orthocas.parametrisations import GradedParametrisation, Linear, Parametrisation, Polynomial
+from orthocas.problem import Problem
+from orthocas.solvers import LBFGS, GaussNewton
+
+
+def fit(
+    problem: Problem,
+    parametrisation: Parametrisation | None = None,
+    solver: Solver | None = None,
+    weights: tuple[float, float] = DEFAULT_WEIGHTS,
+    samples: int | None = None,
+    seed: int = 0,
+    monitor: Monitor = silent,
+) -> Fit:
+    """Find coordinates xi(q) that are as orthogonal as possible to the task.
+
+    Minimises the mean of [AS2023] eq. (24) over uniform samples of the domain. Joints that the task does not feel
+    become coordinates themselves; families linear in their parameters start from a spectral solution of low degree
+    and climb degree by degree. Ctrl-C returns the best coordinates so far, with status INTERRUPTED.
+
+    Args:
+        problem: robot, task, metric and domain.
+        parametrisation: default Polynomial(degree=4).
+        solver: default GaussNewton for families linear in their parameters, LBFGS otherwise.
+        weights: (lambda1, lambda2): task term against mutual term; their ratio picks a point on the front.
+        samples: number of samples; default grows with the number of parameters.
+        seed: seed of samples and of random starts.
+        monitor: called with progress.
+
+    Returns:
+        The chart, how each stage went, and seconds.
+
+    Raises:
+        SingularTaskError, MetricError: if the problem does not pass its own check.
+        MemoryNeedError: if the degree is too large for this machine.
+        InvalidValueError, SolveError: if settings do not fit together, or the loss is not finite.
+    """
+    parametrisation = Polynomial(degree=4) if parametrisation is None else parametrisation
+    if solver is None:
+        linear = isinstance(parametrisation, GradedParametrisation | Linear)
+        solver = GaussNewton() if linear else LBFGS()
+    return fit_chart(problem, parametrisation, solver, Weights(*weights), samples, seed, monitor)
+
+
+def load(path: str | Path) -> Chart:
+    """Read a chart file; see `Chart.load`."""
+    return Chart.load(path)

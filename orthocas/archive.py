@@ -1,0 +1,115 @@
+"""Self-contained files: one zip with a JSON header and `.npy` arrays. Loading never runs code; writing is atomic."""
+
+import hashlib
+import io
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthocas.checks import Array
+from orthocas.errors import ChartFileError
+
+FORMAT = "orthocas-chart"
+VERSION = 1
+_HEADER, _DIGEST = "header.json", "digest.txt"
+_LARGEST_FILE = 2**32  # bytes a file may unpack to
+
+
+def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+    """Write header and arrays to a file that appears whole or not at all.
+
+    Raises:
+        ChartFileError: if the folder is missing or cannot be written.
+    """
+    target = Path(path)
+    entries = {f"{name}.npy": _npy_bytes(array) for name, array in arrays.items()}
+    full = {"format": FORMAT, "version": VERSION, **header, "sha256": {k: _digest(v) for k, v in entries.items()}}
+    text = json.dumps(full, indent=1).encode()
+    entries = {_HEADER: text, _DIGEST: _digest(text).encode(), **entries}
+    if not target.parent.is_dir():
+        raise ChartFileError(f"cannot write {target}: folder {target.parent} does not exist")
+    try:
+        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{target.name}.", delete=False) as draft:
+            try:
+                with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as archive:
+                    for name, content in entries.items():
+                        archive.writestr(zipfile.ZipInfo(name), content)
+                draft.flush()
+                os.fsync(draft.fileno())
+                os.chmod(draft.name, 0o666 & ~_umask())
+                os.replace(draft.name, target)
+            except BaseException:
+                os.unlink(draft.name)
+                raise
+    except OSError as error:
+        raise ChartFileError(f"cannot write {target}: {error.strerror}") from None
+
+
+def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Read header and arrays back.
+
+    Raises:
+        ChartFileError: if the file is missing, truncated, not a chart, edited, or from a newer version.
+    """
+    source = Path(path)
+    try:
+        with zipfile.ZipFile(source) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _LARGEST_FILE:
+                raise ChartFileError(f"{source} unpacks to more than {_LARGEST_FILE / 2**30:.0f} GiB, not a chart file")
+            entries = {name: archive.read(name) for name in archive.namelist()}
+    except FileNotFoundError:
+        raise ChartFileError(f"chart file {source} does not exist") from None
+    except OSError as error:
+        raise ChartFileError(f"cannot read chart file {source}: {error.strerror}") from None
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError):
+        raise ChartFileError(f"{source} is truncated, damaged or not a chart file") from None
+    header = _read_header(source, entries)
+    for name, digest in header["sha256"].items():
+        if name not in entries or _digest(entries[name]) != digest:
+            raise ChartFileError(f"{source} has been edited: entry {name} does not match its checksum")
+    try:
+        arrays = {
+            name.removesuffix(".npy"): np.load(io.BytesIO(entries[name]), allow_pickle=False)
+            for name in header["sha256"]
+        }
+    except (ValueError, EOFError):
+        raise ChartFileError(f"{source} holds an array that cannot be read") from None
+    return header, arrays
+
+
+def _read_header(source: Path, entries: Mapping[str, bytes]) -> dict[str, Any]:
+    """Check format, version and checksum before anything else is believed."""
+    try:
+        header = json.loads(entries[_HEADER])
+        name, version, sums = header["format"], int(header["version"]), dict(header["sha256"])
+    except (KeyError, ValueError, TypeError):
+        raise ChartFileError(f"{source} is not an orthocas chart file") from None
+    if name != FORMAT:
+        raise ChartFileError(f"{source} has format '{name}', expected '{FORMAT}'")
+    if version > VERSION:
+        raise ChartFileError(f"{source} has format version {version}, this orthocas reads up to {VERSION}: upgrade")
+    if entries.get(_DIGEST, b"").decode(errors="replace") != _digest(entries[_HEADER]):
+        raise ChartFileError(f"{source} has been edited: its header does not match its checksum")
+    return {**header, "sha256": sums}
+
+
+def _npy_bytes(array: Array) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, np.asarray(array), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

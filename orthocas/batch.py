@@ -1,0 +1,63 @@
+"""Evaluation of CasADi functions on whole sample sets, without copies through DM.
+
+NumPy sample sets are (N, n); a stack of matrices is (N, rows, columns).
+"""
+
+import casadi as ca
+import numpy as np
+
+from orthocas.checks import Array
+
+CHUNK = 512  #: samples evaluated in one call: large enough to amortise the call, small enough for the cache
+
+
+def dense_function(name: str, inputs: list[ca.SX] | list[ca.MX], outputs: list[ca.SX] | list[ca.MX]) -> ca.Function:
+    """A CasADi function whose outputs have no structural zeros, as `evaluate_batch` needs."""
+    return ca.Function(name, inputs, [ca.densify(out) for out in outputs])
+
+
+def evaluate_batch(function: ca.Function, *arguments: Array) -> list[Array]:
+    """Evaluate a function of one sample on N samples.
+
+    Args:
+        function: dense inputs and outputs of one sample each, matrices (rows, columns).
+        arguments: one array per input, (N, rows) for a column, (N, rows, columns) for a matrix.
+
+    Returns:
+        One array per output: (N, rows) for a column, (N, rows, columns) for a matrix.
+    """
+    return evaluate_columns(function.map(CHUNK), CHUNK, *arguments)
+
+
+def evaluate_columns(function: ca.Function, chunk: int, *arguments: Array) -> list[Array]:
+    """As `evaluate_batch`, for a function that already takes `chunk` samples side by side as columns."""
+    N = len(arguments[0])
+    arguments = tuple(_column_major(a) for a in arguments)
+    buffer, run = function.buffer()
+    inputs = [np.empty((chunk, *a.shape[1:])) for a in arguments]
+    shapes = [function.size_out(i) for i in range(function.n_out())]
+    outputs = [np.empty((chunk, columns // chunk, rows)) for rows, columns in shapes]
+    for i, array in enumerate(inputs):
+        buffer.set_arg(i, memoryview(array))
+    for i, array in enumerate(outputs):
+        buffer.set_res(i, memoryview(array))
+    results = [np.empty((N, *out.shape[1:])) for out in outputs]
+    for start in range(0, N, chunk):
+        count = min(chunk, N - start)
+        for array, argument in zip(inputs, arguments, strict=True):
+            array[:count] = argument[start : start + count]
+            array[count:] = argument[start]  # pad the last chunk with a valid sample
+        run()
+        for result, out in zip(results, outputs, strict=True):
+            result[start : start + count] = out[:count]
+    return [_row_major(result) for result in results]
+
+
+def _column_major(array: Array) -> Array:
+    """CasADi stores matrices column by column, so one sample's (rows, columns) goes in transposed."""
+    return array if array.ndim == 2 else array.transpose(0, 2, 1)
+
+
+def _row_major(result: Array) -> Array:
+    """Undo the transposition; a single column becomes a vector."""
+    return result[:, 0, :] if result.shape[1] == 1 else result.transpose(0, 2, 1)

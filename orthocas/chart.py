@@ -1,0 +1,168 @@
+"""Charts phi(q) = [h(q); xi(q)]: task and extra coordinates together, with Jacobian and inverse map."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Self
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.batch import dense_function, evaluate_batch
+from orthocas.chart_file import read_chart, write_chart
+from orthocas.checks import Array, as_point_set, require_known
+from orthocas.coordinates import Coordinates
+from orthocas.errors import InverseError, ShapeError
+from orthocas.problem import Problem, task_jacobians
+
+FUNCTIONS = ("xi", "phi", "jacobian", "task", "task_jacobian")
+_SINGULAR = 1e-8  # ratio of singular values of J where the inverse map is given up
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """A problem with coordinates xi(q) found for it ([AS2023] eq. (27)).
+
+    NumPy arguments are one joint position (n,) or a set (N, n), [rad] or [m].
+    """
+
+    problem: Problem
+    coordinates: Coordinates
+    notes: Mapping[str, str | float] = field(default_factory=dict)  #: how it was made: solver, weights, seed, ...
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.problem.n
+
+    @property
+    def m(self) -> int:
+        """Number of task components."""
+        return self.problem.m
+
+    @property
+    def r(self) -> int:
+        """Number of extra coordinates."""
+        return self.problem.r
+
+    def xi(self, q: ArrayLike) -> Array:
+        """Extra coordinates, (r,) or (N, r)."""
+        points, single = as_point_set("q", q, self.n)
+        values = self.coordinates.xi(points)
+        return values[0] if single else values
+
+    def task(self, q: ArrayLike) -> Array:
+        """Task values x = h(q), (m,) or (N, m)."""
+        points, single = as_point_set("q", q, self.n)
+        values = evaluate_batch(self.problem.task.function, points)[0]
+        return values[0] if single else values
+
+    def phi(self, q: ArrayLike) -> Array:
+        """Task values and extra coordinates stacked, (n,) or (N, n)."""
+        return np.concatenate([self.task(q), self.xi(q)], axis=-1)
+
+    def jacobian(self, q: ArrayLike) -> Array:
+        """J = dphi/dq, (n, n) or (N, n, n); task rows first."""
+        points, single = as_point_set("q", q, self.n)
+        J = np.concatenate([task_jacobians(self.problem, points), self.coordinates.jacobian(points)], axis=1)
+        return J[0] if single else J
+
+    def inverse(self, phi: ArrayLike, q_start: ArrayLike, tolerance: float = 1e-9) -> Array:
+        """Joint positions q with phi(q) = phi, by Newton's method with line search (KINSOL) from q_start.
+
+        Args:
+            phi: wanted values, (n,) or (N, n).
+            q_start: where to start, (n,), or (N, n) with one start per row of phi.
+            tolerance: largest remaining |phi(q) - phi|.
+
+        Returns:
+            q, (n,) or (N, n). It may lie outside the domain: `orthocas.contains` tells.
+
+        Raises:
+            InverseError: if there is no solution near the start, or J becomes singular on the way (rows named).
+        """
+        targets, single = as_point_set("phi", phi, self.n)
+        starts, _ = as_point_set("q_start", q_start, self.n)
+        if len(starts) not in (1, len(targets)):
+            raise ShapeError("q_start", starts.shape, targets.shape)
+        starts = np.broadcast_to(starts, targets.shape)
+        solutions = np.array([self._solve(x0, p) for x0, p in zip(starts, targets, strict=True)])
+        self._require_solved(solutions, targets, tolerance)
+        return solutions[0] if single else solutions
+
+    def function(self, name: str) -> ca.Function:
+        """The CasADi function behind a method: xi, phi, jacobian (n, n), task, task_jacobian; q is (n, 1).
+
+        Raises:
+            UnknownNameError: if there is no such function.
+        """
+        require_known("chart function", name, FUNCTIONS)
+        return self._functions[name]
+
+    def save(self, path: str | Path) -> None:
+        """Write a self-contained chart file.
+
+        Raises:
+            ChartFileError: if the folder is missing or cannot be written.
+        """
+        write_chart(path, self.problem, self.coordinates, self.notes)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a chart file; never runs code.
+
+        Raises:
+            ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
+        """
+        return cls(*read_chart(path))
+
+    @cached_property
+    def _functions(self) -> dict[str, ca.Function]:
+        q = self.coordinates.symbol.sym("q", self.n)
+        x, xi = self.problem.task.function(q), self.coordinates.expression(q)
+        J_x, J_xi = self.problem.task.jacobian_function(q), ca.jacobian(xi, q)
+        outputs = {
+            "xi": xi,
+            "phi": ca.vertcat(x, xi),
+            "jacobian": ca.vertcat(J_x, J_xi),
+            "task": x,
+            "task_jacobian": J_x,
+        }
+        return {name: dense_function(name, [q], [output]) for name, output in outputs.items()}
+
+    @cached_property
+    def _rootfinder(self) -> ca.Function:
+        q, target = ca.MX.sym("q", self.n), ca.MX.sym("phi", self.n)
+        residual = self._functions["phi"](q) - target
+        options = {"error_on_fail": False, "abstol": 1e-12, "max_iter": 100, "strategy": "linesearch"}
+        quiet = {"disable_internal_warnings": True, "verbose": False}
+        return ca.rootfinder("inverse", "kinsol", {"x": q, "p": target, "g": residual}, {**options, **quiet})
+
+    def _solve(self, q_start: Array, phi: Array) -> Array:
+        try:
+            return np.asarray(self._rootfinder(ca.DM(q_start), ca.DM(phi)).nonzeros())
+        except RuntimeError:  # a singular linear system on the way
+            return np.full(self.n, np.nan)
+
+    def _require_solved(self, solutions: Array, targets: Array, tolerance: float) -> None:
+        finite = np.isfinite(solutions).all(axis=1)
+        safe = np.where(finite[:, None], solutions, self.problem.domain.centre)
+        error = np.where(finite, np.abs(self.phi(safe) - targets).max(axis=1), np.inf)
+        bad = np.flatnonzero(~(error <= tolerance))
+        if bad.size:
+            rows = f"rows {bad[:5].tolist()}" if len(targets) > 1 else "phi"
+            raise InverseError(
+                f"no q with phi(q) = phi found near q_start for {rows}: error {error[bad].max():.3g}, "
+                f"expected <= {tolerance:.1g}; the value may be out of reach or the way to it singular"
+            )
+        values = np.linalg.svd(self.jacobian(safe), compute_uv=False)
+        singular = np.flatnonzero(values[:, -1] < _SINGULAR * values[:, 0])
+        if singular.size:
+            raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}, q is not unique there")
+

@@ -1,0 +1,75 @@
+"""Input checks that raise the package's errors."""
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
+
+Array = NDArray[np.float64]
+
+
+def require_shape(name: str, got: tuple[int, ...], want: tuple[int | None, ...]) -> None:
+    """Raise ShapeError unless got fits want, where None stands for any length."""
+    if len(got) != len(want) or any(w is not None and g != w for g, w in zip(got, want, strict=True)):
+        raise ShapeError(name, got, want)
+
+
+def require_known(what: str, name: str, known: Collection[str]) -> None:
+    """Raise UnknownNameError unless name is one of known."""
+    if name not in known:
+        raise UnknownNameError(what, name, known)
+
+
+def require_count(name: str, value: int, least: int = 1) -> None:
+    """Raise InvalidValueError unless value is a whole number >= least."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InvalidValueError(name, value, f"a whole number >= {least}")
+
+
+def frozen_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
+    """Copy to a read-only float array of the given shape with finite entries.
+
+    Raises:
+        ShapeError: if the shape differs.
+        InvalidValueError: if it is not numeric, or holds NaN or infinity.
+    """
+    array = as_float_array(name, value)
+    require_shape(name, array.shape, shape)
+    require_finite(name, array)
+    frozen = array.copy()
+    frozen.setflags(write=False)
+    return frozen
+
+
+def as_float_array(name: str, value: Any) -> Array:
+    """Convert to a float array, with an error that names the argument."""
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise InvalidValueError(name, repr(value)[:80], "an array of numbers") from None
+
+
+def require_finite(name: str, array: Array) -> None:
+    """Raise InvalidValueError, with the place of the first bad entry, unless all entries are finite."""
+    bad = np.argwhere(~np.isfinite(array))
+    if bad.size:
+        place = tuple(int(i) for i in bad[0])
+        raise InvalidValueError(f"{name}{list(place) if place else ''}", array[place], "a finite number")
+
+
+def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
+    """One point (n,) or a set (N, n) as a set (N, n), and whether it was one point.
+
+    Raises:
+        ShapeError: if the last axis does not have n entries.
+        InvalidValueError: if an entry is not finite.
+    """
+    array = as_float_array(name, value)
+    single = array.ndim == 1
+    points = array[None, :] if single else array
+    require_shape(name, points.shape, (None, n))
+    require_finite(name, points)
+    return points, single

@@ -1,0 +1,106 @@
+"""The coordinates xi(q) of a chart: a fitted family on the active joints, and the idle joints as they are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from orthocas.batch import dense_function, evaluate_batch, evaluate_columns
+from orthocas.checks import Array, frozen_array
+from orthocas.parametrisations import Family, JointSpace, Parametrisation
+from orthocas.parametrisations.family import Expression, joint_derivatives
+from orthocas.problem import Problem
+
+_COLUMNS = 256  # samples side by side in matrix-shaped graphs
+
+
+def joint_space(problem: Problem) -> JointSpace:
+    """The joints of a problem as parametrisations see them."""
+    robot, domain = problem.robot, problem.domain
+    return JointSpace(domain.centre, domain.half_width, robot.tree.prismatic, robot.joint_names)
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """xi(q) = [scale (family(q_active) - offset); q_idle - centre_idle], (r, 1).
+
+    Offset and scale make xi(centre) = 0 and the mean gradient length of each coordinate 1 over the domain; they
+    do not change the loss.
+    """
+
+    parametrisation: Parametrisation
+    space: JointSpace  #: all joints of the robot
+    idle: tuple[int, ...]  #: joints that are coordinates themselves, listed last
+    theta: Array  #: parameters of the family, (size,)
+    offset: Array  #: (r - idle,)
+    scale: Array  #: (r - idle,)
+
+    def __post_init__(self) -> None:
+        fitted = len(self.offset)
+        object.__setattr__(self, "theta", frozen_array("theta", self.theta, (self.family.size,)))
+        object.__setattr__(self, "offset", frozen_array("offset", self.offset, (fitted,)))
+        object.__setattr__(self, "scale", frozen_array("scale", self.scale, (fitted,)))
+
+    @property
+    def r(self) -> int:
+        """Number of coordinates."""
+        return len(self.offset) + len(self.idle)
+
+    @property
+    def active(self) -> list[int]:
+        """Joints the fitted family depends on."""
+        return [i for i in range(self.space.n) if i not in self.idle]
+
+    @cached_property
+    def family(self) -> Family:
+        """The fitted family on the active joints."""
+        return self.parametrisation.family(self.space.restricted_to(self.active), len(self.offset))
+
+    @property
+    def symbol(self) -> type[ca.SX] | type[ca.MX]:
+        """Kind of CasADi graph that suits the family."""
+        return ca.MX if self.family.as_matrices else ca.SX
+
+    def expression(self, q: Expression) -> Expression:
+        """xi(q), (r, N), for joint positions as columns (n, N)."""
+        columns = q.shape[1]
+        rows: list[Expression] = []
+        if len(self.offset):
+            theta = type(q)(ca.DM(self.theta))
+            fitted = self.family.expression(q[self.active, :], theta)
+            rows.append((fitted - _columns(self.offset, columns)) * _columns(self.scale, columns))
+        if self.idle:
+            rows.append(q[list(self.idle), :] - _columns(self.space.centre[list(self.idle)], columns))
+        return ca.vertcat(*rows)
+
+    def xi(self, points: Array) -> Array:
+        """xi at points (N, n), (N, r)."""
+        function, columns = self._batch_functions["xi"]
+        return (evaluate_columns(function, columns, points) if columns > 1 else evaluate_batch(function, points))[0]
+
+    def jacobian(self, points: Array) -> Array:
+        """J_xi at points (N, n), (N, r, n)."""
+        function, columns = self._batch_functions["jacobian"]
+        flat = (evaluate_columns(function, columns, points) if columns > 1 else evaluate_batch(function, points))[0]
+        return flat.reshape(len(points), self.space.n, self.r).transpose(0, 2, 1)
+
+    @cached_property
+    def _batch_functions(self) -> dict[str, tuple[ca.Function, int]]:
+        """xi and vec(J_xi): for one sample (SX, to be mapped) or for many columns at once (MX)."""
+        columns = _COLUMNS if self.family.as_matrices else 1
+        q = self.symbol.sym("q", self.space.n, columns)
+        xi = self.expression(q)
+        if columns == 1:
+            gradients = ca.vec(ca.jacobian(xi, q))
+        else:
+            gradients = ca.vertcat(*joint_derivatives(xi, q))
+        return {
+            "xi": (dense_function("xi", [q], [xi]), columns),
+            "jacobian": (dense_function("jacobian", [q], [gradients]), columns),
+        }
+
+
+def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:
+    return ca.DM(np.repeat(np.asarray(values, dtype=float)[:, None], columns, axis=1))

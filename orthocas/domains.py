@@ -1,0 +1,149 @@
+"""Regions of joint space that coordinates are fitted and judged on, with seeded uniform sampling."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.checks import Array, as_point_set, frozen_array, require_count
+from orthocas.errors import DomainError, InvalidValueError, ShapeError
+from orthocas.robots import Robot
+
+REVOLUTE_HALF_WIDTH = np.pi / 4  #: default half-width [rad], the hyper-cube of [AS2023] Sec. 9
+PRISMATIC_HALF_WIDTH = 0.25  #: default half-width [m] of an unlimited prismatic joint
+
+
+class Domain(Protocol):
+    """A box in joint space; a torus is the box of whole turns."""
+
+    @property
+    def name(self) -> str:
+        """Kind of the domain: 'box' or 'torus'."""
+        ...
+
+    @property
+    def centre(self) -> Array:
+        """Middle of the domain, (n,)."""
+        ...
+
+    @property
+    def half_width(self) -> Array:
+        """Half edge lengths, (n,), > 0."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """All q with |q_i - centre_i| <= half_width_i.
+
+    Args:
+        centre: (n,) [rad] or [m].
+        half_width: (n,) or one number for all joints, > 0 [rad] or [m].
+    """
+
+    centre: Array
+    half_width: Array
+    name: str = "box"
+
+    def __init__(self, centre: ArrayLike, half_width: ArrayLike) -> None:
+        middle = frozen_array("centre", centre, (None,))
+        widths = np.asarray(half_width, dtype=float)
+        if widths.ndim == 1 and widths.shape != middle.shape:
+            raise ShapeError("half_width", widths.shape, middle.shape)
+        widths = frozen_array("half_width", np.broadcast_to(widths, middle.shape), middle.shape)
+        if widths.size == 0 or widths.min() <= 0:
+            raise InvalidValueError("half_width", widths.min() if widths.size else "empty", "positive numbers")
+        object.__setattr__(self, "centre", middle)
+        object.__setattr__(self, "half_width", widths)
+
+
+@dataclass(frozen=True, eq=False)
+class Torus:
+    """Whole turns of n revolute joints, sampled on (-pi, pi]."""
+
+    n: int
+    name: str = "torus"
+
+    def __init__(self, n: int) -> None:
+        require_count("n", n)
+        object.__setattr__(self, "n", n)
+
+    @property
+    def centre(self) -> Array:
+        """The zero posture, (n,)."""
+        return np.zeros(self.n)
+
+    @property
+    def half_width(self) -> Array:
+        """Pi for every joint, (n,)."""
+        return np.full(self.n, np.pi)
+
+
+def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
+    """Points drawn uniformly from the domain, (samples, n)."""
+    require_count("samples", samples)
+    unit = np.random.default_rng(seed).uniform(-1.0, 1.0, (samples, len(domain.centre)))
+    points: Array = domain.centre + domain.half_width * unit
+    return points
+
+
+def contains(domain: Domain, q: ArrayLike) -> Array:
+    """Whether points (n,) or (N, n) lie in the domain; angles of a torus always do."""
+    points, single = as_point_set("q", q, len(domain.centre))
+    if isinstance(domain, Torus):
+        inside = np.ones(len(points), dtype=bool)
+    else:
+        inside = np.all(np.abs(points - domain.centre) <= domain.half_width * (1 + 1e-12), axis=1)
+    return inside[0] if single else inside
+
+
+def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: float | None = None) -> Box:
+    """A box inside the joint limits.
+
+    The centre is the middle of the limits (0 where there are none). Half-widths are pi/4 for revolute and
+    0.25 m for prismatic joints, less where the limits are nearer.
+
+    Args:
+        robot: the robot.
+        centre: another centre (n,).
+        half_width: another half-width for all joints; not shortened, so that it fails where it leaves the limits.
+    """
+    limited = np.isfinite(robot.lower) & np.isfinite(robot.upper)
+    middle = np.zeros(robot.n)
+    middle[limited] = (robot.lower[limited] + robot.upper[limited]) / 2
+    if centre is not None:
+        middle = frozen_array("centre", centre, (robot.n,))
+    if half_width is not None:
+        return Box(middle, half_width)
+    wanted = np.where(robot.tree.prismatic, PRISMATIC_HALF_WIDTH, REVOLUTE_HALF_WIDTH)
+    room = np.minimum(middle - robot.lower, robot.upper - middle)
+    if room.min() <= 0:
+        _raise_outside(robot, int(np.argmin(room)), middle, middle)
+    return Box(middle, np.minimum(wanted, room))
+
+
+def require_within_limits(robot: Robot, domain: Domain) -> None:
+    """Check a domain against a robot.
+
+    Raises:
+        ShapeError: if it has another number of joints.
+        DomainError: if it leaves the joint limits (the joint is named), or is a torus with a prismatic joint.
+    """
+    if len(domain.centre) != robot.n:
+        raise ShapeError("domain", (len(domain.centre),), (robot.n,))
+    if isinstance(domain, Torus) and any(robot.tree.prismatic):
+        name = robot.joint_names[robot.tree.prismatic.index(True)]
+        raise DomainError(f"joint '{name}' is prismatic, expected a Box domain instead of a Torus")
+    low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
+    slack = 1e-9 * domain.half_width  # decimal limits in a URDF do not add up exactly
+    outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
+    if outside.size:
+        _raise_outside(robot, int(outside[0]), low, high)
+
+
+def _raise_outside(robot: Robot, i: int, low: Array, high: Array) -> None:
+    raise DomainError(
+        f"domain of joint '{robot.joint_names[i]}' is [{low[i]:.4g}, {high[i]:.4g}], "
+        f"expected an interval inside its limits [{robot.lower[i]:.4g}, {robot.upper[i]:.4g}]"
+    )

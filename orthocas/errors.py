@@ -1,0 +1,73 @@
+"""Every error orthocas raises on purpose: one line that names what came and what was wanted."""
+
+from collections.abc import Iterable
+
+
+class OrthocasError(Exception):
+    """Base of every error raised on purpose."""
+
+
+class ShapeError(OrthocasError, ValueError):
+    """An array has the wrong shape."""
+
+    def __init__(self, name: str, got: tuple[int, ...], want: tuple[int | None, ...]) -> None:
+        super().__init__(f"{name} has shape {got}, expected {tuple('any' if w is None else w for w in want)}")
+
+
+class InvalidValueError(OrthocasError, ValueError):
+    """A value is outside what the argument allows."""
+
+    def __init__(self, name: str, got: object, want: str) -> None:
+        super().__init__(f"{name} is {got}, expected {want}")
+
+
+class UnknownNameError(OrthocasError, ValueError):
+    """A name that does not exist, with those that do."""
+
+    def __init__(self, what: str, got: str, known: Iterable[str]) -> None:
+        super().__init__(f"unknown {what} '{got}', known: {', '.join(known)}")
+
+
+class RobotError(OrthocasError, ValueError):
+    """A robot description cannot be read, or holds a joint that orthocas cannot handle."""
+
+
+class DomainError(OrthocasError, ValueError):
+    """A joint-space domain is empty, or leaves the joint limits."""
+
+
+class MetricError(OrthocasError, ValueError):
+    """The metric A(q) is not symmetric positive definite."""
+
+
+class NotRedundantError(OrthocasError, ValueError):
+    """The task leaves no freedom: m >= n."""
+
+    def __init__(self, m: int, n: int) -> None:
+        super().__init__(f"the task has m = {m} components and the robot n = {n} joints, expected m < n")
+
+
+class SingularTaskError(OrthocasError, ValueError):
+    """The task Jacobian loses rank all over the domain."""
+
+
+class MemoryNeedError(OrthocasError, MemoryError):
+    """A fit would need more memory than the machine has."""
+
+    def __init__(self, what: str, needed: float, available: float) -> None:
+        super().__init__(
+            f"{what} would need {needed / 2**30:.3g} GiB, this machine has {available / 2**30:.3g} GiB: "
+            "lower the degree or the number of samples"
+        )
+
+
+class SolveError(OrthocasError, RuntimeError):
+    """A minimiser stopped without a usable result."""
+
+
+class InverseError(OrthocasError, RuntimeError):
+    """The inverse map q(x, xi) has no solution near its start, or meets a singular Jacobian."""
+
+
+class ChartFileError(OrthocasError, ValueError):
+    """A chart file is missing, truncated, foreign, edited or too new."""

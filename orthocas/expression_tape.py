@@ -1,0 +1,104 @@
+"""CasADi SX expressions as plain data, so that files can hold custom tasks and metrics without running code.
+
+A tape is a list of steps over numbered work slots. Only elementary operations exist: loading one rebuilds an
+expression and can do nothing else.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+
+from orthocas.errors import OrthocasError
+
+Tape = dict[str, Any]
+
+_UNARY: dict[str, Callable[[ca.SX], ca.SX]] = {
+    "neg": lambda a: -a,
+    "exp": ca.exp,
+    "log": ca.log,
+    "sqrt": ca.sqrt,
+    "sq": lambda a: a * a,
+    "twice": lambda a: 2 * a,
+    "sin": ca.sin,
+    "cos": ca.cos,
+    "tan": ca.tan,
+    "asin": ca.asin,
+    "acos": ca.acos,
+    "atan": ca.atan,
+    "sinh": ca.sinh,
+    "cosh": ca.cosh,
+    "tanh": ca.tanh,
+    "inv": lambda a: 1 / a,
+    "fabs": ca.fabs,
+    "sign": ca.sign,
+    "not": ca.logic_not,
+    "assign": lambda a: a,
+}
+_BINARY: dict[str, Callable[[ca.SX, ca.SX], ca.SX]] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "pow": lambda a, b: a**b,
+    "constpow": lambda a, b: a**b,
+    "atan2": ca.atan2,
+    "fmin": ca.fmin,
+    "fmax": ca.fmax,
+    "lt": lambda a, b: a < b,
+    "le": lambda a, b: a <= b,
+    "eq": lambda a, b: a == b,
+    "ne": lambda a, b: a != b,
+    "and": ca.logic_and,
+    "or": ca.logic_or,
+    "if_else_zero": lambda a, b: ca.if_else(a, b, 0),
+}
+_NAMES: dict[int, str] = {
+    getattr(ca, f"OP_{name.upper()}"): name for name in (*_UNARY, *_BINARY, "const", "input", "output")
+}
+
+
+def to_tape(function: ca.Function) -> Tape:
+    """Write an SX function of one column and one output as a tape.
+
+    Raises:
+        OrthocasError: if it uses an operation that tapes do not know.
+    """
+    rows, columns = function.size_out(0)
+    steps: list[list[Any]] = []
+    for k in range(function.n_instructions()):
+        operation = function.instruction_id(k)
+        if operation not in _NAMES:
+            raise OrthocasError(f"custom expression uses CasADi operation {operation}, which chart files cannot hold")
+        name, into, of = _NAMES[operation], function.instruction_output(k), function.instruction_input(k)
+        if name == "const":
+            steps.append([name, into[0], function.instruction_constant(k)])
+        elif name == "input":
+            steps.append([name, into[0], of[1]])
+        elif name == "output":
+            steps.append([name, into[1], of[0]])
+        else:
+            steps.append([name, into[0], *of[: 2 if name in _BINARY else 1]])
+    return {"rows": rows, "columns": columns, "slots": function.sz_w(), "steps": steps}
+
+
+def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
+    """Rebuild the expression of a tape at q.
+
+    Raises:
+        KeyError, IndexError, TypeError, ValueError: if the tape is malformed (the caller names the file).
+    """
+    work: list[ca.SX] = [ca.SX(0)] * int(tape["slots"])
+    result: list[ca.SX] = [ca.SX(0)] * (tape["rows"] * tape["columns"])
+    for name, into, *of in tape["steps"]:
+        if name == "const":
+            work[into] = ca.SX(float(of[0]))
+        elif name == "input":
+            work[into] = q[int(of[0])]
+        elif name == "output":
+            result[into] = work[of[0]]
+        elif name in _UNARY:
+            work[into] = _UNARY[name](work[of[0]])
+        else:
+            work[into] = _BINARY[name](work[of[0]], work[of[1]])
+    return ca.reshape(ca.vertcat(*result), tape["rows"], tape["columns"])

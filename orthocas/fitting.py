@@ -1,0 +1,200 @@
+"""Fitting coordinates to a problem: idle joints split off, spectral start, degree continuation, a minimiser."""
+
+import os
+import time
+from dataclasses import dataclass
+from math import ceil
+
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.checks import Array, require_count
+from orthocas.coordinates import Coordinates, joint_space
+from orthocas.errors import InvalidValueError, MemoryNeedError, OrthocasError
+from orthocas.graph_objective import GraphObjective
+from orthocas.idle_joints import idle_joints
+from orthocas.linear_objective import LinearObjective
+from orthocas.loss import Weights
+from orthocas.objective import Monitor, Objective, Progress, Solver, SolveResult, Status, silent
+from orthocas.parametrisations import (
+    Family,
+    GradedParametrisation,
+    JointSpace,
+    Linear,
+    LinearFamily,
+    Parametrisation,
+    Polynomial,
+    embed,
+)
+from orthocas.problem import Problem, ProblemCheck, check
+from orthocas.samples import Samples, sample_problem, samples_at
+from orthocas.spectral import spectral_start
+
+MLP_SAMPLES = 2000  #: default sample count of families that are not linear in theta
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One minimisation of a fit."""
+
+    label: str  #: parametrisation, for example 'polynomial:3'
+    parameters: int
+    samples: int
+    result: SolveResult
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted chart and how it came about."""
+
+    chart: Chart
+    stages: tuple[Stage, ...]
+    problem_check: ProblemCheck
+    idle_joints: tuple[str, ...]  #: joints that are exact coordinates themselves
+    seconds: float
+
+    @property
+    def status(self) -> Status:
+        """How the last stage ended; CONVERGED if there was nothing to minimise."""
+        return self.stages[-1].result.status if self.stages else Status.CONVERGED
+
+
+def fit_chart(
+    problem: Problem,
+    parametrisation: Parametrisation,
+    solver: Solver,
+    weights: Weights,
+    samples: int | None = None,
+    seed: int = 0,
+    monitor: Monitor = silent,
+) -> Fit:
+    """Fit coordinates; see `orthocas.fit`, which fills in the default solver."""
+    start = time.perf_counter()
+    if samples is not None:
+        require_count("samples", samples, least=2)
+    found = check(problem, seed=seed)
+    first = sample_problem(problem, 200, (seed, 0))
+    space = joint_space(problem)
+    idle = [] if isinstance(parametrisation, Linear) else idle_joints(first)[-problem.r :]
+    active = [i for i in range(problem.n) if i not in idle]
+    run = _Run(problem, space.restricted_to(active), active, weights, samples, seed, monitor)
+    r = problem.r - len(idle)
+    if r == 0:
+        stages, parametrisation, theta = [], Polynomial(1), np.zeros(0)
+    elif isinstance(parametrisation, Linear):
+        stages, theta = [], run.linear(parametrisation)
+    elif isinstance(parametrisation, GradedParametrisation):
+        stages, parametrisation, theta = run.graded(parametrisation, r, solver)
+    else:
+        stages = [run.stage(parametrisation, parametrisation.family(run.space, r), None, solver, 0)]
+        theta = stages[-1].result.theta
+    coordinates = _normalised(problem, parametrisation, space, tuple(idle), theta, r, first)
+    notes: dict[str, str | float] = {
+        "solver": solver.name if stages else "closed form",
+        "lambda1": weights.task,
+        "lambda2": weights.mutual,
+        "seed": seed,
+        "samples": stages[-1].samples if stages else 0,
+        "status": stages[-1].result.status.value if stages else Status.CONVERGED.value,
+    }
+    return Fit(
+        chart=Chart(problem, coordinates, notes),
+        stages=tuple(stages),
+        problem_check=found,
+        idle_joints=tuple(problem.robot.joint_names[i] for i in idle),
+        seconds=time.perf_counter() - start,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """What the stages of one fit share."""
+
+    problem: Problem
+    space: JointSpace  # active joints only
+    active: list[int]
+    weights: Weights
+    samples: int | None
+    seed: int
+    monitor: Monitor
+
+    def graded(
+        self, target: GradedParametrisation, r: int, solver: Solver
+    ) -> tuple[list[Stage], GradedParametrisation, Array]:
+        """Degree continuation: solve a low degree from a spectral start, embed, solve the next, ..."""
+        self._require_memory(target, r)
+        stages: list[Stage] = []
+        reached, theta = target, None
+        for degree in range(min(target.degree, 2), target.degree + 1):
+            current = target.of_degree(degree)
+            family = current.family(self.space, r)
+            if len(family.terms) < r:
+                continue
+            if theta is not None:
+                theta = embed(theta, r, reached.family(self.space, r).terms, family.terms)
+            stages.append(self.stage(current, family, theta, solver, degree))
+            reached, theta = current, stages[-1].result.theta
+            if stages[-1].result.status is Status.INTERRUPTED:
+                break
+        if theta is None:
+            raise InvalidValueError("degree", target.degree, f"a basis with at least r = {r} functions")
+        return stages, reached, theta
+
+    def stage(
+        self, parametrisation: Parametrisation, family: Family, theta: Array | None, solver: Solver, degree: int
+    ) -> Stage:
+        """Draw samples, find a start if there is none, and minimise."""
+        count = self.samples or self._sample_count(family)
+        self.monitor(Progress(parametrisation.label, 0.0, f"sampling {count} points"))
+        samples = sample_problem(self.problem, count, (self.seed, degree)).restricted_to(self.active)
+        objective: Objective
+        if isinstance(family, LinearFamily):
+            theta = spectral_start(family, samples) if theta is None else theta
+            objective = LinearObjective(family, samples, self.weights)
+        else:
+            theta = family.initial(self.seed) if theta is None else theta
+            objective = GraphObjective(family, samples, self.weights)
+        result = solver.minimise(objective, theta, self.monitor, parametrisation.label).raise_if_failed()
+        return Stage(parametrisation.label, family.size, count, result)
+
+    def linear(self, parametrisation: Linear) -> Array:
+        """Normals of linear coordinates at their base."""
+        base = self.space.centre if parametrisation.base is None else np.asarray(parametrisation.base, dtype=float)
+        at_base = samples_at(self.problem, base[None, :])
+        if len(at_base) == 0:
+            raise InvalidValueError("base", base.tolist(), "a joint position where no task gradient vanishes")
+        return parametrisation.normal_vectors(at_base.raised(at_base.task_jacobian)[0]).ravel()
+
+    def _sample_count(self, family: Family) -> int:
+        """Enough samples that every coefficient sees about 90 residuals."""
+        if not isinstance(family, LinearFamily):
+            return MLP_SAMPLES
+        return 1000 + ceil(90 * len(family.terms) / (self.problem.m + family.outputs - 1))
+
+    def _require_memory(self, target: GradedParametrisation, r: int) -> None:
+        """Refuse a degree that does not fit, before building anything."""
+        K = target.term_count(self.space.n)
+        N = self.samples or 1000 + 90 * K / (self.problem.m + r - 1)
+        needed = 8 * (N * self.space.n * K + 4 * (r * K) ** 2)
+        available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        if needed > 0.8 * available:
+            raise MemoryNeedError(f"{target.label} on {self.space.n} joints with {K} basis functions", needed, available)
+
+
+def _normalised(
+    problem: Problem,
+    parametrisation: Parametrisation,
+    space: JointSpace,
+    idle: tuple[int, ...],
+    theta: Array,
+    r: int,
+    samples: Samples,
+) -> Coordinates:
+    """Shift and scale so that xi(centre) = 0 and each coordinate's mean gradient length is 1."""
+    raw = Coordinates(parametrisation, space, idle, theta, np.zeros(r), np.ones(r))
+    lengths = np.linalg.norm(raw.jacobian(samples.points)[:, :r], axis=2).mean(axis=0)
+    if r and not lengths.min() > 0:
+        raise OrthocasError(f"coordinate {int(np.argmin(lengths))} has no gradient on the domain")
+    offset = raw.xi(problem.domain.centre[None, :])[0, :r]
+    scale = np.ones(r) if isinstance(parametrisation, Linear) else 1 / lengths
+    return Coordinates(parametrisation, space, idle, theta, offset, scale)

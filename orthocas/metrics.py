@@ -1,0 +1,88 @@
+"""Metrics A(q) on joint space: what "orthogonal" means."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.batch import dense_function, evaluate_batch
+from orthocas.checks import Array, frozen_array, require_known
+from orthocas.errors import MetricError, ShapeError
+from orthocas.expression_tape import to_tape
+from orthocas.robots import Robot
+
+METRIC_KINDS = ("euclidean", "inertia")
+MetricLike = str | ArrayLike | Callable[[ca.SX], ca.SX]
+
+
+@dataclass(frozen=True, eq=False)
+class Metric:
+    """A symmetric positive definite A(q), (n, n). Use `from_spec` to build one."""
+
+    name: str  #: euclidean, inertia, constant or custom
+    function: ca.Function  #: q (n, 1) -> A (n, n), dense, SX
+    recipe: dict[str, Any] = field(repr=False)  #: plain data for chart files
+
+    @classmethod
+    def from_spec(cls, robot: Robot, spec: Any) -> Self:
+        """Build from "euclidean", "inertia", a constant matrix (n, n), or a map q -> A(q) on SX.
+
+        Raises:
+            UnknownNameError: if a name is unknown.
+            ShapeError: if A is not (n, n).
+            MetricError: if a constant A is not symmetric positive definite.
+        """
+        q = ca.SX.sym("q", robot.n)
+        if isinstance(spec, str):
+            require_known("metric", spec, METRIC_KINDS)
+            A = robot.function("mass_matrix")(q) if spec == "inertia" else ca.SX.eye(robot.n)
+            return cls(spec, dense_function("metric", [q], [A]), {"kind": spec})
+        if callable(spec):
+            A = ca.SX(spec(q))
+            if A.shape != (robot.n, robot.n):
+                raise ShapeError("metric", A.shape, (robot.n, robot.n))
+            function = dense_function("metric", [q], [A])
+            return cls("custom", function, {"kind": "custom", "tape": to_tape(function)})
+        matrix = frozen_array("metric", spec, (robot.n, robot.n))
+        require_spd(matrix[None], np.zeros((1, robot.n)))
+        return cls("constant", dense_function("metric", [q], [ca.SX(ca.DM(matrix))]), {"kind": "constant", "matrix": matrix.tolist()})
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether A = I everywhere."""
+        return self.name == "euclidean"
+
+
+def metric_matrices(metric: Metric, points: Array) -> Array:
+    """A at points (N, n), (N, n, n), checked to be symmetric positive definite."""
+    n = points.shape[1]
+    if metric.is_identity:
+        return np.broadcast_to(np.eye(n), (len(points), n, n))
+    A = evaluate_batch(metric.function, points)[0].reshape(-1, n, n)
+    require_spd(A, points)
+    return A
+
+
+def require_spd(matrices: Array, points: Array) -> None:
+    """Raise MetricError unless all matrices (N, n, n) are symmetric positive definite; names the worst point."""
+    size = np.abs(matrices).max(axis=(1, 2))
+    if not np.isfinite(size).all():
+        at = points[np.flatnonzero(~np.isfinite(size))[0]]
+        raise MetricError(f"metric is not finite at q = {np.round(at, 4).tolist()}, expected symmetric positive definite")
+    asymmetry = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2))
+    worst = int(np.argmax(asymmetry - 1e-9 * size))
+    if asymmetry[worst] > 1e-9 * size[worst]:
+        raise MetricError(
+            f"metric is not symmetric at q = {np.round(points[worst], 4).tolist()} "
+            f"(difference {asymmetry[worst]:.3g}), expected symmetric positive definite"
+        )
+    smallest = np.linalg.eigvalsh(matrices)[:, 0]
+    worst = int(np.argmin(smallest - 1e-12 * size))
+    if smallest[worst] <= 1e-12 * size[worst]:
+        raise MetricError(
+            f"metric has eigenvalue {smallest[worst]:.3g} at q = {np.round(points[worst], 4).tolist()}, "
+            "expected symmetric positive definite"
+        )

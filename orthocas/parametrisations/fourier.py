@@ -1,0 +1,57 @@
+"""Fourier terms on the torus: products of sines and cosines up to a total degree (ours)."""
+
+from dataclasses import dataclass
+from math import comb, sqrt
+
+import casadi as ca
+
+from orthocas.checks import require_count
+from orthocas.errors import InvalidValueError
+from orthocas.parametrisations.family import JointSpace
+from orthocas.parametrisations.product_basis import LinearFamily, terms_up_to
+
+
+@dataclass(frozen=True)
+class Fourier:
+    """Products of sqrt(2) cos(k q_i) and sqrt(2) sin(k q_i), total degree <= degree; periodic in every joint.
+
+    Args:
+        degree: total degree, >= 1.
+    """
+
+    degree: int
+
+    def __post_init__(self) -> None:
+        require_count("degree", self.degree)
+
+    @property
+    def label(self) -> str:
+        """'fourier:DEGREE'."""
+        return f"fourier:{self.degree}"
+
+    def of_degree(self, degree: int) -> "Fourier":
+        """The same with another degree."""
+        return Fourier(degree)
+
+    def term_count(self, n: int) -> int:
+        """Sum over j of C(n, j) C(d, j) 2^j, without the constant."""
+        return sum(comb(n, j) * comb(self.degree, j) * 2**j for j in range(1, min(n, self.degree) + 1))
+
+    def family(self, space: JointSpace, outputs: int) -> LinearFamily:
+        """Fourier terms of the joint angles.
+
+        Raises:
+            InvalidValueError: if a joint is prismatic (named).
+        """
+        if any(space.prismatic):
+            name = space.joint_names[space.prismatic.index(True)]
+            raise InvalidValueError(f"joint '{name}' of a Fourier basis", "prismatic", "revolute joints; use polynomial")
+
+        def waves(i: int, q: ca.SX) -> list[ca.SX]:
+            out = [1 + 0 * q]
+            for k in range(1, self.degree + 1):
+                out += [sqrt(2) * ca.cos(k * q), sqrt(2) * ca.sin(k * q)]
+            return out
+
+        degrees = [[0] + [k for k in range(1, self.degree + 1) for _ in range(2)]] * space.n
+        return LinearFamily(space, outputs, tuple(terms_up_to(degrees, self.degree)), waves)

@@ -1,0 +1,74 @@
+"""Linear coordinates: stacks of parallel planes ([AS2023] Sec. 4)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+import scipy.linalg
+
+from orthocas.checks import Array, require_known
+from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.parametrisations.family import JointSpace
+from orthocas.parametrisations.product_basis import LinearFamily
+
+Normals = Literal["orthonormal", "paper"]
+
+
+@dataclass(frozen=True)
+class Linear:
+    """xi(q) = N^T (q - q0), exact at the base q0 only ([AS2023] eq. (21)).
+
+    Args:
+        base: q0, (n,) [rad] or [m]; default the centre of the domain.
+        normals: "orthonormal" takes an orthonormal basis of the null space of J_x A^-1; "paper" takes (37) for
+            n = 3, m = 1 and (39) for n = 3, m = 2.
+    """
+
+    base: tuple[float, ...] | None = None
+    normals: Normals = "orthonormal"
+
+    def __post_init__(self) -> None:
+        require_known("normals", self.normals, ("orthonormal", "paper"))
+
+    @property
+    def label(self) -> str:
+        """'linear'."""
+        return "linear"
+
+    def family(self, space: JointSpace, outputs: int) -> LinearFamily:
+        """Linear functions of q; the parameters are the normals, row by row."""
+        terms = tuple(tuple(int(i == k) for i in range(space.n)) for k in range(space.n))
+
+        def displacement(i: int, q: ca.SX) -> list[ca.SX]:
+            return [1 + 0 * q, q - space.centre[i]]
+
+        return LinearFamily(space, outputs, terms, displacement)
+
+    def normal_vectors(self, gradients: Array) -> Array:
+        """Rows n_j with n_j . grad_A h_i = 0, unit length, (r, n).
+
+        Args:
+            gradients: grad_A h_i at the base, (m, n).
+
+        Raises:
+            SingularTaskError: if the gradients are linearly dependent at the base.
+            InvalidValueError: if the paper's normals are asked for and n is not 3.
+        """
+        m, n = gradients.shape
+        normals: Array = scipy.linalg.null_space(gradients, rcond=1e-9).T
+        if len(normals) != n - m:
+            raise SingularTaskError("the task is singular at the base q0 of linear coordinates, choose another base")
+        if self.normals == "orthonormal":
+            return normals
+        if n != 3:
+            raise InvalidValueError("n", n, "3 joints for the paper's normal vectors")
+        if m == 2:
+            normal = np.cross(gradients[0], gradients[1])  # (39)
+            return (normal / np.linalg.norm(normal))[None, :]
+        v = gradients[0]
+        if np.hypot(v[0], v[1]) < 1e-9 * np.linalg.norm(v):
+            raise SingularTaskError("the paper's normals (37) need a task gradient with a part along joints 1 and 2")
+        n1 = np.array([v[1], -v[0], 0.0]) / np.hypot(v[0], v[1])  # (37a)
+        n2 = np.cross(n1, v)  # (37b)
+        return np.array([n1, n2 / np.linalg.norm(n2)])

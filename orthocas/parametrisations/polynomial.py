@@ -1,0 +1,50 @@
+"""Polynomials on the domain box: products of Legendre polynomials up to a total degree (ours)."""
+
+from dataclasses import dataclass
+from math import comb, sqrt
+
+import casadi as ca
+
+from orthocas.checks import require_count
+from orthocas.parametrisations.family import JointSpace
+from orthocas.parametrisations.product_basis import LinearFamily, terms_up_to
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """Tensor Legendre polynomials of total degree <= degree, orthonormal for the uniform density on the box.
+
+    Args:
+        degree: total degree, >= 1.
+    """
+
+    degree: int
+
+    def __post_init__(self) -> None:
+        require_count("degree", self.degree)
+
+    @property
+    def label(self) -> str:
+        """'polynomial:DEGREE'."""
+        return f"polynomial:{self.degree}"
+
+    def of_degree(self, degree: int) -> "Polynomial":
+        """The same with another degree."""
+        return Polynomial(degree)
+
+    def term_count(self, n: int) -> int:
+        """C(n + d, d) - 1."""
+        return comb(n + self.degree, self.degree) - 1
+
+    def family(self, space: JointSpace, outputs: int) -> LinearFamily:
+        """Polynomials in u_i = (q_i - centre_i) / half_width_i."""
+
+        def legendre(i: int, q: ca.SX) -> list[ca.SX]:
+            u = (q - space.centre[i]) / space.half_width[i]
+            P = [1 + 0 * u, u]
+            for k in range(2, self.degree + 1):
+                P.append(((2 * k - 1) * u * P[k - 1] - (k - 1) * P[k - 2]) / k)
+            return [sqrt(2 * k + 1) * p for k, p in enumerate(P[: self.degree + 1])]
+
+        degrees = [list(range(self.degree + 1))] * space.n
+        return LinearFamily(space, outputs, tuple(terms_up_to(degrees, self.degree)), legendre)

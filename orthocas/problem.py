@@ -1,0 +1,128 @@
+"""A problem: a robot, a task, a metric and a domain that fit together."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from orthocas.batch import evaluate_batch
+from orthocas.checks import Array
+from orthocas.domains import Domain, default_box, require_within_limits, sample_uniform
+from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
+from orthocas.metrics import Metric, metric_matrices
+from orthocas.robots import Robot
+from orthocas.tasks import Task
+
+NEAR_SINGULAR = 0.01  #: smallest relative singular value of J_x below which a sample counts as singular
+_RANK_LOST = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Find r = n - m coordinates xi(q) with J_x A^-1 J_xi^T = 0 on a domain ([AS2023] eq. (5)).
+
+    Args:
+        robot: the robot.
+        task: a task of that robot, m < n.
+        metric: "euclidean", "inertia", a constant SPD matrix (n, n), a map q -> A(q) on SX, or a Metric.
+        domain: Box or Torus inside the joint limits; default `default_box(robot)`.
+        name: for reports.
+
+    Raises:
+        NotRedundantError: if m >= n.
+        DomainError: if the domain leaves the joint limits.
+        MetricError: if a constant metric is not SPD (q-dependent ones are checked by `check` and on every sample).
+    """
+
+    robot: Robot
+    task: Task
+    metric: Metric
+    domain: Domain
+    name: str
+
+    def __init__(
+        self, robot: Robot, task: Task, metric: Any = "euclidean", domain: Domain | None = None, name: str = "custom"
+    ) -> None:
+        if task.robot is not robot:
+            raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
+        if task.m >= robot.n:
+            raise NotRedundantError(task.m, robot.n)
+        domain = default_box(robot) if domain is None else domain
+        require_within_limits(robot, domain)
+        metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
+        for key, value in (("robot", robot), ("task", task), ("metric", metric), ("domain", domain), ("name", name)):
+            object.__setattr__(self, key, value)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.robot.n
+
+    @property
+    def m(self) -> int:
+        """Number of task components."""
+        return self.task.m
+
+    @property
+    def r(self) -> int:
+        """Degree of redundancy n - m."""
+        return self.n - self.m
+
+
+@dataclass(frozen=True)
+class ProblemCheck:
+    """What `check` found on its samples."""
+
+    samples: int
+    singular_samples: int  #: near-singular ones: relative singular value of J_x below NEAR_SINGULAR
+    smallest_singular_value: float  #: of J_x with each row divided by its root mean square length
+    most_singular_point: tuple[float, ...]  #: the joint position where that happens [rad] or [m]
+
+    @property
+    def singular_share(self) -> float:
+        """Share of near-singular samples."""
+        return self.singular_samples / self.samples
+
+
+def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
+    """Check the metric (SPD) and the rank of J_x on uniform samples of the domain.
+
+    Rows of J_x are divided by their root mean square length over the domain first, so that units do not matter.
+
+    Raises:
+        MetricError: if A is not symmetric positive definite at a sample.
+        SingularTaskError: if J_x loses rank at every sample, or is not finite at one.
+    """
+    points = sample_uniform(problem.domain, samples, seed)
+    metric_matrices(problem.metric, points)
+    J = task_jacobians(problem, points)
+    scale = np.sqrt((J**2).sum(axis=2).mean(axis=0))
+    idle = np.flatnonzero(scale == 0)
+    if idle.size:
+        raise SingularTaskError(f"task component '{problem.task.labels[idle[0]]}' does not depend on any joint")
+    smallest = np.linalg.svd(J / scale[:, None], compute_uv=False)[:, -1]
+    if smallest.max() < _RANK_LOST:
+        raise SingularTaskError(
+            f"the Jacobian of task '{problem.task.name}' has rank below m = {problem.m} at all {samples} samples of the domain"
+        )
+    worst = int(np.argmin(smallest))
+    return ProblemCheck(
+        samples=samples,
+        singular_samples=int((smallest < NEAR_SINGULAR).sum()),
+        smallest_singular_value=float(smallest[worst]),
+        most_singular_point=tuple(points[worst].tolist()),
+    )
+
+
+def task_jacobians(problem: Problem, points: Array) -> Array:
+    """J_x at points (N, n), (N, m, n).
+
+    Raises:
+        SingularTaskError: if J_x is not finite at a point (for example polar coordinates at the origin).
+    """
+    J = evaluate_batch(problem.task.jacobian_function, points)[0].reshape(-1, problem.m, problem.n)
+    finite = np.isfinite(J).all(axis=(1, 2))
+    if not finite.all():
+        at = np.round(points[np.flatnonzero(~finite)[0]], 4).tolist()
+        raise SingularTaskError(f"the Jacobian of task '{problem.task.name}' is not finite at q = {at}")
+    return J

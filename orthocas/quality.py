@@ -1,0 +1,149 @@
+"""How good a chart is: angles and conditioning on held-out samples ([AS2023] Figs. 20 and 27, and ours)."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.checks import Array, require_count
+from orthocas.domains import sample_uniform
+from orthocas.loss import pairs
+from orthocas.metrics import metric_matrices
+from orthocas.samples import Samples, samples_at
+
+DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
+_CHUNK = 5000
+_BIN_EDGES = np.linspace(0.0, 180.0, 1801)
+
+
+@dataclass(frozen=True, eq=False)
+class AngleStatistics:
+    """Angles between gradients over all samples and pairs, in degrees; 90 is perfect. NaN if there are no pairs."""
+
+    mean: float
+    std: float
+    max: float  #: largest deviation from 90 degrees
+    histogram: Array  #: counts in bins of 0.1 degree from 0 to 180
+
+    @classmethod
+    def of_cosines(cls, cosines: Array) -> "AngleStatistics":
+        """Statistics of arccos, in degrees."""
+        angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).ravel()
+        counts = np.histogram(angles, _BIN_EDGES)[0].astype(float)
+        if angles.size == 0:
+            return cls(np.nan, np.nan, np.nan, counts)
+        return cls(float(angles.mean()), float(angles.std()), float(np.abs(angles - 90).max()), counts)
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """Smallest singular value of [A-orthonormal task basis; unit coordinate gradients]: 1 perfect, 0 degenerate."""
+
+    min: float
+    p01: float  #: 1 % quantile
+    mean: float
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Quality of a chart on uniform samples of its domain."""
+
+    n: int
+    m: int
+    r: int
+    samples: int
+    seed: int
+    metric: str
+    task_angle: AngleStatistics
+    mutual_angle: AngleStatistics
+    conditioning: Conditioning
+    worst_point: tuple[float, ...]  #: the sampled joint position with the smallest conditioning
+    singular_samples: int  #: samples left out because a gradient vanishes there
+
+    @property
+    def degenerate(self) -> bool:
+        """Whether coordinates are nearly parallel, or lean into the task, on more than 1 % of the domain."""
+        return self.conditioning.p01 < DEGENERATE
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON; NaN becomes None."""
+
+        def angle(s: AngleStatistics) -> dict[str, float | None]:
+            return {k: None if np.isnan(v) else v for k, v in (("mean", s.mean), ("std", s.std), ("max", s.max))}
+
+        return {
+            "n": self.n,
+            "m": self.m,
+            "r": self.r,
+            "samples": self.samples,
+            "seed": self.seed,
+            "metric": self.metric,
+            "task_angle_deg": angle(self.task_angle),
+            "mutual_angle_deg": angle(self.mutual_angle),
+            "conditioning": asdict(self.conditioning),
+            "worst_point": list(self.worst_point),
+            "singular_samples": self.singular_samples,
+            "degenerate": self.degenerate,
+        }
+
+
+def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
+    """Judge a chart on uniform samples of its domain, with a seed other than the fit's.
+
+    Angles are those of [AS2023] eq. (24): between each dxi_j and grad_A h_i, over all m r pairs, and between
+    the coordinates, over all r (r - 1) / 2 pairs. The conditioning is taken in coordinates where A is the identity,
+    so it does not depend on the task's own conditioning or units.
+
+    Args:
+        chart: the chart.
+        samples: number of samples N.
+        seed: seed of the samples.
+    """
+    require_count("samples", samples)
+    points = sample_uniform(chart.problem.domain, samples, seed)
+    parts = [_judge(chart, points[start : start + _CHUNK]) for start in range(0, samples, _CHUNK)]
+    task, mutual, smallest, kept = (np.concatenate([part[i] for part in parts]) for i in range(4))
+    worst = int(np.argmin(smallest))
+    return Report(
+        n=chart.n,
+        m=chart.m,
+        r=chart.r,
+        samples=samples,
+        seed=seed,
+        metric=chart.problem.metric.name,
+        task_angle=AngleStatistics.of_cosines(task),
+        mutual_angle=AngleStatistics.of_cosines(mutual),
+        conditioning=Conditioning(float(smallest[worst]), float(np.quantile(smallest, 0.01)), float(smallest.mean())),
+        worst_point=tuple(kept[worst].tolist()),
+        singular_samples=samples - len(kept),
+    )
+
+
+def _judge(chart: Chart, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Task cosines (N, m, r), mutual cosines (N, pairs), smallest singular values (N,), and the points kept."""
+    samples = samples_at(chart.problem, points)
+    J = chart.coordinates.jacobian(samples.points)
+    lengths = np.linalg.norm(J, axis=2)
+    alive = lengths.min(axis=1) > 0
+    if not alive.all():
+        return _judge(chart, samples.points[alive])
+    raised = samples.raised(J)
+    task = samples.unit_task_gradients @ (J / lengths[:, :, None]).transpose(0, 2, 1)
+    first, second = (np.array([pair[k] for pair in pairs(chart.r)], dtype=int) for k in (0, 1))
+    products = np.einsum("spn,spn->sp", raised[:, first], J[:, second])
+    mutual = products / (np.linalg.norm(raised, axis=2)[:, first] * lengths[:, second])
+    return task, mutual, _smallest_singular_values(chart, samples, J, raised), samples.points
+
+
+def _smallest_singular_values(chart: Chart, samples: Samples, J: Array, raised: Array) -> Array:
+    """Singular values through the Gram matrix of task basis and unit gradients in the metric A^-1."""
+    unit = 1 / np.sqrt(np.einsum("sjn,sjn->sj", J, raised))
+    basis = samples.task_basis
+    if not chart.problem.metric.is_identity:  # lower the index: e^T A
+        basis = basis @ metric_matrices(chart.problem.metric, samples.points)
+    task_raised = samples.raised(basis)
+    rows = np.concatenate([basis, J * unit[:, :, None]], axis=1)
+    raised_rows = np.concatenate([task_raised, raised * unit[:, :, None]], axis=1)
+    gram = rows @ raised_rows.transpose(0, 2, 1)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh((gram + gram.transpose(0, 2, 1)) / 2)[:, 0], 0.0))

@@ -1,0 +1,192 @@
+"""Mass matrix (composite rigid bodies) and inverse dynamics (recursive Newton-Euler) as CasADi expressions.
+
+Source: R. Featherstone, Rigid Body Dynamics Algorithms (docs/references.md [F2008]), chapters 5 and 6, written with
+3-vectors in body frames. `regroup` follows the base parameters of [KD2002].
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from orthocas.checks import Array
+from orthocas.robots.spatial import constant, skew, turn
+from orthocas.robots.tree import KinematicTree
+
+_Z = ca.SX([0, 0, 1])
+
+
+@dataclass
+class _Body:
+    """Inertial parameters about the body frame's origin."""
+
+    mass: float
+    moment: Array  # m c, (3,)
+    inertia: Array  # about the origin, (3, 3)
+
+
+def mass_matrix(tree: KinematicTree, q: ca.SX) -> ca.SX:
+    """M(q), (n, n), symmetric positive definite [kg m^2] for revolute rows, with rotor inertias on the diagonal."""
+    joints = _joint_transforms(tree, q)
+    bodies = _regroup(tree)
+    mass = [ca.SX(body.mass) for body in bodies]
+    moment = [constant(body.moment) for body in bodies]
+    inertia = [constant(body.inertia) for body in bodies]
+    M = ca.SX.zeros(tree.n, tree.n)
+    for i in reversed(range(tree.n)):
+        force, torque = _unit_acceleration_wrench(tree, i, mass[i], moment[i], inertia[i])
+        M[i, i] = _along_joint(tree, i, force, torque) + tree.armatures[i]
+        j = i
+        while tree.parents[j] >= 0:
+            force, torque = joints[j].wrench_to_parent(force, torque)
+            j = tree.parents[j]
+            M[i, j] = M[j, i] = _along_joint(tree, j, force, torque)
+        parent = tree.parents[i]
+        if parent >= 0:
+            m, mc, inert = joints[i].inertia_to_parent(mass[i], moment[i], inertia[i])
+            mass[parent], moment[parent], inertia[parent] = mass[parent] + m, moment[parent] + mc, inertia[parent] + inert
+    return M
+
+
+def inverse_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, ddq: ca.SX, gravity: Array) -> ca.SX:
+    """tau = M ddq + C dq + g, (n, 1) [N m] or [N], for the given gravity acceleration (3,) in the world."""
+    joints = _joint_transforms(tree, q)
+    bodies = _regroup(tree)
+    states: list[tuple[ca.SX, ca.SX, ca.SX]] = []  # angular velocity, angular acceleration matrix, linear acceleration
+    accelerations: list[ca.SX] = []
+    at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-gravity))
+    for i, parent in enumerate(tree.parents):
+        omega_p, U_p, a_p = states[parent] if parent >= 0 else at_rest
+        alpha_p = accelerations[parent] if parent >= 0 else ca.SX(3, 1)
+        to_child = joints[i].to_child
+        omega, alpha, a = to_child(omega_p), to_child(alpha_p), to_child(a_p + U_p @ joints[i].offset)
+        if tree.joint_kinds[i] == "prismatic":
+            a += 2 * ca.cross(omega, _Z) * dq[i] + _Z * ddq[i]
+        else:
+            alpha += ca.cross(omega, _Z) * dq[i] + _Z * ddq[i]
+            omega += _Z * dq[i]
+        # U v = alpha x v + omega x (omega x v), one matrix for every vector fixed in the body
+        U = skew(alpha) + omega @ omega.T - ca.SX.eye(3) * ca.dot(omega, omega)
+        states.append((omega, U, a))
+        accelerations.append(alpha)
+    return _joint_forces(tree, joints, bodies, states, accelerations) + ca.SX(ca.DM(tree.armatures)) * ddq
+
+
+def bias(tree: KinematicTree, q: ca.SX, dq: ca.SX, gravity: Array) -> ca.SX:
+    """C(q, dq) dq + g(q), (n, 1)."""
+    return inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity)
+
+
+def coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX) -> ca.SX:
+    """C(q, v) w with the Christoffel form of C, (n, 1), by polarisation of the quadratic form C(q, v) v.
+
+    C(q, v) w = (c(v + w) - c(v - w)) / 4 with c(v) = C(q, v) v; bilinear and symmetric in (v, w).
+    """
+    weightless = np.zeros(3)
+    return (bias(tree, q, v + w, weightless) - bias(tree, q, v - w, weightless)) / 4
+
+
+@dataclass
+class _JointTransform:
+    """Body i in its parent's frame, kept as a constant rotation and a turn about z: cheaper than their product."""
+
+    rotation: ca.SX  # constant, (3, 3)
+    turn: ca.SX  # Rz(q) or the identity
+    offset: ca.SX  # origin of the body in the parent's frame
+
+    def to_child(self, v: ca.SX) -> ca.SX:
+        return self.turn.T @ (self.rotation.T @ v)
+
+    def to_parent(self, v: ca.SX) -> ca.SX:
+        return self.rotation @ (self.turn @ v)
+
+    def wrench_to_parent(self, force: ca.SX, torque: ca.SX) -> tuple[ca.SX, ca.SX]:
+        f = self.to_parent(force)
+        return f, self.to_parent(torque) + ca.cross(self.offset, f)
+
+    def inertia_to_parent(self, mass: ca.SX, moment: ca.SX, inertia: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+        turned = self.rotation @ (self.turn @ inertia @ self.turn.T) @ self.rotation.T
+        mc, r = self.to_parent(moment), self.offset
+        shift = 2 * ca.dot(r, mc) * ca.SX.eye(3) - r @ mc.T - mc @ r.T
+        steiner = mass * (ca.dot(r, r) * ca.SX.eye(3) - r @ r.T)
+        return mass, mc + mass * r, ca.triu2symm(ca.triu(turned + shift + steiner))
+
+
+def _joint_transforms(tree: KinematicTree, q: ca.SX) -> list[_JointTransform]:
+    transforms = []
+    for i in range(tree.n):
+        rotation, offset = constant(tree.rotations[i]), constant(tree.translations[i])
+        if tree.joint_kinds[i] == "prismatic":
+            transforms.append(_JointTransform(rotation, ca.SX.eye(3), offset + rotation[:, 2] * q[i]))
+        else:
+            transforms.append(_JointTransform(rotation, turn(q[i]), offset))
+    return transforms
+
+
+def _joint_forces(
+    tree: KinematicTree,
+    joints: list[_JointTransform],
+    bodies: list[_Body],
+    states: list[tuple[ca.SX, ca.SX, ca.SX]],
+    accelerations: list[ca.SX],
+) -> ca.SX:
+    """Backward pass: body wrenches summed towards the base, projected on the joint axes."""
+    forces = [ca.SX(3, 1)] * tree.n
+    torques = [ca.SX(3, 1)] * tree.n
+    tau = ca.SX.zeros(tree.n)
+    for i in reversed(range(tree.n)):
+        omega, U, a = states[i]
+        moment, inertia = constant(bodies[i].moment), constant(bodies[i].inertia)
+        force = forces[i] + bodies[i].mass * a + U @ moment
+        torque = torques[i] + inertia @ accelerations[i] + ca.cross(omega, inertia @ omega) + ca.cross(moment, a)
+        tau[i] = _along_joint(tree, i, force, torque)
+        parent = tree.parents[i]
+        if parent >= 0:
+            f, n = joints[i].wrench_to_parent(force, torque)
+            forces[parent], torques[parent] = forces[parent] + f, torques[parent] + n
+    return tau
+
+
+def _along_joint(tree: KinematicTree, i: int, force: ca.SX, torque: ca.SX) -> ca.SX:
+    return force[2] if tree.joint_kinds[i] == "prismatic" else torque[2]
+
+
+def _unit_acceleration_wrench(
+    tree: KinematicTree, i: int, mass: ca.SX, moment: ca.SX, inertia: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """Force and torque about the origin that give body i unit acceleration along its joint."""
+    if tree.joint_kinds[i] == "prismatic":
+        return mass * _Z, ca.cross(moment, _Z)
+    return ca.cross(_Z, moment), inertia[:, 2]
+
+
+def _regroup(tree: KinematicTree) -> list[_Body]:
+    """Move the part of each body that its own revolute joint cannot see to the parent: fewer operations, same motion.
+
+    Mass and first moment along the axis, and the inertia of a rod along the axis, do not change when the body
+    turns about that axis, so they may as well belong to the parent.
+    """
+    bodies = [_body(tree.masses[i], tree.centres[i], tree.inertias[i]) for i in range(tree.n)]
+    for i in reversed(range(tree.n)):
+        if tree.joint_kinds[i] == "prismatic":
+            continue
+        body = bodies[i]
+        rod = _Body(body.mass, np.array([0, 0, body.moment[2]]), np.diag([body.inertia[1, 1]] * 2 + [0.0]))
+        bodies[i] = _Body(0.0, body.moment - rod.moment, body.inertia - rod.inertia)
+        if tree.parents[i] >= 0:
+            _attach(bodies[tree.parents[i]], rod, tree.rotations[i], tree.translations[i])
+    return bodies
+
+
+def _body(mass: float, centre: Array, inertia: Array) -> _Body:
+    return _Body(mass, mass * centre, inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre)))
+
+
+def _attach(parent: _Body, child: _Body, R: Array, p: Array) -> None:
+    """Add a body fixed at rotation R and position p in the parent's frame."""
+    mc = R @ child.moment
+    shift = 2 * (p @ mc) * np.eye(3) - np.outer(p, mc) - np.outer(mc, p)
+    steiner = child.mass * (p @ p * np.eye(3) - np.outer(p, p))
+    parent.inertia = parent.inertia + R @ child.inertia @ R.T + shift + steiner
+    parent.moment = parent.moment + mc + child.mass * p
+    parent.mass += child.mass

@@ -1,0 +1,87 @@
+"""From a `pin.Model` to the numbers of a `KinematicTree`."""
+
+import numpy as np
+import pinocchio as pin
+
+from orthocas.checks import Array, require_known
+from orthocas.errors import RobotError
+from orthocas.robots.tree import JointKind, KinematicTree
+
+_ROUNDING = 1e-14  # rotation entries this close to 0 or +-1 come from rounding in rpy -> matrix
+_UNLIMITED = 1e10  # Pinocchio writes the largest double for "no limit"
+
+
+def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
+    """Read joints, bodies, limits and the tip frame out of a Pinocchio model.
+
+    Raises:
+        UnknownNameError: if there is no frame called tip.
+        RobotError: if a joint is not revolute, continuous or prismatic (named in the message).
+    """
+    require_known("frame", tip, [frame.name for frame in model.frames])
+    axes = [_joint_axis(model, i) for i in range(1, model.njoints)]
+    turns = [np.eye(3)] + [_rotation_z_to(axis) for _, axis in axes]  # body frame -> frame with the axis along z
+    bodies = range(1, model.njoints)
+    frame = model.frames[model.getFrameId(tip)]
+    carrier = frame.parentJoint
+    continuous = [model.joints[i].nq == 2 for i in bodies]
+    return KinematicTree(
+        joint_names=tuple(model.names[i] for i in bodies),
+        joint_kinds=tuple(kind for kind, _ in axes),
+        parents=tuple(model.parents[i] - 1 for i in bodies),
+        rotations=np.array([_snap(turns[model.parents[i]].T @ model.jointPlacements[i].rotation @ turns[i]) for i in bodies]),
+        translations=np.array([turns[model.parents[i]].T @ model.jointPlacements[i].translation for i in bodies]),
+        masses=np.array([model.inertias[i].mass for i in bodies]),
+        centres=np.array([turns[i].T @ model.inertias[i].lever for i in bodies]),
+        inertias=np.array([turns[i].T @ model.inertias[i].inertia @ turns[i] for i in bodies]),
+        armatures=np.array([model.armature[model.joints[i].idx_v] for i in bodies]),
+        lower=_limits(model, model.lowerPositionLimit, continuous, -np.inf),
+        upper=_limits(model, model.upperPositionLimit, continuous, np.inf),
+        tip_name=tip,
+        tip_parent=carrier - 1,
+        tip_rotation=_snap(turns[carrier].T @ frame.placement.rotation),
+        tip_translation=turns[carrier].T @ frame.placement.translation,
+        gravity=np.array(model.gravity.linear),
+    )
+
+
+def _joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
+    """Kind and axis of joint i, read off its motion subspace."""
+    joint, name = model.joints[i], model.names[i]
+    if joint.shortname() == "JointModelMimic":
+        raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: lock it or the joint it follows")
+    if joint.nv != 1:
+        raise RobotError(
+            f"joint '{name}' is of type {joint.shortname()} with {joint.nv} degrees of freedom, "
+            "expected revolute, continuous or prismatic joints"
+        )
+    data = joint.createData()
+    joint.calc(data, pin.neutral(model))
+    subspace = np.asarray(data.S).ravel()
+    linear, angular = subspace[:3], subspace[3:]
+    if not linear.any():
+        return "revolute", angular
+    if not angular.any():
+        return "prismatic", linear
+    raise RobotError(f"joint '{name}' is helical, expected revolute, continuous or prismatic joints")
+
+
+def _rotation_z_to(axis: Array) -> Array:
+    """A rotation T with T z = axis; a signed permutation where axis is a coordinate axis, so that zeros stay zeros."""
+    z = _snap(axis / np.linalg.norm(axis))
+    helper = np.roll(np.eye(3)[int(np.argmax(np.abs(z)))], 1)
+    y = np.cross(z, helper)
+    y = _snap(y / np.linalg.norm(y))
+    return np.column_stack([np.cross(y, z), y, z])
+
+
+def _snap(values: Array) -> Array:
+    """Round entries that are 0 or +-1 up to rounding, so that CasADi drops the terms."""
+    rounded = np.round(values)
+    return np.where(np.abs(values - rounded) < _ROUNDING, rounded, values) + 0.0
+
+
+def _limits(model: pin.Model, limits: Array, continuous: list[bool], unlimited: float) -> Array:
+    """Position limits, one per joint; a continuous joint has none."""
+    values = [unlimited if free else limits[model.joints[i + 1].idx_q] for i, free in enumerate(continuous)]
+    return np.array([unlimited if abs(value) > _UNLIMITED else value for value in values])

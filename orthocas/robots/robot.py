@@ -1,0 +1,164 @@
+"""The robot as users meet it: names, limits, and kinematics and dynamics for SX, MX and NumPy."""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import casadi as ca
+import pinocchio as pin
+
+from orthocas.batch import dense_function, evaluate_batch
+from orthocas.checks import Array, as_point_set, require_known
+from orthocas.errors import ShapeError
+from orthocas.robots import dynamics, files, kinematics, planar
+from orthocas.robots.pinocchio_model import tree_from_model
+from orthocas.robots.tree import KinematicTree
+
+
+class Robot:
+    """A fixed-base robot with n revolute or prismatic joints and one tip frame.
+
+    Methods take CasADi columns (n, 1), SX or MX, and return the same kind; or NumPy, one state (n,) or a set
+    (N, n), and return NumPy. Positions in rad or m, velocities in rad/s or m/s, forces in N m or N.
+    """
+
+    def __init__(self, tree: KinematicTree) -> None:
+        self.tree = tree
+
+    @classmethod
+    def from_model(cls, model: pin.Model, tip: str, locked: Mapping[str, float] | None = None) -> Self:
+        """Build from a Pinocchio model.
+
+        Args:
+            model: the model; joints may be revolute, continuous or prismatic.
+            tip: name of any frame of the model.
+            locked: joints to fix, with their positions [rad] or [m].
+
+        Raises:
+            UnknownNameError: if the frame or a locked joint does not exist.
+            RobotError: if a joint left free is of another type (floating base, spherical, mimic, ...).
+        """
+        require_known("frame", tip, [frame.name for frame in model.frames])
+        return cls(tree_from_model(files.lock_joints(model, locked or {}), tip))
+
+    @classmethod
+    def from_urdf(cls, path: str | Path, tip: str | None = None, locked: Mapping[str, float] | None = None) -> Self:
+        """Build from a URDF file; see `from_model`. Without a tip, the last frame of a single chain."""
+        model = files.read_urdf(path)
+        return cls.from_model(model, tip or files.default_tip(model), locked)
+
+    @classmethod
+    def from_mjcf(cls, path: str | Path, tip: str | None = None, locked: Mapping[str, float] | None = None) -> Self:
+        """Build from a MuJoCo MJCF file; see `from_model`. Without a tip, the last frame of a single chain."""
+        model = files.read_mjcf(path)
+        return cls.from_model(model, tip or files.default_tip(model), locked)
+
+    @classmethod
+    def chain_from_urdf(cls, path: str | Path, tip: str | None = None) -> Self:
+        """Build the chain that moves the tip from a URDF file; every other joint is locked at (or next to) zero."""
+        model = files.read_urdf(path)
+        tip = tip or files.default_tip(model)
+        return cls.from_model(model, tip, files.joints_off_chain(model, tip))
+
+    @classmethod
+    def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
+        """A planar arm with uniform links, lengths [m] and masses [kg]; x horizontal, gravity along -y."""
+        return cls(tree_from_model(planar.planar_model(lengths, masses), planar.TIP))
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.tree.n
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of q."""
+        return self.tree.joint_names
+
+    @property
+    def lower(self) -> Array:
+        """Lower joint limits (n,) [rad] or [m], -inf where unlimited."""
+        return self.tree.lower
+
+    @property
+    def upper(self) -> Array:
+        """Upper joint limits (n,) [rad] or [m], inf where unlimited."""
+        return self.tree.upper
+
+    def mass_matrix(self, q: Any) -> Any:
+        """M(q), (n, n), symmetric positive definite."""
+        return self._call("mass_matrix", q)
+
+    def gravity(self, q: Any) -> Any:
+        """g(q), (n,): the joint forces that hold the robot still."""
+        return self._call("gravity", q)
+
+    def bias(self, q: Any, dq: Any) -> Any:
+        """C(q, dq) dq + g(q), (n,)."""
+        return self._call("bias", q, dq)
+
+    def inverse_dynamics(self, q: Any, dq: Any, ddq: Any) -> Any:
+        """tau = M ddq + C dq + g, (n,)."""
+        return self._call("inverse_dynamics", q, dq, ddq)
+
+    def coriolis_product(self, q: Any, v: Any, w: Any) -> Any:
+        """C(q, v) w, (n,), with the Christoffel C (dM/dt - 2 C is skew): bilinear and symmetric in (v, w)."""
+        return self._call("coriolis_product", q, v, w)
+
+    def tip_position(self, q: Any) -> Any:
+        """Position of the tip in the world, (3,) [m]."""
+        return self._call("tip_position", q)
+
+    def tip_rotation(self, q: Any) -> Any:
+        """Rotation of the tip in the world, (3, 3)."""
+        return self._call("tip_rotation", q)
+
+    def tip_jacobian(self, q: Any) -> Any:
+        """Geometric Jacobian of the tip in world axes, (6, n): linear rows, then angular rows."""
+        return self._call("tip_jacobian", q)
+
+    def function(self, name: str) -> ca.Function:
+        """The CasADi function behind a method, for code generation and larger graphs.
+
+        Raises:
+            UnknownNameError: if there is no such function.
+        """
+        require_known("robot function", name, self._functions)
+        return self._functions[name]
+
+    @cached_property
+    def _functions(self) -> dict[str, ca.Function]:
+        tree = self.tree
+        q, dq, ddq = (ca.SX.sym(name, self.n) for name in ("q", "dq", "ddq"))
+        R, p = kinematics.tip_pose(tree, q)
+        outputs: dict[str, tuple[list[ca.SX], ca.SX]] = {
+            "mass_matrix": ([q], dynamics.mass_matrix(tree, q)),
+            "gravity": ([q], dynamics.bias(tree, q, ca.SX(self.n, 1), tree.gravity)),
+            "bias": ([q, dq], dynamics.bias(tree, q, dq, tree.gravity)),
+            "inverse_dynamics": ([q, dq, ddq], dynamics.inverse_dynamics(tree, q, dq, ddq, tree.gravity)),
+            "coriolis_product": ([q, dq, ddq], dynamics.coriolis_product(tree, q, dq, ddq)),
+            "tip_position": ([q], p),
+            "tip_rotation": ([q], R),
+            "tip_jacobian": ([q], kinematics.tip_jacobian(tree, q)),
+        }
+        return {name: dense_function(name, inputs, [output]) for name, (inputs, output) in outputs.items()}
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        """Call a function with CasADi or NumPy arguments, same kind out."""
+        function = self._functions[name]
+        if any(isinstance(a, ca.SX | ca.MX) for a in arguments):
+            for a in arguments:
+                if a.shape != (self.n, 1):
+                    raise ShapeError("a CasADi joint vector", a.shape, (self.n, 1))
+            return function(*arguments)
+        sets = [as_point_set(function.name_in(i), a, self.n) for i, a in enumerate(arguments)]
+        points = [p for p, _ in sets]
+        if len({len(p) for p in points}) > 1:
+            raise ShapeError("the second state set", points[1].shape, points[0].shape)
+        rows, columns = function.size_out(0)
+        result = evaluate_batch(function, *points)[0].reshape((-1, rows, columns) if name in _MATRICES else (-1, rows))
+        return result[0] if all(single for _, single in sets) else result
+
+
+_MATRICES = ("mass_matrix", "tip_rotation", "tip_jacobian")

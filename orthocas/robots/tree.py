@@ -1,0 +1,78 @@
+"""The plain numbers of a kinematic tree: what a robot is once Pinocchio has read it, and what a chart file keeps."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from orthocas.checks import Array, frozen_array, require_known
+from orthocas.errors import InvalidValueError, RobotError
+
+JointKind = Literal["revolute", "prismatic"]
+JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "prismatic")
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicTree:
+    """Joints, bodies and one tip frame. Joint i moves body i; bodies come parents first.
+
+    Body frames are turned so that every joint axis is the body's z axis: joint i places its body at
+    `rotations[i] Rz(q_i), translations[i]` (revolute) or `rotations[i], translations[i] + q_i rotations[i] z`
+    (prismatic) in the parent body's frame.
+    """
+
+    joint_names: tuple[str, ...]
+    joint_kinds: tuple[JointKind, ...]
+    parents: tuple[int, ...]  #: index of the parent body, -1 for the base
+    rotations: Array  #: (n, 3, 3) joint frames in the parent's frame
+    translations: Array  #: (n, 3) [m]
+    masses: Array  #: (n,) [kg]
+    centres: Array  #: (n, 3) centre of mass in the body frame [m]
+    inertias: Array  #: (n, 3, 3) about the centre of mass, in the body frame [kg m^2]
+    armatures: Array  #: (n,) rotor inertia seen at the joint [kg m^2] or [kg]
+    lower: Array  #: (n,) joint limits [rad] or [m], -inf where unlimited
+    upper: Array  #: (n,)
+    tip_name: str
+    tip_parent: int  #: body that carries the tip, -1 for the base
+    tip_rotation: Array  #: (3, 3) in that body's frame
+    tip_translation: Array  #: (3,) [m]
+    gravity: Array  #: (3,) gravity acceleration in the world [m/s^2]
+
+    def __post_init__(self) -> None:
+        n = self.n
+        if n == 0:
+            raise RobotError("the robot has no movable joint, expected at least one")
+        shapes: dict[str, tuple[int, ...]] = {
+            "rotations": (n, 3, 3),
+            "translations": (n, 3),
+            "masses": (n,),
+            "centres": (n, 3),
+            "inertias": (n, 3, 3),
+            "armatures": (n,),
+            "tip_rotation": (3, 3),
+            "tip_translation": (3,),
+            "gravity": (3,),
+        }
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+        for name in ("lower", "upper"):  # may be infinite
+            limits = np.array(getattr(self, name), dtype=float)
+            limits.setflags(write=False)
+            object.__setattr__(self, name, limits)
+        for kind in self.joint_kinds:
+            require_known("joint kind", kind, JOINT_KINDS)
+        for i, parent in enumerate(self.parents):
+            if not -1 <= parent < i:
+                raise InvalidValueError(f"parents[{i}]", parent, f"an index from -1 to {i - 1}")
+        if not -1 <= self.tip_parent < n:
+            raise InvalidValueError("tip_parent", self.tip_parent, f"an index from -1 to {n - 1}")
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @property
+    def prismatic(self) -> tuple[bool, ...]:
+        """Which joints slide."""
+        return tuple(kind == "prismatic" for kind in self.joint_kinds)

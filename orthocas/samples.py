@@ -1,0 +1,63 @@
+"""Sample sets of a problem: everything the loss needs that does not depend on the coordinates."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthocas.checks import Array
+from orthocas.domains import sample_uniform
+from orthocas.metrics import metric_matrices
+from orthocas.problem import Problem, task_jacobians
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """N joint positions with their task gradients and metrics; samples with a vanishing gradient are left out."""
+
+    points: Array  #: q, (N, n)
+    task_jacobian: Array  #: J_x, (N, m, n)
+    metric_inverse: Array | None  #: A^-1, (N, n, n); None for the identity
+    dropped: int = 0  #: samples left out because a task gradient vanishes there
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def restricted_to(self, joints: list[int]) -> "Samples":
+        """Only some joints; the metric must not couple them to the others."""
+        inverse = None if self.metric_inverse is None else self.metric_inverse[:, joints][:, :, joints]
+        return Samples(self.points[:, joints], self.task_jacobian[:, :, joints], inverse, self.dropped)
+
+    def raised(self, covectors: Array) -> Array:
+        """A^-1 v for covectors v (N, k, n): gradients in the metric ([AS2023] eq. (16))."""
+        return covectors if self.metric_inverse is None else covectors @ self.metric_inverse
+
+    @property
+    def unit_task_gradients(self) -> Array:
+        """A^-1 v_x,i / |A^-1 v_x,i| with Euclidean norms, as in [AS2023] eq. (24), (N, m, n)."""
+        gradients = self.raised(self.task_jacobian)
+        return gradients / np.linalg.norm(gradients, axis=2, keepdims=True)
+
+    @property
+    def task_basis(self) -> Array:
+        """An A-orthonormal basis e_1..e_m of span{grad_A h_i}, (N, m, n)."""
+        gradients = self.raised(self.task_jacobian)
+        gram = gradients @ self.task_jacobian.transpose(0, 2, 1)
+        scale = np.sqrt(np.einsum("sii->si", gram))  # rows of unit length first: units do not matter
+        gram = gram / scale[:, :, None] / scale[:, None, :]
+        values, vectors = np.linalg.eigh(gram)
+        values = np.maximum(values, 1e-14)  # singular samples stay finite
+        return (vectors / np.sqrt(values)[:, None, :]).transpose(0, 2, 1) @ (gradients / scale[:, :, None])
+
+
+def sample_problem(problem: Problem, samples: int, seed: int | tuple[int, ...]) -> Samples:
+    """Draw samples uniformly from the problem's domain."""
+    return samples_at(problem, sample_uniform(problem.domain, samples, seed))
+
+
+def samples_at(problem: Problem, points: Array) -> Samples:
+    """Samples at given joint positions (N, n)."""
+    J = task_jacobians(problem, points)
+    kept = np.all((J**2).sum(axis=2) > 0, axis=1)
+    points, J = points[kept], J[kept]
+    inverse = None if problem.metric.is_identity else np.linalg.inv(metric_matrices(problem.metric, points))
+    return Samples(points, J, inverse, dropped=int((~kept).sum()))

@@ -1,0 +1,39 @@
+"""Spectral start: the best coordinates of a linear family in a quadratic sense, without an initial guess (ours)."""
+
+import numpy as np
+import scipy.linalg
+
+from orthocas.checks import Array
+from orthocas.parametrisations import LinearFamily
+from orthocas.samples import Samples
+
+_MUTUAL_WEIGHT = 1.0
+_RIDGE = 1e-10  # relative; keeps the pencil definite where basis functions coincide on the samples
+
+
+def spectral_start(family: LinearFamily, samples: Samples) -> Array:
+    """Coefficients, (r K,), of coordinates found one after the other from generalised eigenproblems.
+
+    Each minimises E |Pi_x grad xi|^2 subject to E |grad xi|^2 = 1, with Pi_x the A-orthogonal projector on the task
+    gradients; plus E (grad xi_j . grad xi)^2 / |grad xi_j|^2 for those already found, because a function of a found
+    coordinate would be a minimiser too. All products in the metric A^-1.
+
+    Source:
+        ours, docs/derivations.md#spectral-start.
+    """
+    G = family.basis_gradients(samples.points)
+    N, n, K = G.shape
+    along_task = (samples.task_basis @ G).reshape(-1, K)  # e_i^T d psi, the components along the task gradients
+    S = along_task.T @ along_task / N
+    raised = G if samples.metric_inverse is None else samples.metric_inverse @ G
+    T = G.reshape(-1, K).T @ raised.reshape(-1, K) / N
+    T += _RIDGE * np.trace(T) / K * np.eye(K)
+    found = []
+    for _ in range(family.outputs):
+        c = scipy.linalg.eigh(S, T, subset_by_index=[0, 0])[1][:, 0]
+        found.append(c)
+        gradient = raised @ c  # (N, n)
+        length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))
+        along = np.einsum("sn,snk->sk", gradient / length[:, None], G)
+        S = S + _MUTUAL_WEIGHT * along.T @ along / N
+    return np.concatenate(found)

@@ -1,0 +1,25 @@
+"""The KUKA LBR iiwa 7 R800 with the position of its flange as the task ([AS2023] Sec. 9)."""
+
+from importlib.resources import as_file, files
+
+import numpy as np
+
+from orthocas.domains import Box
+from orthocas.problem import Problem
+from orthocas.robots import Robot
+from orthocas.tasks import Task
+
+CENTRE = (0.0, 0.52, 0.0, -1.05, 0.0, 0.79, 0.0)  #: q0 [rad]
+HALF_WIDTH = np.pi / 4  #: [rad]
+
+
+def robot() -> Robot:
+    """The arm, tip at the flange (link_ee)."""
+    with as_file(files("orthocas.problems") / "data" / "iiwa7_r800.urdf") as path:
+        return Robot.from_urdf(path, tip="link_ee")
+
+
+def iiwa() -> Problem:
+    """Seven joints, flange position, A = I, hyper-cube of edge pi/2 about q0."""
+    arm = robot()
+    return Problem(arm, Task.position(arm), "euclidean", Box(CENTRE, HALF_WIDTH), "iiwa")

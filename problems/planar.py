@@ -1,0 +1,36 @@
+"""The planar arms of [AS2023] (Fig. 5): links of 1 m and 3 kg, mass spread uniformly (lengths are ours)."""
+
+import numpy as np
+
+from orthocas.domains import Box, Torus
+from orthocas.problem import Problem
+from orthocas.robots import Robot
+from orthocas.tasks import Task
+
+
+def _arm(joints: int) -> Robot:
+    return Robot.planar(lengths=[1.0] * joints, masses=[3.0] * joints)
+
+
+def planar_2r() -> Problem:
+    """Two joints, task x of the tip, A = I, whole torus ([AS2023] Sec. 6.1).
+
+    Self-motion manifolds are circles here, so no smooth coordinate is good everywhere: expect bad regions near the
+    singularities of the task.
+    """
+    robot = _arm(2)
+    return Problem(robot, Task.position(robot, "x"), "euclidean", Torus(2), "planar_2r")
+
+
+def planar_3r_x() -> Problem:
+    """Three joints, task x of the tip, A = M: exact coordinates exist. A box away from singularities (ours)."""
+    robot = _arm(3)
+    box = Box([np.pi / 2, -np.pi / 4, -np.pi / 4], np.pi / 6)
+    return Problem(robot, Task.position(robot, "x"), "inertia", box, "planar_3r_x")
+
+
+def planar_3r_xy() -> Problem:
+    """Three joints, task (x, y) of the tip, A = M: exact coordinates do not exist. Box as for planar_3r_x (ours)."""
+    robot = _arm(3)
+    box = Box([np.pi / 2, -np.pi / 4, -np.pi / 4], np.pi / 6)
+    return Problem(robot, Task.position(robot, "xy"), "inertia", box, "planar_3r_xy")

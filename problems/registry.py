@@ -1,0 +1,29 @@
+"""Named problems by name."""
+
+from collections.abc import Callable
+
+from orthocas.checks import require_known
+from orthocas.problem import Problem
+from orthocas.problems import iiwa, planar
+
+PROBLEMS: dict[str, Callable[[], Problem]] = {
+    "planar_2r": planar.planar_2r,
+    "planar_3r_x": planar.planar_3r_x,
+    "planar_3r_xy": planar.planar_3r_xy,
+    "iiwa": iiwa.iiwa,
+}
+
+
+def names() -> tuple[str, ...]:
+    """Names of all problems."""
+    return tuple(PROBLEMS)
+
+
+def get(name: str) -> Problem:
+    """Build a named problem.
+
+    Raises:
+        UnknownNameError: if there is no such problem.
+    """
+    require_known("problem", name, PROBLEMS)
+    return PROBLEMS[name]()
