@@ -10,7 +10,6 @@ if not (_Path(__file__).parent / "problems").is_dir():
 from orthocas import problems, solvers
 from orthocas.api import fit, load
 from orthocas.chart import Chart
-
 from orthocas.domains import Box, Torus, contains
 from orthocas.parametrisations import MLP, Fourier, Linear, Polynomial
 from orthocas.problem import Problem, check
@@ -19,5 +18,23 @@ from orthocas.robots import Robot
 from orthocas.tasks import Task
 
 __version__ = "0.1.0"
-__all__ = ["MLP", "Box", "Chart", "Fourier", "Linear", "Polynomial", "Problem", "Report", "Robot", "Task", "Torus",
- "check", "contains", "evaluate", "fit", "load", "problems", "solvers"]
+__all__ = [
+    "MLP",
+    "Box",
+    "Chart",
+    "Fourier",
+    "Linear",
+    "Polynomial",
+    "Problem",
+    "Report",
+    "Robot",
+    "Task",
+    "Torus",
+    "check",
+    "contains",
+    "evaluate",
+    "fit",
+    "load",
+    "problems",
+    "solvers",
+]

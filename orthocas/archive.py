@@ -28,12 +28,11 @@ def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[s
         ChartFileError: if the folder is missing or cannot be written.
     """
     target = Path(path)
+    require_writable(target)
     entries = {f"{name}.npy": _npy_bytes(array) for name, array in arrays.items()}
     full = {"format": FORMAT, "version": VERSION, **header, "sha256": {k: _digest(v) for k, v in entries.items()}}
     text = json.dumps(full, indent=1).encode()
     entries = {_HEADER: text, _DIGEST: _digest(text).encode(), **entries}
-    if not target.parent.is_dir():
-        raise ChartFileError(f"cannot write {target}: folder {target.parent} does not exist")
     try:
         with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{target.name}.", delete=False) as draft:
             try:
@@ -49,6 +48,20 @@ def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[s
                 raise
     except OSError as error:
         raise ChartFileError(f"cannot write {target}: {error.strerror}") from None
+
+
+def require_writable(path: Path) -> None:
+    """Check early, before long work, that a file can be written.
+
+    Raises:
+        ChartFileError: if its folder is missing or read-only, or the path is a folder.
+    """
+    if not path.parent.is_dir():
+        raise ChartFileError(f"cannot write {path}: folder {path.parent} does not exist")
+    if path.is_dir():
+        raise ChartFileError(f"cannot write {path}: it is a folder, expected a file name")
+    if not os.access(path.parent, os.W_OK):
+        raise ChartFileError(f"cannot write {path}: folder {path.parent} is read-only")
 
 
 def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, Array]]:

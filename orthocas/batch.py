@@ -3,6 +3,9 @@
 NumPy sample sets are (N, n); a stack of matrices is (N, rows, columns).
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import casadi as ca
 import numpy as np
 
@@ -11,8 +14,8 @@ from orthocas.checks import Array
 CHUNK = 512  #: samples evaluated in one call: large enough to amortise the call, small enough for the cache
 
 
-def dense_function(name: str, inputs: list[ca.SX] | list[ca.MX], outputs: list[ca.SX] | list[ca.MX]) -> ca.Function:
-    """A CasADi function whose outputs have no structural zeros, as `evaluate_batch` needs."""
+def dense_function(name: str, inputs: Sequence[Any], outputs: Sequence[Any]) -> ca.Function:
+    """A CasADi function, SX or MX, whose outputs have no structural zeros, as `evaluate_batch` needs."""
     return ca.Function(name, inputs, [ca.densify(out) for out in outputs])
 
 
@@ -33,14 +36,15 @@ def evaluate_columns(function: ca.Function, chunk: int, *arguments: Array) -> li
     """As `evaluate_batch`, for a function that already takes `chunk` samples side by side as columns."""
     N = len(arguments[0])
     arguments = tuple(_column_major(a) for a in arguments)
-    buffer, run = function.buffer()
+    buffer: Any
+    buffer, run = function.buffer()  # the stub of set_arg and set_res asks for a size, the method takes none
     inputs = [np.empty((chunk, *a.shape[1:])) for a in arguments]
     shapes = [function.size_out(i) for i in range(function.n_out())]
     outputs = [np.empty((chunk, columns // chunk, rows)) for rows, columns in shapes]
     for i, array in enumerate(inputs):
-        buffer.set_arg(i, memoryview(array))
+        buffer.set_arg(i, array.data)
     for i, array in enumerate(outputs):
-        buffer.set_res(i, memoryview(array))
+        buffer.set_res(i, array.data)
     results = [np.empty((N, *out.shape[1:])) for out in outputs]
     for start in range(0, N, chunk):
         count = min(chunk, N - start)

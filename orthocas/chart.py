@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Self
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.batch import dense_function, evaluate_batch
 from orthocas.chart_file import read_chart, write_chart
@@ -124,9 +124,10 @@ class Chart:
 
     @cached_property
     def _functions(self) -> dict[str, ca.Function]:
-        q = self.coordinates.symbol.sym("q", self.n)
-        x, xi = self.problem.task.function(q), self.coordinates.expression(q)
-        J_x, J_xi = self.problem.task.jacobian_function(q), ca.jacobian(xi, q)
+        q = ca.MX.sym("q", self.n)
+        task, coordinates = self.problem.task, self.coordinates.functions
+        x, J_x = task.function(q), task.jacobian_function(q)
+        xi, J_xi = coordinates["xi"](q), coordinates["jacobian"](q)
         outputs = {
             "xi": xi,
             "phi": ca.vertcat(x, xi),
@@ -140,9 +141,10 @@ class Chart:
     def _rootfinder(self) -> ca.Function:
         q, target = ca.MX.sym("q", self.n), ca.MX.sym("phi", self.n)
         residual = self._functions["phi"](q) - target
-        options = {"error_on_fail": False, "abstol": 1e-12, "max_iter": 100, "strategy": "linesearch"}
-        quiet = {"disable_internal_warnings": True, "verbose": False}
-        return ca.rootfinder("inverse", "kinsol", {"x": q, "p": target, "g": residual}, {**options, **quiet})
+        options: dict[str, Any] = {"error_on_fail": False, "abstol": 1e-12, "max_iter": 100, "strategy": "linesearch"}
+        options |= {"disable_internal_warnings": True, "verbose": False}
+        equations: dict[str, Any] = {"x": q, "p": target, "g": residual}
+        return ca.rootfinder("inverse", "kinsol", equations, options)
 
     def _solve(self, q_start: Array, phi: Array) -> Array:
         try:
@@ -151,7 +153,7 @@ class Chart:
             return np.full(self.n, np.nan)
 
     def _require_solved(self, solutions: Array, targets: Array, tolerance: float) -> None:
-        finite = np.isfinite(solutions).all(axis=1)
+        finite: NDArray[np.bool_] = np.isfinite(solutions).all(axis=1)
         safe = np.where(finite[:, None], solutions, self.problem.domain.centre)
         error = np.where(finite, np.abs(self.phi(safe) - targets).max(axis=1), np.inf)
         bad = np.flatnonzero(~(error <= tolerance))
@@ -165,4 +167,3 @@ class Chart:
         singular = np.flatnonzero(values[:, -1] < _SINGULAR * values[:, 0])
         if singular.size:
             raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}, q is not unique there")
-

@@ -82,14 +82,16 @@ def read_chart(path: str | Path) -> tuple[Problem, Coordinates, Notes]:
 
 
 def _tree(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> KinematicTree:
-    numbers = {name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")}
-    texts = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
+    numbers: dict[str, Any] = {
+        name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
+    }
+    texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
     return KinematicTree(**texts, **numbers)
 
 
 def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Array]) -> Problem:
-    domain: Domain = Torus(robot.n) if data["domain"] == "torus" else Box(
-        arrays["domain_centre"], arrays["domain_half_width"]
+    domain: Domain = (
+        Torus(robot.n) if data["domain"] == "torus" else Box(arrays["domain_centre"], arrays["domain_half_width"])
     )
     return Problem(robot, _task(robot, data["task"]), _metric(robot, data["metric"]), domain, data["name"])
 

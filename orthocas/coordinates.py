@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -58,11 +59,6 @@ class Coordinates:
         """The fitted family on the active joints."""
         return self.parametrisation.family(self.space.restricted_to(self.active), len(self.offset))
 
-    @property
-    def symbol(self) -> type[ca.SX] | type[ca.MX]:
-        """Kind of CasADi graph that suits the family."""
-        return ca.MX if self.family.as_matrices else ca.SX
-
     def expression(self, q: Expression) -> Expression:
         """xi(q), (r, N), for joint positions as columns (n, N)."""
         columns = q.shape[1]
@@ -76,30 +72,36 @@ class Coordinates:
         return ca.vertcat(*rows)
 
     def xi(self, points: Array) -> Array:
-        """xi at points (N, n), (N, r)."""
-        function, columns = self._batch_functions["xi"]
-        return (evaluate_columns(function, columns, points) if columns > 1 else evaluate_batch(function, points))[0]
+        """Xi at points (N, n), (N, r)."""
+        if self.family.as_matrices:
+            return evaluate_columns(self._column_functions["xi"], _COLUMNS, points)[0]
+        return evaluate_batch(self.functions["xi"], points)[0]
 
     def jacobian(self, points: Array) -> Array:
         """J_xi at points (N, n), (N, r, n)."""
-        function, columns = self._batch_functions["jacobian"]
-        flat = (evaluate_columns(function, columns, points) if columns > 1 else evaluate_batch(function, points))[0]
-        return flat.reshape(len(points), self.space.n, self.r).transpose(0, 2, 1)
+        if self.family.as_matrices:
+            flat = evaluate_columns(self._column_functions["jacobian"], _COLUMNS, points)[0]
+            return flat.reshape(len(points), self.space.n, self.r).transpose(0, 2, 1)
+        return evaluate_batch(self.functions["jacobian"], points)[0].reshape(len(points), self.r, self.space.n)
 
     @cached_property
-    def _batch_functions(self) -> dict[str, tuple[ca.Function, int]]:
-        """xi and vec(J_xi): for one sample (SX, to be mapped) or for many columns at once (MX)."""
-        columns = _COLUMNS if self.family.as_matrices else 1
-        q = self.symbol.sym("q", self.space.n, columns)
+    def functions(self) -> dict[str, ca.Function]:
+        """Xi (r, 1) and jacobian (r, n) of one joint position q (n, 1)."""
+        q = self._symbols(1)
         xi = self.expression(q)
-        if columns == 1:
-            gradients = ca.vec(ca.jacobian(xi, q))
-        else:
-            gradients = ca.vertcat(*joint_derivatives(xi, q))
-        return {
-            "xi": (dense_function("xi", [q], [xi]), columns),
-            "jacobian": (dense_function("jacobian", [q], [gradients]), columns),
-        }
+        return {"xi": dense_function("xi", [q], [xi]), "jacobian": dense_function("J_xi", [q], [ca.jacobian(xi, q)])}
+
+    @cached_property
+    def _column_functions(self) -> dict[str, ca.Function]:
+        """Xi and vec(J_xi) of many joint positions side by side: what dense products are fast at."""
+        q = self._symbols(_COLUMNS)
+        xi = self.expression(q)
+        J_xi = ca.vertcat(*joint_derivatives(xi, q))
+        return {"xi": dense_function("xi", [q], [xi]), "jacobian": dense_function("J_xi", [q], [J_xi])}
+
+    def _symbols(self, columns: int) -> Any:
+        """Joint positions in the kind of graph that suits the family: SX for scalars, MX for matrices."""
+        return (ca.MX if self.family.as_matrices else ca.SX).sym("q", self.space.n, columns)
 
 
 def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:

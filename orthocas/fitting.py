@@ -79,6 +79,7 @@ def fit_chart(
     active = [i for i in range(problem.n) if i not in idle]
     run = _Run(problem, space.restricted_to(active), active, weights, samples, seed, monitor)
     r = problem.r - len(idle)
+    stages: list[Stage]
     if r == 0:
         stages, parametrisation, theta = [], Polynomial(1), np.zeros(0)
     elif isinstance(parametrisation, Linear):
@@ -178,7 +179,9 @@ class _Run:
         needed = 8 * (N * self.space.n * K + 4 * (r * K) ** 2)
         available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         if needed > 0.8 * available:
-            raise MemoryNeedError(f"{target.label} on {self.space.n} joints with {K} basis functions", needed, available)
+            raise MemoryNeedError(
+                f"{target.label} on {self.space.n} joints with {K} basis functions", needed, available
+            )
 
 
 def _normalised(

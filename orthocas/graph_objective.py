@@ -13,14 +13,16 @@ def loss_expression(family: Family, samples: Samples, weights: Weights, theta: c
     """Mean loss (25) over samples as an MX expression in theta (size, 1); samples run side by side as columns."""
     N, m, n = samples.task_jacobian.shape
     q = ca.MX.sym("q", n, N)
-    gradients = ca.vertcat(*joint_derivatives(family.expression(q, theta), q))  # column s is J_xi of sample s, column by column
+    J_xi = ca.vertcat(*joint_derivatives(family.expression(q, theta), q))  # column s: vec(J_xi) of sample s
     data = [ca.DM(_side_by_side(samples.unit_task_gradients))]
     if samples.metric_inverse is not None:
         data.append(ca.DM(_side_by_side(samples.metric_inverse)))
     sample_loss = _sample_loss(n, m, family.outputs, samples.metric_inverse is None, weights)
-    losses = sample_loss.map(N)(gradients, *data)
+    losses = sample_loss.map(N)(J_xi, *data)
     mean = ca.sum2(losses) / N
-    return ca.graph_substitute(mean, [q], [ca.MX(ca.DM(samples.points.T))])
+    loss: ca.MX
+    (loss,) = ca.graph_substitute([mean], [q], [ca.MX(ca.DM(samples.points.T))])
+    return loss
 
 
 class GraphObjective:

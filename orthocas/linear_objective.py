@@ -1,4 +1,4 @@
-"""The loss of families that are linear in theta: basis gradients are sampled once, then all is dense products (ours)."""
+"""The loss of families linear in theta: basis gradients are sampled once, then all is dense products (ours)."""
 
 import numpy as np
 
@@ -53,9 +53,7 @@ class LinearObjective:
 
     def _linearised_residuals(self, theta: Array) -> tuple[Array, Array]:
         """Residuals (N, p) and d rho / d J_xi as (N, p, r, n)."""
-        rho, derivative = evaluate_batch(
-            self._residuals_and_derivative, self.coordinate_jacobians(theta), *self._data
-        )
+        rho, derivative = evaluate_batch(self._residuals_and_derivative, self.coordinate_jacobians(theta), *self._data)
         return rho, derivative.reshape(self.N, -1, self.r, self.n)
 
     def _gradient(self, rho: Array, derivative: Array) -> Array:

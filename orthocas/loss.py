@@ -50,7 +50,8 @@ def task_cosines(unit_task_gradients: ca.SX, coordinate_jacobian: ca.SX) -> ca.S
     n = unit_task_gradients.shape[1]
     require_shape("coordinate_jacobian", coordinate_jacobian.shape, (None, n))
     lengths = ca.sqrt(ca.sum2(coordinate_jacobian**2))
-    return (unit_task_gradients @ coordinate_jacobian.T) / ca.repmat(lengths.T, unit_task_gradients.shape[0], 1)
+    products: ca.SX = unit_task_gradients @ coordinate_jacobian.T
+    return products / ca.repmat(lengths.T, unit_task_gradients.shape[0], 1)
 
 
 def mutual_cosines(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
@@ -84,11 +85,12 @@ def loss_residuals(
         [AS2023] eq. (24), written as least squares (ours).
     """
     m, r = unit_task_gradients.shape[0], coordinate_jacobian.shape[0]
-    task = ca.vec(task_cosines(unit_task_gradients, coordinate_jacobian)) * (weights.task / (m * r)) ** 0.5
+    task_weight = (weights.task / (m * r)) ** 0.5
+    task: ca.SX = task_weight * ca.vec(task_cosines(unit_task_gradients, coordinate_jacobian))
     if r == 1:
         return task
-    mutual = mutual_cosines(coordinate_jacobian, metric_inverse) * (weights.mutual / len(pairs(r))) ** 0.5
-    return ca.vertcat(task, mutual)
+    mutual_weight = (weights.mutual / len(pairs(r))) ** 0.5
+    return ca.vertcat(task, mutual_weight * mutual_cosines(coordinate_jacobian, metric_inverse))
 
 
 def residual_function(n: int, m: int, r: int, identity_metric: bool, weights: Weights) -> ca.Function:

@@ -48,7 +48,11 @@ class Metric:
             return cls("custom", function, {"kind": "custom", "tape": to_tape(function)})
         matrix = frozen_array("metric", spec, (robot.n, robot.n))
         require_spd(matrix[None], np.zeros((1, robot.n)))
-        return cls("constant", dense_function("metric", [q], [ca.SX(ca.DM(matrix))]), {"kind": "constant", "matrix": matrix.tolist()})
+        return cls(
+            "constant",
+            dense_function("metric", [q], [ca.SX(ca.DM(matrix))]),
+            {"kind": "constant", "matrix": matrix.tolist()},
+        )
 
     @property
     def is_identity(self) -> bool:
@@ -71,7 +75,9 @@ def require_spd(matrices: Array, points: Array) -> None:
     size = np.abs(matrices).max(axis=(1, 2))
     if not np.isfinite(size).all():
         at = points[np.flatnonzero(~np.isfinite(size))[0]]
-        raise MetricError(f"metric is not finite at q = {np.round(at, 4).tolist()}, expected symmetric positive definite")
+        raise MetricError(
+            f"metric is not finite at q = {np.round(at, 4).tolist()}, expected symmetric positive definite"
+        )
     asymmetry = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2))
     worst = int(np.argmax(asymmetry - 1e-9 * size))
     if asymmetry[worst] > 1e-9 * size[worst]:

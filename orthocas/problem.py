@@ -103,7 +103,8 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
     smallest = np.linalg.svd(J / scale[:, None], compute_uv=False)[:, -1]
     if smallest.max() < _RANK_LOST:
         raise SingularTaskError(
-            f"the Jacobian of task '{problem.task.name}' has rank below m = {problem.m} at all {samples} samples of the domain"
+            f"the Jacobian of task '{problem.task.name}' has rank below m = {problem.m} "
+            f"at all {samples} samples of the domain"
         )
     worst = int(np.argmin(smallest))
     return ProblemCheck(

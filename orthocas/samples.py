@@ -29,13 +29,15 @@ class Samples:
 
     def raised(self, covectors: Array) -> Array:
         """A^-1 v for covectors v (N, k, n): gradients in the metric ([AS2023] eq. (16))."""
-        return covectors if self.metric_inverse is None else covectors @ self.metric_inverse
+        gradients: Array = covectors if self.metric_inverse is None else covectors @ self.metric_inverse
+        return gradients
 
     @property
     def unit_task_gradients(self) -> Array:
         """A^-1 v_x,i / |A^-1 v_x,i| with Euclidean norms, as in [AS2023] eq. (24), (N, m, n)."""
         gradients = self.raised(self.task_jacobian)
-        return gradients / np.linalg.norm(gradients, axis=2, keepdims=True)
+        unit: Array = gradients / np.linalg.norm(gradients, axis=2, keepdims=True)
+        return unit
 
     @property
     def task_basis(self) -> Array:
@@ -46,7 +48,9 @@ class Samples:
         gram = gram / scale[:, :, None] / scale[:, None, :]
         values, vectors = np.linalg.eigh(gram)
         values = np.maximum(values, 1e-14)  # singular samples stay finite
-        return (vectors / np.sqrt(values)[:, None, :]).transpose(0, 2, 1) @ (gradients / scale[:, :, None])
+        whitening = (vectors / np.sqrt(values)[:, None, :]).transpose(0, 2, 1)
+        basis: Array = whitening @ (gradients / scale[:, :, None])
+        return basis
 
 
 def sample_problem(problem: Problem, samples: int, seed: int | tuple[int, ...]) -> Samples:
@@ -59,5 +63,7 @@ def samples_at(problem: Problem, points: Array) -> Samples:
     J = task_jacobians(problem, points)
     kept = np.all((J**2).sum(axis=2) > 0, axis=1)
     points, J = points[kept], J[kept]
-    inverse = None if problem.metric.is_identity else np.linalg.inv(metric_matrices(problem.metric, points))
+    inverse: Array | None = None
+    if not problem.metric.is_identity:
+        inverse = np.asarray(np.linalg.inv(metric_matrices(problem.metric, points)), dtype=float)
     return Samples(points, J, inverse, dropped=int((~kept).sum()))

@@ -22,7 +22,7 @@ def spectral_start(family: LinearFamily, samples: Samples) -> Array:
         ours, docs/derivations.md#spectral-start.
     """
     G = family.basis_gradients(samples.points)
-    N, n, K = G.shape
+    N, _, K = G.shape
     along_task = (samples.task_basis @ G).reshape(-1, K)  # e_i^T d psi, the components along the task gradients
     S = along_task.T @ along_task / N
     raised = G if samples.metric_inverse is None else samples.metric_inverse @ G

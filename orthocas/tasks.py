@@ -113,7 +113,7 @@ class Task:
 
     @cached_property
     def jacobian_function(self) -> ca.Function:
-        """q (n, 1) -> J_x = dh/dq (m, n), by automatic differentiation."""
+        """Q (n, 1) -> J_x = dh/dq (m, n), by automatic differentiation."""
         q = ca.SX.sym("q", self.robot.n)
         return dense_function("task_jacobian", [q], [ca.jacobian(self.function(q), q)])
 

@@ -7,6 +7,8 @@ from orthocas.problem import Problem
 from orthocas.robots import Robot
 from orthocas.tasks import Task
 
+_BENT = Box((0.6, 0.8, 0.8), np.pi / 8)  # [rad]; neither task is singular here
+
 
 def _arm(joints: int) -> Robot:
     return Robot.planar(lengths=[1.0] * joints, masses=[3.0] * joints)
@@ -25,12 +27,10 @@ def planar_2r() -> Problem:
 def planar_3r_x() -> Problem:
     """Three joints, task x of the tip, A = M: exact coordinates exist. A box away from singularities (ours)."""
     robot = _arm(3)
-    box = Box([np.pi / 2, -np.pi / 4, -np.pi / 4], np.pi / 6)
-    return Problem(robot, Task.position(robot, "x"), "inertia", box, "planar_3r_x")
+    return Problem(robot, Task.position(robot, "x"), "inertia", _BENT, "planar_3r_x")
 
 
 def planar_3r_xy() -> Problem:
     """Three joints, task (x, y) of the tip, A = M: exact coordinates do not exist. Box as for planar_3r_x (ours)."""
     robot = _arm(3)
-    box = Box([np.pi / 2, -np.pi / 4, -np.pi / 4], np.pi / 6)
-    return Problem(robot, Task.position(robot, "xy"), "inertia", box, "planar_3r_xy")
+    return Problem(robot, Task.position(robot, "xy"), "inertia", _BENT, "planar_3r_xy")

@@ -1,9 +1,10 @@
 """Minimisers behind one protocol (`orthocas.objective.Solver`)."""
 
-from orthocas.checks import require_known
-from orthocas.objective import Solver
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.lbfgs import LBFGS
+
+from orthocas.checks import require_known
+from orthocas.objective import Solver
 
 __all__ = ["LBFGS", "SOLVERS", "GaussNewton", "get"]
 

@@ -1,5 +1,6 @@
 """What a parametrisation is: a choice of family, and the family itself once the joints are known."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -91,7 +92,7 @@ def joint_derivatives(xi: Expression, q: Expression) -> list[Expression]:
     return derivatives
 
 
-def embed(theta: Array, outputs: int, coarse: list[tuple[int, ...]], fine: list[tuple[int, ...]]) -> Array:
+def embed(theta: Array, outputs: int, coarse: Sequence[tuple[int, ...]], fine: Sequence[tuple[int, ...]]) -> Array:
     """Coefficients of a coarse basis written in a finer one that contains it, (outputs * len(fine),)."""
     place = {term: k for k, term in enumerate(fine)}
     wide = np.zeros((outputs, len(fine)))

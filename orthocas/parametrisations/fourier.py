@@ -45,7 +45,9 @@ class Fourier:
         """
         if any(space.prismatic):
             name = space.joint_names[space.prismatic.index(True)]
-            raise InvalidValueError(f"joint '{name}' of a Fourier basis", "prismatic", "revolute joints; use polynomial")
+            raise InvalidValueError(
+                f"joint '{name}' of a Fourier basis", "prismatic", "revolute joints; use polynomial"
+            )
 
         def waves(i: int, q: ca.SX) -> list[ca.SX]:
             out = [1 + 0 * q]

@@ -56,7 +56,7 @@ class Linear:
             InvalidValueError: if the paper's normals are asked for and n is not 3.
         """
         m, n = gradients.shape
-        normals: Array = scipy.linalg.null_space(gradients, rcond=1e-9).T
+        normals = np.asarray(scipy.linalg.null_space(gradients, rcond=1e-9).T, dtype=float)
         if len(normals) != n - m:
             raise SingularTaskError("the task is singular at the base q0 of linear coordinates, choose another base")
         if self.normals == "orthonormal":
@@ -65,7 +65,7 @@ class Linear:
             raise InvalidValueError("n", n, "3 joints for the paper's normal vectors")
         if m == 2:
             normal = np.cross(gradients[0], gradients[1])  # (39)
-            return (normal / np.linalg.norm(normal))[None, :]
+            return np.asarray(normal / np.linalg.norm(normal), dtype=float)[None, :]
         v = gradients[0]
         if np.hypot(v[0], v[1]) < 1e-9 * np.linalg.norm(v):
             raise SingularTaskError("the paper's normals (37) need a task gradient with a part along joints 1 and 2")

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -13,7 +13,6 @@ from orthocas.checks import Array
 from orthocas.parametrisations.family import Expression, JointSpace
 
 Term = tuple[int, ...]  #: for every joint, which one-joint function the term takes; 0 is the constant 1
-OneJointFunctions = Callable[[int, Expression], list[Expression]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +25,7 @@ class LinearFamily:
     space: JointSpace
     outputs: int
     terms: tuple[Term, ...]
-    one_joint_functions: Callable[[int, ca.SX], list[ca.SX]]
+    one_joint_functions: Callable[[int, Any], list[Any]]
     as_matrices: bool = False
 
     @property
@@ -37,10 +36,11 @@ class LinearFamily:
     def basis(self, q: Expression) -> Expression:
         """psi(q), (K, N), for q (n, N)."""
         tables = [self.one_joint_functions(i, q[i, :]) for i in range(self.space.n)]
-        products: dict[Term, Expression] = {}
+        products: dict[Term, Any] = {}
         for term in self.terms:
             self._product(term, tables, products)
-        return ca.vertcat(*(products[term] for term in self.terms))
+        values: Expression = ca.vertcat(*(products[term] for term in self.terms))
+        return values
 
     def expression(self, q: Expression, theta: Expression) -> Expression:
         """xi_theta(q), (r, N), for q (n, N)."""
@@ -53,7 +53,7 @@ class LinearFamily:
         return C.ravel()
 
     def basis_gradients(self, points: Array) -> Array:
-        """d psi / dq at points (N, n), (N, n, K)."""
+        """D psi / dq at points (N, n), (N, n, K)."""
         return evaluate_batch(self._gradient_function, points)[0].transpose(0, 2, 1)  # contiguous: CasADi fills columns
 
     @cached_property
@@ -62,10 +62,10 @@ class LinearFamily:
         return dense_function("basis_gradients", [q], [ca.jacobian(self.basis(q), q)])
 
     @classmethod
-    def _product(cls, term: Term, tables: list[list[Expression]], products: dict[Term, Expression]) -> Expression:
+    def _product(cls, term: Term, tables: list[list[Any]], products: dict[Term, Any]) -> Any:
         """Value of a term: the term without its last factor, times that factor."""
         if term not in products:
-            last = max(i for i, k in enumerate(term) if k)
+            last = int(np.flatnonzero(term)[-1])
             rest = (*term[:last], 0, *term[last + 1 :])
             factor = tables[last][term[last]]
             products[term] = cls._product(rest, tables, products) * factor if any(rest) else factor

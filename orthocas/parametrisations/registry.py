@@ -15,7 +15,9 @@ def _whole(label: str, text: str) -> int:
     try:
         return int(text)
     except ValueError:
-        raise InvalidValueError("parametrisation", repr(label), "whole numbers, as in polynomial:4 or mlp:64x64") from None
+        raise InvalidValueError(
+            "parametrisation", repr(label), "whole numbers, as in polynomial:4 or mlp:64x64"
+        ) from None
 
 
 def _linear(label: str, text: str) -> Linear:

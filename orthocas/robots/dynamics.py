@@ -44,12 +44,16 @@ def mass_matrix(tree: KinematicTree, q: ca.SX) -> ca.SX:
         parent = tree.parents[i]
         if parent >= 0:
             m, mc, inert = joints[i].inertia_to_parent(mass[i], moment[i], inertia[i])
-            mass[parent], moment[parent], inertia[parent] = mass[parent] + m, moment[parent] + mc, inertia[parent] + inert
+            mass[parent], moment[parent], inertia[parent] = (
+                mass[parent] + m,
+                moment[parent] + mc,
+                inertia[parent] + inert,
+            )
     return M
 
 
 def inverse_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, ddq: ca.SX, gravity: Array) -> ca.SX:
-    """tau = M ddq + C dq + g, (n, 1) [N m] or [N], for the given gravity acceleration (3,) in the world."""
+    """Tau = M ddq + C dq + g, (n, 1) [N m] or [N], for the given gravity acceleration (3,) in the world."""
     joints = _joint_transforms(tree, q)
     bodies = _regroup(tree)
     states: list[tuple[ca.SX, ca.SX, ca.SX]] = []  # angular velocity, angular acceleration matrix, linear acceleration

@@ -79,7 +79,7 @@ def default_tip(model: pin.Model) -> str:
     """
     carriers = {model.parents[i] for i in range(1, model.njoints)}
     leaves = [i for i in range(1, model.njoints) if i not in carriers]
-    last = {i: [frame.name for frame in model.frames if frame.parentJoint == i][-1] for i in leaves}
+    last: dict[int, str] = {i: [frame.name for frame in model.frames if frame.parentJoint == i][-1] for i in leaves}
     if len(leaves) != 1:
         raise RobotError(f"the robot ends in {len(leaves)} places, name the tip frame: {', '.join(last.values())}")
     return last[leaves[0]]

@@ -29,7 +29,9 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         joint_names=tuple(model.names[i] for i in bodies),
         joint_kinds=tuple(kind for kind, _ in axes),
         parents=tuple(model.parents[i] - 1 for i in bodies),
-        rotations=np.array([_snap(turns[model.parents[i]].T @ model.jointPlacements[i].rotation @ turns[i]) for i in bodies]),
+        rotations=np.array(
+            [_snap(turns[model.parents[i]].T @ model.jointPlacements[i].rotation @ turns[i]) for i in bodies]
+        ),
         translations=np.array([turns[model.parents[i]].T @ model.jointPlacements[i].translation for i in bodies]),
         masses=np.array([model.inertias[i].mass for i in bodies]),
         centres=np.array([turns[i].T @ model.inertias[i].lever for i in bodies]),
@@ -49,7 +51,9 @@ def _joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
     """Kind and axis of joint i, read off its motion subspace."""
     joint, name = model.joints[i], model.names[i]
     if joint.shortname() == "JointModelMimic":
-        raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: lock it or the joint it follows")
+        raise RobotError(
+            f"joint '{name}' is a mimic joint, expected independent joints: lock it or the joint it follows"
+        )
     if joint.nv != 1:
         raise RobotError(
             f"joint '{name}' is of type {joint.shortname()} with {joint.nv} degrees of freedom, "

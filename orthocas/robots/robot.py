@@ -55,9 +55,12 @@ class Robot:
         return cls.from_model(model, tip or files.default_tip(model), locked)
 
     @classmethod
-    def chain_from_urdf(cls, path: str | Path, tip: str | None = None) -> Self:
-        """Build the chain that moves the tip from a URDF file; every other joint is locked at (or next to) zero."""
-        model = files.read_urdf(path)
+    def chain_from_file(cls, path: str | Path, tip: str | None = None) -> Self:
+        """Build the chain that moves the tip from a URDF or MJCF (.xml) file.
+
+        Every joint that does not move the tip is locked at zero, or at the limit next to zero.
+        """
+        model = files.read_mjcf(path) if Path(path).suffix == ".xml" else files.read_urdf(path)
         tip = tip or files.default_tip(model)
         return cls.from_model(model, tip, files.joints_off_chain(model, tip))
 
@@ -99,7 +102,7 @@ class Robot:
         return self._call("bias", q, dq)
 
     def inverse_dynamics(self, q: Any, dq: Any, ddq: Any) -> Any:
-        """tau = M ddq + C dq + g, (n,)."""
+        """Tau = M ddq + C dq + g, (n,)."""
         return self._call("inverse_dynamics", q, dq, ddq)
 
     def coriolis_product(self, q: Any, v: Any, w: Any) -> Any:

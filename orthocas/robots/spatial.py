@@ -1,7 +1,8 @@
 """Small pieces of rigid-body algebra on CasADi SX columns."""
 
 import casadi as ca
-import numpy as np
+
+from orthocas.checks import Array
 
 
 def skew(v: ca.SX) -> ca.SX:
@@ -16,6 +17,6 @@ def turn(q: ca.SX) -> ca.SX:
     return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
 
 
-def constant(values: "np.typing.ArrayLike") -> ca.SX:
+def constant(values: Array) -> ca.SX:
     """A constant with its zeros dropped from the structure, so that products with them vanish."""
     return ca.SX(ca.sparsify(ca.DM(values)))

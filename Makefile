@@ -1,0 +1,40 @@
+# Two commands do everything on a fresh machine: `make demo` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+.PHONY: demo test lint types wheel-check bench clean
+
+demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and picture in out/
+	$(BIN)/python examples/iiwa_demo.py --out out
+
+test: $(INSTALLED)  ## the whole test suite
+	$(BIN)/python -m pytest
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(INSTALLED) build/site  ## mypy on what is installed: the wheel, unpacked
+	cd build/site && ../../$(BIN)/mypy --config-file ../../pyproject.toml -p orthocas
+
+wheel-check: $(INSTALLED)  ## the built wheel in a fresh environment, outside the repo
+	$(BIN)/python tests/check_wheel.py
+
+bench: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet -e '.[bench]'
+	$(BIN)/python benchmarks/run_all.py
+
+$(INSTALLED): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -e '.[test]'
+	touch $@
+
+build/site: $(INSTALLED) $(shell find orthocas problems solvers -type f -not -path '*/__pycache__/*')
+	rm -rf build
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheel .
+	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/site build/wheel/*.whl
+
+clean:
+	rm -rf $(VENV) build dist out *.egg-info

@@ -1,0 +1,24 @@
+"""`orthocas evaluate`: the quality of a chart file on held-out samples."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from orthocas import quality
+from orthocas.chart import Chart
+from orthocas.cli.output import AsJson, Samples, print_json, print_rows, report_rows
+
+
+def evaluate(
+    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    samples: Samples = 100_000,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the samples; take another than the fit's.")] = 1,
+    json: AsJson = False,
+) -> None:
+    """Judge a chart on held-out samples of its domain."""
+    report = quality.evaluate(Chart.load(chart), samples, seed)
+    if json:
+        print_json(report.as_dict())
+    else:
+        print_rows(report_rows(report))

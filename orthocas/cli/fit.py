@@ -1,0 +1,103 @@
+"""`orthocas fit`: from a robot to a chart file."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from orthocas import api
+from orthocas.archive import require_writable
+from orthocas.cli.output import AsJson, note, print_json, print_rows, report_rows
+from orthocas.cli.problem_argument import (
+    CentreText,
+    HalfWidth,
+    MetricName,
+    ProblemName,
+    ProblemOptions,
+    TaskName,
+    TipName,
+    build_problem,
+)
+from orthocas.fitting import Fit
+from orthocas.loss import DEFAULT_WEIGHTS
+from orthocas.objective import Status
+from orthocas.parametrisations import parse_parametrisation
+from orthocas.progress import terminal_monitor
+from orthocas.quality import Report, evaluate
+from orthocas.solvers import get as get_solver
+
+
+def fit(
+    problem: ProblemName,
+    tip: TipName = None,
+    task: TaskName = None,
+    metric: MetricName = None,
+    param: Annotated[
+        str, typer.Option("--param", help="polynomial:4, fourier:2, mlp:64x64 or linear.")
+    ] = "polynomial:4",
+    solver: Annotated[str | None, typer.Option("--solver", help="gauss_newton or lbfgs; default what suits.")] = None,
+    centre: CentreText = None,
+    half_width: HalfWidth = None,
+    samples: Annotated[int | None, typer.Option("--samples", help="Training samples; default by size.")] = None,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of samples and random starts.")] = 0,
+    weights: Annotated[tuple[float, float], typer.Option("--weights", help="lambda1 lambda2.")] = DEFAULT_WEIGHTS,
+    out: Annotated[Path | None, typer.Option("--out", help="Chart file; default PROBLEM.orthocas here.")] = None,
+    json: AsJson = False,
+) -> None:
+    """Fit extra coordinates to a problem and save the chart."""
+    built = build_problem(problem, ProblemOptions(tip, task, metric, centre, half_width))
+    target = out or Path(f"{built.name}.orthocas")
+    require_writable(target)
+    parametrisation = parse_parametrisation(param)
+    minimiser = None if solver is None else get_solver(solver)
+    with terminal_monitor() as monitor:
+        result = api.fit(built, parametrisation, minimiser, weights, samples, seed, monitor)
+    result.chart.save(target)
+    report = evaluate(result.chart, seed=seed + 1)
+    if json:
+        print_json(_as_dict(result, report, target))
+    else:
+        print_rows(_rows(result, report, target))
+    if result.status is Status.INTERRUPTED:
+        note("interrupted: the chart holds the best coordinates found so far")
+        raise typer.Exit(130)
+
+
+def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
+    coordinates = result.chart.coordinates
+    rows = report_rows(report)
+    rows["fit"] = f"{coordinates.parametrisation.label}, {result.seconds:.2f} s, {result.status.value}"
+    if result.idle_joints:
+        rows["exact"] = f"joints the task does not feel: {', '.join(result.idle_joints)}"
+    if result.problem_check.singular_samples:
+        check = result.problem_check
+        at = ", ".join(f"{value:.2f}" for value in check.most_singular_point)
+        rows["singular"] = f"{check.singular_share:.2%} of the domain is near-singular, worst at q = ({at})"
+    rows["chart"] = str(target)
+    return rows
+
+
+def _as_dict(result: Fit, report: Report, target: Path) -> dict[str, Any]:
+    check = result.problem_check
+    return {
+        "chart": str(target),
+        "parametrisation": result.chart.coordinates.parametrisation.label,
+        "status": result.status.value,
+        "seconds": result.seconds,
+        "idle_joints": list(result.idle_joints),
+        "near_singular_share": check.singular_share,
+        "most_singular_point": list(check.most_singular_point),
+        "stages": [
+            {
+                "parametrisation": stage.label,
+                "parameters": stage.parameters,
+                "samples": stage.samples,
+                "loss": stage.result.value,
+                "status": stage.result.status.value,
+                "iterations": stage.result.iterations,
+                "seconds": stage.result.seconds,
+            }
+            for stage in result.stages
+        ],
+        **report.as_dict(),
+    }

@@ -1,0 +1,86 @@
+"""`orthocas info`: what a chart, a named problem or a robot file holds."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthocas import problems
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.cli.output import AsJson, print_json, print_rows
+from orthocas.cli.problem_argument import ProblemName, ProblemOptions, TipName, build_problem, is_robot_file
+from orthocas.problem import Problem, check
+from orthocas.robots import Robot
+
+
+def info(target: ProblemName, tip: TipName = None, json: AsJson = False) -> None:
+    """Show a chart file, a named problem, or a robot file."""
+    if is_robot_file(target):
+        data = _robot(Robot.chain_from_file(target, tip))
+    elif target in problems.names():
+        data = _problem(build_problem(target, ProblemOptions(tip=tip)))
+    else:
+        chart = Chart.load(_chart_path(target))
+        data = {
+            **_problem(chart.problem),
+            "parametrisation": chart.coordinates.parametrisation.label,
+            "parameters": int(chart.coordinates.theta.size),
+            "notes": dict(chart.notes),
+        }
+    if json:
+        print_json(data)
+    else:
+        print_rows({name: _text(value) for name, value in data.items()})
+
+
+def _chart_path(target: str) -> Path:
+    """A path, or an error that lists the named problems if nothing is there and it looks like a name."""
+    path = Path(target)
+    if not path.exists() and not path.suffix:
+        build_problem(target, ProblemOptions())
+    return path
+
+
+def _robot(robot: Robot) -> dict[str, Any]:
+    return {
+        "joints": list(robot.joint_names),
+        "kinds": list(robot.tree.joint_kinds),
+        "lower": _finite(robot.lower),
+        "upper": _finite(robot.upper),
+        "tip": robot.tree.tip_name,
+        "mass_kg": float(robot.tree.masses.sum()),
+    }
+
+
+def _problem(problem: Problem) -> dict[str, Any]:
+    found = check(problem)
+    return {
+        "problem": problem.name,
+        "n": problem.n,
+        "m": problem.m,
+        "r": problem.r,
+        "task": problem.task.name,
+        "metric": problem.metric.name,
+        "domain": problem.domain.name,
+        "centre": problem.domain.centre.tolist(),
+        "half_width": problem.domain.half_width.tolist(),
+        "near_singular_share": found.singular_share,
+        "most_singular_point": list(found.most_singular_point),
+        **_robot(problem.robot),
+    }
+
+
+def _finite(limits: Array) -> list[float | None]:
+    """Limits for JSON, which has no infinity."""
+    return [float(value) if np.isfinite(value) else None for value in limits]
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(_text(item) for item in value)
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_text(item)}" for name, item in value.items())
+    if value is None:
+        return "unlimited"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,47 @@
+"""What commands print: aligned text for people, or one JSON object."""
+
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+
+from orthocas.quality import Report
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+Samples = Annotated[int, typer.Option("--samples", help="Number of held-out samples.")]
+
+
+def print_json(data: Mapping[str, Any]) -> None:
+    """Print one JSON object."""
+    typer.echo(json.dumps(data, allow_nan=False))
+
+
+def print_rows(rows: Mapping[str, str]) -> None:
+    """Print names and values in two columns."""
+    width = max(len(name) for name in rows) + 2
+    for name, value in rows.items():
+        typer.echo(f"{name:<{width}}{value}")
+
+
+def note(text: str) -> None:
+    """A remark on standard error."""
+    typer.echo(f"note: {text}", err=True)
+
+
+def report_rows(report: Report) -> dict[str, str]:
+    """A quality report as rows."""
+    task, mutual, conditioning = report.task_angle, report.mutual_angle, report.conditioning
+    quality = f"mean {conditioning.mean:.3f}, 1 % quantile {conditioning.p01:.3f}, min {conditioning.min:.3g}"
+    rows = {
+        "problem": f"n = {report.n} joints, m = {report.m} task, r = {report.r} extra, metric {report.metric}",
+        "task angle": f"mean {task.mean:.2f}, std {task.std:.2f}, largest deviation {task.max:.1f} deg",
+        "mutual angle": f"mean {mutual.mean:.2f}, std {mutual.std:.2f}, largest deviation {mutual.max:.1f} deg",
+        "conditioning": quality,
+        "samples": f"{report.samples} held out, seed {report.seed}",
+    }
+    if report.r == 1:
+        rows["mutual angle"] = "none, r = 1"
+    if report.degenerate:
+        rows["DEGENERATE"] = "coordinates are nearly parallel or lean into the task: raise lambda2 or change the domain"
+    return rows
