@@ -14,9 +14,12 @@ from orthocas.checks import Array
 CHUNK = 512  #: samples evaluated in one call: large enough to amortise the call, small enough for the cache
 
 
-def dense_function(name: str, inputs: Sequence[Any], outputs: Sequence[Any]) -> ca.Function:
+def dense_function(
+    name: str, inputs: Sequence[Any], outputs: Sequence[Any], input_names: Sequence[str] | None = None
+) -> ca.Function:
     """A CasADi function, SX or MX, whose outputs have no structural zeros, as `evaluate_batch` needs."""
-    return ca.Function(name, inputs, [ca.densify(out) for out in outputs])
+    names = input_names or [f"i{k}" for k in range(len(inputs))]
+    return ca.Function(name, inputs, [ca.densify(out) for out in outputs], names, [f"o{k}" for k in range(len(outputs))])
 
 
 def evaluate_batch(function: ca.Function, *arguments: Array) -> list[Array]:

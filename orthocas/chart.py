@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthocas.batch import dense_function, evaluate_batch
 from orthocas.chart_file import read_chart, write_chart
@@ -153,7 +153,7 @@ class Chart:
             return np.full(self.n, np.nan)
 
     def _require_solved(self, solutions: Array, targets: Array, tolerance: float) -> None:
-        finite: NDArray[np.bool_] = np.isfinite(solutions).all(axis=1)
+        finite = np.asarray(np.isfinite(solutions).all(axis=1))
         safe = np.where(finite[:, None], solutions, self.problem.domain.centre)
         error = np.where(finite, np.abs(self.phi(safe) - targets).max(axis=1), np.inf)
         bad = np.flatnonzero(~(error <= tolerance))

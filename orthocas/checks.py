@@ -70,6 +70,7 @@ def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
     array = as_float_array(name, value)
     single = array.ndim == 1
     points = array[None, :] if single else array
-    require_shape(name, points.shape, (None, n))
+    if points.ndim != 2 or points.shape[1] != n:
+        raise ShapeError(name, array.shape, (n,) if single else (None, n))
     require_finite(name, points)
     return points, single

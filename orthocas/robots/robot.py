@@ -135,17 +135,26 @@ class Robot:
         tree = self.tree
         q, dq, ddq = (ca.SX.sym(name, self.n) for name in ("q", "dq", "ddq"))
         R, p = kinematics.tip_pose(tree, q)
-        outputs: dict[str, tuple[list[ca.SX], ca.SX]] = {
-            "mass_matrix": ([q], dynamics.mass_matrix(tree, q)),
-            "gravity": ([q], dynamics.bias(tree, q, ca.SX(self.n, 1), tree.gravity)),
-            "bias": ([q, dq], dynamics.bias(tree, q, dq, tree.gravity)),
-            "inverse_dynamics": ([q, dq, ddq], dynamics.inverse_dynamics(tree, q, dq, ddq, tree.gravity)),
-            "coriolis_product": ([q, dq, ddq], dynamics.coriolis_product(tree, q, dq, ddq)),
-            "tip_position": ([q], p),
-            "tip_rotation": ([q], R),
-            "tip_jacobian": ([q], kinematics.tip_jacobian(tree, q)),
+        static = {
+            "mass_matrix": dynamics.mass_matrix(tree, q),
+            "gravity": dynamics.bias(tree, q, ca.SX(self.n, 1), tree.gravity),
+            "tip_position": p,
+            "tip_rotation": R,
+            "tip_jacobian": kinematics.tip_jacobian(tree, q),
         }
-        return {name: dense_function(name, inputs, [output]) for name, (inputs, output) in outputs.items()}
+        return {
+            **{name: dense_function(name, [q], [output], ["q"]) for name, output in static.items()},
+            "bias": dense_function("bias", [q, dq], [dynamics.bias(tree, q, dq, tree.gravity)], ["q", "dq"]),
+            "inverse_dynamics": dense_function(
+                "inverse_dynamics",
+                [q, dq, ddq],
+                [dynamics.inverse_dynamics(tree, q, dq, ddq, tree.gravity)],
+                ["q", "dq", "ddq"],
+            ),
+            "coriolis_product": dense_function(
+                "coriolis_product", [q, dq, ddq], [dynamics.coriolis_product(tree, q, dq, ddq)], ["q", "v", "w"]
+            ),
+        }
 
     def _call(self, name: str, *arguments: Any) -> Any:
         """Call a function with CasADi or NumPy arguments, same kind out."""

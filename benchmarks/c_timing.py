@@ -1,0 +1,95 @@
+"""Compile CasADi functions to a shared library and time them in C, several functions in one process."""
+
+import ctypes
+import re
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from statistics import median
+
+import casadi as ca
+import numpy as np
+
+_HARNESS = r"""
+#include <time.h>
+#include <stddef.h>
+typedef int (*function)(const double**, double**, long long*, double*, int);
+/* nanoseconds a call, over `calls` calls on `states` input sets laid out one after the other */
+double time_calls(function f, const double* inputs, int n_in, const int* sizes, int states, double** out,
+                  long long* iw, double* w, long calls) {
+  struct timespec a, b;
+  const double* arg[8];
+  int total = 0;
+  for (int i = 0; i < n_in; ++i) total += sizes[i];
+  clock_gettime(CLOCK_MONOTONIC, &a);
+  for (long k = 0; k < calls; ++k) {
+    const double* p = inputs + (size_t)(k % states) * total;
+    for (int i = 0; i < n_in; ++i) { arg[i] = p; p += sizes[i]; }
+    f(arg, out, iw, w, 0);
+  }
+  clock_gettime(CLOCK_MONOTONIC, &b);
+  return ((b.tv_sec - a.tv_sec) * 1e9 + (b.tv_nsec - a.tv_nsec)) / calls;
+}
+"""
+
+
+def nanoseconds_per_call(functions: dict[str, ca.Function], rounds: int = 9, calls: int = 100_000) -> dict[str, float]:
+    """Median time of each function over rounds that take turns, compiled together with gcc -O3 -march=native.
+
+    All functions take the same inputs; they are fed with 64 random states.
+    """
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        raise RuntimeError("no C compiler found, expected gcc or cc on the path")
+    first = next(iter(functions.values()))
+    sizes = np.array([first.numel_in(i) for i in range(first.n_in())], dtype=np.int32)
+    inputs = np.random.default_rng(0).uniform(-1, 1, (64, int(sizes.sum())))
+    with tempfile.TemporaryDirectory() as folder:
+        library = _compile(compiler, Path(folder), functions)
+        times: dict[str, list[float]] = {name: [] for name in functions}
+        for _ in range(rounds):
+            for name, function in functions.items():
+                times[name].append(_time(library, name, function, inputs, sizes, calls))
+    return {name: median(values) for name, values in times.items()}
+
+
+def _compile(compiler: str, folder: Path, functions: dict[str, ca.Function]) -> ctypes.CDLL:
+    sources = [folder / "harness.c"]
+    sources[0].write_text(_HARNESS)
+    for name, function in functions.items():
+        generator = ca.CodeGenerator(f"{name}.c", {"main": False, "mex": False})
+        generator.add(_renamed(name, function))
+        generator.generate(f"{folder}/")
+        sources.append(folder / f"{name}.c")
+    target = folder / "timing.so"
+    command = [compiler, "-O3", "-march=native", "-shared", "-fPIC", "-o", str(target), *map(str, sources), "-lm"]
+    subprocess.run(command, check=True)
+    return ctypes.CDLL(str(target))
+
+
+def _renamed(name: str, function: ca.Function) -> ca.Function:
+    symbols = [ca.SX.sym(f"i{i}", *function.size_in(i)) for i in range(function.n_in())]
+    return ca.Function(re.sub(r"\W", "_", name), symbols, function.call(symbols))
+
+
+def _time(
+    library: ctypes.CDLL, name: str, function: ca.Function, inputs: np.ndarray, sizes: np.ndarray, calls: int
+) -> float:
+    outputs = [np.zeros(max(1, function.nnz_out(i))) for i in range(function.n_out())]
+    pointers = (ctypes.c_void_p * 8)(*(out.ctypes.data for out in outputs))
+    work, integers = np.zeros(function.sz_w() + 10_000), np.zeros(1000, dtype=np.int64)
+    library.time_calls.restype = ctypes.c_double
+    return float(
+        library.time_calls(
+            ctypes.cast(getattr(library, name), ctypes.c_void_p),
+            inputs.ctypes.data_as(ctypes.c_void_p),
+            ctypes.c_int(len(sizes)),
+            sizes.ctypes.data_as(ctypes.c_void_p),
+            ctypes.c_int(len(inputs)),
+            pointers,
+            integers.ctypes.data_as(ctypes.c_void_p),
+            work.ctypes.data_as(ctypes.c_void_p),
+            ctypes.c_long(calls),
+        )
+    )

@@ -1,0 +1,91 @@
+"""Domains: sampling, limits, default boxes, bad input."""
+
+import numpy as np
+import pytest
+from conftest import robot_data
+
+import orthocas as oc
+from orthocas.domains import default_box, require_within_limits, sample_uniform
+from orthocas.errors import DomainError, InvalidValueError, ShapeError
+
+
+def panda() -> oc.Robot:
+    return oc.Robot.chain_from_file(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+
+
+def test_samples_fill_the_box_uniformly_and_follow_the_seed() -> None:
+    box = oc.Box([1.0, -2.0], [0.5, 2.0])
+    points = sample_uniform(box, 20_000, seed=3)
+    unit = (points - box.centre) / box.half_width
+    assert np.abs(unit).max() <= 1
+    np.testing.assert_allclose(unit.mean(axis=0), 0, atol=0.02)  # standard error 0.004
+    np.testing.assert_allclose((unit**2).mean(axis=0), 1 / 3, atol=0.02)
+    np.testing.assert_array_equal(points, sample_uniform(box, 20_000, seed=3))
+    assert not np.array_equal(points, sample_uniform(box, 20_000, seed=4))
+
+
+def test_torus_is_whole_turns() -> None:
+    points = sample_uniform(oc.Torus(2), 5000, seed=0)
+    assert points.min() < -3.1
+    assert points.max() > 3.1
+    assert oc.contains(oc.Torus(2), [100.0, -100.0])
+
+
+def test_contains_is_true_inside_and_false_outside_a_box() -> None:
+    box = oc.Box([0.0, 0.0], 1.0)
+    np.testing.assert_array_equal(oc.contains(box, [[0.9, -0.9], [1.1, 0.0]]), [True, False])
+    assert oc.contains(box, [1.0, 1.0])
+
+
+def test_default_box_respects_joint_limits() -> None:
+    robot = panda()
+    box = default_box(robot)
+    require_within_limits(robot, box)
+    np.testing.assert_allclose(box.centre[3], (-3.0718 - 0.0698) / 2, atol=1e-12)
+    np.testing.assert_allclose(box.half_width[0], np.pi / 4)
+    near = default_box(robot, centre=[0, 0, 0, -0.2, 0, 1, 0])
+    np.testing.assert_allclose(near.half_width[3], 0.2 - 0.0698)  # shortened at the limit
+
+
+def test_default_box_of_prismatic_joint_is_in_metres() -> None:
+    robot = oc.Robot.chain_from_file(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
+    np.testing.assert_allclose(default_box(robot).half_width[0], 0.35 / 2)
+
+
+def test_domain_outside_limits_names_the_joint() -> None:
+    robot = panda()
+    task = oc.Task.position(robot)
+    with pytest.raises(DomainError, match="panda_joint4.*inside its limits"):
+        oc.Problem(robot, task, domain=oc.Box(np.zeros(7), 0.5))
+    with pytest.raises(DomainError, match="panda_joint1"):
+        oc.Problem(robot, task, domain=oc.Torus(7))
+    with pytest.raises(DomainError, match="panda_joint4"):
+        default_box(robot, centre=np.zeros(7))
+
+
+def test_torus_with_a_prismatic_joint_is_refused() -> None:
+    robot = oc.Robot.chain_from_file(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
+    with pytest.raises(DomainError, match="torso_lift_joint.*prismatic"):
+        require_within_limits(robot, oc.Torus(robot.n))
+
+
+@pytest.mark.parametrize("half_width", [0.0, -1.0, [1.0, 0.0]])
+def test_half_width_must_be_positive(half_width: object) -> None:
+    with pytest.raises(InvalidValueError, match="half_width"):
+        oc.Box([0.0, 0.0], half_width)
+
+
+def test_bad_boxes_are_refused() -> None:
+    with pytest.raises(ShapeError):
+        oc.Box([0.0, 0.0], [1.0, 1.0, 1.0])
+    with pytest.raises(InvalidValueError, match=r"centre\[1\] is nan"):
+        oc.Box([0.0, np.nan], 1.0)
+    with pytest.raises(InvalidValueError, match="empty"):
+        oc.Box([], 1.0)
+    with pytest.raises(InvalidValueError):
+        oc.Torus(0)
+    with pytest.raises(InvalidValueError, match="samples"):
+        sample_uniform(oc.Torus(1), 0, 0)
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    with pytest.raises(ShapeError, match="domain"):
+        require_within_limits(robot, oc.Torus(3))
