@@ -19,7 +19,9 @@ def dense_function(
 ) -> ca.Function:
     """A CasADi function, SX or MX, whose outputs have no structural zeros, as `evaluate_batch` needs."""
     names = input_names or [f"i{k}" for k in range(len(inputs))]
-    return ca.Function(name, inputs, [ca.densify(out) for out in outputs], names, [f"o{k}" for k in range(len(outputs))])
+    return ca.Function(
+        name, inputs, [ca.densify(out) for out in outputs], names, [f"o{k}" for k in range(len(outputs))]
+    )
 
 
 def evaluate_batch(function: ca.Function, *arguments: Array) -> list[Array]:

@@ -37,7 +37,9 @@ def test_singular_samples_are_counted_and_located() -> None:
 
 def test_task_that_is_singular_everywhere_is_refused() -> None:
     robot = arm()
-    doubled = oc.Task.custom(robot, "twice x", lambda q: ca.vertcat(robot.tip_position(q)[0], 2 * robot.tip_position(q)[0]))
+    doubled = oc.Task.custom(
+        robot, "twice x", lambda q: ca.vertcat(robot.tip_position(q)[0], 2 * robot.tip_position(q)[0])
+    )
     with pytest.raises(SingularTaskError, match="rank below m = 2 at all"):
         oc.check(oc.Problem(robot, doubled))
     with pytest.raises(SingularTaskError, match="rank below"):

@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import robot_data
+from orthocas.problems.iiwa import robot as iiwa_robot
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, RobotError, ShapeError, UnknownNameError
-from orthocas.problems.iiwa import robot as iiwa_robot
 from orthocas.robots import files
 from orthocas.robots.planar import planar_model
 
@@ -101,9 +101,7 @@ def test_unaligned_axes_and_prismatic_joints_match_pinocchio() -> None:
     for q, dq, ddq in rng.uniform(-2, 2, (20, 3, 4)):
         want = pin.crba(model, data, q)
         np.testing.assert_allclose(robot.mass_matrix(q), np.triu(want) + np.triu(want, 1).T, atol=1e-10)
-        np.testing.assert_allclose(
-            robot.inverse_dynamics(q, dq, ddq), pin.rnea(model, data, q, dq, ddq), atol=1e-9
-        )
+        np.testing.assert_allclose(robot.inverse_dynamics(q, dq, ddq), pin.rnea(model, data, q, dq, ddq), atol=1e-9)
 
 
 def test_mass_matrix_matches_kinetic_energy_hessian() -> None:
@@ -194,7 +192,11 @@ def test_mimic_joint_is_refused_by_name() -> None:
 
 @pytest.mark.parametrize(
     ("joint", "kind"),
-    [(pin.JointModelSpherical(), "Spherical"), (pin.JointModelFreeFlyer(), "FreeFlyer"), (pin.JointModelPlanar(), "Planar")],
+    [
+        (pin.JointModelSpherical(), "Spherical"),
+        (pin.JointModelFreeFlyer(), "FreeFlyer"),
+        (pin.JointModelPlanar(), "Planar"),
+    ],
 )
 def test_joints_with_several_freedoms_are_refused_by_name(joint: object, kind: str) -> None:
     model = pin.Model()

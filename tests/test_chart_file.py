@@ -1,0 +1,202 @@
+"""Chart files: complete, atomic, versioned, checked; nothing in them is executed."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas import archive
+from orthocas.errors import ChartFileError
+from orthocas.fitting import Fit
+
+
+@pytest.fixture
+def saved(planar_fit: Fit, tmp_path: Path) -> Path:
+    path = tmp_path / "chart.orthocas"
+    planar_fit.chart.save(path)
+    return path
+
+
+def rewritten(path: Path, changes: dict[str, bytes], honest: bool = True) -> Path:
+    """Replace entries; honest repairs the header's checksum, as a newer program would write it."""
+    with zipfile.ZipFile(path) as source:
+        entries = {name: source.read(name) for name in source.namelist()} | changes
+    if honest:
+        entries["digest.txt"] = archive._digest(entries["header.json"]).encode()
+    with zipfile.ZipFile(path, "w") as target:
+        for name, content in entries.items():
+            target.writestr(name, content)
+    return path
+
+
+def header_of(path: Path) -> dict[str, object]:
+    with zipfile.ZipFile(path) as source:
+        return dict(json.loads(source.read("header.json")))
+
+
+KINDS = {
+    "polynomial, inertia": lambda r: (oc.Task.position(r, "x"), "inertia", oc.Polynomial(2)),
+    "mlp, constant metric": lambda r: (oc.Task.position(r, "xy"), np.diag([1.0, 2.0, 3.0]), oc.MLP((4,))),
+    "fourier, polar": lambda r: (oc.Task.polar(r), "euclidean", oc.Fourier(1)),
+    "linear, custom task": lambda r: (
+        oc.Task.custom(r, "mine", lambda q: ca.vertcat(ca.sin(q[0]) + q[1], q[2] * ca.exp(q[0]))),
+        "euclidean",
+        oc.Linear(),
+    ),
+    "custom metric": lambda r: (
+        oc.Task.position(r, "x"),
+        lambda q: ca.diag(ca.vertcat(1 + q[0] ** 2, 1, 2)),
+        oc.Polynomial(1),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_chart_comes_back_the_same(kind: str, tmp_path: Path) -> None:
+    robot = oc.Robot.planar([1.0, 0.9, 0.8], [3.0, 2.0, 1.0])
+    task, metric, parametrisation = KINDS[kind](robot)
+    problem = oc.Problem(robot, task, metric, oc.Box([0.6, 0.8, 0.8], 0.3), "mine")
+    chart = oc.fit(problem, parametrisation, samples=60).chart
+    path = tmp_path / "chart.orthocas"
+    chart.save(path)
+    again = oc.load(path)
+    q = np.random.default_rng(0).uniform(0.5, 0.9, (10, 3))
+    np.testing.assert_array_equal(again.phi(q), chart.phi(q))
+    np.testing.assert_array_equal(again.jacobian(q), chart.jacobian(q))
+    assert oc.evaluate(again, 50).as_dict() == oc.evaluate(chart, 50).as_dict()
+    assert again.notes == chart.notes
+    np.testing.assert_allclose(again.problem.robot.mass_matrix(q), robot.mass_matrix(q))
+
+
+def test_pose_and_torus_come_back(tmp_path: Path, iiwa: oc.Problem) -> None:
+    task = oc.Task.named(iiwa.robot, "pose", iiwa.domain.centre)
+    chart = oc.fit(oc.Problem(iiwa.robot, task, domain=iiwa.domain), oc.Polynomial(1), samples=100).chart
+    chart.save(tmp_path / "pose.orthocas")
+    q = iiwa.domain.centre + 0.1
+    np.testing.assert_array_equal(oc.load(tmp_path / "pose.orthocas").phi(q), chart.phi(q))
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    turning = oc.fit(oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Torus(2)), oc.Fourier(1)).chart
+    turning.save(tmp_path / "torus.orthocas")
+    assert isinstance(oc.load(tmp_path / "torus.orthocas").problem.domain, oc.Torus)
+
+
+def test_same_chart_gives_the_same_bytes(planar_fit: Fit, saved: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.orthocas"
+    planar_fit.chart.save(other)
+    assert other.read_bytes() == saved.read_bytes()
+
+
+def test_missing_foreign_and_truncated_files_are_named(saved: Path, tmp_path: Path) -> None:
+    with pytest.raises(ChartFileError, match="does not exist"):
+        oc.load(tmp_path / "nothing")
+    with pytest.raises(ChartFileError, match="cannot read"):
+        oc.load(tmp_path)
+    (tmp_path / "text").write_text("hello")
+    with pytest.raises(ChartFileError, match="truncated, damaged or not a chart"):
+        oc.load(tmp_path / "text")
+    with zipfile.ZipFile(tmp_path / "zip", "w") as other:
+        other.writestr("a.txt", "a")
+    with pytest.raises(ChartFileError, match="not an orthocas chart"):
+        oc.load(tmp_path / "zip")
+    content = saved.read_bytes()
+    for length in range(0, len(content), 997):
+        saved.write_bytes(content[:length])
+        with pytest.raises(ChartFileError):
+            oc.load(saved)
+
+
+def test_any_flipped_byte_is_an_error_or_harmless(planar_fit: Fit, saved: Path) -> None:
+    content = saved.read_bytes()
+    q = np.array([0.6, 0.8, 0.8])
+    for place in np.random.default_rng(0).integers(0, len(content), 60):
+        broken = bytearray(content)
+        broken[place] ^= 0x41
+        saved.write_bytes(bytes(broken))
+        try:
+            chart = oc.load(saved)
+        except ChartFileError:
+            continue
+        np.testing.assert_array_equal(chart.phi(q), planar_fit.chart.phi(q))  # zip padding and time stamps
+
+
+def test_edited_header_and_array_are_noticed(saved: Path) -> None:
+    header = header_of(saved)
+    header["problem"] = {**header["problem"], "name": "other"}  # type: ignore[dict-item]
+    with pytest.raises(ChartFileError, match="edited: its header"):
+        oc.load(rewritten(saved, {"header.json": json.dumps(header).encode()}, honest=False))
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros(3))
+    with pytest.raises(ChartFileError, match=r"edited: entry offset\.npy"):
+        oc.load(rewritten(saved, {"offset.npy": buffer.getvalue(), "header.json": json.dumps(header).encode()}))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": 99}, "version 99, this orthocas reads up to 1"),
+        ({"format": "other"}, "has format 'other'"),
+        ({"robot": {}}, "incomplete"),
+        ({"coordinates": {"parametrisation": "spline:3", "idle": []}}, "inconsistent: unknown parametrisation"),
+        ({"coordinates": {"parametrisation": "polynomial:9", "idle": []}}, "inconsistent: theta has shape"),
+        ({"coordinates": {"parametrisation": "polynomial:4", "idle": [77]}}, "in"),
+        (
+            {"problem": {"name": "x", "task": {"kind": "import os"}, "metric": {"kind": "euclidean"}, "domain": "box"}},
+            "task",
+        ),
+        ({"sha256": "none"}, "not an orthocas chart"),
+    ],
+)
+def test_newer_foreign_and_inconsistent_headers_are_refused(
+    saved: Path, change: dict[str, object], message: str
+) -> None:
+    header = json.dumps(header_of(saved) | change).encode()
+    with pytest.raises(ChartFileError, match=message):
+        oc.load(rewritten(saved, {"header.json": header}))
+
+
+def test_tapes_with_unknown_steps_are_refused(tmp_path: Path) -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    problem = oc.Problem(robot, oc.Task.custom(robot, "t", lambda q: q[0] ** 2 + q[1]))
+    path = tmp_path / "c.orthocas"
+    oc.fit(problem, oc.Polynomial(1)).chart.save(path)
+    header = header_of(path)
+    header["problem"]["task"]["tape"]["steps"][0][0] = "system"  # type: ignore[index]
+    with pytest.raises(ChartFileError, match="incomplete"):
+        oc.load(rewritten(path, {"header.json": json.dumps(header).encode()}))
+
+
+def test_arrays_are_never_unpickled(saved: Path) -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    header = header_of(saved)
+    header["sha256"] = {**header["sha256"], "theta.npy": archive._digest(buffer.getvalue())}  # type: ignore[dict-item]
+    with pytest.raises(ChartFileError, match="cannot be read"):
+        oc.load(rewritten(saved, {"theta.npy": buffer.getvalue(), "header.json": json.dumps(header).encode()}))
+
+
+def test_failed_write_leaves_the_old_file(planar_fit: Fit, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = saved.read_bytes()
+
+    def full_disk(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(archive.os, "fsync", full_disk)
+    with pytest.raises(ChartFileError, match="No space left"):
+        planar_fit.chart.save(saved)
+    assert saved.read_bytes() == before
+    assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_bad_output_places_are_refused(planar_fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ChartFileError, match="does not exist"):
+        planar_fit.chart.save(tmp_path / "no" / "chart")
+    with pytest.raises(ChartFileError, match="is a folder"):
+        planar_fit.chart.save(tmp_path)
+    monkeypatch.setattr(archive.os, "access", lambda *_: False)
+    with pytest.raises(ChartFileError, match="read-only"):
+        planar_fit.chart.save(tmp_path / "chart")

@@ -1,0 +1,145 @@
+"""The loss against a plain NumPy reading of (24), its gradients by Taylor slopes, and its rank trap."""
+
+from itertools import product
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas.coordinates import joint_space
+from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.graph_objective import GraphObjective
+from orthocas.linear_objective import LinearObjective
+from orthocas.loss import Weights, mutual_cosines, pairs, task_cosines
+from orthocas.samples import Samples, sample_problem
+from orthocas.spectral import spectral_start
+
+WEIGHTS = Weights(1000.0, 30.0)
+
+
+def loss_by_hand(J_x: np.ndarray, J_xi: np.ndarray, B: np.ndarray, weights: Weights) -> float:
+    """Equation (24) at one sample, written out."""
+    m, r = len(J_x), len(J_xi)
+    total = 0.0
+    for i, j in product(range(m), range(r)):
+        cosine = J_x[i] @ B @ J_xi[j] / (np.linalg.norm(B @ J_x[i]) * np.linalg.norm(J_xi[j]))
+        total += weights.task / (2 * m * r) * cosine**2
+    for i, j in product(range(r), range(r)):
+        if i > j:
+            cosine = J_xi[i] @ B @ J_xi[j] / (np.linalg.norm(B @ J_xi[i]) * np.linalg.norm(J_xi[j]))
+            total += weights.mutual / (2 * (r * (r - 1) / 2)) * cosine**2
+    return total
+
+
+def objectives(problem: oc.Problem, parametrisation: oc.Polynomial) -> tuple[LinearObjective, GraphObjective, Samples]:
+    samples = sample_problem(problem, 60, 9)
+    family = parametrisation.family(joint_space(problem), problem.r)
+    return LinearObjective(family, samples, WEIGHTS), GraphObjective(family, samples, WEIGHTS), samples
+
+
+@pytest.fixture(params=["planar_x", "planar_xy", "iiwa"])
+def problem(request: pytest.FixtureRequest) -> oc.Problem:
+    return request.getfixturevalue(request.param)
+
+
+def test_both_objectives_equal_the_formula_written_out(problem: oc.Problem) -> None:
+    linear, graph, samples = objectives(problem, oc.Polynomial(2))
+    theta = linear.family.initial(3)
+    inverse = samples.metric_inverse
+    B = np.broadcast_to(np.eye(problem.n), (len(samples), problem.n, problem.n)) if inverse is None else inverse
+    J_xi = linear.coordinate_jacobians(theta)
+    want = np.mean([loss_by_hand(a, b, c, WEIGHTS) for a, b, c in zip(samples.task_jacobian, J_xi, B, strict=True)])
+    np.testing.assert_allclose(linear.value(theta), want, rtol=1e-12)
+    np.testing.assert_allclose(graph.value(theta), want, rtol=1e-12)
+
+
+def test_gradients_of_both_objectives_agree(problem: oc.Problem) -> None:
+    linear, graph, _ = objectives(problem, oc.Polynomial(2))
+    theta = linear.family.initial(3)
+    np.testing.assert_allclose(linear.value_and_gradient(theta)[1], graph.value_and_gradient(theta)[1], atol=1e-9)
+
+
+@pytest.mark.parametrize("parametrisation", [oc.Polynomial(2), oc.Fourier(1), oc.MLP((6,))], ids=lambda p: p.label)
+def test_taylor_remainder_falls_with_the_square_of_the_step(planar_x: oc.Problem, parametrisation: object) -> None:
+    family = parametrisation.family(joint_space(planar_x), planar_x.r)
+    objective = GraphObjective(family, sample_problem(planar_x, 40, 2), WEIGHTS)
+    theta = family.initial(1)
+    direction = np.random.default_rng(2).normal(size=family.size)
+    value, gradient = objective.value_and_gradient(theta)
+    steps = np.array([1e-3, 1e-4, 1e-5]) / np.linalg.norm(direction)
+    remainders = [abs(objective.value(theta + s * direction) - value - s * gradient @ direction) for s in steps]
+    slopes = np.diff(np.log(remainders)) / np.diff(np.log(steps))
+    np.testing.assert_allclose(slopes, 2.0, atol=0.15)
+
+
+def test_gauss_newton_matrix_is_that_of_the_residuals(planar_x: oc.Problem) -> None:
+    objective, _, _ = objectives(planar_x, oc.Polynomial(2))
+    theta = objective.family.initial(3)
+
+    def residuals(theta: np.ndarray) -> np.ndarray:
+        return objective._linearised_residuals(theta)[0].ravel()
+
+    step = 1e-6
+    jacobian = np.array(
+        [(residuals(theta + step * e) - residuals(theta - step * e)) / (2 * step) for e in np.eye(len(theta))]
+    )
+    want = jacobian @ jacobian.T / objective.N
+    _, _, H = objective.normal_equations(theta)
+    np.testing.assert_allclose(H, want, atol=2e-6 * np.abs(want).max())  # products are in single precision
+
+
+def test_loss_does_not_see_the_scale_of_coordinates(planar_x: oc.Problem) -> None:
+    objective, _, _ = objectives(planar_x, oc.Polynomial(2))
+    theta = objective.family.initial(3)
+    scaled = (theta.reshape(2, -1) * np.array([[5.0], [0.1]])).ravel()
+    np.testing.assert_allclose(objective.value(scaled), objective.value(theta), rtol=1e-12)
+
+
+def test_cosines_vanish_for_hand_derived_coordinate_of_planar_2r() -> None:
+    """At q1 = pi/2, x = cos q1 + cos(q1 + q2) has J_x = -(1 + cos q2, cos q2): orthogonal to (cos q2, -1 - cos q2)."""
+    c = np.cos(0.7)
+    task = ca.SX(ca.DM([[-(1 + c), -c]]) / np.hypot(1 + c, c))
+    cosines = task_cosines(task, ca.SX(ca.DM([[c, -(1 + c)]])))
+    np.testing.assert_allclose(float(ca.evalf(cosines)), 0, atol=1e-15)
+    np.testing.assert_allclose(float(ca.evalf(task_cosines(task, task * 3))), 1.0)
+
+
+def test_pairs_are_ordered_like_the_paper_sum() -> None:
+    assert pairs(1) == []
+    assert pairs(3) == [(1, 0), (2, 0), (2, 1)]
+
+
+def test_single_coordinate_has_no_mutual_cosine() -> None:
+    assert mutual_cosines(ca.SX.ones(1, 3), None).shape == (0, 1)
+
+
+def test_bad_weights_and_shapes_are_refused(planar_x: oc.Problem) -> None:
+    for weights in ((0.0, 1.0), (-1.0, 1.0), (1.0, float("nan")), (1.0, -2.0)):
+        with pytest.raises(InvalidValueError, match="lambda"):
+            oc.fit(planar_x, oc.Polynomial(1), weights=weights)
+    with pytest.raises(ShapeError, match="coordinate_jacobian"):
+        task_cosines(ca.SX.ones(1, 3), ca.SX.ones(2, 4))
+
+
+def test_rank_trap_at_the_papers_weights_is_reported(iiwa: oc.Problem) -> None:
+    """With lambda2 / lambda1 = 1/1000 two coordinates become nearly parallel: good task angles, no chart."""
+    good = oc.evaluate(oc.fit(iiwa, oc.Polynomial(3)).chart, samples=5000)
+    trapped = oc.evaluate(oc.fit(iiwa, oc.Polynomial(3), weights=(1000.0, 1.0)).chart, samples=5000)
+    assert trapped.task_angle.std < good.task_angle.std
+    assert trapped.mutual_angle.std > 3 * good.mutual_angle.std
+    assert trapped.conditioning.p01 < 0.1 < good.conditioning.p01
+    assert trapped.degenerate
+    assert not good.degenerate
+
+
+def test_spectral_start_finds_an_exact_linear_coordinate() -> None:
+    """Task q1 + 2 q2 with A = I: the plane direction (2, -1) is orthogonal to it everywhere."""
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    task = oc.Task.custom(robot, "sum", lambda q: q[0] + 2 * q[1])
+    problem = oc.Problem(robot, task, domain=oc.Box([0.0, 0.0], 1.0))
+    family = oc.Polynomial(2).family(joint_space(problem), 1)
+    theta = spectral_start(family, sample_problem(problem, 100, 0))
+    objective = LinearObjective(family, sample_problem(problem, 100, 1), WEIGHTS)
+    directions = objective.coordinate_jacobians(theta)[:, 0]
+    np.testing.assert_allclose(directions @ np.array([1.0, 2.0]), 0, atol=1e-6 * np.abs(directions).max())

@@ -1,0 +1,159 @@
+"""Parametrisations: Jacobians against finite differences, bases against closed forms, names."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from conftest import robot_data
+
+import orthocas as oc
+from orthocas.errors import InvalidValueError, SingularTaskError, UnknownNameError
+from orthocas.parametrisations import JointSpace, embed, joint_derivatives, parse_parametrisation
+from orthocas.parametrisations.product_basis import LinearFamily
+
+SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))
+SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE.joint_names)
+ALL = [oc.Linear(), oc.Polynomial(3), oc.Fourier(2), oc.MLP((5, 4))]
+
+
+def values(parametrisation: object, space: JointSpace, points: np.ndarray, theta: np.ndarray, r: int = 2) -> np.ndarray:
+    family = parametrisation.family(space, r)
+    q, p = ca.MX.sym("q", space.n, len(points)), ca.MX.sym("theta", family.size)
+    return np.array(ca.Function("xi", [q, p], [family.expression(q, p)])(points.T, theta)).T
+
+
+@pytest.mark.parametrize("parametrisation", ALL, ids=lambda p: p.label)
+def test_jacobian_by_ad_matches_central_differences(parametrisation: object) -> None:
+    family = parametrisation.family(SPACE, 2)
+    theta = family.initial(seed=4)
+    points = np.random.default_rng(5).uniform(-0.5, 0.5, (6, 3))
+    q = ca.MX.sym("q", 3, 6)
+    J = ca.Function("J", [q], joint_derivatives(family.expression(q, ca.MX(ca.DM(theta))), q))(points.T)
+    step = 1e-6
+    for k, e in enumerate(np.eye(3)):
+        ahead = values(parametrisation, SPACE, points + step * e, theta)
+        behind = values(parametrisation, SPACE, points - step * e, theta)
+        np.testing.assert_allclose(np.array(J[k]).T, (ahead - behind) / (2 * step), atol=1e-8)
+
+
+@pytest.mark.parametrize("parametrisation", ALL, ids=lambda p: p.label)
+def test_columns_are_independent_samples_and_sx_agrees_with_mx(parametrisation: object) -> None:
+    family = parametrisation.family(SPACE, 2)
+    theta = family.initial(seed=4)
+    points = np.random.default_rng(6).uniform(-0.5, 0.5, (5, 3))
+    together = values(parametrisation, SPACE, points, theta)
+    q = ca.SX.sym("q", 3)
+    single = ca.Function("xi", [q], [family.expression(q, ca.SX(ca.DM(theta)))])
+    np.testing.assert_allclose(together, [np.array(single(p)).ravel() for p in points], atol=1e-13)
+
+
+@pytest.mark.parametrize("parametrisation", [oc.Polynomial(4), oc.Fourier(3)], ids=lambda p: p.label)
+def test_basis_has_the_counted_terms_and_is_orthonormal(parametrisation: object) -> None:
+    whole = JointSpace(np.zeros(2), np.full(2, np.pi), (False, False), ("a", "b"))
+    family = parametrisation.family(whole, 1)
+    assert len(family.terms) == len(set(family.terms)) == parametrisation.term_count(2)
+    nodes, weights = np.polynomial.legendre.leggauss(24)
+    grid = np.pi * np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2)
+    mass = np.outer(weights, weights).ravel() / 4
+    q = ca.SX.sym("q", 2)
+    basis = ca.Function("psi", [q], [family.basis(q)])
+    psi = np.array([np.array(basis(p)).ravel() for p in grid])
+    np.testing.assert_allclose((psi * mass[:, None]).T @ psi, np.eye(len(family.terms)), atol=1e-10)
+    np.testing.assert_allclose(mass @ psi, 0, atol=1e-10)  # no constant among them
+
+
+def test_fourier_is_periodic() -> None:
+    theta = oc.Fourier(3).family(SPACE, 2).initial(0)
+    points = np.random.default_rng(1).uniform(-3, 3, (4, 3))
+    turned = points + 2 * np.pi * np.array([1, -1, 2])
+    np.testing.assert_allclose(values(oc.Fourier(3), SPACE, points, theta), values(oc.Fourier(3), SPACE, turned, theta))
+
+
+def test_mlp_is_the_formula_of_the_paper_and_takes_sliding_joints_raw() -> None:
+    family = oc.MLP((4, 3)).family(SLIDING, 2)
+    theta = np.random.default_rng(2).normal(size=family.size)
+    q = np.array([0.3, 1.7, -0.4])
+    inputs = np.array([np.sin(q[0]), np.sin(q[2]), np.cos(q[0]), np.cos(q[2]), q[1]])
+    W1, rest = theta[:20].reshape(4, 5, order="F"), theta[20:]
+    b1, W2, b2 = rest[:4], rest[4:16].reshape(3, 4, order="F"), rest[16:19]
+    Wout, bout = rest[19:25].reshape(2, 3, order="F"), rest[25:]
+    want = Wout @ np.tanh(W2 @ np.tanh(W1 @ inputs + b1) + b2) + bout
+    np.testing.assert_allclose(values(oc.MLP((4, 3)), SLIDING, q[None], theta)[0], want, atol=1e-13)
+
+
+def test_embedding_keeps_the_function() -> None:
+    coarse, fine = oc.Polynomial(2).family(SPACE, 2), oc.Polynomial(4).family(SPACE, 2)
+    theta = coarse.initial(3)
+    wide = embed(theta, 2, coarse.terms, fine.terms)
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (4, 3))
+    got = values(oc.Polynomial(4), SPACE, points, wide)
+    np.testing.assert_allclose(got, values(oc.Polynomial(2), SPACE, points, theta), atol=1e-12)
+
+
+def test_basis_gradients_match_differences_of_the_basis() -> None:
+    family: LinearFamily = oc.Polynomial(3).family(SPACE, 1)
+    point = np.array([0.2, 0.1, -0.1])
+    q = ca.SX.sym("q", 3)
+    psi = ca.Function("psi", [q], [family.basis(q)])
+    G = family.basis_gradients(point[None])[0]  # (n, K)
+    step = 1e-6
+    want = [np.array(psi(point + step * e) - psi(point - step * e)).ravel() / (2 * step) for e in np.eye(3)]
+    np.testing.assert_allclose(G, want, atol=1e-7)
+
+
+def test_linear_normals_of_the_paper() -> None:
+    v = np.array([[0.5, -1.2, 0.7]])
+    n1, n2 = oc.Linear(normals="paper").normal_vectors(v)
+    np.testing.assert_allclose(n1, np.array([-1.2, -0.5, 0]) / np.hypot(1.2, 0.5))  # (37a)
+    np.testing.assert_allclose(n2, np.cross(n1, v[0]) / np.linalg.norm(np.cross(n1, v[0])))  # (37b)
+    np.testing.assert_allclose(np.array([n1, n2]) @ v[0], 0, atol=1e-14)
+    gradients = np.array([[0.5, -1.2, 0.7], [1.0, 0.3, 0.2]])
+    (normal,) = oc.Linear(normals="paper").normal_vectors(gradients)  # (39)
+    np.testing.assert_allclose(gradients @ normal, 0, atol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(normal), 1)
+
+
+def test_linear_normals_at_bad_bases_are_refused() -> None:
+    with pytest.raises(SingularTaskError, match="singular at the base"):
+        oc.Linear().normal_vectors(np.array([[1.0, 2, 3], [2.0, 4, 6]]))
+    with pytest.raises(SingularTaskError, match="joints 1 and 2"):
+        oc.Linear(normals="paper").normal_vectors(np.array([[0.0, 0, 1]]))
+    with pytest.raises(InvalidValueError, match="n is 4"):
+        oc.Linear(normals="paper").normal_vectors(np.ones((1, 4)))
+    with pytest.raises(UnknownNameError):
+        oc.Linear(normals="best")
+
+
+@pytest.mark.parametrize("label", ["linear", "polynomial:4", "fourier:2", "mlp:64x64", "mlp:8"])
+def test_labels_are_read_back(label: str) -> None:
+    assert parse_parametrisation(label).label == label
+
+
+@pytest.mark.parametrize(
+    ("label", "error", "message"),
+    [
+        ("spline:3", UnknownNameError, "known: linear, polynomial, fourier, mlp"),
+        ("polynomial", InvalidValueError, "whole numbers"),
+        ("polynomial:x", InvalidValueError, "whole numbers"),
+        ("polynomial:0", InvalidValueError, "degree is 0"),
+        ("fourier:-1", InvalidValueError, "degree is -1"),
+        ("mlp:64x", InvalidValueError, "whole numbers"),
+        ("mlp:0", InvalidValueError, "hidden is 0"),
+        ("linear:2", InvalidValueError, "'linear' without a number"),
+    ],
+)
+def test_bad_labels_are_refused(label: str, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        parse_parametrisation(label)
+
+
+def test_fourier_refuses_a_prismatic_joint_by_name() -> None:
+    with pytest.raises(InvalidValueError, match="joint 'b' of a Fourier basis is prismatic"):
+        oc.Fourier(2).family(SLIDING, 1)
+    robot = oc.Robot.chain_from_file(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
+    with pytest.raises(InvalidValueError, match="torso_lift_joint"):
+        oc.fit(oc.Problem(robot, oc.Task.position(robot)), oc.Fourier(1))
+
+
+def test_empty_mlp_is_refused() -> None:
+    with pytest.raises(InvalidValueError, match="at least one hidden layer"):
+        oc.MLP(())

@@ -1,0 +1,105 @@
+"""Figures of merit against closed forms and a second computation."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import orthocas as oc
+from orthocas.chart import Chart
+from orthocas.coordinates import Coordinates, joint_space
+from orthocas.errors import InvalidValueError
+from orthocas.fitting import Fit
+from orthocas.quality import AngleStatistics
+
+
+def chart_with_normals(normals: list[list[float]], metric: object = "euclidean") -> Chart:
+    """Task q1 of a three-joint arm, with linear coordinates of given normals."""
+    robot = oc.Robot.planar([1.0] * 3, [1.0] * 3)
+    problem = oc.Problem(robot, oc.Task.custom(robot, "q1", lambda q: q[0]), metric)
+    coordinates = Coordinates(oc.Linear(), joint_space(problem), (), np.ravel(normals), np.zeros(2), np.ones(2))
+    return Chart(problem, coordinates)
+
+
+def test_perfect_coordinates_have_right_angles_and_conditioning_one() -> None:
+    report = oc.evaluate(chart_with_normals([[0, 1, 0], [0, 0, 2]]), 100)
+    assert report.task_angle.mean == report.mutual_angle.mean == 90
+    assert report.task_angle.std == report.task_angle.max == 0
+    assert report.conditioning.min == pytest.approx(1, abs=1e-7)  # through a Gram matrix: half the digits
+    assert not report.degenerate
+
+
+def test_known_angles_are_reported() -> None:
+    lean = np.radians(10)
+    report = oc.evaluate(chart_with_normals([[np.sin(lean), np.cos(lean), 0], [0, 1, 1]]), 100)
+    np.testing.assert_allclose(report.task_angle.mean, (80 + 90) / 2)
+    np.testing.assert_allclose(report.task_angle.std, 5)
+    np.testing.assert_allclose(report.task_angle.max, 10)
+    np.testing.assert_allclose(report.mutual_angle.mean, np.degrees(np.arccos(np.cos(lean) / np.sqrt(2))))
+    assert report.task_angle.histogram.sum() == 200
+
+
+def test_parallel_coordinates_are_reported_as_degenerate() -> None:
+    report = oc.evaluate(chart_with_normals([[0, 1, 0], [0, 1, 0.01]]), 100)
+    assert report.conditioning.mean < 0.01
+    assert report.degenerate
+    assert report.as_dict()["degenerate"] is True
+
+
+def test_conditioning_ignores_how_the_task_is_scaled_but_not_the_metric() -> None:
+    normals = [[0, 1, 0], [0.2, 0.3, 1]]
+    plain = oc.evaluate(chart_with_normals(normals), 100)
+    robot = plain_robot = oc.Robot.planar([1.0] * 3, [1.0] * 3)
+    task = oc.Task.custom(plain_robot, "1000 q1", lambda q: 1000 * q[0])
+    problem = oc.Problem(robot, task)
+    coordinates = Coordinates(oc.Linear(), joint_space(problem), (), np.ravel(normals), np.zeros(2), np.ones(2))
+    assert oc.evaluate(Chart(problem, coordinates), 100).conditioning == plain.conditioning
+    other = oc.evaluate(chart_with_normals(normals, np.diag([1.0, 4.0, 9.0])), 100)
+    assert abs(other.conditioning.mean - plain.conditioning.mean) > 0.01
+
+
+def test_conditioning_matches_a_direct_computation_in_whitened_coordinates(planar_fit: Fit) -> None:
+    chart = planar_fit.chart
+    report = oc.evaluate(chart, samples=200, seed=5)
+    from orthocas.domains import sample_uniform
+
+    smallest = []
+    for q in sample_uniform(chart.problem.domain, 200, 5):
+        L = np.linalg.cholesky(chart.problem.robot.mass_matrix(q))
+        white = scipy.linalg.solve_triangular(L, chart.jacobian(q).T, lower=True).T  # covectors where A is the identity
+        task = scipy.linalg.orth(white[:1].T).T
+        units = white[1:] / np.linalg.norm(white[1:], axis=1, keepdims=True)
+        smallest.append(np.linalg.svd(np.vstack([task, units]), compute_uv=False)[-1])
+    np.testing.assert_allclose(report.conditioning.mean, np.mean(smallest), atol=1e-9)
+    np.testing.assert_allclose(report.conditioning.min, np.min(smallest), atol=1e-7)
+    worst = sample_uniform(chart.problem.domain, 200, 5)[int(np.argmin(smallest))]
+    np.testing.assert_allclose(report.worst_point, worst)
+
+
+def test_held_out_samples_depend_on_the_seed(planar_fit: Fit) -> None:
+    first, again, other = (oc.evaluate(planar_fit.chart, 500, seed) for seed in (1, 1, 2))
+    assert first.as_dict() == again.as_dict()
+    assert first.task_angle.std != other.task_angle.std
+
+
+def test_report_as_plain_data_has_the_promised_keys(planar_fit: Fit) -> None:
+    data = oc.evaluate(planar_fit.chart, 100).as_dict()
+    assert set(data["task_angle_deg"]) == set(data["mutual_angle_deg"]) == {"mean", "std", "max"}
+    assert set(data["conditioning"]) == {"min", "p01", "mean"}
+    assert {"n", "m", "r", "samples", "seed", "metric"} <= set(data)
+
+
+def test_no_pairs_give_nan_and_json_null(planar_xy: oc.Problem) -> None:
+    report = oc.evaluate(oc.fit(planar_xy, oc.Linear()).chart, 100)
+    assert np.isnan(report.mutual_angle.std)
+    assert report.as_dict()["mutual_angle_deg"] == {"mean": None, "std": None, "max": None}
+
+
+def test_histogram_counts_degrees() -> None:
+    counts = AngleStatistics.of_cosines(np.cos(np.radians([60.05, 60.05, 120.05]))).histogram
+    assert counts[600] == 2
+    assert counts[1200] == 1
+
+
+def test_samples_must_be_positive(planar_fit: Fit) -> None:
+    with pytest.raises(InvalidValueError, match="samples is 0"):
+        oc.evaluate(planar_fit.chart, samples=0)
