@@ -15,7 +15,7 @@ def fit(
     problem: Problem,
     parametrisation: Parametrisation | None = None,
     solver: Solver | None = None,
-    weights: tuple[float, float] = DEFAULT_WEIGHTS,
+    weights: tuple[float, float] | tuple[float, float, float] = DEFAULT_WEIGHTS,
     samples: int | None = None,
     seed: int = 0,
     monitor: Monitor = silent,
@@ -30,7 +30,9 @@ def fit(
         problem: robot, task, metric and domain.
         parametrisation: default Polynomial(degree=4).
         solver: default GaussNewton for families linear in their parameters, LBFGS otherwise.
-        weights: (lambda1, lambda2): task term against mutual term; their ratio picks a point on the front.
+        weights: (lambda1, lambda2) is the loss of the paper: task term against mutual term; their ratio picks a point
+            on the front. (lambda1, lambda2, lambda3) adds the regularity term (ours), which keeps the gradients of
+            the coordinates from collapsing anywhere.
         samples: number of samples; default grows with the number of parameters.
         seed: seed of samples and of random starts.
         monitor: called with progress.

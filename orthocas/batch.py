@@ -3,7 +3,9 @@
 NumPy sample sets are (N, n); a stack of matrices is (N, rows, columns).
 """
 
+import os
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
@@ -11,34 +13,43 @@ import numpy as np
 
 from orthocas.checks import Array
 
-CHUNK = 512  #: samples evaluated in one call: large enough to amortise the call, small enough for the cache
+_CHUNKS = (1, 64, 512)  # samples evaluated in one call: the smallest that holds the set, or the largest
+_THREADED = 512  # chunks of this size are worth starting threads for
+_THREADS = os.cpu_count() or 1
 
 
 def dense_function(
     name: str, inputs: Sequence[Any], outputs: Sequence[Any], input_names: Sequence[str] | None = None
 ) -> ca.Function:
-    """A CasADi function, SX or MX, whose outputs have no structural zeros, as `evaluate_batch` needs."""
+    """A CasADi function, SX or MX, whose outputs have no structural zeros, as `Batched` needs."""
     names = input_names or [f"i{k}" for k in range(len(inputs))]
     return ca.Function(
         name, inputs, [ca.densify(out) for out in outputs], names, [f"o{k}" for k in range(len(outputs))]
     )
 
 
-def evaluate_batch(function: ca.Function, *arguments: Array) -> list[Array]:
-    """Evaluate a function of one sample on N samples.
+@dataclass(frozen=True)
+class Batched:
+    """A function of one sample, to be called with N samples.
 
-    Args:
-        function: dense inputs and outputs of one sample each, matrices (rows, columns).
-        arguments: one array per input, (N, rows) for a column, (N, rows, columns) for a matrix.
-
-    Returns:
-        One array per output: (N, rows) for a column, (N, rows, columns) for a matrix.
+    Takes one array per input, (N, rows) for a column or (N, rows, columns) for a matrix, and returns one array per
+    output in the same form. Inputs and outputs are dense.
     """
-    return evaluate_columns(function.map(CHUNK), CHUNK, *arguments)
+
+    function: ca.Function
+    _mapped: dict[int, ca.Function] = field(default_factory=dict, repr=False)
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate N samples."""
+        chunk = next((size for size in _CHUNKS if size >= len(arguments[0])), _CHUNKS[-1])
+        if chunk not in self._mapped:
+            how = ("thread", _THREADS) if chunk >= _THREADED and _THREADS > 1 else ()
+            self._mapped[chunk] = self.function.map(chunk, *how)
+        return evaluate_columns(self._mapped[chunk], chunk, *arguments)
 
 
 def evaluate_columns(function: ca.Function, chunk: int, *arguments: Array) -> list[Array]:
-    """As `evaluate_batch`, for a function that already takes `chunk` samples side by side as columns."""
+    """As `Batched`, for a function that itself takes `chunk` samples side by side as columns."""
     N = len(arguments[0])
     arguments = tuple(_column_major(a) for a in arguments)
     buffer: Any

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.batch import dense_function, evaluate_batch
+from orthocas.batch import dense_function
 from orthocas.chart_file import read_chart, write_chart
 from orthocas.checks import Array, as_point_set, require_known
 from orthocas.coordinates import Coordinates
@@ -60,7 +60,7 @@ class Chart:
     def task(self, q: ArrayLike) -> Array:
         """Task values x = h(q), (m,) or (N, m)."""
         points, single = as_point_set("q", q, self.n)
-        values = evaluate_batch(self.problem.task.function, points)[0]
+        values = self.problem.task.batched(points)[0]
         return values[0] if single else values
 
     def phi(self, q: ArrayLike) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.batch import dense_function, evaluate_batch, evaluate_columns
+from orthocas.batch import Batched, dense_function, evaluate_columns
 from orthocas.checks import Array, frozen_array
 from orthocas.parametrisations import Family, JointSpace, Parametrisation
 from orthocas.parametrisations.family import Expression, joint_derivatives
@@ -75,14 +75,14 @@ class Coordinates:
         """Xi at points (N, n), (N, r)."""
         if self.family.as_matrices:
             return evaluate_columns(self._column_functions["xi"], _COLUMNS, points)[0]
-        return evaluate_batch(self.functions["xi"], points)[0]
+        return self._batched["xi"](points)[0]
 
     def jacobian(self, points: Array) -> Array:
         """J_xi at points (N, n), (N, r, n)."""
         if self.family.as_matrices:
             flat = evaluate_columns(self._column_functions["jacobian"], _COLUMNS, points)[0]
             return flat.reshape(len(points), self.space.n, self.r).transpose(0, 2, 1)
-        return evaluate_batch(self.functions["jacobian"], points)[0].reshape(len(points), self.r, self.space.n)
+        return self._batched["jacobian"](points)[0].reshape(len(points), self.r, self.space.n)
 
     @cached_property
     def functions(self) -> dict[str, ca.Function]:
@@ -90,6 +90,10 @@ class Coordinates:
         q = self._symbols(1)
         xi = self.expression(q)
         return {"xi": dense_function("xi", [q], [xi]), "jacobian": dense_function("J_xi", [q], [ca.jacobian(xi, q)])}
+
+    @cached_property
+    def _batched(self) -> dict[str, Batched]:
+        return {name: Batched(function) for name, function in self.functions.items()}
 
     @cached_property
     def _column_functions(self) -> dict[str, ca.Function]:

@@ -88,6 +88,26 @@ def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) ->
     return points
 
 
+def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
+    """Points that fill the domain more evenly than random ones, (samples, n); any part of the sequence does.
+
+    The additive recurrence frac(shift + k alpha), alpha_j = g^-j with g the root of g^(n+1) = g + 1, with a random
+    shift: uniform in distribution, and a better mean over the domain than independent points give.
+
+    Source:
+        M. Roberts, docs/references.md [R2018]; the use for training is ours.
+    """
+    require_count("samples", samples)
+    n = len(domain.centre)
+    g = 1.5
+    for _ in range(64):
+        g = (1 + g) ** (1 / (n + 1))
+    shift = np.random.default_rng(seed).uniform(size=n)
+    unit = (shift + np.arange(1, samples + 1)[:, None] * g ** -np.arange(1.0, n + 1)) % 1.0
+    points: Array = domain.centre + domain.half_width * (2 * unit - 1)
+    return points
+
+
 def contains(domain: Domain, q: ArrayLike) -> Array:
     """Whether points (n,) or (N, n) lie in the domain; angles of a torus always do."""
     points, single = as_point_set("q", q, len(domain.centre))

@@ -10,6 +10,7 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_count
 from orthocas.coordinates import Coordinates, joint_space
+from orthocas.domains import sample_evenly
 from orthocas.errors import InvalidValueError, MemoryNeedError, OrthocasError
 from orthocas.graph_objective import GraphObjective
 from orthocas.idle_joints import idle_joints
@@ -133,7 +134,8 @@ class _Run:
                 continue
             if theta is not None:
                 theta = embed(theta, r, reached.family(self.space, r).terms, family.terms)
-            stages.append(self.stage(current, family, theta, solver, degree))
+            minimiser = solver if degree == target.degree else solver.coarser()
+            stages.append(self.stage(current, family, theta, minimiser, degree))
             reached, theta = current, stages[-1].result.theta
             if stages[-1].result.status is Status.INTERRUPTED:
                 break
@@ -147,14 +149,15 @@ class _Run:
         """Draw samples, find a start if there is none, and minimise."""
         count = self.samples or self._sample_count(family)
         self.monitor(Progress(parametrisation.label, 0.0, f"sampling {count} points"))
-        samples = sample_problem(self.problem, count, (self.seed, degree)).restricted_to(self.active)
+        points = sample_evenly(self.problem.domain, count, (self.seed, degree))
+        samples = samples_at(self.problem, points).restricted_to(self.active)
         objective: Objective
         if isinstance(family, LinearFamily):
             theta = spectral_start(family, samples) if theta is None else theta
-            objective = LinearObjective(family, samples, self.weights)
+            objective = LinearObjective(family, samples, self.weights, theta)
         else:
             theta = family.initial(self.seed) if theta is None else theta
-            objective = GraphObjective(family, samples, self.weights)
+            objective = GraphObjective(family, samples, self.weights, theta)
         result = solver.minimise(objective, theta, self.monitor, parametrisation.label).raise_if_failed()
         return Stage(parametrisation.label, family.size, count, result)
 
@@ -167,15 +170,15 @@ class _Run:
         return parametrisation.normal_vectors(at_base.raised(at_base.task_jacobian)[0]).ravel()
 
     def _sample_count(self, family: Family) -> int:
-        """Enough samples that every coefficient sees about 90 residuals."""
+        """Enough samples that every coefficient sees about 140 residuals."""
         if not isinstance(family, LinearFamily):
             return MLP_SAMPLES
-        return 1000 + ceil(90 * len(family.terms) / (self.problem.m + family.outputs - 1))
+        return 1000 + ceil(140 * len(family.terms) / (self.problem.m + family.outputs - 1))
 
     def _require_memory(self, target: GradedParametrisation, r: int) -> None:
         """Refuse a degree that does not fit, before building anything."""
         K = target.term_count(self.space.n)
-        N = self.samples or 1000 + 90 * K / (self.problem.m + r - 1)
+        N = self.samples or 1000 + 140 * K / (self.problem.m + r - 1)
         needed = 8 * (N * self.space.n * K + 4 * (r * K) ** 2)
         available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         if needed > 0.8 * available:

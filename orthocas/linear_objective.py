@@ -1,14 +1,16 @@
 """The loss of families linear in theta: basis gradients are sampled once, then all is dense products (ours)."""
 
 import numpy as np
+from numpy.typing import NDArray
 
-from orthocas.batch import evaluate_batch
+from orthocas.batch import Batched
 from orthocas.checks import Array
-from orthocas.loss import Weights, pairs, residual_function
+from orthocas.loss import LossShape, Weights, pairs, residual_functions
 from orthocas.parametrisations.product_basis import LinearFamily
 from orthocas.samples import Samples
 
 _CHUNK = 512  # samples per block of the Gauss-Newton matrix: the rows stay in the cache
+_STRIDE = 2  # the Gauss-Newton matrix is a mean too, and half of the samples tell it well enough
 
 
 class LinearObjective:
@@ -17,18 +19,22 @@ class LinearObjective:
     With G = d psi / dq sampled once, (N, n, K), the coordinate gradients are J_xi = C G^T. Residuals rho and their
     derivatives with respect to J_xi come from CasADi, sample by sample. The residual of task i and coordinate j
     depends on row j of C only, so the Gauss-Newton matrix is built block by block from few rows per sample.
+
+    Args:
+        family: the coordinates.
+        samples: fixed samples of the family's joints.
+        weights: of the loss.
+        start: parameters, (size,), whose orientation the regularity term keeps.
     """
 
-    def __init__(self, family: LinearFamily, samples: Samples, weights: Weights) -> None:
+    def __init__(self, family: LinearFamily, samples: Samples, weights: Weights, start: Array) -> None:
         self.family = family
         self.r, self.K, self.N = family.outputs, len(family.terms), len(samples)
-        self.m, self.n = samples.task_jacobian.shape[1:]
+        m, self.n = samples.task_jacobian.shape[1:]
         self.G = family.basis_gradients(samples.points)  # (N, n, K)
-        inverse = samples.metric_inverse
-        self._data = (samples.unit_task_gradients, *(() if inverse is None else (inverse,)))
-        both = residual_function(self.n, self.m, self.r, inverse is None, weights)
-        self._residuals = both.factory("residuals_only", both.name_in(), both.name_out()[:1])
-        self._residuals_and_derivative = both
+        self._shape = LossShape(self.n, m, self.r, samples.metric_inverse is None, weights)
+        self._data = samples.loss_data(self.coordinate_jacobians(start) if self._shape.regular else None)
+        self._residuals, self._linearised = (Batched(function) for function in residual_functions(self._shape))
 
     def coordinate_jacobians(self, theta: Array) -> Array:
         """J_xi at every sample, (N, r, n)."""
@@ -37,50 +43,60 @@ class LinearObjective:
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
-        (rho,) = evaluate_batch(self._residuals, self.coordinate_jacobians(theta), *self._data)
-        return float(np.sum(rho**2) / (2 * self.N))
+        (rho,) = self._residuals(self.coordinate_jacobians(theta), *self._data)
+        return self._mean_loss(rho)
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        rho, derivative = self._linearised_residuals(theta)
-        return float(np.sum(rho**2) / (2 * self.N)), self._gradient(rho, derivative)
+        rho, *derivatives = self._linearised(self.coordinate_jacobians(theta), *self._data)
+        return self._mean_loss(rho), self._gradient(rho, derivatives)
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """L(theta), its gradient, and the Gauss-Newton matrix, whose products are taken in single precision."""
-        rho, derivative = self._linearised_residuals(theta)
-        value = float(np.sum(rho**2) / (2 * self.N))
-        return value, self._gradient(rho, derivative), self._gauss_newton_matrix(derivative)
+        rho, *derivatives = self._linearised(self.coordinate_jacobians(theta), *self._data)
+        H = self._gauss_newton_matrix(derivatives[: self.r])
+        if self._shape.regular:
+            H += self._regularity_matrix(derivatives[-1], rho[:, -1] > 0)
+        return self._mean_loss(rho), self._gradient(rho, derivatives), H
 
-    def _linearised_residuals(self, theta: Array) -> tuple[Array, Array]:
-        """Residuals (N, p) and d rho / d J_xi as (N, p, r, n)."""
-        rho, derivative = evaluate_batch(self._residuals_and_derivative, self.coordinate_jacobians(theta), *self._data)
-        return rho, derivative.reshape(self.N, -1, self.r, self.n)
+    def _mean_loss(self, rho: Array) -> float:
+        return float(np.vdot(rho, rho) / (2 * self.N))
 
-    def _gradient(self, rho: Array, derivative: Array) -> Array:
-        forces = np.einsum("sp,sprn->snr", rho, derivative, optimize=True).reshape(-1, self.r)
-        gradient: Array = (self.G.reshape(-1, self.K).T @ forces).T.ravel() / self.N
+    def _gradient(self, rho: Array, derivatives: list[Array]) -> Array:
+        forces = np.stack([self._along(rho, D, j) for j, D in enumerate(derivatives[: self.r])], axis=2)  # (N, n, r)
+        if self._shape.regular:
+            forces += (rho[:, -1, None, None] * derivatives[-1]).transpose(0, 2, 1)
+        gradient: Array = (self.G.reshape(-1, self.K).T @ forces.reshape(-1, self.r)).T.ravel() / self.N
         return gradient
 
-    def _gauss_newton_matrix(self, derivative: Array) -> Array:
+    def _along(self, rho: Array, derivative: Array, j: int) -> Array:
+        """rho^T d rho / d(row j of J_xi), (N, n)."""
+        product: Array = (rho[:, None, self._shape.rows_of(j)] @ derivative)[:, 0]
+        return product
+
+    def _gauss_newton_matrix(self, derivatives: list[Array]) -> Array:
+        """Part of the residuals of (24), block by block for pairs of coordinates, from every second sample."""
         r, K = self.r, self.K
         blocks = np.zeros((r, r, K, K))
-        rows = [_rows_of(j, self.m, r) for j in range(r)]
-        D = [np.ascontiguousarray(derivative[:, rows[j], j, :], dtype=np.float32) for j in range(r)]
-        for start in range(0, self.N, _CHUNK):
+        rows = [self._shape.rows_of(j) for j in range(r)]
+        D = [derivative[::_STRIDE].astype(np.float32) for derivative in derivatives]
+        used = len(D[0])
+        for start in range(0, used, _CHUNK):
             part = slice(start, start + _CHUNK)
-            G = self.G[part].astype(np.float32)
+            G = self.G[::_STRIDE][part].astype(np.float32)
             X = [D[j][part] @ G for j in range(r)]  # d rho / d C_j, (chunk, rows, K)
             for j in range(r):
                 flat = X[j].reshape(-1, K)
                 blocks[j, j] += flat.T @ flat
             for p, (i, j) in enumerate(pairs(r)):
-                row = r * self.m + p
+                row = r * self._shape.m + p
                 blocks[i, j] += X[i][:, rows[i].index(row)].T @ X[j][:, rows[j].index(row)]
         for i, j in pairs(r):
             blocks[j, i] = blocks[i, j].T
-        return blocks.transpose(0, 2, 1, 3).reshape(r * K, r * K) / self.N
+        return blocks.transpose(0, 2, 1, 3).reshape(r * K, r * K) / used
 
-
-def _rows_of(j: int, m: int, r: int) -> list[int]:
-    """Residuals that depend on coordinate j: its task cosines, and the pairs it is part of."""
-    return [*range(j * m, (j + 1) * m), *(r * m + p for p, pair in enumerate(pairs(r)) if j in pair)]
+    def _regularity_matrix(self, derivative: Array, active: NDArray[np.bool_]) -> Array:
+        """Part of the regularity residual, which couples all coordinates but acts at few samples."""
+        rows = (derivative[active].astype(np.float32) @ self.G[active].astype(np.float32)).reshape(-1, self.r * self.K)
+        product: Array = (rows.T @ rows).astype(float) / self.N
+        return product

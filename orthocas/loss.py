@@ -1,4 +1,4 @@
-"""The loss of [AS2023] eqs. (24) and (25) as CasADi expressions, and as least squares."""
+"""The loss of [AS2023] (24) and (25) as CasADi expressions and least squares, and a regularity term (ours)."""
 
 from dataclasses import dataclass
 from itertools import combinations
@@ -9,18 +9,20 @@ from orthocas.batch import dense_function
 from orthocas.checks import require_shape
 from orthocas.errors import InvalidValueError
 
-DEFAULT_WEIGHTS = (1000.0, 30.0)  #: (lambda1, lambda2); at the paper's 1000 : 1 the optimum can lose rank
+DEFAULT_WEIGHTS = (1000.0, 30.0, 120.0)  #: lambda1, lambda2, lambda3; at the paper's 1000 : 1 the optimum can lose rank
+REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
 
 
 @dataclass(frozen=True)
 class Weights:
-    """lambda1 and lambda2 of the loss: task term against mutual term."""
+    """lambda1 (task term) and lambda2 (mutual term) of (24), and lambda3 of the regularity term (ours)."""
 
-    task: float = DEFAULT_WEIGHTS[0]
-    mutual: float = DEFAULT_WEIGHTS[1]
+    task: float
+    mutual: float
+    regularity: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, value in (("lambda1", self.task), ("lambda2", self.mutual)):
+        for name, value in (("lambda1", self.task), ("lambda2", self.mutual), ("lambda3", self.regularity)):
             if not 0 <= value < float("inf"):
                 raise InvalidValueError(name, value, "a finite number >= 0")
         if self.task == 0:
@@ -73,38 +75,90 @@ def mutual_cosines(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> 
     return ca.vertcat(*cosines) if cosines else ca.SX(0, 1)
 
 
-def loss_residuals(
-    unit_task_gradients: ca.SX, coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None, weights: Weights
-) -> ca.SX:
-    """Residuals rho of one sample with L(q, theta) = |rho|^2 / 2, (m r + r (r - 1) / 2, 1).
+def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
+    """Signed volume of the coordinate gradients across the task, det(D) with D_jk = v_xi,j . z_k / |v_xi,j|_A^-1.
 
-    First the task cosines, coordinate by coordinate, times sqrt(lambda1 / (m r)); then the mutual cosines times
-    sqrt(lambda2 / C(r, 2)).
+    The z_k are an A-orthonormal basis of ker J_x, so D holds the parts of the unit gradients that the task does not
+    see. |det D| is 1 for perfect coordinates, and the chart phi is regular exactly where det D is not 0.
+
+    Args:
+        coordinate_jacobian: J_xi, (r, n).
+        null_basis: columns z_1..z_r, (n, r), oriented continuously over the domain.
+        metric_inverse: A^-1, (n, n); None for the identity.
 
     Source:
-        [AS2023] eq. (24), written as least squares (ours).
+        ours, docs/derivations.md#regularity.
     """
-    m, r = unit_task_gradients.shape[0], coordinate_jacobian.shape[0]
-    task_weight = (weights.task / (m * r)) ** 0.5
-    task: ca.SX = task_weight * ca.vec(task_cosines(unit_task_gradients, coordinate_jacobian))
-    if r == 1:
-        return task
-    mutual_weight = (weights.mutual / len(pairs(r))) ** 0.5
-    return ca.vertcat(task, mutual_weight * mutual_cosines(coordinate_jacobian, metric_inverse))
+    J = coordinate_jacobian
+    raised = J if metric_inverse is None else J @ metric_inverse
+    lengths = ca.sqrt(ca.sum2(raised * J))
+    return ca.det((J @ null_basis) / ca.repmat(lengths, 1, J.shape[0]))
 
 
-def residual_function(n: int, m: int, r: int, identity_metric: bool, weights: Weights) -> ca.Function:
-    """The residuals of one sample and their derivative with respect to J_xi.
+@dataclass(frozen=True)
+class LossShape:
+    """Sizes and weights that fix the residuals of one sample."""
 
-    Inputs: J_xi (r, n), unit task gradients (m, n), and A^-1 (n, n) unless the metric is the identity.
-    Outputs: rho (p, 1) and d rho / d J_xi, (p, r n), with J_xi read row by row.
+    n: int
+    m: int
+    r: int
+    identity_metric: bool
+    weights: Weights
+
+    @property
+    def regular(self) -> bool:
+        """Whether there is a regularity residual (the last one)."""
+        return self.weights.regularity > 0
+
+    def symbols(self) -> list[ca.SX]:
+        """Symbols of the data of one sample: unit task gradients (m, n); A^-1 (n, n) and null basis (n, r) if used."""
+        data = [ca.SX.sym("g", self.m, self.n)]
+        data += [] if self.identity_metric else [ca.SX.sym("B", self.n, self.n)]
+        return data + ([ca.SX.sym("Z", self.n, self.r)] if self.regular else [])
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: list[ca.SX]) -> ca.SX:
+        """Residuals rho of one sample with L(q, theta) = |rho|^2 / 2.
+
+        First the task cosines, coordinate by coordinate, times sqrt(lambda1 / (m r)); then the mutual cosines times
+        sqrt(lambda2 / C(r, 2)); last sqrt(lambda3) max(v0 - det D, 0), if lambda3 > 0.
+
+        Source:
+            [AS2023] eq. (24), written as least squares; the last residual is ours.
+        """
+        inverse = None if self.identity_metric else data[1]
+        count = len(pairs(self.r))
+        task: ca.SX = ca.vec(task_cosines(data[0], coordinate_jacobian))
+        rows = [(self.weights.task / (self.m * self.r)) ** 0.5 * task]
+        if count:
+            rows.append((self.weights.mutual / count) ** 0.5 * mutual_cosines(coordinate_jacobian, inverse))
+        if self.regular:
+            volume = gradient_volume(coordinate_jacobian, data[-1], inverse)
+            rows.append(self.weights.regularity**0.5 * ca.fmax(REGULAR_VOLUME - volume, 0))
+        rho: ca.SX = ca.vertcat(*rows)
+        return rho
+
+    def rows_of(self, j: int) -> list[int]:
+        """Residuals of (24) that depend on coordinate j: its task cosines, and the pairs it is part of."""
+        return [
+            *range(j * self.m, (j + 1) * self.m),
+            *(self.m * self.r + p for p, pair in enumerate(pairs(self.r)) if j in pair),
+        ]
+
+
+def residual_functions(shape: LossShape) -> tuple[ca.Function, ca.Function]:
+    """The residuals of one sample, without and with their derivatives with respect to J_xi.
+
+    Inputs: J_xi (r, n), then the data of `LossShape.symbols`.
+    Outputs: rho (p, 1); then for every coordinate j the derivative of the residuals `rows_of(j)` with respect to row j
+    of J_xi, (rows, n); then, with a regularity residual, its derivative with respect to J_xi, (r, n).
     """
-    Jt = ca.SX.sym("Jt", n, r)
-    gradients = ca.SX.sym("g", m, n)
-    inverse = None if identity_metric else ca.SX.sym("B", n, n)
-    rho = loss_residuals(gradients, Jt.T, inverse, weights)
-    derivative = ca.jacobian(rho, ca.vec(Jt))
-    J = ca.SX.sym("J", r, n)
-    rho, derivative = ca.substitute([rho, derivative], [Jt], [J.T])
-    inputs = [J, gradients] + ([] if inverse is None else [inverse])
-    return dense_function("residuals", inputs, [rho, derivative])
+    J, data = ca.SX.sym("J", shape.r, shape.n), shape.symbols()
+    rho = shape.residuals(J, data)
+    by_entry = ca.jacobian(rho, ca.vec(J))  # columns: J_xi column by column
+    derivatives = [by_entry[shape.rows_of(j), j :: shape.r] for j in range(shape.r)]
+    if shape.regular:
+        derivatives.append(ca.reshape(by_entry[-1, :], shape.r, shape.n))
+    inputs = [J, *data]
+    return dense_function("residuals", inputs, [rho]), dense_function(
+        "linearised_residuals", inputs, [rho, *derivatives]
+    )

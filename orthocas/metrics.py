@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Self
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.batch import dense_function, evaluate_batch
+from orthocas.batch import Batched, dense_function
 from orthocas.checks import Array, frozen_array, require_known
 from orthocas.errors import MetricError, ShapeError
 from orthocas.expression_tape import to_tape
@@ -54,6 +55,11 @@ class Metric:
             {"kind": "constant", "matrix": matrix.tolist()},
         )
 
+    @cached_property
+    def batched(self) -> Batched:
+        """A at many points."""
+        return Batched(self.function)
+
     @property
     def is_identity(self) -> bool:
         """Whether A = I everywhere."""
@@ -65,7 +71,7 @@ def metric_matrices(metric: Metric, points: Array) -> Array:
     n = points.shape[1]
     if metric.is_identity:
         return np.broadcast_to(np.eye(n), (len(points), n, n))
-    A = evaluate_batch(metric.function, points)[0].reshape(-1, n, n)
+    A = metric.batched(points)[0].reshape(-1, n, n)
     require_spd(A, points)
     return A
 

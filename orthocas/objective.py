@@ -82,6 +82,10 @@ class Solver(Protocol):
         """Short name, as on the command line."""
         ...
 
+    def coarser(self) -> "Solver":
+        """The same with looser settings, for the stages of a continuation before the last."""
+        ...
+
     def minimise(self, objective: Objective, theta0: Array, monitor: Monitor = silent, stage: str = "") -> SolveResult:
         """Minimise from theta0; Ctrl-C returns the best point so far with status INTERRUPTED."""
         ...

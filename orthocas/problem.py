@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.batch import evaluate_batch
 from orthocas.checks import Array
 from orthocas.domains import Domain, default_box, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
@@ -121,7 +120,7 @@ def task_jacobians(problem: Problem, points: Array) -> Array:
     Raises:
         SingularTaskError: if J_x is not finite at a point (for example polar coordinates at the origin).
     """
-    J = evaluate_batch(problem.task.jacobian_function, points)[0].reshape(-1, problem.m, problem.n)
+    J = problem.task.batched_jacobian(points)[0].reshape(-1, problem.m, problem.n)
     finite = np.isfinite(J).all(axis=(1, 2))
     if not finite.all():
         at = np.round(points[np.flatnonzero(~finite)[0]], 4).tolist()

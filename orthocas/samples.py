@@ -1,6 +1,7 @@
 """Sample sets of a problem: everything the loss needs that does not depend on the coordinates."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -51,6 +52,33 @@ class Samples:
         whitening = (vectors / np.sqrt(values)[:, None, :]).transpose(0, 2, 1)
         basis: Array = whitening @ (gradients / scale[:, :, None])
         return basis
+
+    @cached_property
+    def null_basis(self) -> Array:
+        """An A-orthonormal basis z_1..z_r of ker J_x, (N, n, r), oriented so that det [J_x; Z^T] > 0."""
+        m = self.task_jacobian.shape[1]
+        Z = np.linalg.svd(self.task_jacobian)[2][:, m:].transpose(0, 2, 1)
+        if self.metric_inverse is not None:
+            gram = Z.transpose(0, 2, 1) @ np.linalg.solve(self.metric_inverse, Z)
+            Z = Z @ np.linalg.inv(np.linalg.cholesky(gram)).transpose(0, 2, 1)
+        stacked = np.concatenate([self.task_jacobian, Z.transpose(0, 2, 1)], axis=1)
+        Z[:, :, -1] *= np.where(np.linalg.det(stacked) < 0, -1.0, 1.0)[:, None]
+        return Z
+
+    def loss_data(self, coordinate_jacobians: Array | None) -> list[Array]:
+        """What the residuals need of every sample; see `orthocas.loss.LossShape.symbols`.
+
+        Args:
+            coordinate_jacobians: J_xi of the starting coordinates, (N, r, n): the null basis is oriented like them, so
+                that the volume of their gradients is positive at most samples. None without a regularity residual.
+        """
+        data = [self.unit_task_gradients]
+        data += [] if self.metric_inverse is None else [self.metric_inverse]
+        if coordinate_jacobians is not None:
+            Z = self.null_basis.copy()
+            Z[:, :, -1] *= 1.0 if np.median(np.linalg.det(coordinate_jacobians @ Z)) >= 0 else -1.0
+            data.append(Z)
+        return data
 
 
 def sample_problem(problem: Problem, samples: int, seed: int | tuple[int, ...]) -> Samples:

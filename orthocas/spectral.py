@@ -1,7 +1,6 @@
 """Spectral start: the best coordinates of a linear family in a quadratic sense, without an initial guess (ours)."""
 
 import numpy as np
-import scipy.linalg
 
 from orthocas.checks import Array
 from orthocas.parametrisations import LinearFamily
@@ -28,9 +27,10 @@ def spectral_start(family: LinearFamily, samples: Samples) -> Array:
     raised = G if samples.metric_inverse is None else samples.metric_inverse @ G
     T = G.reshape(-1, K).T @ raised.reshape(-1, K) / N
     T += _RIDGE * np.trace(T) / K * np.eye(K)
+    whitening = np.linalg.inv(np.linalg.cholesky(T)).T  # W^T T W = I
     found = []
     for _ in range(family.outputs):
-        c = scipy.linalg.eigh(S, T, subset_by_index=[0, 0])[1][:, 0]
+        c = whitening @ np.linalg.eigh(whitening.T @ S @ whitening)[1][:, 0]
         found.append(c)
         gradient = raised @ c  # (N, n)
         length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.batch import dense_function
+from orthocas.batch import Batched, dense_function
 from orthocas.checks import frozen_array
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.expression_tape import to_tape
@@ -116,6 +116,16 @@ class Task:
         """Q (n, 1) -> J_x = dh/dq (m, n), by automatic differentiation."""
         q = ca.SX.sym("q", self.robot.n)
         return dense_function("task_jacobian", [q], [ca.jacobian(self.function(q), q)])
+
+    @cached_property
+    def batched(self) -> Batched:
+        """H at many points."""
+        return Batched(self.function)
+
+    @cached_property
+    def batched_jacobian(self) -> Batched:
+        """J_x at many points."""
+        return Batched(self.jacobian_function)
 
     @classmethod
     def _relative_to(cls, robot: Robot, kind: str, reference: ArrayLike | None) -> Self:

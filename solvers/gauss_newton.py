@@ -1,10 +1,9 @@
 """Gauss-Newton with Levenberg-Marquardt damping, for losses with a normal matrix."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 
 from orthocas.checks import Array
 from orthocas.errors import InvalidValueError
@@ -25,8 +24,12 @@ class GaussNewton:
     """
 
     max_iterations: int = 30
-    tolerance: float = 1e-4
+    tolerance: float = 1e-3
     name: str = "gauss_newton"
+
+    def coarser(self) -> "GaussNewton":
+        """At most 10 iterations."""
+        return replace(self, max_iterations=min(10, self.max_iterations))
 
     def minimise(self, objective: Objective, theta0: Array, monitor: Monitor = silent, stage: str = "") -> SolveResult:
         """Minimise from theta0.
@@ -76,13 +79,9 @@ class _Run:
         diagonal = H.diagonal()
         scale = np.maximum(diagonal, 1e-3 * diagonal.mean())
         for _ in range(_MAX_REJECTIONS):
-            try:
-                damped = H + np.diag(self.damping * scale)
-                factor = scipy.linalg.cho_factor(damped, overwrite_a=True, check_finite=False)
-            except scipy.linalg.LinAlgError:
-                self.damping = max(10 * self.damping, 1e-8)
-                continue
-            candidate = self.theta - scipy.linalg.cho_solve(factor, gradient, check_finite=False)
+            damped = H.copy()
+            damped[np.diag_indices_from(H)] += self.damping * scale
+            candidate = self.theta - np.linalg.solve(damped, gradient)
             value = self.objective.value(candidate)
             self.evaluations += 1
             if value < self.value:

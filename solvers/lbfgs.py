@@ -1,7 +1,7 @@
 """Limited-memory BFGS (SciPy), for any parametrisation."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.optimize
@@ -24,6 +24,10 @@ class LBFGS:
     tolerance: float = 1e-6
     memory: int = 20
     name: str = "lbfgs"
+
+    def coarser(self) -> "LBFGS":
+        """A quarter of the iterations."""
+        return replace(self, max_iterations=max(1, self.max_iterations // 4))
 
     def minimise(self, objective: Objective, theta0: Array, monitor: Monitor = silent, stage: str = "") -> SolveResult:
         """Minimise from theta0."""

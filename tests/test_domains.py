@@ -5,7 +5,7 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas.domains import default_box, require_within_limits, sample_uniform
+from orthocas.domains import default_box, require_within_limits, sample_evenly, sample_uniform
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
 
 
@@ -22,6 +22,17 @@ def test_samples_fill_the_box_uniformly_and_follow_the_seed() -> None:
     np.testing.assert_allclose((unit**2).mean(axis=0), 1 / 3, atol=0.02)
     np.testing.assert_array_equal(points, sample_uniform(box, 20_000, seed=3))
     assert not np.array_equal(points, sample_uniform(box, 20_000, seed=4))
+
+
+def test_even_samples_give_better_means_than_random_ones() -> None:
+    box = oc.Box(np.full(6, 0.3), 0.5)
+    errors = {}
+    for draw in (sample_uniform, sample_evenly):
+        means = [np.prod(np.cos(draw(box, 4000, seed)), axis=1).mean() for seed in range(20)]
+        errors[draw.__name__] = np.std(means)
+        assert np.abs(draw(box, 100, 0) - box.centre).max() <= 0.5
+    assert errors["sample_evenly"] < 0.2 * errors["sample_uniform"]
+    np.testing.assert_array_equal(sample_evenly(box, 10, 3), sample_evenly(box, 10, 3))
 
 
 def test_torus_is_whole_turns() -> None:

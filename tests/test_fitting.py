@@ -124,6 +124,9 @@ class StopsAfterFirstStage:
     def __init__(self) -> None:
         self.stages = 0
 
+    def coarser(self) -> "StopsAfterFirstStage":
+        return self
+
     def minimise(
         self, objective: Objective, theta0: np.ndarray, monitor: Monitor = silent, stage: str = ""
     ) -> SolveResult:

@@ -11,15 +11,16 @@ from orthocas.coordinates import joint_space
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.graph_objective import GraphObjective
 from orthocas.linear_objective import LinearObjective
-from orthocas.loss import Weights, mutual_cosines, pairs, task_cosines
-from orthocas.samples import Samples, sample_problem
+from orthocas.loss import REGULAR_VOLUME, Weights, mutual_cosines, pairs, task_cosines
+from orthocas.samples import Samples, sample_problem, samples_at
 from orthocas.spectral import spectral_start
 
 WEIGHTS = Weights(1000.0, 30.0)
+REGULAR = Weights(1000.0, 30.0, 120.0)
 
 
-def loss_by_hand(J_x: np.ndarray, J_xi: np.ndarray, B: np.ndarray, weights: Weights) -> float:
-    """Equation (24) at one sample, written out."""
+def loss_by_hand(J_x: np.ndarray, J_xi: np.ndarray, B: np.ndarray, weights: Weights, sign: float) -> float:
+    """Equation (24) at one sample, written out, and the regularity term in coordinates where the metric is I."""
     m, r = len(J_x), len(J_xi)
     total = 0.0
     for i, j in product(range(m), range(r)):
@@ -29,13 +30,22 @@ def loss_by_hand(J_x: np.ndarray, J_xi: np.ndarray, B: np.ndarray, weights: Weig
         if i > j:
             cosine = J_xi[i] @ B @ J_xi[j] / (np.linalg.norm(B @ J_xi[i]) * np.linalg.norm(J_xi[j]))
             total += weights.mutual / (2 * (r * (r - 1) / 2)) * cosine**2
-    return total
+    L = np.linalg.cholesky(B)
+    white_task, white = J_x @ L, J_xi @ L
+    white /= np.linalg.norm(white, axis=1, keepdims=True)
+    across = np.linalg.svd(white_task)[2][m:]  # orthonormal complement of the task gradients
+    across[-1] *= np.sign(np.linalg.det(np.vstack([white_task, across])))
+    volume = sign * np.linalg.det(white @ across.T)
+    return float(total + weights.regularity / 2 * max(REGULAR_VOLUME - volume, 0) ** 2)
 
 
-def objectives(problem: oc.Problem, parametrisation: oc.Polynomial) -> tuple[LinearObjective, GraphObjective, Samples]:
+def objectives(
+    problem: oc.Problem, parametrisation: oc.Polynomial, weights: Weights = WEIGHTS
+) -> tuple[LinearObjective, GraphObjective, Samples]:
     samples = sample_problem(problem, 60, 9)
     family = parametrisation.family(joint_space(problem), problem.r)
-    return LinearObjective(family, samples, WEIGHTS), GraphObjective(family, samples, WEIGHTS), samples
+    theta = family.initial(3)
+    return LinearObjective(family, samples, weights, theta), GraphObjective(family, samples, weights, theta), samples
 
 
 @pytest.fixture(params=["planar_x", "planar_xy", "iiwa"])
@@ -43,27 +53,30 @@ def problem(request: pytest.FixtureRequest) -> oc.Problem:
     return request.getfixturevalue(request.param)
 
 
-def test_both_objectives_equal_the_formula_written_out(problem: oc.Problem) -> None:
-    linear, graph, samples = objectives(problem, oc.Polynomial(2))
+@pytest.mark.parametrize("weights", [WEIGHTS, REGULAR], ids=["paper", "regular"])
+def test_both_objectives_equal_the_formula_written_out(problem: oc.Problem, weights: Weights) -> None:
+    linear, graph, samples = objectives(problem, oc.Polynomial(2), weights)
     theta = linear.family.initial(3)
     inverse = samples.metric_inverse
     B = np.broadcast_to(np.eye(problem.n), (len(samples), problem.n, problem.n)) if inverse is None else inverse
     J_xi = linear.coordinate_jacobians(theta)
-    want = np.mean([loss_by_hand(a, b, c, WEIGHTS) for a, b, c in zip(samples.task_jacobian, J_xi, B, strict=True)])
+    sign = np.sign(np.median(np.linalg.det(J_xi @ samples.null_basis)))
+    want = np.mean([loss_by_hand(*row, weights, sign) for row in zip(samples.task_jacobian, J_xi, B, strict=True)])
     np.testing.assert_allclose(linear.value(theta), want, rtol=1e-12)
     np.testing.assert_allclose(graph.value(theta), want, rtol=1e-12)
 
 
 def test_gradients_of_both_objectives_agree(problem: oc.Problem) -> None:
-    linear, graph, _ = objectives(problem, oc.Polynomial(2))
+    linear, graph, _ = objectives(problem, oc.Polynomial(2), REGULAR)
     theta = linear.family.initial(3)
     np.testing.assert_allclose(linear.value_and_gradient(theta)[1], graph.value_and_gradient(theta)[1], atol=1e-9)
+    np.testing.assert_allclose(linear.normal_equations(theta)[1], graph.value_and_gradient(theta)[1], atol=1e-9)
 
 
 @pytest.mark.parametrize("parametrisation", [oc.Polynomial(2), oc.Fourier(1), oc.MLP((6,))], ids=lambda p: p.label)
 def test_taylor_remainder_falls_with_the_square_of_the_step(planar_x: oc.Problem, parametrisation: object) -> None:
     family = parametrisation.family(joint_space(planar_x), planar_x.r)
-    objective = GraphObjective(family, sample_problem(planar_x, 40, 2), WEIGHTS)
+    objective = GraphObjective(family, sample_problem(planar_x, 40, 2), REGULAR, family.initial(1))
     theta = family.initial(1)
     direction = np.random.default_rng(2).normal(size=family.size)
     value, gradient = objective.value_and_gradient(theta)
@@ -74,11 +87,14 @@ def test_taylor_remainder_falls_with_the_square_of_the_step(planar_x: oc.Problem
 
 
 def test_gauss_newton_matrix_is_that_of_the_residuals(planar_x: oc.Problem) -> None:
-    objective, _, _ = objectives(planar_x, oc.Polynomial(2))
-    theta = objective.family.initial(3)
+    twice = samples_at(planar_x, np.repeat(sample_problem(planar_x, 40, 9).points, 2, axis=0))  # every second is used
+    family = oc.Polynomial(2).family(joint_space(planar_x), 2)
+    theta = family.initial(3)
+    objective = LinearObjective(family, twice, REGULAR, theta)
+    assert (objective._residuals(objective.coordinate_jacobians(theta), *objective._data)[0][:, -1] > 0).any()
 
     def residuals(theta: np.ndarray) -> np.ndarray:
-        return objective._linearised_residuals(theta)[0].ravel()
+        return objective._residuals(objective.coordinate_jacobians(theta), *objective._data)[0].ravel()
 
     step = 1e-6
     jacobian = np.array(
@@ -140,6 +156,6 @@ def test_spectral_start_finds_an_exact_linear_coordinate() -> None:
     problem = oc.Problem(robot, task, domain=oc.Box([0.0, 0.0], 1.0))
     family = oc.Polynomial(2).family(joint_space(problem), 1)
     theta = spectral_start(family, sample_problem(problem, 100, 0))
-    objective = LinearObjective(family, sample_problem(problem, 100, 1), WEIGHTS)
+    objective = LinearObjective(family, sample_problem(problem, 100, 1), WEIGHTS, theta)
     directions = objective.coordinate_jacobians(theta)[:, 0]
     np.testing.assert_allclose(directions @ np.array([1.0, 2.0]), 0, atol=1e-6 * np.abs(directions).max())

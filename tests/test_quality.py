@@ -7,6 +7,7 @@ import scipy.linalg
 import orthocas as oc
 from orthocas.chart import Chart
 from orthocas.coordinates import Coordinates, joint_space
+from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError
 from orthocas.fitting import Fit
 from orthocas.quality import AngleStatistics
@@ -60,8 +61,6 @@ def test_conditioning_ignores_how_the_task_is_scaled_but_not_the_metric() -> Non
 def test_conditioning_matches_a_direct_computation_in_whitened_coordinates(planar_fit: Fit) -> None:
     chart = planar_fit.chart
     report = oc.evaluate(chart, samples=200, seed=5)
-    from orthocas.domains import sample_uniform
-
     smallest = []
     for q in sample_uniform(chart.problem.domain, 200, 5):
         L = np.linalg.cholesky(chart.problem.robot.mass_matrix(q))

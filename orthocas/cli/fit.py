@@ -17,7 +17,9 @@ from orthocas.cli.problem_argument import (
     TaskName,
     TipName,
     build_problem,
+    parse_numbers,
 )
+from orthocas.errors import InvalidValueError
 from orthocas.fitting import Fit
 from orthocas.loss import DEFAULT_WEIGHTS
 from orthocas.objective import Status
@@ -25,6 +27,8 @@ from orthocas.parametrisations import parse_parametrisation
 from orthocas.progress import terminal_monitor
 from orthocas.quality import Report, evaluate
 from orthocas.solvers import get as get_solver
+
+_WEIGHTS = ",".join(f"{value:g}" for value in DEFAULT_WEIGHTS)
 
 
 def fit(
@@ -40,7 +44,9 @@ def fit(
     half_width: HalfWidth = None,
     samples: Annotated[int | None, typer.Option("--samples", help="Training samples; default by size.")] = None,
     seed: Annotated[int, typer.Option("--seed", help="Seed of samples and random starts.")] = 0,
-    weights: Annotated[tuple[float, float], typer.Option("--weights", help="lambda1 lambda2.")] = DEFAULT_WEIGHTS,
+    weights: Annotated[
+        str, typer.Option("--weights", help='"lambda1,lambda2" or "lambda1,lambda2,lambda3".')
+    ] = _WEIGHTS,
     out: Annotated[Path | None, typer.Option("--out", help="Chart file; default PROBLEM.orthocas here.")] = None,
     json: AsJson = False,
 ) -> None:
@@ -51,7 +57,7 @@ def fit(
     parametrisation = parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
     with terminal_monitor() as monitor:
-        result = api.fit(built, parametrisation, minimiser, weights, samples, seed, monitor)
+        result = api.fit(built, parametrisation, minimiser, parse_weights(weights), samples, seed, monitor)
     result.chart.save(target)
     report = evaluate(result.chart, seed=seed + 1)
     if json:
@@ -61,6 +67,16 @@ def fit(
     if result.status is Status.INTERRUPTED:
         note("interrupted: the chart holds the best coordinates found so far")
         raise typer.Exit(130)
+
+
+def parse_weights(text: str) -> tuple[float, float] | tuple[float, float, float]:
+    """Read "1000,30" or "1000,30,120"."""
+    values = parse_numbers("--weights", text).tolist()
+    if len(values) == 2:
+        return values[0], values[1]
+    if len(values) == 3:
+        return values[0], values[1], values[2]
+    raise InvalidValueError("--weights", repr(text), "two or three numbers")
 
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:

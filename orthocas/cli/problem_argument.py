@@ -60,21 +60,21 @@ def build_problem(name: str, options: ProblemOptions) -> Problem:
         return base
     if options.tip is not None:
         raise InvalidValueError("--tip", options.tip, f"no tip for the named problem '{name}', it has its own")
-    centre = base.domain.centre if options.centre is None else parse_centre(options.centre)
+    centre = base.domain.centre if options.centre is None else parse_numbers("--centre", options.centre)
     kept = options.centre is None and options.half_width is None
     domain = base.domain if kept else default_box(base.robot, centre, options.half_width)
     task = base.task if options.task is None else Task.named(base.robot, options.task, domain.centre)
     return Problem(base.robot, task, options.metric or base.metric, domain, name)
 
 
-def parse_centre(text: str) -> Array:
+def parse_numbers(option: str, text: str) -> Array:
     """Read "0,0.5,..."."""
-    return as_float_array("--centre", [part.strip() for part in text.split(",")])
+    return as_float_array(option, [part.strip() for part in text.split(",")])
 
 
 def _from_file(path: Path, options: ProblemOptions) -> Problem:
     robot = Robot.chain_from_file(path, options.tip)
-    centre = None if options.centre is None else parse_centre(options.centre)
+    centre = None if options.centre is None else parse_numbers("--centre", options.centre)
     domain = default_box(robot, centre, options.half_width)
     task = Task.named(robot, options.task or "position", domain.centre)
     return Problem(robot, task, options.metric or "euclidean", domain, path.stem)

@@ -5,7 +5,6 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
 
 from orthocas.checks import Array, require_known
 from orthocas.errors import InvalidValueError, SingularTaskError
@@ -56,8 +55,9 @@ class Linear:
             InvalidValueError: if the paper's normals are asked for and n is not 3.
         """
         m, n = gradients.shape
-        normals = np.asarray(scipy.linalg.null_space(gradients, rcond=1e-9).T, dtype=float)
-        if len(normals) != n - m:
+        values, vectors = np.linalg.svd(gradients)[1:]
+        normals = vectors[m:]
+        if values[-1] <= 1e-9 * values[0]:
             raise SingularTaskError("the task is singular at the base q0 of linear coordinates, choose another base")
         if self.normals == "orthonormal":
             return normals

@@ -8,7 +8,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from orthocas.batch import dense_function, evaluate_batch
+from orthocas.batch import Batched, dense_function
 from orthocas.checks import Array
 from orthocas.parametrisations.family import Expression, JointSpace
 
@@ -54,12 +54,12 @@ class LinearFamily:
 
     def basis_gradients(self, points: Array) -> Array:
         """D psi / dq at points (N, n), (N, n, K)."""
-        return evaluate_batch(self._gradient_function, points)[0].transpose(0, 2, 1)  # contiguous: CasADi fills columns
+        return self._batched_gradients(points)[0].transpose(0, 2, 1)  # contiguous: CasADi fills columns
 
     @cached_property
-    def _gradient_function(self) -> ca.Function:
+    def _batched_gradients(self) -> Batched:
         q = ca.SX.sym("q", self.space.n)
-        return dense_function("basis_gradients", [q], [ca.jacobian(self.basis(q), q)])
+        return Batched(dense_function("basis_gradients", [q], [ca.jacobian(self.basis(q), q)]))
 
     @classmethod
     def _product(cls, term: Term, tables: list[list[Any]], products: dict[Term, Any]) -> Any:

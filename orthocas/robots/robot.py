@@ -8,7 +8,7 @@ from typing import Any, Self
 import casadi as ca
 import pinocchio as pin
 
-from orthocas.batch import dense_function, evaluate_batch
+from orthocas.batch import Batched, dense_function
 from orthocas.checks import Array, as_point_set, require_known
 from orthocas.errors import ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
@@ -131,6 +131,10 @@ class Robot:
         return self._functions[name]
 
     @cached_property
+    def _batched(self) -> dict[str, Batched]:
+        return {name: Batched(function) for name, function in self._functions.items()}
+
+    @cached_property
     def _functions(self) -> dict[str, ca.Function]:
         tree = self.tree
         q, dq, ddq = (ca.SX.sym(name, self.n) for name in ("q", "dq", "ddq"))
@@ -169,7 +173,7 @@ class Robot:
         if len({len(p) for p in points}) > 1:
             raise ShapeError("the second state set", points[1].shape, points[0].shape)
         rows, columns = function.size_out(0)
-        result = evaluate_batch(function, *points)[0].reshape((-1, rows, columns) if name in _MATRICES else (-1, rows))
+        result = self._batched[name](*points)[0].reshape((-1, rows, columns) if name in _MATRICES else (-1, rows))
         return result[0] if all(single for _, single in sets) else result
 
 
