@@ -2,7 +2,7 @@
 
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 
 import numpy as np
@@ -42,6 +42,10 @@ class Stage:
     parameters: int
     samples: int
     result: SolveResult
+
+    def interrupted(self) -> "Stage":
+        """The same, marked as the last because of Ctrl-C."""
+        return replace(self, result=replace(self.result, status=Status.INTERRUPTED))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +99,7 @@ def fit_chart(
         "solver": solver.name if stages else "closed form",
         "lambda1": weights.task,
         "lambda2": weights.mutual,
+        "lambda3": weights.regularity,
         "seed": seed,
         "samples": stages[-1].samples if stages else 0,
         "status": stages[-1].result.status.value if stages else Status.CONVERGED.value,
@@ -132,10 +137,15 @@ class _Run:
             family = current.family(self.space, r)
             if len(family.terms) < r:
                 continue
-            if theta is not None:
-                theta = embed(theta, r, reached.family(self.space, r).terms, family.terms)
+            start = None if theta is None else embed(theta, r, reached.family(self.space, r).terms, family.terms)
             minimiser = solver if degree == target.degree else solver.coarser()
-            stages.append(self.stage(current, family, theta, minimiser, degree))
+            try:
+                stages.append(self.stage(current, family, start, minimiser, degree))
+            except KeyboardInterrupt:  # between minimisations: the last degree is the best so far
+                if not stages:
+                    raise
+                stages[-1] = stages[-1].interrupted()
+                break
             reached, theta = current, stages[-1].result.theta
             if stages[-1].result.status is Status.INTERRUPTED:
                 break

@@ -7,13 +7,17 @@ import typer
 
 from orthocas import quality
 from orthocas.chart import Chart
-from orthocas.cli.output import AsJson, Samples, print_json, print_rows, report_rows
+from orthocas.cli.output import AsJson, print_json, print_rows, report_rows, whole_number
 
 
 def evaluate(
     chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
-    samples: Samples = 100_000,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the samples; take another than the fit's.")] = 1,
+    samples: Annotated[
+        int, typer.Option("--samples", parser=whole_number, help="Number of held-out samples.")
+    ] = 100_000,
+    seed: Annotated[
+        int, typer.Option("--seed", parser=whole_number, help="Seed of the samples; take another than the fit's.")
+    ] = 1,
     json: AsJson = False,
 ) -> None:
     """Judge a chart on held-out samples of its domain."""

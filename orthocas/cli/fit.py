@@ -7,7 +7,7 @@ import typer
 
 from orthocas import api
 from orthocas.archive import require_writable
-from orthocas.cli.output import AsJson, note, print_json, print_rows, report_rows
+from orthocas.cli.output import AsJson, note, print_json, print_rows, report_rows, whole_number
 from orthocas.cli.problem_argument import (
     CentreText,
     HalfWidth,
@@ -42,8 +42,10 @@ def fit(
     solver: Annotated[str | None, typer.Option("--solver", help="gauss_newton or lbfgs; default what suits.")] = None,
     centre: CentreText = None,
     half_width: HalfWidth = None,
-    samples: Annotated[int | None, typer.Option("--samples", help="Training samples; default by size.")] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of samples and random starts.")] = 0,
+    samples: Annotated[
+        int | None, typer.Option("--samples", parser=whole_number, help="Training samples; default by size.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", parser=whole_number, help="Seed of samples and random starts.")] = 0,
     weights: Annotated[
         str, typer.Option("--weights", help='"lambda1,lambda2" or "lambda1,lambda2,lambda3".')
     ] = _WEIGHTS,

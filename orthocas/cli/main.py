@@ -33,6 +33,7 @@ def main() -> None:
         typer.echo(f"orthocas: {' '.join(text.split())}" if len(text) < 500 else text, err=True)
         code = 2
     except KeyboardInterrupt:
-        typer.echo("orthocas: interrupted, nothing was saved", err=True)
         code = INTERRUPTED
+    if code == INTERRUPTED:
+        typer.echo("orthocas: interrupted", err=True)
     sys.exit(code or 0)

@@ -8,8 +8,24 @@ import typer
 
 from orthocas.quality import Report
 
+
+def whole_number(text: str) -> int:
+    """Read a whole number option."""
+    try:
+        return int(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} came, expected a whole number") from None
+
+
+def number(text: str) -> float:
+    """Read a number option."""
+    try:
+        return float(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} came, expected a number") from None
+
+
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
-Samples = Annotated[int, typer.Option("--samples", help="Number of held-out samples.")]
 
 
 def print_json(data: Mapping[str, Any]) -> None:

@@ -8,6 +8,7 @@ import typer
 
 from orthocas import problems
 from orthocas.checks import Array, as_float_array
+from orthocas.cli.output import number
 from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, UnknownNameError
 from orthocas.problem import Problem
@@ -19,7 +20,9 @@ TipName = Annotated[str | None, typer.Option("--tip", help="Tip frame of a URDF 
 TaskName = Annotated[str | None, typer.Option("--task", help="position, position:xy, polar, orientation or pose.")]
 MetricName = Annotated[str | None, typer.Option("--metric", help="euclidean or inertia.")]
 CentreText = Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')]
-HalfWidth = Annotated[float | None, typer.Option("--half-width", help="Half-width of the domain [rad or m].")]
+HalfWidth = Annotated[
+    float | None, typer.Option("--half-width", parser=number, help="Half-width of the domain [rad or m].")
+]
 
 
 @dataclass(frozen=True)

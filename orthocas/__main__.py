@@ -1,0 +1,6 @@
+"""`python -m orthocas`."""
+
+from orthocas.cli import main
+
+if __name__ == "__main__":
+    main()

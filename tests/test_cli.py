@@ -1,0 +1,193 @@
+"""The command line: outputs, exit codes, one-line errors, nothing half-written."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import robot_data
+
+import orthocas as oc
+from orthocas.cli import main
+from orthocas.fitting import Fit
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> object:
+    """Run a command in an empty folder; exit code, standard output, standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["orthocas", *words])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        out, err = capsys.readouterr()
+        return int(stop.value.code or 0), out, err
+
+    return call
+
+
+@pytest.fixture
+def saved(iiwa_fit: Fit, tmp_path: Path) -> str:
+    path = tmp_path / "arm.orthocas"
+    iiwa_fit.chart.save(path)
+    return str(path)
+
+
+def test_fit_writes_a_chart_and_prints_its_quality(run, tmp_path: Path) -> None:
+    code, out, err = run("fit", "planar_3r_x", "--param", "polynomial:3", "--out", "a.orthocas")
+    assert (code, err) == (0, "")
+    assert "task angle" in out
+    assert "conditioning" in out
+    assert oc.load(tmp_path / "a.orthocas").r == 2
+
+
+def test_fit_json_is_one_object(run) -> None:
+    code, out, err = run("fit", "planar_3r_xy", "--param", "linear", "--json")
+    data = json.loads(out)
+    assert (code, err) == (0, "")
+    assert data["chart"] == "planar_3r_xy.orthocas"
+    assert data["parametrisation"] == "linear"
+    assert data["task_angle_deg"]["std"] > 0
+
+
+def test_evaluate_json_has_the_promised_keys(run, saved: str) -> None:
+    code, out, err = run("evaluate", saved, "--samples", "500", "--seed", "3", "--json")
+    data = json.loads(out)
+    assert (code, err) == (0, "")
+    assert {"n", "m", "r", "samples", "seed", "metric", "task_angle_deg", "mutual_angle_deg", "conditioning"} <= set(
+        data
+    )
+    assert (data["n"], data["m"], data["r"], data["samples"], data["seed"]) == (7, 3, 4, 500, 3)
+    assert set(data["task_angle_deg"]) == {"mean", "std", "max"}
+    assert set(data["conditioning"]) == {"min", "p01", "mean"}
+    want = oc.evaluate(oc.load(saved), 500, 3).as_dict()
+    assert data == json.loads(json.dumps(want))
+
+
+def test_info_shows_charts_problems_and_robots(run, saved: str) -> None:
+    assert "polynomial:3" in run("info", saved)[1]
+    assert json.loads(run("info", "planar_2r", "--json")[1])["domain"] == "torus"
+    path = str(robot_data("panda_description/urdf/panda.urdf"))
+    code, out, _ = run("info", path, "--tip", "panda_hand", "--json")
+    assert code == 0
+    assert json.loads(out)["joints"][0] == "panda_joint1"
+
+
+def test_urdf_with_every_option(run) -> None:
+    path = str(robot_data("ur_description/urdf/ur5_robot.urdf"))
+    words = ["--tip", "tool0", "--task", "orientation", "--metric", "inertia", "--param", "fourier:1"]
+    words += [
+        "--centre",
+        "0,-1,1,0.1,0.5,0",
+        "--half-width",
+        "0.3",
+        "--samples",
+        "200",
+        "--seed",
+        "3",
+        "--weights",
+        "1000,10",
+    ]
+    code, out, err = run("fit", path, *words, "--solver", "lbfgs", "--json", "--out", "x.orthocas")
+    data = json.loads(out)
+    assert (code, err) == (0, "")
+    assert (data["n"], data["m"], data["metric"], data["seed"]) == (6, 3, "inertia", 4)
+    info = json.loads(run("info", "x.orthocas", "--json")[1])
+    assert info["centre"] == [0, -1, 1, 0.1, 0.5, 0]
+    assert info["notes"]["solver"] == "lbfgs"
+    assert info["notes"]["lambda2"] == 10
+    assert info["notes"]["lambda3"] == 0
+
+
+def test_named_problem_with_overrides(run) -> None:
+    code, out, _ = run("fit", "iiwa", "--param", "linear", "--metric", "inertia", "--task", "position:xy", "--json")
+    assert code == 0
+    assert (json.loads(out)["m"], json.loads(out)["metric"]) == (2, "inertia")
+    code, out, _ = run("fit", "planar_3r_x", "--param", "linear", "--centre", "0.5,0.5,0.5", "--half-width", "0.1")
+    assert code == 0
+
+
+PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["fit", "spot"], "unknown problem 'spot', known: planar_2r, planar_3r_x, planar_3r_xy, iiwa, or a FILE"),
+        (["fit", "nowhere.urdf"], "cannot read URDF file nowhere.urdf: No such file or directory"),
+        (["fit", PANDA, "--tip", "hand"], "unknown frame 'hand'"),
+        (["fit", PANDA], "name the tip frame"),
+        (["fit", PANDA, "--tip", "panda_hand", "--task", "grasp"], "unknown task 'grasp', known: position"),
+        (["fit", PANDA, "--tip", "panda_hand", "--metric", "mass"], "unknown metric 'mass', known: euclidean, inertia"),
+        (["fit", PANDA, "--tip", "panda_hand", "--half-width", "9"], "inside its limits"),
+        (["fit", PANDA, "--tip", "panda_hand", "--half-width", "-1"], "half_width is -1.0, expected positive numbers"),
+        (["fit", PANDA, "--tip", "panda_hand", "--centre", "0,a"], "--centre is"),
+        (["fit", PANDA, "--tip", "panda_hand", "--centre", "0,1"], "centre has shape (2,), expected (7,)"),
+        (["fit", "iiwa", "--tip", "link_3"], "--tip is link_3, expected no tip"),
+        (["fit", "planar_2r", "--task", "position:xy"], "m = 2 components and the robot n = 2 joints"),
+        (["fit", "planar_3r_x", "--task", "position:z"], "'z' does not depend on any joint"),
+        (["fit", "iiwa", "--param", "spline"], "unknown parametrisation 'spline', known: linear, polynomial"),
+        (["fit", "iiwa", "--param", "polynomial:0"], "degree is 0, expected a whole number >= 1"),
+        (["fit", "iiwa", "--param", "polynomial:25"], "GiB"),
+        (["fit", "iiwa", "--solver", "sgd"], "unknown solver 'sgd', known: gauss_newton, lbfgs"),
+        (["fit", "iiwa", "--samples", "0"], "samples is 0"),
+        (["fit", "iiwa", "--samples", "many"], "'many' came, expected a whole number"),
+        (["fit", "iiwa", "--half-width", "wide"], "'wide' came, expected a number"),
+        (["fit", "iiwa", "--weights", "1000"], "two or three numbers"),
+        (["fit", "iiwa", "--weights", "0,1"], "lambda1 is 0.0"),
+        (["fit", "iiwa", "--out", "no/such/folder/x.orthocas"], "folder no/such/folder does not exist"),
+        (["fit", "iiwa", "--out", "/proc/x.orthocas"], "cannot write /proc/x.orthocas"),
+        (["fit"], "Missing argument"),
+        (["fit", "iiwa", "--colour"], "No such option"),
+        (["fly"], "No such command"),
+        (["evaluate", "nothing.orthocas"], "chart file nothing.orthocas does not exist"),
+        (["evaluate", PANDA], "not a chart file"),
+        (["info", "nothing"], "unknown problem 'nothing', known: planar_2r"),
+        (["info", "nothing.orthocas"], "does not exist"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_two(run, tmp_path: Path, words: list[str], message: str) -> None:
+    code, out, err = run(*words)
+    assert code == 2
+    assert message in err
+    assert err.count("\n") == 1
+    assert out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_words_show_help(run) -> None:
+    _, out, err = run()
+    assert "fit" in out + err
+
+
+def test_help_names_the_commands() -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "orthocas", "--help"], capture_output=True, text=True, check=True, cwd="/"
+    )
+    for command in ("fit", "evaluate", "info"):
+        assert command in result.stdout
+
+
+def test_output_folder_is_checked_before_the_long_work(run) -> None:
+    start = time.perf_counter()
+    assert run("fit", "iiwa", "--param", "polynomial:6", "--out", "no/x.orthocas")[0] == 2
+    assert time.perf_counter() - start < 5  # the fit itself takes far longer
+
+
+def test_ctrl_c_saves_the_best_chart_so_far(tmp_path: Path) -> None:
+    """A degree-6 fit takes much longer than two seconds, and its low degrees much less."""
+    command = [sys.executable, "-m", "orthocas", "fit", "iiwa", "--param", "polynomial:6", "--out", "c.orthocas"]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, stdout=subprocess.DEVNULL)
+    time.sleep(6)
+    os.kill(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert "best coordinates found so far" in err
+    chart = oc.load(tmp_path / "c.orthocas")
+    assert chart.notes["status"] == "interrupted"
