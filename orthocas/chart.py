@@ -74,7 +74,7 @@ class Chart:
         return J[0] if single else J
 
     def inverse(self, phi: ArrayLike, q_start: ArrayLike, tolerance: float = 1e-9) -> Array:
-        """Joint positions q with phi(q) = phi, by Newton's method with line search (KINSOL) from q_start.
+        """Joint positions q with phi(q) = phi, by Newton's method with line search from q_start.
 
         Args:
             phi: wanted values, (n,) or (N, n).
@@ -141,10 +141,9 @@ class Chart:
     def _rootfinder(self) -> ca.Function:
         q, target = ca.MX.sym("q", self.n), ca.MX.sym("phi", self.n)
         residual = self._functions["phi"](q) - target
-        options: dict[str, Any] = {"error_on_fail": False, "abstol": 1e-12, "max_iter": 100, "strategy": "linesearch"}
-        options |= {"disable_internal_warnings": True, "verbose": False}
+        options: dict[str, Any] = {"error_on_fail": False, "abstol": 1e-12, "max_iter": 100, "line_search": True}
         equations: dict[str, Any] = {"x": q, "p": target, "g": residual}
-        return ca.rootfinder("inverse", "kinsol", equations, options)
+        return ca.rootfinder("inverse", "newton", equations, options)
 
     def _solve(self, q_start: Array, phi: Array) -> Array:
         try:

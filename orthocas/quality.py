@@ -14,7 +14,7 @@ from orthocas.samples import Samples, samples_at
 
 DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
 _CHUNK = 5000
-_BIN_EDGES = np.linspace(0.0, 180.0, 1801)
+_BIN_EDGES = np.linspace(-0.05, 180.05, 1802)  # a right angle lies in the middle of its bin
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class AngleStatistics:
     mean: float
     std: float
     max: float  #: largest deviation from 90 degrees
-    histogram: Array  #: counts in bins of 0.1 degree from 0 to 180
+    histogram: Array  #: counts in bins of 0.1 degree, centred at 0.0, 0.1, ..., 180.0
 
     @classmethod
     def of_cosines(cls, cosines: Array) -> "AngleStatistics":

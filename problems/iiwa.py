@@ -1,6 +1,8 @@
 """The KUKA LBR iiwa 7 R800 with the position of its flange as the task ([AS2023] Sec. 9)."""
 
+from contextlib import AbstractContextManager
 from importlib.resources import as_file, files
+from pathlib import Path
 
 import numpy as np
 
@@ -13,9 +15,14 @@ CENTRE = (0.0, 0.52, 0.0, -1.05, 0.0, 0.79, 0.0)  #: q0 [rad]
 HALF_WIDTH = np.pi / 4  #: [rad]
 
 
+def urdf_path() -> AbstractContextManager[Path]:
+    """The arm's URDF as a file, for as long as the context lasts."""
+    return as_file(files("orthocas.problems") / "data" / "iiwa7_r800.urdf")
+
+
 def robot() -> Robot:
     """The arm, tip at the flange (link_ee)."""
-    with as_file(files("orthocas.problems") / "data" / "iiwa7_r800.urdf") as path:
+    with urdf_path() as path:
         return Robot.from_urdf(path, tip="link_ee")
 
 

@@ -86,7 +86,7 @@ class _Run:
             self.evaluations += 1
             if value < self.value:
                 self.theta, self.value = candidate, value
-                self.damping = max(self.damping / 5, 1e-7)
+                self.damping = max(self.damping / 5, 1e-3)
                 return True
             self.damping *= 4
         return False

@@ -94,7 +94,7 @@ def test_no_pairs_give_nan_and_json_null(planar_xy: oc.Problem) -> None:
 
 
 def test_histogram_counts_degrees() -> None:
-    counts = AngleStatistics.of_cosines(np.cos(np.radians([60.05, 60.05, 120.05]))).histogram
+    counts = AngleStatistics.of_cosines(np.cos(np.radians([60.02, 59.98, 120.03]))).histogram
     assert counts[600] == 2
     assert counts[1200] == 1
 

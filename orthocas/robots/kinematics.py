@@ -43,3 +43,13 @@ def tip_jacobian(tree: KinematicTree, q: ca.SX) -> ca.SX:
             J[:3, i], J[3:, i] = ca.cross(axis, p_tip - p), axis
         i = tree.parents[i]
     return J
+
+
+def joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
+    """Base, origins of the joints that move the tip, and the tip, (3, points), in the world."""
+    poses = body_poses(tree, q)
+    chain, i = [], tree.tip_parent
+    while i >= 0:
+        chain.append(poses[i][1])
+        i = tree.parents[i]
+    return ca.horzcat(ca.SX.zeros(3), *reversed(chain), tip_pose(tree, q)[1])

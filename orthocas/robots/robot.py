@@ -121,6 +121,12 @@ class Robot:
         """Geometric Jacobian of the tip in world axes, (6, n): linear rows, then angular rows."""
         return self._call("tip_jacobian", q)
 
+    def joint_points(self, q: Any) -> Array:
+        """Base, joint origins and tip along the chain to the tip, for drawing; q (N, n) -> (N, points, 3) [m]."""
+        points, single = as_point_set("q", q, self.n)
+        flat = self._batched["joint_points"](points)[0].transpose(0, 2, 1)
+        return flat[0] if single else flat
+
     def function(self, name: str) -> ca.Function:
         """The CasADi function behind a method, for code generation and larger graphs.
 
@@ -145,6 +151,7 @@ class Robot:
             "tip_position": p,
             "tip_rotation": R,
             "tip_jacobian": kinematics.tip_jacobian(tree, q),
+            "joint_points": kinematics.joint_points(tree, q),
         }
         return {
             **{name: dense_function(name, [q], [output], ["q"]) for name, output in static.items()},

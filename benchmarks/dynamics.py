@@ -1,0 +1,51 @@
+"""Mass matrix and bias of the 7-DoF arm in compiled C: ours against adam-robotics, and Pinocchio's C++ from Python."""
+
+import time
+
+import adam
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from adam.casadi import KinDynComputations
+from c_timing import nanoseconds_per_call
+from orthocas.problems import iiwa
+
+
+def main() -> dict[str, float]:
+    """Nanoseconds per call, median of 9 rounds that take turns in one process."""
+    robot = iiwa.robot()
+    q, dq = ca.SX.sym("q", robot.n), ca.SX.sym("dq", robot.n)
+    ours = [robot.function("mass_matrix")(q), robot.function("bias")(q, dq)]
+    with iiwa.urdf_path() as path:
+        peer = KinDynComputations(str(path), list(robot.joint_names))
+        model = pin.buildModelFromUrdf(str(path))
+    peer.set_frame_velocity_representation(adam.Representations.MIXED_REPRESENTATION)
+    base, still = ca.SX.eye(4), ca.SX.zeros(6)
+    M = ca.SX(peer.mass_matrix_fun()(base, q))[6:, 6:]
+    bias = ca.SX(peer.bias_force_fun()(base, q, still, dq))[6:]
+    functions = {
+        "orthocas": ca.Function("orthocas", [q, dq], ours),
+        "adam_robotics": ca.Function("adam_robotics", [q, dq], [M, bias]),
+    }
+    state = np.full(robot.n, 0.3)
+    np.testing.assert_allclose(
+        functions["orthocas"](state, state)[0].full(), functions["adam_robotics"](state, state)[0].full(), atol=1e-10
+    )
+    times = nanoseconds_per_call(functions)
+    times["pinocchio_from_python"] = _pinocchio_nanoseconds(model)
+    times["ratio"] = times["orthocas"] / times["adam_robotics"]
+    return times
+
+
+def _pinocchio_nanoseconds(model: pin.Model, calls: int = 20_000) -> float:
+    data, q = model.createData(), np.full(model.nq, 0.3)
+    start = time.perf_counter()
+    for _ in range(calls):
+        pin.crba(model, data, q)
+        pin.nonLinearEffects(model, data, q, q)
+    return (time.perf_counter() - start) / calls * 1e9
+
+
+if __name__ == "__main__":
+    for name, value in main().items():
+        print(f"{name:>22}: {value:8.2f}{'' if name == 'ratio' else ' ns'}")

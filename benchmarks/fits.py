@@ -1,0 +1,64 @@
+"""Quality and time of fits on the named problems and on two arms straight from their URDFs."""
+
+import argparse
+from importlib.metadata import files
+from pathlib import Path
+from statistics import median
+
+import orthocas as oc
+from orthocas import problems
+
+CASES = (
+    ("iiwa", "polynomial:3"),
+    ("iiwa", "polynomial:4"),
+    ("iiwa", "polynomial:5"),
+    ("iiwa", "polynomial:6"),
+    ("planar_3r_x", "polynomial:8"),
+    ("planar_3r_xy", "polynomial:6"),
+    ("panda", "polynomial:4"),
+    ("ur10", "polynomial:4"),
+)
+ROBOTS = {
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
+}
+HEADER = (
+    "| problem | parametrisation | fit [s] | task std [deg] | mutual std [deg] | conditioning mean / 1 % / min |\n"
+    "| --- | --- | --- | --- | --- | --- |"
+)
+
+
+def build(name: str) -> oc.Problem:
+    """A named problem, or a robot of example-robot-data with its hand position as task and the default box."""
+    if name in problems.names():
+        return problems.get(name)
+    file, tip = ROBOTS[name]
+    path = next(Path(str(f.locate())).resolve() for f in files("example-robot-data") or [] if str(f).endswith(file))
+    robot = oc.Robot.chain_from_file(path, tip)
+    return oc.Problem(robot, oc.Task.position(robot), name=name)
+
+
+def row(name: str, label: str, runs: int, samples: int) -> str:
+    """One row of the table: median fit time over runs, quality on held-out samples."""
+    problem, parametrisation = build(name), oc.parametrisations.parse_parametrisation(label)
+    fits = [oc.fit(problem, parametrisation) for _ in range(runs)]
+    report = oc.evaluate(fits[0].chart, samples)
+    conditioning = report.conditioning
+    return (
+        f"| {name} | {label} | {median(f.seconds for f in fits):.2f} | {report.task_angle.std:.3f} "
+        f"| {report.mutual_angle.std:.3f} | {conditioning.mean:.3f} / {conditioning.p01:.3f} / {conditioning.min:.3f} |"
+    )
+
+
+def main(quick: bool = False) -> list[str]:
+    """All rows; quick: low degrees, one run, few samples."""
+    cases = [("iiwa", "polynomial:2"), ("planar_3r_xy", "polynomial:2")] if quick else CASES
+    return [row(name, label, 1 if quick else 3, 2_000 if quick else 100_000) for name, label in cases]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    print(HEADER)
+    for line in main(parser.parse_args().quick):
+        print(line)

@@ -1,0 +1,12 @@
+"""Run every benchmark one after the other (about 8 minutes on 2 cores); docs/performance.md holds the results."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPTS = ("dynamics", "command", "fits", "scaling", "against_torch")
+
+if __name__ == "__main__":
+    for name in SCRIPTS:
+        print(f"\n## {name}", flush=True)
+        subprocess.run([sys.executable, str(Path(__file__).parent / f"{name}.py")], check=True)

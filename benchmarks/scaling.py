@@ -1,0 +1,51 @@
+"""Cost of a fit against the number of joints, the degree and the number of samples: planar arms and the 7-DoF arm."""
+
+import argparse
+import resource
+
+import numpy as np
+
+import orthocas as oc
+from orthocas import problems
+
+HEADER = (
+    "| problem | n, m, r | degree | parameters | samples | fit [s] | task std [deg] | peak memory so far [MiB] |\n"
+    "| --- | --- | --- | --- | --- | --- | --- | --- |"
+)
+
+
+def row(problem: oc.Problem, degree: int, samples: int | None = None) -> str:
+    """Fit once and print the cost."""
+    fit = oc.fit(problem, oc.Polynomial(degree), samples=samples)
+    report = oc.evaluate(fit.chart, 10_000)
+    last = fit.stages[-1]
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return (
+        f"| {problem.name} | {problem.n}, {problem.m}, {problem.r} | {degree} | {last.parameters} | {last.samples} "
+        f"| {fit.seconds:.2f} | {report.task_angle.std:.2f} | {peak:.0f} |"
+    )
+
+
+def planar(n: int) -> oc.Problem:
+    """An n-joint planar arm, tip position, A = I, bent so that the task is regular."""
+    robot = oc.Robot.planar([1.0] * n, [1.0] * n)
+    box = oc.Box(np.concatenate([[0.6], np.full(n - 1, 2.0 / n)]), np.pi / 8)
+    return oc.Problem(robot, oc.Task.position(robot, "xy"), domain=box, name=f"planar_{n}r")
+
+
+def main(quick: bool = False) -> list[str]:
+    """Rows for n, then degree, then samples."""
+    iiwa = problems.get("iiwa")
+    if quick:
+        return [row(planar(3), 2), row(iiwa, 2, 500)]
+    rows = [row(planar(n), 3) for n in (3, 4, 5, 6, 7, 8)]
+    rows += [row(iiwa, degree) for degree in (1, 2, 3, 4, 5)]
+    return rows + [row(iiwa, 4, samples) for samples in (2_000, 4_000, 8_000, 16_000)]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    print(HEADER)
+    for line in main(parser.parse_args().quick):
+        print(line)

@@ -1,0 +1,105 @@
+"""Figures of charts: histograms of angles as in [AS2023] Figs. 20 and 27, and leaves of the coordinates."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.quality import AngleStatistics, Report
+
+_TASK, _EXTRA = "#1f5fa8", "#d95f02"
+
+
+def quality_figure(report: Report) -> Figure:
+    """Histograms of task angles and mutual angles in degrees, with mean and standard deviation."""
+    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2, sharex=True)
+    _draw_angles(left, report.task_angle, _TASK, r"task angle $\angle(\mathrm{d}\xi_j, \nabla_A h_i)$")
+    _draw_angles(right, report.mutual_angle, _EXTRA, r"mutual angle $\angle(\mathrm{d}\xi_i, \mathrm{d}\xi_j)$")
+    left.set_ylabel("share of angles per degree")
+    figure.suptitle(f"{report.samples:,} held-out samples, conditioning mean {report.conditioning.mean:.2f}")
+    return figure
+
+
+def self_motion_figure(chart: Chart, postures: int = 9, reach: float = 0.4) -> Figure:
+    """The arm while one extra coordinate sweeps and task and other coordinates are held; one panel per coordinate.
+
+    Args:
+        chart: the chart; the sweep starts at the centre of its domain.
+        postures: number of postures per panel.
+        reach: largest value of the swept coordinate.
+
+    Raises:
+        InverseError: if a posture of the sweep cannot be reached.
+    """
+    figure = Figure(figsize=(3.0 * chart.r, 3.6), layout="constrained")
+    values = np.linspace(-reach, reach, postures)
+    sweeps = [_sweep(chart, j, values) for j in range(chart.r)]
+    everything = chart.problem.robot.joint_points(np.concatenate(sweeps)).reshape(-1, 3)
+    colours = mpl.colormaps["viridis"](np.linspace(0.1, 0.9, postures))
+    for j, sweep in enumerate(sweeps):
+        panel = figure.add_subplot(1, chart.r, j + 1, projection="3d")
+        for points, colour in zip(chart.problem.robot.joint_points(sweep), colours, strict=True):
+            panel.plot(*points.T, "-o", color=colour, markersize=2.5, linewidth=1.5)
+        moved = np.abs(chart.task(sweep) - chart.task(chart.problem.domain.centre)).max()
+        panel.set_title(rf"$\xi_{j + 1}$ from {-reach:g} to {reach:g}" + f"\ntask moves {_bound(moved)}", fontsize=10)
+        _equal_axes(panel, everything)
+    return figure
+
+
+def save_figure(figure: Figure, path: Path, dpi: int = 150) -> Path:
+    """Write a figure, in the format of the path's ending."""
+    figure.savefig(path, dpi=dpi)
+    return path
+
+
+def _draw_angles(axes: Axes, angles: AngleStatistics, colour: str, label: str) -> None:
+    first = 3  # groups of five bins, such that a right angle lies in the middle of its group
+    counts = angles.histogram[first:-3].reshape(-1, 5).sum(axis=1)
+    edges = (first - 0.5) / 10 + 0.5 * np.arange(len(counts) + 1)
+    axes.stairs(counts / max(counts.sum(), 1) / 0.5, edges, fill=True, color=colour, alpha=0.85)
+    width = max(6.0, 5 * (0.0 if np.isnan(angles.std) else angles.std))
+    axes.set_xlim(90 - width, 90 + width)
+    axes.set_xlabel(f"{label} [deg]")
+    axes.set_title(f"mean {angles.mean:.2f}°, std {angles.std:.2f}°", fontsize=10)
+    axes.grid(alpha=0.3)
+
+
+def _sweep(chart: Chart, j: int, values: Array) -> Array:
+    """Joint positions along xi_j with everything else held, each found from its neighbour, from the middle outwards."""
+    centre = chart.problem.domain.centre
+    base = chart.phi(centre)
+    found = np.empty((len(values), chart.n))
+    middle = int(np.argmin(np.abs(values)))
+    for order in (range(middle, len(values)), range(middle - 1, -1, -1)):
+        q = centre
+        for k in order:
+            target = base.copy()
+            target[chart.m + j] = values[k]
+            q = chart.inverse(target, q)
+            found[k] = q
+    return found
+
+
+def _equal_axes(axes: Any, points: Array) -> None:
+    """Same scale on all three axes, around the points; a planar arm is seen from above."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = (high - low).max() / 2 * 1.05
+    for name, middle in zip("xyz", (low + high) / 2, strict=True):
+        getattr(axes, f"set_{name}lim")(middle - half, middle + half)
+        getattr(axes, f"set_{name}label")(f"{name} [m]", fontsize=8)
+        getattr(axes, f"{name}axis").labelpad = -3
+    axes.tick_params(labelsize=7, pad=0)
+    axes.locator_params(nbins=4)
+    axes.set_box_aspect((1, 1, 1))
+    flat = (high - low)[2] < 1e-9
+    axes.view_init(elev=90 if flat else 22, azim=-90 if flat else -60)
+
+
+def _bound(length: float) -> str:
+    return f"< 1e{int(np.ceil(np.log10(max(length, 1e-16)))):d} m"

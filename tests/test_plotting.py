@@ -1,0 +1,37 @@
+"""Figures hold what they say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas.errors import InverseError
+from orthocas.fitting import Fit
+from orthocas.plotting import quality_figure, save_figure, self_motion_figure
+
+
+def test_quality_figure_shows_both_deviations(planar_fit: Fit) -> None:
+    report = oc.evaluate(planar_fit.chart, 1000)
+    left, right = quality_figure(report).axes
+    assert f"std {report.task_angle.std:.2f}" in left.get_title()
+    assert f"std {report.mutual_angle.std:.2f}" in right.get_title()
+    assert "[deg]" in left.get_xlabel()
+
+
+def test_quality_figure_without_mutual_angles(planar_xy: oc.Problem, tmp_path: Path) -> None:
+    report = oc.evaluate(oc.fit(planar_xy, oc.Linear()).chart, 100)
+    assert save_figure(quality_figure(report), tmp_path / "q.png").stat().st_size > 5000
+
+
+def test_self_motion_figure_has_a_panel_per_coordinate_and_a_line_per_posture(iiwa_fit: Fit) -> None:
+    figure = self_motion_figure(iiwa_fit.chart, postures=3, reach=0.2)
+    assert len(figure.axes) == 4
+    assert all(len(panel.lines) == 3 for panel in figure.axes)
+    tips = [line.get_data_3d()[0][-1] for line in figure.axes[0].lines]  # type: ignore[attr-defined]
+    np.testing.assert_allclose(tips, tips[0], atol=1e-8)  # the flange stays
+
+
+def test_sweep_out_of_reach_is_an_error(planar_fit: Fit) -> None:
+    with pytest.raises(InverseError):
+        self_motion_figure(planar_fit.chart, postures=3, reach=50.0)
