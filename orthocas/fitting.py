@@ -77,6 +77,7 @@ def fit_chart(
     start = time.perf_counter()
     if samples is not None:
         require_count("samples", samples, least=2)
+    require_count("seed", seed, least=0)
     found = check(problem, seed=seed)
     first = sample_problem(problem, 200, (seed, 0))
     space = joint_space(problem)

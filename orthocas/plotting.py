@@ -96,7 +96,7 @@ def _equal_axes(axes: Any, points: Array) -> None:
         getattr(axes, f"{name}axis").labelpad = -3
     axes.tick_params(labelsize=7, pad=0)
     axes.locator_params(nbins=4)
-    axes.set_box_aspect((1, 1, 1))
+    axes.set_box_aspect((1, 1, 1), zoom=0.85)
     flat = (high - low)[2] < 1e-9
     axes.view_init(elev=90 if flat else 22, azim=-90 if flat else -60)
 

@@ -60,6 +60,7 @@ class Report:
     conditioning: Conditioning
     worst_point: tuple[float, ...]  #: the sampled joint position with the smallest conditioning
     singular_samples: int  #: samples left out because a gradient vanishes there
+    folded_samples: int  #: samples where det J has not the sign it has at most samples: the chart has folded over
 
     @property
     def degenerate(self) -> bool:
@@ -84,6 +85,7 @@ class Report:
             "conditioning": asdict(self.conditioning),
             "worst_point": list(self.worst_point),
             "singular_samples": self.singular_samples,
+            "folded_samples": self.folded_samples,
             "degenerate": self.degenerate,
         }
 
@@ -101,9 +103,10 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
         seed: seed of the samples.
     """
     require_count("samples", samples)
+    require_count("seed", seed, least=0)
     points = sample_uniform(chart.problem.domain, samples, seed)
     parts = [_judge(chart, points[start : start + _CHUNK]) for start in range(0, samples, _CHUNK)]
-    task, mutual, smallest, kept = (np.concatenate([part[i] for part in parts]) for i in range(4))
+    task, mutual, smallest, signs, kept = (np.concatenate([part[i] for part in parts]) for i in range(5))
     worst = int(np.argmin(smallest))
     return Report(
         n=chart.n,
@@ -117,11 +120,12 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
         conditioning=Conditioning(float(smallest[worst]), float(np.quantile(smallest, 0.01)), float(smallest.mean())),
         worst_point=tuple(kept[worst].tolist()),
         singular_samples=samples - len(kept),
+        folded_samples=int(min((signs > 0).sum(), (signs <= 0).sum())),
     )
 
 
-def _judge(chart: Chart, points: Array) -> tuple[Array, Array, Array, Array]:
-    """Task cosines (N, m, r), mutual cosines (N, pairs), smallest singular values (N,), and the points kept."""
+def _judge(chart: Chart, points: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Task cosines (N, m, r), mutual cosines (N, pairs), smallest singular values (N,), signs of det J, points kept."""
     samples = samples_at(chart.problem, points)
     J = chart.coordinates.jacobian(samples.points)
     lengths = np.linalg.norm(J, axis=2)
@@ -133,7 +137,8 @@ def _judge(chart: Chart, points: Array) -> tuple[Array, Array, Array, Array]:
     first, second = (np.array([pair[k] for pair in pairs(chart.r)], dtype=int) for k in (0, 1))
     products = np.einsum("spn,spn->sp", raised[:, first], J[:, second])
     mutual = products / (np.linalg.norm(raised, axis=2)[:, first] * lengths[:, second])
-    return task, mutual, _smallest_singular_values(chart, samples, J, raised), samples.points
+    signs = np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1)))
+    return task, mutual, _smallest_singular_values(chart, samples, J, raised), signs, samples.points
 
 
 def _smallest_singular_values(chart: Chart, samples: Samples, J: Array, raised: Array) -> Array:

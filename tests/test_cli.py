@@ -138,6 +138,8 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["fit", "iiwa", "--samples", "0"], "samples is 0"),
         (["fit", "iiwa", "--samples", "many"], "'many' came, expected a whole number"),
         (["fit", "iiwa", "--half-width", "wide"], "'wide' came, expected a number"),
+        (["fit", "iiwa", "--seed", "-1"], "seed is -1, expected a whole number >= 0"),
+        (["fit", "iiwa", "--weights", "1000,nan"], "--weights"),
         (["fit", "iiwa", "--weights", "1000"], "two or three numbers"),
         (["fit", "iiwa", "--weights", "0,1"], "lambda1 is 0.0"),
         (["fit", "iiwa", "--out", "no/such/folder/x.orthocas"], "folder no/such/folder does not exist"),

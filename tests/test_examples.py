@@ -5,6 +5,7 @@ from pathlib import Path
 import c_timing
 import casadi as ca
 import fits
+import front
 import iiwa_demo
 import numpy as np
 import pytest
@@ -37,3 +38,12 @@ def test_compiled_timing_harness_times_calls() -> None:
         pytest.skip(str(error))
     assert np.isfinite(times["f"])
     assert times["f"] > 1
+
+
+def test_front_shows_the_trade_and_the_trap(tmp_path: Path) -> None:
+    found = front.main(tmp_path, quick=True)
+    assert found["task_std_small_lambda2"] < found["task_std_large_lambda2"]
+    assert found["p01_small_lambda2"] < 0.2  # nearly parallel coordinates at the paper's weights
+    assert found["p01_with_regularity"] > found["p01_without_regularity"]
+    assert found["folded_with_regularity"] == 0
+    assert (tmp_path / "front.png").stat().st_size > 10_000

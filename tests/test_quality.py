@@ -74,6 +74,20 @@ def test_conditioning_matches_a_direct_computation_in_whitened_coordinates(plana
     np.testing.assert_allclose(report.worst_point, worst)
 
 
+def test_folded_samples_are_counted() -> None:
+    """xi = q2^2 - 1.2 q2 folds at q2 = 0.6: on |q2| <= pi/4 that is the part above, 11.8 % of the box."""
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    problem = oc.Problem(robot, oc.Task.custom(robot, "q1", lambda q: q[0]))
+    family = oc.Polynomial(2).family(joint_space(problem), 1)
+    half = np.pi / 4
+    C = {(0, 2): half**2 * 2 / 3 / np.sqrt(5), (0, 1): -1.2 * half / np.sqrt(3)}  # Legendre coefficients
+    theta = np.array([C.get(term, 0.0) for term in family.terms])
+    chart = Chart(problem, Coordinates(oc.Polynomial(2), joint_space(problem), (), theta, np.zeros(1), np.ones(1)))
+    np.testing.assert_allclose(chart.jacobian([0.0, 0.3])[1], [0, 2 * 0.3 - 1.2], atol=1e-12)
+    report = oc.evaluate(chart, 20_000)
+    assert report.folded_samples / report.samples == pytest.approx((half - 0.6) / (2 * half), abs=0.01)
+
+
 def test_held_out_samples_depend_on_the_seed(planar_fit: Fit) -> None:
     first, again, other = (oc.evaluate(planar_fit.chart, 500, seed) for seed in (1, 1, 2))
     assert first.as_dict() == again.as_dict()

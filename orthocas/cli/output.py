@@ -58,6 +58,10 @@ def report_rows(report: Report) -> dict[str, str]:
     }
     if report.r == 1:
         rows["mutual angle"] = "none, r = 1"
+    if report.folded_samples:
+        at = ", ".join(f"{value:.2f}" for value in report.worst_point)
+        share = report.folded_samples / report.samples
+        rows["folded"] = f"{share:.3%} of the domain, where det J changes sign; conditioning worst at q = ({at})"
     if report.degenerate:
         rows["DEGENERATE"] = "coordinates are nearly parallel or lean into the task: raise lambda2 or change the domain"
     return rows

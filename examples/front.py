@@ -1,0 +1,112 @@
+"""Task angle against mutual angle by lambda2, and the price of a chart without folds by lambda3 (60 s).
+
+The left panel is the front of the 7-DoF arm for polynomial degrees 3 and 4 beside the paper's network; colours show
+where the coordinates get close to parallel (the rank trap). The right panel raises the regularity weight lambda3.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import orthocas as oc
+from orthocas import problems
+from orthocas.plotting import save_figure
+from orthocas.quality import Report
+
+PAPER = (2.06, 3.44)
+LAMBDA2 = (1.0, 3.0, 10.0, 20.0, 30.0, 60.0, 100.0, 300.0)
+LAMBDA3 = (0.0, 120.0, 500.0, 2000.0, 8000.0)
+
+
+def main(out: Path, quick: bool = False) -> dict[str, float]:
+    """Draw both panels.
+
+    Args:
+        out: folder for the picture.
+        quick: degree 2 and three points a curve.
+
+    Returns:
+        Some numbers of the picture: task std [deg] at the ends of the front, conditioning at the ends of lambda3.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    problem, samples = problems.get("iiwa"), 5_000 if quick else 100_000
+    degrees, lambda2 = ((2,), LAMBDA2[::3]) if quick else ((3, 4), LAMBDA2)
+    lambda3 = LAMBDA3[::2] if quick else LAMBDA3
+
+    def judged(degree: int, *weights: float) -> Report:
+        fit = oc.fit(problem, oc.Polynomial(degree), weights=(1000.0, *weights))  # type: ignore[arg-type]
+        return oc.evaluate(fit.chart, samples)
+
+    fronts = {degree: [judged(degree, value) for value in lambda2] for degree in degrees}
+    regular = [judged(degrees[-1], 30.0, value) for value in lambda3]
+    figure = Figure(figsize=(10.5, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _draw_fronts(figure, left, lambda2, fronts)
+    _draw_regularity(right, degrees[-1], lambda3, regular)
+    save_figure(figure, out / "front.png")
+    first = fronts[degrees[0]]
+    return {
+        "task_std_small_lambda2": first[0].task_angle.std,
+        "task_std_large_lambda2": first[-1].task_angle.std,
+        "p01_small_lambda2": first[0].conditioning.p01,
+        "p01_without_regularity": regular[0].conditioning.p01,
+        "p01_with_regularity": regular[-1].conditioning.p01,
+        "folded_with_regularity": float(regular[-1].folded_samples),
+    }
+
+
+def _draw_fronts(figure: Figure, axes: Axes, lambda2: tuple[float, ...], fronts: dict[int, list[Report]]) -> None:
+    for (degree, reports), marker in zip(fronts.items(), "os", strict=False):
+        task = [report.task_angle.std for report in reports]
+        mutual = [report.mutual_angle.std for report in reports]
+        quality = [report.conditioning.p01 for report in reports]
+        axes.plot(task, mutual, color="0.6", zorder=1)
+        points = axes.scatter(
+            task, mutual, c=quality, cmap="viridis", vmin=0, vmax=0.7, marker=marker, s=45, label=f"degree {degree}"
+        )
+        for x, y, value in zip(task, mutual, lambda2, strict=True):
+            axes.annotate(f"{value:g}", (x, y), xytext=(6, -2), textcoords="offset points", fontsize=7)
+    figure.colorbar(points, ax=axes, label="conditioning, 1 % quantile")
+    axes.scatter(*PAPER, color="#d95f02", marker="*", s=120, label="paper's network (its own samples)")
+    axes.set_yscale("log")
+    axes.set_yticks([1, 2, 3, 5, 10, 20, 40], [str(v) for v in (1, 2, 3, 5, 10, 20, 40)])
+    axes.minorticks_off()
+    axes.set_xlabel("task angle, std [deg]")
+    axes.set_ylabel("mutual angle, std [deg]")
+    axes.set_title(r"front by $\lambda_2$ (numbers), $\lambda_1 = 1000$, $\lambda_3 = 0$", fontsize=10)
+    axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+
+
+def _draw_regularity(axes: Axes, degree: int, lambda3: tuple[float, ...], reports: list[Report]) -> None:
+    places = np.arange(len(lambda3))
+    axes.plot(places, [r.conditioning.p01 for r in reports], "o-", color="#1f5fa8", label="conditioning, 1 % quantile")
+    axes.plot(places, [r.conditioning.min for r in reports], "s-", color="#7570b3", label="conditioning, minimum")
+    axes.set_xticks(places, [f"{v:g}\n{r.folded_samples}" for v, r in zip(lambda3, reports, strict=True)])
+    axes.set_xlabel(r"$\lambda_3$, and below it the number of folded samples")
+    axes.set_ylabel("conditioning")
+    axes.set_ylim(0, 1)
+    axes.set_title(rf"price of a chart without folds, degree {degree}, $\lambda_2 = 30$", fontsize=10)
+    other = axes.twinx()
+    other.plot(
+        places, [r.task_angle.std for r in reports], "^--", color="#d95f02", label="task angle, std [deg] (right)"
+    )
+    other.set_ylabel("task angle, std [deg]")
+    other.set_ylim(0, None)
+    handles = [*axes.get_lines(), *other.get_lines()]
+    axes.legend(
+        handles, [str(h.get_label()) for h in handles], fontsize=8, loc="lower left", bbox_to_anchor=(0.02, 0.15)
+    )
+    axes.grid(alpha=0.3)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out"))
+    parser.add_argument("--quick", action="store_true")
+    arguments = parser.parse_args()
+    for name, value in main(arguments.out, arguments.quick).items():
+        print(f"{name:>26}: {value:.3f}")
