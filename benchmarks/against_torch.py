@@ -1,7 +1,7 @@
 """Time to the quality of the paper's network (task 2.06, mutual 3.44 deg): our fit against PyTorch, in one run.
 
-Both split off the idle joint. Schedules of the peer: the fastest of a search over batch (32 to 1000), steps and
-learning rate (5e-3 to 3e-2) on the same machine; ours: fewer samples than the default, the same code.
+Both split off the idle joint and use the same weights. Schedules of the peer: the fastest of a search over batch (32 to
+1000), steps and learning rate (5e-3 to 3e-2) on the same machine; ours: fewer samples than the default, the same code.
 """
 
 from statistics import median
@@ -12,14 +12,19 @@ import orthocas as oc
 from orthocas import problems
 
 TASK, MUTUAL = 2.06, 3.44
-SCHEDULES = (
-    PeerSettings(steps=900, batch=64, learning_rate=1e-2),
-    PeerSettings(steps=1100, batch=64, learning_rate=1e-2),
-    PeerSettings(steps=1100, batch=64, learning_rate=2e-2),
-    PeerSettings(steps=1500, batch=64, learning_rate=1e-2),
-    PeerSettings(steps=1300, batch=100, learning_rate=2e-2),
+WEIGHTS, SAMPLES = (1000.0, 30.0), 3500
+SCHEDULES = tuple(
+    PeerSettings(steps=steps, batch=batch, learning_rate=rate, weights=WEIGHTS)
+    for steps, batch, rate in (
+        (1000, 32, 1e-2),
+        (1300, 32, 1e-2),
+        (800, 64, 2e-2),
+        (1000, 64, 2e-2),
+        (1100, 64, 1e-2),
+        (1500, 64, 1e-2),
+        (1000, 100, 2e-2),
+    )
 )
-WEIGHTS, SAMPLES = (1000.0, 20.0), 3000
 
 
 def main(runs: int = 5) -> dict[str, float]:
@@ -31,9 +36,8 @@ def main(runs: int = 5) -> dict[str, float]:
     for seed in range(runs):
         fit = oc.fit(problem, oc.Polynomial(4), weights=WEIGHTS, samples=SAMPLES, seed=seed)
         report = oc.evaluate(fit.chart, 50_000)
-        assert report.task_angle.std <= TASK, report.task_angle
-        assert report.mutual_angle.std <= MUTUAL, report.mutual_angle
-        ours.append(fit.seconds)
+        there = report.task_angle.std <= TASK and report.mutual_angle.std <= MUTUAL
+        ours.append(fit.seconds if there else float("inf"))
         for settings in SCHEDULES:
             result = train(problem, settings, seed)
             reached = result.task_std_deg <= TASK and result.mutual_std_deg <= MUTUAL

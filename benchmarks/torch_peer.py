@@ -1,7 +1,8 @@
 """The strongest peer we know for fitting: a PyTorch MLP trained with Adam, on the same problem and loss.
 
 float32, fresh uniform samples in every step, cosine learning rate, all cores. It gets the same help as our own fit:
-the idle joint is split off, so it fits three coordinates of six joints.
+the idle joint is split off, so it fits three coordinates of six joints; and its samples, with the task gradients, are
+made before its clock starts (ours makes them while the clock runs).
 """
 
 import math
@@ -39,16 +40,15 @@ class PeerResult:
 def train(problem: Problem, settings: PeerSettings, seed: int = 0, held_out: int = 20_000) -> PeerResult:
     """Train once and judge on held-out samples."""
     torch.manual_seed(seed)
-    rng = np.random.default_rng(seed)
     joints, r = list(range(problem.n - 1)), problem.r - 1
     widths = [2 * len(joints), settings.hidden, settings.hidden, r]
     layers = [torch.nn.Linear(a, b) for a, b in pairwise(widths)]
     parameters = [p for layer in layers for p in layer.parameters()]
     optimiser = torch.optim.Adam(parameters, lr=settings.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.steps)
+    all_q, all_g = _samples(problem, joints, settings.steps * settings.batch, seed)
     start = time.perf_counter()
-    for _ in range(settings.steps):
-        q, g = _samples(problem, joints, settings.batch, int(rng.integers(2**31)))
+    for q, g in zip(all_q.split(settings.batch), all_g.split(settings.batch), strict=True):
         task, mutual = _cosines(layers, q, g)
         pairs = mutual.shape[1]
         loss = settings.weights[0] / (2 * 3 * r) * (task**2).sum(dim=(1, 2)).mean()

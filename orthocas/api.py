@@ -3,6 +3,8 @@
 from pathlib import Path
 
 from orthocas.chart import Chart
+from orthocas.checks import as_float_array
+from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import Fit, fit_chart
 from orthocas.loss import DEFAULT_WEIGHTS, Weights
 from orthocas.objective import Monitor, Solver, silent
@@ -46,10 +48,17 @@ def fit(
         InvalidValueError, SolveError: if settings do not fit together, or the loss is not finite.
     """
     parametrisation = Polynomial(degree=4) if parametrisation is None else parametrisation
+    if not isinstance(parametrisation, Parametrisation):
+        raise InvalidValueError("parametrisation", repr(parametrisation), "an object such as Polynomial(degree=4)")
     if solver is None:
         linear = isinstance(parametrisation, GradedParametrisation | Linear)
         solver = GaussNewton() if linear else LBFGS()
-    return fit_chart(problem, parametrisation, solver, Weights(*weights), samples, seed, monitor)
+    if not isinstance(solver, Solver):
+        raise InvalidValueError("solver", repr(solver), "an object such as GaussNewton()")
+    values = as_float_array("weights", weights)
+    if values.shape not in ((2,), (3,)):
+        raise ShapeError("weights", values.shape, (3,))
+    return fit_chart(problem, parametrisation, solver, Weights(*values.tolist()), samples, seed, monitor)
 
 
 def load(path: str | Path) -> Chart:

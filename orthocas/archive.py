@@ -27,14 +27,14 @@ def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[s
     Raises:
         ChartFileError: if the folder is missing or cannot be written.
     """
-    target = Path(path)
-    require_writable(target)
+    require_writable(Path(path))
+    target = Path(path).resolve()  # a link stays a link
     entries = {f"{name}.npy": _npy_bytes(array) for name, array in arrays.items()}
     full = {"format": FORMAT, "version": VERSION, **header, "sha256": {k: _digest(v) for k, v in entries.items()}}
     text = json.dumps(full, indent=1).encode()
     entries = {_HEADER: text, _DIGEST: _digest(text).encode(), **entries}
     try:
-        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{target.name}.", delete=False) as draft:
+        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=".orthocas-", delete=False) as draft:
             try:
                 with zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as archive:
                     for name, content in entries.items():
@@ -54,14 +54,19 @@ def require_writable(path: Path) -> None:
     """Check early, before long work, that a file can be written.
 
     Raises:
-        ChartFileError: if its folder is missing or read-only, or the path is a folder.
+        ChartFileError: if its folder is missing or read-only, or something other than a writable file is there.
     """
-    if not path.parent.is_dir():
-        raise ChartFileError(f"cannot write {path}: folder {path.parent} does not exist")
-    if path.is_dir():
-        raise ChartFileError(f"cannot write {path}: it is a folder, expected a file name")
-    if not os.access(path.parent, os.W_OK):
-        raise ChartFileError(f"cannot write {path}: folder {path.parent} is read-only")
+    try:
+        if not path.parent.is_dir():
+            raise ChartFileError(f"cannot write {path}: folder {path.parent} does not exist")
+        if path.is_dir():
+            raise ChartFileError(f"cannot write {path}: it is a folder, expected a file name")
+        if path.exists() and not (path.is_file() and os.access(path, os.W_OK)):
+            raise ChartFileError(f"cannot write {path}: it is not a writable file")
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise ChartFileError(f"cannot write {str(path)[:200]}: {error.strerror}") from None
 
 
 def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, Array]]:
@@ -101,10 +106,12 @@ def _read_header(source: Path, entries: Mapping[str, bytes]) -> dict[str, Any]:
     try:
         header = json.loads(entries[_HEADER])
         name, version, sums = header["format"], int(header["version"]), dict(header["sha256"])
-    except (KeyError, ValueError, TypeError):
+    except (KeyError, ValueError, TypeError, OverflowError, RecursionError):
         raise ChartFileError(f"{source} is not an orthocas chart file") from None
     if name != FORMAT:
         raise ChartFileError(f"{source} has format '{name}', expected '{FORMAT}'")
+    if version < 1:
+        raise ChartFileError(f"{source} has format version {version}, expected 1 to {VERSION}")
     if version > VERSION:
         raise ChartFileError(f"{source} has format version {version}, this orthocas reads up to {VERSION}: upgrade")
     if entries.get(_DIGEST, b"").decode(errors="replace") != _digest(entries[_HEADER]):

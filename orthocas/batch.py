@@ -15,17 +15,19 @@ from orthocas.checks import Array
 
 _CHUNKS = (1, 64, 512)  # samples evaluated in one call: the smallest that holds the set, or the largest
 _THREADED = 512  # chunks of this size are worth starting threads for
-_THREADS = os.cpu_count() or 1
+_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def dense_function(
-    name: str, inputs: Sequence[Any], outputs: Sequence[Any], input_names: Sequence[str] | None = None
+    name: str, inputs: Sequence[Any], outputs: Sequence[Any], input_names: Sequence[str] = ()
 ) -> ca.Function:
-    """A CasADi function, SX or MX, whose outputs have no structural zeros, as `Batched` needs."""
-    names = input_names or [f"i{k}" for k in range(len(inputs))]
-    return ca.Function(
-        name, inputs, [ca.densify(out) for out in outputs], names, [f"o{k}" for k in range(len(outputs))]
-    )
+    """A CasADi function, SX or MX, whose outputs have no structural zeros, as `Batched` needs.
+
+    Its first output is called `out`; a single input is called `q` unless `input_names` says otherwise.
+    """
+    names = list(input_names) or (["q"] if len(inputs) == 1 else [f"i{k}" for k in range(len(inputs))])
+    results = ["out", *(f"out{k}" for k in range(1, len(outputs)))]
+    return ca.Function(name, inputs, [ca.densify(out) for out in outputs], names, results)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.batch import dense_function
 from orthocas.chart_file import read_chart, write_chart
 from orthocas.checks import Array, as_point_set, require_known
 from orthocas.coordinates import Coordinates
@@ -92,7 +91,7 @@ class Chart:
         if len(starts) not in (1, len(targets)):
             raise ShapeError("q_start", starts.shape, targets.shape)
         starts = np.broadcast_to(starts, targets.shape)
-        solutions = np.array([self._solve(x0, p) for x0, p in zip(starts, targets, strict=True)])
+        solutions = np.array([self._solve(x0, p) for x0, p in zip(starts, targets, strict=True)]).reshape(-1, self.n)
         self._require_solved(solutions, targets, tolerance)
         return solutions[0] if single else solutions
 
@@ -135,7 +134,7 @@ class Chart:
             "task": x,
             "task_jacobian": J_x,
         }
-        return {name: dense_function(name, [q], [output]) for name, output in outputs.items()}
+        return {name: ca.Function(name, [q], [ca.densify(out)], ["q"], [name]) for name, out in outputs.items()}
 
     @cached_property
     def _rootfinder(self) -> ca.Function:

@@ -5,16 +5,17 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from orthocas.archive import read_archive, write_archive
-from orthocas.checks import Array
+from orthocas.checks import Array, require_count, require_known
 from orthocas.coordinates import Coordinates, joint_space
 from orthocas.domains import Box, Domain, Torus
 from orthocas.errors import ChartFileError, OrthocasError
-from orthocas.expression_tape import from_tape
+from orthocas.expression_tape import from_tape, to_tape
 from orthocas.metrics import Metric
-from orthocas.parametrisations import parse_parametrisation
+from orthocas.parametrisations import parametrisation_from_data, parametrisation_to_data
 from orthocas.problem import Problem
 from orthocas.robots import KinematicTree, Robot
 from orthocas.tasks import Task
@@ -42,11 +43,11 @@ def write_chart(path: str | Path, problem: Problem, coordinates: Coordinates, no
         "robot": {name: value for name, value in numbers.items() if not isinstance(value, np.ndarray)},
         "problem": {
             "name": problem.name,
-            "task": problem.task.recipe,
-            "metric": problem.metric.recipe,
+            "task": _with_tape(problem.task.recipe, problem.task.function),
+            "metric": _with_tape(problem.metric.recipe, problem.metric.function),
             "domain": problem.domain.name,
         },
-        "coordinates": {"parametrisation": coordinates.parametrisation.label, "idle": list(coordinates.idle)},
+        "coordinates": {**parametrisation_to_data(coordinates.parametrisation), "idle": list(coordinates.idle)},
         "notes": dict(notes),
     }
     write_archive(path, header, arrays)
@@ -63,9 +64,9 @@ def read_chart(path: str | Path) -> tuple[Problem, Coordinates, Notes]:
         robot = Robot(_tree(header["robot"], arrays))
         problem = _problem(robot, header["problem"], arrays)
         coordinates = Coordinates(
-            parse_parametrisation(header["coordinates"]["parametrisation"]),
+            parametrisation_from_data(header["coordinates"]),
             joint_space(problem),
-            tuple(header["coordinates"]["idle"]),
+            _idle(header["coordinates"]["idle"], robot.n),
             arrays["theta"],
             arrays["offset"],
             arrays["scale"],
@@ -77,8 +78,21 @@ def read_chart(path: str | Path) -> tuple[Problem, Coordinates, Notes]:
         raise
     except OrthocasError as error:
         raise ChartFileError(f"{path} is inconsistent: {error}") from None
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
         raise ChartFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
+
+
+def _with_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:
+    """A task or metric as plain data; a custom one with its expression."""
+    return {**recipe, "tape": to_tape(function)} if recipe["kind"] == "custom" else dict(recipe)
+
+
+def _idle(joints: list[int], n: int) -> tuple[int, ...]:
+    """Idle joints, checked."""
+    idle = tuple(require_count("idle joint", k, least=0) for k in joints)
+    if len(set(idle)) != len(idle) or any(k >= n for k in idle):
+        raise ChartFileError(f"idle joints {list(idle)} do not fit {n} joints")
+    return idle
 
 
 def _tree(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> KinematicTree:
@@ -90,9 +104,9 @@ def _tree(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> KinematicTree
 
 
 def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Array]) -> Problem:
-    domain: Domain = (
-        Torus(robot.n) if data["domain"] == "torus" else Box(arrays["domain_centre"], arrays["domain_half_width"])
-    )
+    require_known("domain", data["domain"], ("box", "torus"))
+    box = Box(arrays["domain_centre"], arrays["domain_half_width"])
+    domain: Domain = Torus(robot.n) if data["domain"] == "torus" else box
     return Problem(robot, _task(robot, data["task"]), _metric(robot, data["metric"]), domain, data["name"])
 
 

@@ -1,12 +1,13 @@
 """Input checks that raise the package's errors."""
 
+import os
 from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
+from orthocas.errors import InvalidValueError, MemoryNeedError, ShapeError, UnknownNameError
 
 Array = NDArray[np.float64]
 
@@ -23,10 +24,18 @@ def require_known(what: str, name: str, known: Collection[str]) -> None:
         raise UnknownNameError(what, name, known)
 
 
-def require_count(name: str, value: int, least: int = 1) -> None:
-    """Raise InvalidValueError unless value is a whole number >= least."""
+def require_count(name: str, value: int, least: int = 1) -> int:
+    """The value as a Python int; raises InvalidValueError unless it is a whole number >= least."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise InvalidValueError(name, value, f"a whole number >= {least}")
+    return int(value)
+
+
+def require_memory(what: str, needed: float) -> None:
+    """Raise MemoryNeedError if that many bytes are more than 80 % of this machine's memory."""
+    available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed > 0.8 * available:
+        raise MemoryNeedError(what, needed, available)
 
 
 def frozen_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:

@@ -1,19 +1,21 @@
 """Regions of joint space that coordinates are fitted and judged on, with seeded uniform sampling."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_point_set, frozen_array, require_count
+from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_count
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
 from orthocas.robots import Robot
 
 REVOLUTE_HALF_WIDTH = np.pi / 4  #: default half-width [rad], the hyper-cube of [AS2023] Sec. 9
 PRISMATIC_HALF_WIDTH = 0.25  #: default half-width [m] of an unlimited prismatic joint
+_WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes and overflow later
 
 
+@runtime_checkable
 class Domain(Protocol):
     """A box in joint space; a torus is the box of whole turns."""
 
@@ -48,12 +50,15 @@ class Box:
 
     def __init__(self, centre: ArrayLike, half_width: ArrayLike) -> None:
         middle = frozen_array("centre", centre, (None,))
-        widths = np.asarray(half_width, dtype=float)
-        if widths.ndim == 1 and widths.shape != middle.shape:
+        widths = as_float_array("half_width", half_width)
+        if widths.ndim > 0 and widths.shape != middle.shape:
             raise ShapeError("half_width", widths.shape, middle.shape)
         widths = frozen_array("half_width", np.broadcast_to(widths, middle.shape), middle.shape)
-        if widths.size == 0 or widths.min() <= 0:
-            raise InvalidValueError("half_width", widths.min() if widths.size else "empty", "positive numbers")
+        if widths.size == 0:
+            raise InvalidValueError("centre", "empty", "at least one joint")
+        if widths.min() <= 0 or widths.max() > _WIDEST:
+            bad = widths.min() if widths.min() <= 0 else widths.max()
+            raise InvalidValueError("half_width", bad, f"positive numbers up to {_WIDEST:g}")
         object.__setattr__(self, "centre", middle)
         object.__setattr__(self, "half_width", widths)
 
@@ -83,6 +88,7 @@ class Torus:
 def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
     """Points drawn uniformly from the domain, (samples, n)."""
     require_count("samples", samples)
+    _require_seed(seed)
     unit = np.random.default_rng(seed).uniform(-1.0, 1.0, (samples, len(domain.centre)))
     points: Array = domain.centre + domain.half_width * unit
     return points
@@ -98,6 +104,7 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
         M. Roberts, docs/references.md [R2018]; the use for training is ours.
     """
     require_count("samples", samples)
+    _require_seed(seed)
     n = len(domain.centre)
     g = 1.5
     for _ in range(64):
@@ -121,22 +128,22 @@ def contains(domain: Domain, q: ArrayLike) -> Array:
 def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: float | None = None) -> Box:
     """A box inside the joint limits.
 
-    The centre is the middle of the limits (0 where there are none). Half-widths are pi/4 for revolute and
-    0.25 m for prismatic joints, less where the limits are nearer.
+    The centre is the middle of the limits (0, or the value next to 0, where there are none). Half-widths are pi/4 for
+    revolute and 0.25 m for prismatic joints, less where the limits are nearer.
 
     Args:
         robot: the robot.
         centre: another centre (n,).
         half_width: another half-width for all joints; not shortened, so that it fails where it leaves the limits.
     """
+    wanted = np.where(robot.tree.prismatic, PRISMATIC_HALF_WIDTH, REVOLUTE_HALF_WIDTH)
     limited = np.isfinite(robot.lower) & np.isfinite(robot.upper)
-    middle = np.zeros(robot.n)
+    middle = np.clip(np.zeros(robot.n), robot.lower + wanted, robot.upper - wanted)
     middle[limited] = (robot.lower[limited] + robot.upper[limited]) / 2
     if centre is not None:
         middle = frozen_array("centre", centre, (robot.n,))
     if half_width is not None:
         return Box(middle, half_width)
-    wanted = np.where(robot.tree.prismatic, PRISMATIC_HALF_WIDTH, REVOLUTE_HALF_WIDTH)
     room = np.minimum(middle - robot.lower, robot.upper - middle)
     if room.min() <= 0:
         _raise_outside(robot, int(np.argmin(room)), middle, middle)
@@ -160,6 +167,11 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
     if outside.size:
         _raise_outside(robot, int(outside[0]), low, high)
+
+
+def _require_seed(seed: int | tuple[int, ...]) -> None:
+    for part in seed if isinstance(seed, tuple) else (seed,):
+        require_count("seed", part, least=0)
 
 
 def _raise_outside(robot: Robot, i: int, low: Array, high: Array) -> None:

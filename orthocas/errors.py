@@ -1,6 +1,9 @@
 """Every error orthocas raises on purpose: one line that names what came and what was wanted."""
 
+import difflib
 from collections.abc import Iterable
+
+_MOST_NAMES = 30  # names an error lists at the most: those nearest to what came
 
 
 class OrthocasError(Exception):
@@ -25,7 +28,11 @@ class UnknownNameError(OrthocasError, ValueError):
     """A name that does not exist, with those that do."""
 
     def __init__(self, what: str, got: str, known: Iterable[str]) -> None:
-        super().__init__(f"unknown {what} '{got}', known: {', '.join(known)}")
+        names = list(known)
+        if len(names) > _MOST_NAMES:
+            close = difflib.get_close_matches(got, names, _MOST_NAMES, 0.0)
+            names = [*close, f"and {len(names) - len(close)} more"]
+        super().__init__(f"unknown {what} '{got[:80]}', known: {', '.join(names)}")
 
 
 class RobotError(OrthocasError, ValueError):

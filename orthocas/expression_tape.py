@@ -33,6 +33,14 @@ _UNARY: dict[str, Callable[[ca.SX], ca.SX]] = {
     "fabs": ca.fabs,
     "sign": ca.sign,
     "not": ca.logic_not,
+    "floor": ca.floor,
+    "ceil": ca.ceil,
+    "erf": ca.erf,
+    "log1p": ca.log1p,
+    "expm1": ca.expm1,
+    "asinh": ca.asinh,
+    "acosh": ca.acosh,
+    "atanh": ca.atanh,
     "assign": lambda a: a,
 }
 _BINARY: dict[str, Callable[[ca.SX, ca.SX], ca.SX]] = {
@@ -43,6 +51,9 @@ _BINARY: dict[str, Callable[[ca.SX, ca.SX], ca.SX]] = {
     "pow": lambda a, b: a**b,
     "constpow": lambda a, b: a**b,
     "atan2": ca.atan2,
+    "hypot": ca.hypot,
+    "fmod": ca.fmod,
+    "copysign": ca.copysign,
     "fmin": ca.fmin,
     "fmax": ca.fmax,
     "lt": lambda a, b: a < b,
@@ -79,7 +90,7 @@ def to_tape(function: ca.Function) -> Tape:
             steps.append([name, into[1], of[0]])
         else:
             steps.append([name, into[0], *of[: 2 if name in _BINARY else 1]])
-    return {"rows": rows, "columns": columns, "slots": function.sz_w(), "steps": steps}
+    return {"rows": rows, "columns": columns, "steps": steps}
 
 
 def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
@@ -88,17 +99,20 @@ def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
     Raises:
         KeyError, IndexError, TypeError, ValueError: if the tape is malformed (the caller names the file).
     """
-    work: list[ca.SX] = [ca.SX(0)] * int(tape["slots"])
-    result: list[ca.SX] = [ca.SX(0)] * (tape["rows"] * tape["columns"])
+    rows, columns = int(tape["rows"]), int(tape["columns"])
+    work: dict[int, ca.SX] = {}
+    result: dict[int, ca.SX] = {}
     for name, into, *of in tape["steps"]:
         if name == "const":
             work[into] = ca.SX(float(of[0]))
         elif name == "input":
-            work[into] = q[int(of[0])]
+            if not 0 <= of[0] < q.shape[0]:
+                raise IndexError(f"input {of[0]} of {q.shape[0]} joints")
+            work[into] = q[of[0]]
         elif name == "output":
             result[into] = work[of[0]]
         elif name in _UNARY:
             work[into] = _UNARY[name](work[of[0]])
         else:
             work[into] = _BINARY[name](work[of[0]], work[of[1]])
-    return ca.reshape(ca.vertcat(*result), tape["rows"], tape["columns"])
+    return ca.reshape(ca.vertcat(*(result[k] for k in range(rows * columns))), rows, columns)

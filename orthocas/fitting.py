@@ -1,6 +1,5 @@
 """Fitting coordinates to a problem: idle joints split off, spectral start, degree continuation, a minimiser."""
 
-import os
 import time
 from dataclasses import dataclass, replace
 from math import ceil
@@ -8,10 +7,10 @@ from math import ceil
 import numpy as np
 
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_count
+from orthocas.checks import Array, frozen_array, require_count, require_memory
 from orthocas.coordinates import Coordinates, joint_space
 from orthocas.domains import sample_evenly
-from orthocas.errors import InvalidValueError, MemoryNeedError, OrthocasError
+from orthocas.errors import InvalidValueError, OrthocasError
 from orthocas.graph_objective import GraphObjective
 from orthocas.idle_joints import idle_joints
 from orthocas.linear_objective import LinearObjective
@@ -31,6 +30,7 @@ from orthocas.problem import Problem, ProblemCheck, check
 from orthocas.samples import Samples, sample_problem, samples_at
 from orthocas.spectral import spectral_start
 
+_FIRST_SAMPLES = 1000  # tag of the samples that scale coordinates, apart from those of the stages
 MLP_SAMPLES = 2000  #: default sample count of families that are not linear in theta
 
 
@@ -75,13 +75,12 @@ def fit_chart(
 ) -> Fit:
     """Fit coordinates; see `orthocas.fit`, which fills in the default solver."""
     start = time.perf_counter()
-    if samples is not None:
-        require_count("samples", samples, least=2)
-    require_count("seed", seed, least=0)
+    samples = None if samples is None else require_count("samples", samples, least=2)
+    seed = require_count("seed", seed, least=0)
     found = check(problem, seed=seed)
-    first = sample_problem(problem, 200, (seed, 0))
+    first = sample_problem(problem, 200, (seed, _FIRST_SAMPLES))
     space = joint_space(problem)
-    idle = [] if isinstance(parametrisation, Linear) else idle_joints(first)[-problem.r :]
+    idle = [] if isinstance(parametrisation, Linear) else idle_joints(problem, first)[-problem.r :]
     active = [i for i in range(problem.n) if i not in idle]
     run = _Run(problem, space.restricted_to(active), active, weights, samples, seed, monitor)
     r = problem.r - len(idle)
@@ -160,13 +159,14 @@ class _Run:
         """Draw samples, find a start if there is none, and minimise."""
         count = self.samples or self._sample_count(family)
         self.monitor(Progress(parametrisation.label, 0.0, f"sampling {count} points"))
-        points = sample_evenly(self.problem.domain, count, (self.seed, degree))
+        points = sample_evenly(self.problem.domain, count, (self.seed, 1 + degree))
         samples = samples_at(self.problem, points).restricted_to(self.active)
         objective: Objective
         if isinstance(family, LinearFamily):
             theta = spectral_start(family, samples) if theta is None else theta
             objective = LinearObjective(family, samples, self.weights, theta)
         else:
+            self._require_graph_memory(parametrisation.label, family, count)
             theta = family.initial(self.seed) if theta is None else theta
             objective = GraphObjective(family, samples, self.weights, theta)
         result = solver.minimise(objective, theta, self.monitor, parametrisation.label).raise_if_failed()
@@ -174,7 +174,7 @@ class _Run:
 
     def linear(self, parametrisation: Linear) -> Array:
         """Normals of linear coordinates at their base."""
-        base = self.space.centre if parametrisation.base is None else np.asarray(parametrisation.base, dtype=float)
+        base = _base(self.problem, parametrisation)
         at_base = samples_at(self.problem, base[None, :])
         if len(at_base) == 0:
             raise InvalidValueError("base", base.tolist(), "a joint position where no task gradient vanishes")
@@ -186,16 +186,23 @@ class _Run:
             return MLP_SAMPLES
         return 1000 + ceil(140 * len(family.terms) / (self.problem.m + family.outputs - 1))
 
+    def _require_graph_memory(self, label: str, family: Family, count: int) -> None:
+        """Refuse a network whose parameters and minimiser memory do not fit."""
+        require_memory(f"{label} with {family.size} parameters", 8.0 * (60 * family.size + 100 * count * self.space.n))
+
     def _require_memory(self, target: GradedParametrisation, r: int) -> None:
         """Refuse a degree that does not fit, before building anything."""
         K = target.term_count(self.space.n)
         N = self.samples or 1000 + 140 * K / (self.problem.m + r - 1)
         needed = 8 * (N * self.space.n * K + 4 * (r * K) ** 2)
-        available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        if needed > 0.8 * available:
-            raise MemoryNeedError(
-                f"{target.label} on {self.space.n} joints with {K} basis functions", needed, available
-            )
+        require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)
+
+
+def _base(problem: Problem, parametrisation: Linear) -> Array:
+    """Base q0 of linear coordinates, (n,)."""
+    return frozen_array(
+        "base", problem.domain.centre if parametrisation.base is None else parametrisation.base, (problem.n,)
+    )
 
 
 def _normalised(
@@ -207,11 +214,15 @@ def _normalised(
     r: int,
     samples: Samples,
 ) -> Coordinates:
-    """Shift and scale so that xi(centre) = 0 and each coordinate's mean gradient length is 1."""
+    """Shift and scale so that xi(centre) = 0 and each coordinate's mean gradient length is 1.
+
+    Linear coordinates keep their unit normals and vanish at their own base.
+    """
     raw = Coordinates(parametrisation, space, idle, theta, np.zeros(r), np.ones(r))
     lengths = np.linalg.norm(raw.jacobian(samples.points)[:, :r], axis=2).mean(axis=0)
     if r and not lengths.min() > 0:
         raise OrthocasError(f"coordinate {int(np.argmin(lengths))} has no gradient on the domain")
-    offset = raw.xi(problem.domain.centre[None, :])[0, :r]
+    base = _base(problem, parametrisation) if isinstance(parametrisation, Linear) else problem.domain.centre
+    offset = raw.xi(base[None, :])[0, :r]
     scale = np.ones(r) if isinstance(parametrisation, Linear) else 1 / lengths
     return Coordinates(parametrisation, space, idle, theta, offset, scale)

@@ -2,15 +2,18 @@
 
 import numpy as np
 
+from orthocas.problem import Problem
 from orthocas.samples import Samples
 
 _NEGLIGIBLE = 1e-12
 
 
-def idle_joints(samples: Samples) -> list[int]:
-    """Joints k whose column of J_x vanishes and whose row of A^-1 is zero off the diagonal, at every sample.
+def idle_joints(problem: Problem, samples: Samples) -> list[int]:
+    """Joints k that the task does not feel and the metric keeps apart.
 
-    Then J_x A^-1 e_k = 0, so xi = q_k is exact, and orthogonal to every coordinate that does not use q_k.
+    The column of J_x vanishes and the row of A^-1 is zero off the diagonal at every sample, and A does not depend on
+    q_k. Then J_x A^-1 e_k = 0, so xi = q_k is exact, orthogonal to every coordinate of the other joints, and the rest
+    of the problem does not know of joint k.
     """
     J = samples.task_jacobian
     size = np.abs(J).max(axis=(0, 1))
@@ -19,4 +22,6 @@ def idle_joints(samples: Samples) -> list[int]:
         B = np.abs(samples.metric_inverse).max(axis=0)
         off_diagonal = (B - np.diag(B.diagonal())).max(axis=1)
         idle &= off_diagonal <= _NEGLIGIBLE * B.diagonal()
+        felt_by_metric = problem.metric.function.jac_sparsity(0, 0).get_col()
+        idle[felt_by_metric] = False
     return [int(k) for k in np.flatnonzero(idle)]

@@ -9,7 +9,7 @@ from orthocas.batch import dense_function
 from orthocas.checks import require_shape
 from orthocas.errors import InvalidValueError
 
-DEFAULT_WEIGHTS = (1000.0, 30.0, 120.0)  #: lambda1, lambda2, lambda3; at the paper's 1000 : 1 the optimum can lose rank
+DEFAULT_WEIGHTS = (1000.0, 30.0, 150.0)  #: lambda1, lambda2, lambda3; at the paper's 1000 : 1 the optimum can lose rank
 REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
 
 
@@ -25,6 +25,8 @@ class Weights:
         for name, value in (("lambda1", self.task), ("lambda2", self.mutual), ("lambda3", self.regularity)):
             if not 0 <= value < float("inf"):
                 raise InvalidValueError(name, value, "a finite number >= 0")
+        for name in ("task", "mutual", "regularity"):
+            object.__setattr__(self, name, float(getattr(self, name)))
         if self.task == 0:
             raise InvalidValueError("lambda1", self.task, "a positive number")
 

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from orthocas.batch import Batched, dense_function
 from orthocas.checks import Array, frozen_array, require_known
+from orthocas.custom_expression import expression_of
 from orthocas.errors import MetricError, ShapeError
-from orthocas.expression_tape import to_tape
 from orthocas.robots import Robot
 
 METRIC_KINDS = ("euclidean", "inertia")
@@ -42,11 +42,10 @@ class Metric:
             A = robot.function("mass_matrix")(q) if spec == "inertia" else ca.SX.eye(robot.n)
             return cls(spec, dense_function("metric", [q], [A]), {"kind": spec})
         if callable(spec):
-            A = ca.SX(spec(q))
+            A = expression_of("metric", spec, q)
             if A.shape != (robot.n, robot.n):
                 raise ShapeError("metric", A.shape, (robot.n, robot.n))
-            function = dense_function("metric", [q], [A])
-            return cls("custom", function, {"kind": "custom", "tape": to_tape(function)})
+            return cls("custom", dense_function("metric", [q], [A]), {"kind": "custom"})
         matrix = frozen_array("metric", spec, (robot.n, robot.n))
         require_spd(matrix[None], np.zeros((1, robot.n)))
         return cls(

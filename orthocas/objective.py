@@ -74,6 +74,7 @@ class SolveResult:
         return self
 
 
+@runtime_checkable
 class Solver(Protocol):
     """A minimiser."""
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.checks import Array
+from orthocas.checks import Array, require_shape
 from orthocas.domains import Domain, default_box, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
 from orthocas.metrics import Metric, metric_matrices
@@ -42,14 +42,27 @@ class Problem:
     def __init__(
         self, robot: Robot, task: Task, metric: Any = "euclidean", domain: Domain | None = None, name: str = "custom"
     ) -> None:
+        if not isinstance(task, Task) or not isinstance(robot, Robot):
+            raise InvalidValueError(
+                "robot and task", f"{type(robot).__name__} and {type(task).__name__}", "Robot and Task"
+            )
         if task.robot is not robot:
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
         if task.m >= robot.n:
             raise NotRedundantError(task.m, robot.n)
         domain = default_box(robot) if domain is None else domain
+        if not isinstance(domain, Domain):
+            raise InvalidValueError("domain", repr(domain), "a Box or a Torus")
         require_within_limits(robot, domain)
         metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
-        for key, value in (("robot", robot), ("task", task), ("metric", metric), ("domain", domain), ("name", name)):
+        require_shape("metric", metric.function.size_out(0), (robot.n, robot.n))
+        for key, value in (
+            ("robot", robot),
+            ("task", task),
+            ("metric", metric),
+            ("domain", domain),
+            ("name", str(name)),
+        ):
             object.__setattr__(self, key, value)
 
     @property

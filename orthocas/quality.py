@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_count
+from orthocas.checks import Array, require_count, require_memory
 from orthocas.domains import sample_uniform
+from orthocas.errors import SingularTaskError
 from orthocas.loss import pairs
 from orthocas.metrics import metric_matrices
 from orthocas.samples import Samples, samples_at
@@ -102,11 +103,13 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
         samples: number of samples N.
         seed: seed of the samples.
     """
-    require_count("samples", samples)
-    require_count("seed", seed, least=0)
+    samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
+    require_memory(f"evaluating {samples} samples", 8.0 * samples * chart.n * (chart.n + 4))
     points = sample_uniform(chart.problem.domain, samples, seed)
     parts = [_judge(chart, points[start : start + _CHUNK]) for start in range(0, samples, _CHUNK)]
     task, mutual, smallest, signs, kept = (np.concatenate([part[i] for part in parts]) for i in range(5))
+    if len(kept) == 0:
+        raise SingularTaskError(f"a gradient vanishes at all {samples} samples, nothing to evaluate")
     worst = int(np.argmin(smallest))
     return Report(
         n=chart.n,

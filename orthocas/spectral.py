@@ -7,6 +7,7 @@ from orthocas.parametrisations import LinearFamily
 from orthocas.samples import Samples
 
 _MUTUAL_WEIGHT = 1.0
+_MIXING_ANGLE = np.radians(10)
 _RIDGE = 1e-10  # relative; keeps the pencil definite where basis functions coincide on the samples
 
 
@@ -36,4 +37,16 @@ def spectral_start(family: LinearFamily, samples: Samples) -> Array:
         length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))
         along = np.einsum("sn,snk->sk", gradient / length[:, None], G)
         S = S + _MUTUAL_WEIGHT * along.T @ along / N
-    return np.concatenate(found)
+    return _mixed(np.array(found), G).ravel()
+
+
+def _mixed(C: Array, G: Array) -> Array:
+    """Scale coordinates to a mean gradient length of 1 and mix neighbours a little.
+
+    The spectral solution inherits the symmetries of the problem, and a symmetric point is often a saddle of the loss.
+    """
+    C = C / np.linalg.norm(G @ C.T, axis=1).mean(axis=0)[:, None]
+    c, s = np.cos(_MIXING_ANGLE), np.sin(_MIXING_ANGLE)
+    for j in range(len(C) - 1):
+        C[j], C[j + 1] = c * C[j] + s * C[j + 1], c * C[j + 1] - s * C[j]
+    return C

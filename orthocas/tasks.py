@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from orthocas.batch import Batched, dense_function
 from orthocas.checks import frozen_array
+from orthocas.custom_expression import expression_of
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
-from orthocas.expression_tape import to_tape
 from orthocas.robots import Robot
 
 TASK_KINDS = ("position", "position:AXES", "polar", "orientation", "pose")
@@ -67,7 +67,7 @@ class Task:
     def custom(
         cls, robot: Robot, name: str, function: Callable[[ca.SX], ca.SX] | ca.Function, labels: Sequence[str] = ()
     ) -> Self:
-        """Any task that CasADi can express.
+        """Any task of elementary operations that CasADi can express.
 
         Args:
             robot: the robot.
@@ -79,14 +79,14 @@ class Task:
             ShapeError: if x is not a column.
         """
         q = ca.SX.sym("q", robot.n)
-        x = ca.SX(function(q))
+        x = expression_of(f"task '{name}'", function, q)
         if x.shape[1] != 1 or x.shape[0] == 0:
             raise ShapeError(f"task '{name}'", x.shape, (None, 1))
-        labels = tuple(labels) or tuple(f"{name}[{i}]" for i in range(x.shape[0]))
+        labels = tuple(str(label) for label in labels) or tuple(f"{name}[{i}]" for i in range(x.shape[0]))
         if len(labels) != x.shape[0]:
             raise ShapeError("labels", (len(labels),), (x.shape[0],))
         h = dense_function("h", [q], [x])
-        return cls(robot, name, labels, h, {"kind": "custom", "name": name, "labels": labels, "tape": to_tape(h)})
+        return cls(robot, str(name), labels, h, {"kind": "custom", "name": str(name), "labels": labels})
 
     @classmethod
     def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> Self:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orthocas.checks import Array
+from orthocas.checks import Array, require_count
 from orthocas.errors import InvalidValueError
 from orthocas.objective import LeastSquaresObjective, Monitor, Objective, Progress, SolveResult, Status, silent
 
@@ -23,9 +23,14 @@ class GaussNewton:
         tolerance: stop when a step lowers the loss by less than this share.
     """
 
-    max_iterations: int = 30
+    max_iterations: int = 100
     tolerance: float = 1e-3
     name: str = "gauss_newton"
+
+    def __post_init__(self) -> None:
+        require_count("max_iterations", self.max_iterations)
+        if not self.tolerance >= 0:
+            raise InvalidValueError("tolerance", self.tolerance, "a number >= 0")
 
     def coarser(self) -> "GaussNewton":
         """At most 10 iterations."""
@@ -45,6 +50,8 @@ class GaussNewton:
         try:
             status = run.iterate(monitor, stage)
         except KeyboardInterrupt:
+            if not np.isfinite(run.value):  # nothing found yet
+                raise
             status = Status.INTERRUPTED
         return run.result(status)
 
@@ -86,7 +93,7 @@ class _Run:
             self.evaluations += 1
             if value < self.value:
                 self.theta, self.value = candidate, value
-                self.damping = max(self.damping / 5, 1e-3)
+                self.damping = max(self.damping / 5, 1e-7)
                 return True
             self.damping *= 4
         return False

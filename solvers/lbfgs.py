@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.optimize
 
-from orthocas.checks import Array
+from orthocas.checks import Array, require_count
+from orthocas.errors import InvalidValueError
 from orthocas.objective import Monitor, Objective, Progress, SolveResult, Status, silent
 
 
@@ -24,6 +25,11 @@ class LBFGS:
     tolerance: float = 1e-6
     memory: int = 20
     name: str = "lbfgs"
+
+    def __post_init__(self) -> None:
+        require_count("max_iterations", self.max_iterations)
+        if not self.tolerance >= 0:
+            raise InvalidValueError("tolerance", self.tolerance, "a number >= 0")
 
     def coarser(self) -> "LBFGS":
         """A quarter of the iterations."""
@@ -49,9 +55,11 @@ class LBFGS:
             )
             status = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}.get(outcome.status, Status.STALLED)
         except KeyboardInterrupt:
+            if not np.isfinite(run.value):  # nothing found yet
+                raise
             status = Status.INTERRUPTED
         if not np.isfinite(run.value):
-            status = Status.FAILED if status is not Status.INTERRUPTED else status
+            status = Status.FAILED
         return SolveResult(
             run.theta, run.value, status, run.iterations, run.evaluations, time.perf_counter() - run.start
         )

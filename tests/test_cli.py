@@ -2,6 +2,7 @@
 
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -135,11 +136,17 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["fit", "iiwa", "--param", "polynomial:0"], "degree is 0, expected a whole number >= 1"),
         (["fit", "iiwa", "--param", "polynomial:25"], "GiB"),
         (["fit", "iiwa", "--solver", "sgd"], "unknown solver 'sgd', known: gauss_newton, lbfgs"),
+        (["fit", "iiwa", "--param", "mlp:100000x100000"], "GiB"),
+        (["fit", "iiwa", "--half-width", "1e300"], "half_width is 1e+300"),
+        (["fit", "iiwa", "--metric", ""], "unknown metric ''"),
+        (["fit", "iiwa", "--out", "x" * 300], "File name too long"),
+        (["fit", "x\n" * 300], "unknown problem 'x"),
+        (["info", PANDA, "--tip", "panda"], "panda_hand"),
         (["fit", "iiwa", "--samples", "0"], "samples is 0"),
         (["fit", "iiwa", "--samples", "many"], "'many' came, expected a whole number"),
         (["fit", "iiwa", "--half-width", "wide"], "'wide' came, expected a number"),
         (["fit", "iiwa", "--seed", "-1"], "seed is -1, expected a whole number >= 0"),
-        (["fit", "iiwa", "--weights", "1000,nan"], "--weights"),
+        (["fit", "iiwa", "--weights", "1000,nan"], "lambda2 is nan"),
         (["fit", "iiwa", "--weights", "1000"], "two or three numbers"),
         (["fit", "iiwa", "--weights", "0,1"], "lambda1 is 0.0"),
         (["fit", "iiwa", "--out", "no/such/folder/x.orthocas"], "folder no/such/folder does not exist"),
@@ -181,13 +188,28 @@ def test_output_folder_is_checked_before_the_long_work(run) -> None:
     assert time.perf_counter() - start < 5  # the fit itself takes far longer
 
 
+def _read_terminal(descriptor: int) -> bytes:
+    """What the other side wrote; nothing once it is closed."""
+    try:
+        return os.read(descriptor, 4096)
+    except OSError:
+        return b""
+
+
 def test_ctrl_c_saves_the_best_chart_so_far(tmp_path: Path) -> None:
-    """A degree-6 fit takes much longer than two seconds, and its low degrees much less."""
+    """The signal is sent when the progress bar, on a pseudo-terminal, shows the third degree of six."""
     command = [sys.executable, "-m", "orthocas", "fit", "iiwa", "--param", "polynomial:6", "--out", "c.orthocas"]
-    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, stdout=subprocess.DEVNULL)
-    time.sleep(6)
-    os.kill(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=theirs, stdout=subprocess.DEVNULL)
+    os.close(theirs)
+    seen, stop_sent = b"", False
+    while chunk := _read_terminal(ours):
+        seen += chunk
+        if b"polynomial:4" in seen and not stop_sent:
+            os.kill(process.pid, signal.SIGINT)
+            stop_sent = True
+    process.wait(timeout=60)
+    err = seen.decode(errors="replace")
     assert process.returncode == 130
     assert "Traceback" not in err
     assert "best coordinates found so far" in err

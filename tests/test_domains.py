@@ -1,5 +1,7 @@
 """Domains: sampling, limits, default boxes, bad input."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from conftest import robot_data
@@ -63,6 +65,14 @@ def test_default_box_of_prismatic_joint_is_in_metres() -> None:
     np.testing.assert_allclose(default_box(robot).half_width[0], 0.35 / 2)
 
 
+def test_default_box_with_a_limit_on_one_side_lies_inside_it() -> None:
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
+    limits = {"lower": np.array([-np.inf, 0.5, -np.inf]), "upper": np.array([-1.0, np.inf, np.inf])}
+    robot = oc.Robot(dataclasses.replace(robot.tree, **limits))
+    np.testing.assert_allclose(default_box(robot).centre, [-1 - np.pi / 4, 0.5 + np.pi / 4, 0])
+    require_within_limits(robot, default_box(robot))
+
+
 def test_domain_outside_limits_names_the_joint() -> None:
     robot = panda()
     task = oc.Task.position(robot)
@@ -93,6 +103,14 @@ def test_bad_boxes_are_refused() -> None:
         oc.Box([0.0, np.nan], 1.0)
     with pytest.raises(InvalidValueError, match="empty"):
         oc.Box([], 1.0)
+    with pytest.raises(InvalidValueError, match="half_width"):
+        oc.Box([0.0], 1e300)
+    with pytest.raises(InvalidValueError, match="array of numbers"):
+        oc.Box([0.0], "wide")
+    with pytest.raises(ShapeError):
+        oc.Box([0.0, 0.0], np.ones((2, 2)))
+    with pytest.raises(InvalidValueError, match="seed is -1"):
+        sample_uniform(oc.Torus(1), 1, -1)
     with pytest.raises(InvalidValueError):
         oc.Torus(0)
     with pytest.raises(InvalidValueError, match="samples"):

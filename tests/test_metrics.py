@@ -42,6 +42,13 @@ def test_custom_metric_is_checked_on_the_domain() -> None:
         oc.check(problem(lambda q: ca.diag(ca.vertcat(1 / ca.fmax(q[0] - 10, 0), 1))))
 
 
+def test_metric_of_another_robot_is_refused() -> None:
+    big = oc.Robot.planar([1.0] * 3, [1.0] * 3)
+    other = oc.Problem(big, oc.Task.position(big, "x"), "inertia").metric
+    with pytest.raises(ShapeError, match="metric"):
+        problem(other)
+
+
 def test_wrong_shape_and_unknown_name_are_refused() -> None:
     with pytest.raises(ShapeError, match="metric"):
         problem(np.eye(3))

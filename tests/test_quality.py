@@ -1,5 +1,6 @@
 """Figures of merit against closed forms and a second computation."""
 
+import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
@@ -8,7 +9,7 @@ import orthocas as oc
 from orthocas.chart import Chart
 from orthocas.coordinates import Coordinates, joint_space
 from orthocas.domains import sample_uniform
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, MemoryNeedError, SingularTaskError
 from orthocas.fitting import Fit
 from orthocas.quality import AngleStatistics
 
@@ -88,6 +89,15 @@ def test_folded_samples_are_counted() -> None:
     assert report.folded_samples / report.samples == pytest.approx((half - 0.6) / (2 * half), abs=0.01)
 
 
+def test_nothing_left_to_evaluate_is_an_error() -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    problem = oc.Problem(robot, oc.Task.custom(robot, "flat", lambda q: ca.fmax(q[0], 0) ** 2))
+    chart = oc.fit(problem, oc.Polynomial(1)).chart
+    flat = Chart(oc.Problem(robot, problem.task, domain=oc.Box([-0.5, 0], 0.4)), chart.coordinates)
+    with pytest.raises(SingularTaskError, match="all 10 samples"):
+        oc.evaluate(flat, 10)
+
+
 def test_held_out_samples_depend_on_the_seed(planar_fit: Fit) -> None:
     first, again, other = (oc.evaluate(planar_fit.chart, 500, seed) for seed in (1, 1, 2))
     assert first.as_dict() == again.as_dict()
@@ -116,3 +126,5 @@ def test_histogram_counts_degrees() -> None:
 def test_samples_must_be_positive(planar_fit: Fit) -> None:
     with pytest.raises(InvalidValueError, match="samples is 0"):
         oc.evaluate(planar_fit.chart, samples=0)
+    with pytest.raises(MemoryNeedError, match="GiB"):
+        oc.evaluate(planar_fit.chart, samples=10**14)

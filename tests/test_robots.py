@@ -40,9 +40,8 @@ def pinocchio_position(model: pin.Model, q: np.ndarray) -> np.ndarray:
 def test_dynamics_and_kinematics_match_pinocchio_on_random_states(name: str) -> None:
     file, tip = ROBOTS[name]
     full = files.read_urdf(robot_data(file))
-    locked = files.joints_off_chain(full, tip) if "both arms" not in name else {}
-    model = files.lock_joints(full, locked)
-    robot = oc.Robot.from_model(full, tip, locked)
+    model = full if "both arms" in name else files.lock_off_chain(full, tip)
+    robot = oc.Robot.from_model(model, tip)
     data, frame = model.createData(), model.getFrameId(tip)
     rng = np.random.default_rng(7)
     q, dq, ddq, w = rng.uniform(-2, 2, (4, 100, robot.n))
@@ -253,6 +252,60 @@ def test_malformed_urdf_gets_one_clear_error(
     with pytest.raises(RobotError, match=message):
         oc.Robot.from_urdf(path)
     assert capfd.readouterr().err == ""  # the C++ parser's own lines are part of the message instead
+
+
+ARM = """<robot name="r"><link name="base"/>
+<link name="a"><inertial><mass value="{mass}"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+<joint name="{joint}" type="{kind}"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
+<limit lower="{lower}" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
+
+def one_joint(folder: Path, mass: str = "1", joint: str = "j", kind: str = "revolute", lower: str = "-1") -> Path:
+    path = folder / "arm.urdf"
+    path.write_text(ARM.format(mass=mass, joint=joint, kind=kind, lower=lower))
+    return path
+
+
+@pytest.mark.parametrize(("mass", "message"), [("nan", "mass"), ("abc", "mass"), ("-1", "mass -1 kg, expected >= 0")])
+def test_broken_inertias_are_not_swallowed(tmp_path: Path, mass: str, message: str) -> None:
+    with pytest.raises(RobotError, match=message):
+        oc.Robot.from_urdf(one_joint(tmp_path, mass=mass), "a")
+
+
+def test_link_and_joint_may_share_a_name(tmp_path: Path) -> None:
+    robot = oc.Robot.chain_from_file(one_joint(tmp_path, joint="a"), "a")
+    assert robot.joint_names == ("a",)
+
+
+def test_limits_the_wrong_way_round_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="joint 'j' has limits"):
+        oc.Robot.from_urdf(one_joint(tmp_path, lower="2"), "a")
+
+
+def test_joints_of_any_type_off_the_chain_are_locked(tmp_path: Path) -> None:
+    path = one_joint(tmp_path)
+    floating = (
+        """<link name="b"/><joint name="free" type="floating"><parent link="base"/><child link="b"/></joint></robot>"""
+    )
+    path.write_text(path.read_text().replace("</robot>", floating))
+    assert oc.Robot.chain_from_file(path, "a").joint_names == ("j",)
+    with pytest.raises(RobotError, match="free"):
+        oc.Robot.from_urdf(path, "a")
+
+
+def test_locked_must_be_a_mapping_to_numbers() -> None:
+    path = robot_data("ur_description/urdf/ur5_robot.urdf")
+    with pytest.raises(InvalidValueError, match="mapping"):
+        oc.Robot.from_urdf(path, "tool0", ["elbow_joint"])  # type: ignore[arg-type]
+    with pytest.raises(InvalidValueError, match="elbow_joint"):
+        oc.Robot.from_urdf(path, "tool0", {"elbow_joint": "x"})  # type: ignore[dict-item]
+
+
+def test_long_lists_of_names_are_cut_to_the_nearest() -> None:
+    with pytest.raises(UnknownNameError, match="gripper_left_base_link.*and .* more") as caught:
+        oc.Robot.from_urdf(robot_data("talos_data/robots/talos_reduced.urdf"), "gripper_left_base_lin")
+    assert len(str(caught.value)) < 1000  # the robot has 170 frames
 
 
 def test_missing_urdf_names_the_path(tmp_path: Path) -> None:

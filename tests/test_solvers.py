@@ -45,6 +45,10 @@ class Interrupted(Valley):
         self.count()
         return super().value_and_gradient(theta)
 
+    def normal_equations(self, theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        self.count()
+        return super().normal_equations(theta)
+
     def count(self) -> None:
         self.left -= 1
         if self.left < 0:
@@ -81,6 +85,10 @@ class TestContract:
         assert result.status is Status.INTERRUPTED
         assert result.value < Valley().value(START)
         np.testing.assert_allclose(Valley().value(result.theta), result.value)
+
+    def test_interrupt_before_the_first_value_is_passed_on(self, solver: Solver) -> None:
+        with pytest.raises(KeyboardInterrupt):
+            solver.minimise(Interrupted(after=0), START)
 
     def test_not_finite_loss_fails(self, solver: Solver) -> None:
         result = solver.minimise(NotFinite(), START)

@@ -8,7 +8,7 @@ from orthocas.problems.iiwa import robot as iiwa_robot
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
-from orthocas.expression_tape import from_tape
+from orthocas.expression_tape import from_tape, to_tape
 
 Q = np.array([0.3, 0.7, -0.4, -1.0, 0.5, 0.9, 0.2])
 
@@ -61,7 +61,7 @@ def test_custom_task_survives_its_recipe() -> None:
 
     task = oc.Task.custom(robot, "odd", odd, labels=("a", "b"))
     symbol = ca.SX.sym("q", 3)
-    again = ca.Function("again", [symbol], [from_tape(task.recipe["tape"], symbol)])
+    again = ca.Function("again", [symbol], [from_tape(to_tape(task.function), symbol)])
     for q in np.random.default_rng(0).uniform(-2, 2, (20, 3)):
         np.testing.assert_allclose(np.array(again(q)), np.array(task.function(q)), atol=1e-14)
 
@@ -79,5 +79,16 @@ def test_bad_tasks_are_refused() -> None:
         oc.Task.pose(robot, np.eye(4))
     with pytest.raises(ShapeError, match="task 'flat'"):
         oc.Task.custom(robot, "flat", lambda q: ca.horzcat(q[0], q[1]))
+    broken = {
+        "none": lambda q: None,
+        "mx": lambda q: ca.MX.sym("x"),
+        "too far": lambda q: q[7],
+        "free": lambda q: q[0] + ca.SX.sym("unknown"),
+        "two arguments": lambda q, p: q,
+        "text": "q[0]",
+    }
+    for name, function in broken.items():
+        with pytest.raises(InvalidValueError, match=f"task '{name}' is"):
+            oc.Task.custom(robot, name, function)
     with pytest.raises(ShapeError, match="labels"):
         oc.Task.custom(robot, "one", lambda q: q[0], labels=("a", "b"))

@@ -10,6 +10,7 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.cli.problem_argument import ProblemName, ProblemOptions, TipName, build_problem, is_robot_file
+from orthocas.errors import InvalidValueError
 from orthocas.problem import Problem, check
 from orthocas.robots import Robot
 
@@ -20,6 +21,8 @@ def info(target: ProblemName, tip: TipName = None, json: AsJson = False) -> None
         data = _robot(Robot.chain_from_file(target, tip))
     elif target in problems.names():
         data = _problem(build_problem(target, ProblemOptions(tip=tip)))
+    elif tip is not None:
+        raise InvalidValueError("--tip", tip, f"no tip for the chart {target}, it has its own")
     else:
         chart = Chart.load(_chart_path(target))
         data = {

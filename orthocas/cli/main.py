@@ -2,6 +2,7 @@
 
 import sys
 
+import numpy as np
 import typer
 
 from orthocas.cli.evaluate import evaluate
@@ -24,13 +25,21 @@ app.command()(evaluate)
 app.command()(info)
 
 
+def _complain(text: str) -> None:
+    """One line of bounded length on standard error."""
+    line = " ".join(text.split())
+    typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
+
+
 def main() -> None:
     """Run the command line; bad input gives one line on standard error and exit code 2."""
     try:
         code = app(standalone_mode=False)
     except (OrthocasError, typer.TyperException) as error:
-        text = error.format_message() if isinstance(error, typer.TyperException) else str(error)
-        typer.echo(f"orthocas: {' '.join(text.split())}" if len(text) < 500 else text, err=True)
+        _complain(error.format_message() if isinstance(error, typer.TyperException) else str(error))
+        code = 2
+    except (OSError, MemoryError, np.linalg.LinAlgError) as error:  # from below: still one line, not a traceback
+        _complain(f"{type(error).__name__}: {error}")
         code = 2
     except KeyboardInterrupt:
         code = INTERRUPTED

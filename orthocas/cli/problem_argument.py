@@ -67,7 +67,7 @@ def build_problem(name: str, options: ProblemOptions) -> Problem:
     kept = options.centre is None and options.half_width is None
     domain = base.domain if kept else default_box(base.robot, centre, options.half_width)
     task = base.task if options.task is None else Task.named(base.robot, options.task, domain.centre)
-    return Problem(base.robot, task, options.metric or base.metric, domain, name)
+    return Problem(base.robot, task, base.metric if options.metric is None else options.metric, domain, name)
 
 
 def parse_numbers(option: str, text: str) -> Array:
@@ -79,5 +79,5 @@ def _from_file(path: Path, options: ProblemOptions) -> Problem:
     robot = Robot.chain_from_file(path, options.tip)
     centre = None if options.centre is None else parse_numbers("--centre", options.centre)
     domain = default_box(robot, centre, options.half_width)
-    task = Task.named(robot, options.task or "position", domain.centre)
-    return Problem(robot, task, options.metric or "euclidean", domain, path.stem)
+    task = Task.named(robot, "position" if options.task is None else options.task, domain.centre)
+    return Problem(robot, task, "euclidean" if options.metric is None else options.metric, domain, path.stem)

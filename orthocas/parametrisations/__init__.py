@@ -6,7 +6,12 @@ from orthocas.parametrisations.linear import Linear
 from orthocas.parametrisations.mlp import MLP
 from orthocas.parametrisations.polynomial import Polynomial
 from orthocas.parametrisations.product_basis import GradedParametrisation, LinearFamily
-from orthocas.parametrisations.registry import PARAMETRISATIONS, parse_parametrisation
+from orthocas.parametrisations.registry import (
+    PARAMETRISATIONS,
+    parametrisation_from_data,
+    parametrisation_to_data,
+    parse_parametrisation,
+)
 
 __all__ = [
     "MLP",
@@ -21,5 +26,7 @@ __all__ = [
     "Polynomial",
     "embed",
     "joint_derivatives",
+    "parametrisation_from_data",
+    "parametrisation_to_data",
     "parse_parametrisation",
 ]

@@ -22,7 +22,7 @@ class Fourier:
     degree: int
 
     def __post_init__(self) -> None:
-        require_count("degree", self.degree)
+        object.__setattr__(self, "degree", require_count("degree", self.degree))
 
     @property
     def label(self) -> str:

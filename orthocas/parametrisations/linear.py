@@ -6,7 +6,7 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 
-from orthocas.checks import Array, require_known
+from orthocas.checks import Array, frozen_array, require_known
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.parametrisations.family import JointSpace
 from orthocas.parametrisations.product_basis import LinearFamily
@@ -29,6 +29,8 @@ class Linear:
 
     def __post_init__(self) -> None:
         require_known("normals", self.normals, ("orthonormal", "paper"))
+        if self.base is not None:
+            object.__setattr__(self, "base", tuple(frozen_array("base", self.base, (None,)).tolist()))
 
     @property
     def label(self) -> str:

@@ -22,11 +22,9 @@ class MLP:
     hidden: tuple[int, ...] = (64, 64)
 
     def __post_init__(self) -> None:
-        if not self.hidden:
-            raise InvalidValueError("hidden", self.hidden, "at least one hidden layer")
-        for width in self.hidden:
-            require_count("hidden", width)
-        object.__setattr__(self, "hidden", tuple(self.hidden))
+        if not isinstance(self.hidden, tuple | list) or not self.hidden:
+            raise InvalidValueError("hidden", self.hidden, "the widths of at least one hidden layer, such as (64, 64)")
+        object.__setattr__(self, "hidden", tuple(require_count("hidden", width) for width in self.hidden))
 
     @property
     def label(self) -> str:

@@ -1,6 +1,8 @@
-"""Parametrisations by their short names, for the command line and chart files."""
+"""Parametrisations by name: short labels for the command line, plain data for chart files."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any
 
 from orthocas.checks import require_known
 from orthocas.errors import InvalidValueError
@@ -32,6 +34,35 @@ PARAMETRISATIONS: dict[str, Callable[[str, str], Parametrisation]] = {
     "fourier": lambda label, text: Fourier(_whole(label, text)),
     "mlp": lambda label, text: MLP(tuple(_whole(label, width) for width in text.split("x"))),
 }
+
+
+_CLASSES: dict[str, type[Linear] | type[Polynomial] | type[Fourier] | type[MLP]] = {
+    kind.__name__: kind for kind in (Linear, Polynomial, Fourier, MLP)
+}
+
+
+def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
+    """Kind and settings as plain data.
+
+    Raises:
+        InvalidValueError: if it is not one of ours, so that it could not be read back.
+    """
+    if not isinstance(parametrisation, Linear | Polynomial | Fourier | MLP):
+        known = ", ".join(_CLASSES)
+        raise InvalidValueError(
+            "parametrisation", type(parametrisation).__name__, f"one that chart files know: {known}"
+        )
+    return {"parametrisation": type(parametrisation).__name__, "settings": asdict(parametrisation)}
+
+
+def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
+    """Read `parametrisation_to_data` back.
+
+    Raises:
+        UnknownNameError: if there is no such parametrisation.
+    """
+    require_known("parametrisation", data["parametrisation"], _CLASSES)
+    return _CLASSES[data["parametrisation"]](**data["settings"])
 
 
 def parse_parametrisation(label: str) -> Parametrisation:

@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from orthocas.checks import Array, require_known
 from orthocas.errors import InvalidValueError, RobotError
+from orthocas.robots.pinocchio_model import frame_index
 
 
 def read_urdf(path: str | Path) -> pin.Model:
@@ -40,35 +41,36 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
         UnknownNameError: if there is no such joint.
         InvalidValueError: if a position is not finite.
     """
+    if not isinstance(locked, Mapping):
+        raise InvalidValueError("locked", locked, "a mapping from joint names to positions")
     names = list(model.names)[1:]
     position = pin.neutral(model)
     ids = []
     for name, value in locked.items():
         require_known("joint", name, names)
-        if not np.isfinite(value):
-            raise InvalidValueError(f"locked position of joint '{name}'", value, "a finite number")
+        if not isinstance(value, int | float | np.number) or not np.isfinite(value):
+            raise InvalidValueError(f"locked position of joint '{name}'", repr(value), "a finite number")
         ids.append(model.getJointId(name))
         _set_position(model, ids[-1], float(value), position)
     ids += [i for i in _mimic_ids(model) if i not in ids and _is_led_by(model, i, ids)]
     return pin.buildReducedModel(model, ids, position) if ids else model
 
 
-def joints_off_chain(model: pin.Model, tip: str) -> dict[str, float]:
-    """Joints that do not move the tip, with the position nearest to zero inside their limits.
+def lock_off_chain(model: pin.Model, tip: str) -> pin.Model:
+    """Fix every joint that does not move the tip, whatever its type, at neutral or the limit next to zero.
 
     Raises:
         UnknownNameError: if there is no frame called tip.
     """
-    require_known("frame", tip, [frame.name for frame in model.frames])
-    chain = set(model.supports[model.frames[model.getFrameId(tip)].parentJoint])
-    mimic = _mimic_ids(model)
-    positions = {}
-    for i in range(1, model.njoints):
+    chain = set(model.supports[model.frames[frame_index(model, tip)].parentJoint])
+    ids = [i for i in range(1, model.njoints) if i not in chain]
+    position = pin.neutral(model)
+    for i in ids:
         joint = model.joints[i]
-        if i not in chain and i not in mimic and joint.nv == 1:
+        if joint.nq == joint.nv == 1 and i not in _mimic_ids(model):
             limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-            positions[model.names[i]] = 0.0 if joint.nq == 2 else float(np.clip(0.0, *limits))
-    return positions
+            position[joint.idx_q] = np.clip(0.0, *limits)
+    return pin.buildReducedModel(model, ids, position) if ids else model
 
 
 def default_tip(model: pin.Model) -> str:
@@ -97,11 +99,13 @@ def _read(path: Path, root: str, kind: str, build: Callable[[str], pin.Model]) -
         raise RobotError(f"{path} is not a {kind} file: its root element is <{found}>, expected <{root}>")
     with _captured_stderr() as notes:
         try:
-            return build(str(path))
+            model = build(str(path))
         except (ValueError, RuntimeError) as error:
-            notes.seek(0)
-            reason = " ".join((notes.read().decode(errors="replace") or str(error)).split())
-            raise RobotError(f"{path} is not a usable {kind} model: {reason[:300]}") from None
+            raise RobotError(f"{path} is not a usable {kind} model: {_text(notes) or error}") from None
+        complaints = _text(notes)
+    if "Error:" in complaints:  # the parser goes on without what it could not read, a mass for example
+        raise RobotError(f"{path} is not a usable {kind} model: {complaints}")
+    return model
 
 
 @contextmanager
@@ -115,6 +119,12 @@ def _captured_stderr() -> Iterator[IO[bytes]]:
         finally:
             os.dup2(saved, 2)
             os.close(saved)
+
+
+def _text(notes: IO[bytes]) -> str:
+    """What was caught, on one line of at most 300 characters."""
+    notes.seek(0)
+    return " ".join(notes.read().decode(errors="replace").split())[:300]
 
 
 def _set_position(model: pin.Model, i: int, value: float, position: Array) -> None:

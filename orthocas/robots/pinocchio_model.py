@@ -18,11 +18,10 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         UnknownNameError: if there is no frame called tip.
         RobotError: if a joint is not revolute, continuous or prismatic (named in the message).
     """
-    require_known("frame", tip, [frame.name for frame in model.frames])
+    frame = model.frames[frame_index(model, tip)]
     axes = [_joint_axis(model, i) for i in range(1, model.njoints)]
     turns = [np.eye(3)] + [_rotation_z_to(axis) for _, axis in axes]  # body frame -> frame with the axis along z
     bodies = range(1, model.njoints)
-    frame = model.frames[model.getFrameId(tip)]
     carrier = frame.parentJoint
     continuous = [model.joints[i].nq == 2 for i in bodies]
     return KinematicTree(
@@ -47,13 +46,22 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
     )
 
 
+def frame_index(model: pin.Model, name: str) -> int:
+    """Index of a frame; where a link and a joint share a name, as URDF allows, the link's.
+
+    Raises:
+        UnknownNameError: if there is no such frame.
+    """
+    require_known("frame", name, [frame.name for frame in model.frames])
+    found = [i for i, frame in enumerate(model.frames) if frame.name == name]
+    return min(found, key=lambda i: model.frames[i].type != pin.FrameType.BODY)
+
+
 def _joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
     """Kind and axis of joint i, read off its motion subspace."""
     joint, name = model.joints[i], model.names[i]
     if joint.shortname() == "JointModelMimic":
-        raise RobotError(
-            f"joint '{name}' is a mimic joint, expected independent joints: lock it or the joint it follows"
-        )
+        raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: lock the joint it follows")
     if joint.nv != 1:
         raise RobotError(
             f"joint '{name}' is of type {joint.shortname()} with {joint.nv} degrees of freedom, "

@@ -12,7 +12,7 @@ from orthocas.batch import Batched, dense_function
 from orthocas.checks import Array, as_point_set, require_known
 from orthocas.errors import ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
-from orthocas.robots.pinocchio_model import tree_from_model
+from orthocas.robots.pinocchio_model import frame_index, tree_from_model
 from orthocas.robots.tree import KinematicTree
 
 
@@ -39,7 +39,7 @@ class Robot:
             UnknownNameError: if the frame or a locked joint does not exist.
             RobotError: if a joint left free is of another type (floating base, spherical, mimic, ...).
         """
-        require_known("frame", tip, [frame.name for frame in model.frames])
+        frame_index(model, tip)
         return cls(tree_from_model(files.lock_joints(model, locked or {}), tip))
 
     @classmethod
@@ -58,11 +58,11 @@ class Robot:
     def chain_from_file(cls, path: str | Path, tip: str | None = None) -> Self:
         """Build the chain that moves the tip from a URDF or MJCF (.xml) file.
 
-        Every joint that does not move the tip is locked at zero, or at the limit next to zero.
+        Every joint that does not move the tip, of any type, is locked at zero, or at the limit next to zero.
         """
         model = files.read_mjcf(path) if Path(path).suffix == ".xml" else files.read_urdf(path)
         tip = tip or files.default_tip(model)
-        return cls.from_model(model, tip, files.joints_off_chain(model, tip))
+        return cls.from_model(files.lock_off_chain(model, tip), tip)
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:

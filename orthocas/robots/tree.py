@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from orthocas.checks import Array, frozen_array, require_known
+from orthocas.checks import Array, frozen_array, require_known, require_shape
 from orthocas.errors import InvalidValueError, RobotError
 
 JointKind = Literal["revolute", "prismatic"]
@@ -57,15 +57,27 @@ class KinematicTree:
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
         for name in ("lower", "upper"):  # may be infinite
             limits = np.array(getattr(self, name), dtype=float)
+            require_shape(name, limits.shape, (n,))
             limits.setflags(write=False)
             object.__setattr__(self, name, limits)
-        for kind in self.joint_kinds:
-            require_known("joint kind", kind, JOINT_KINDS)
-        for i, parent in enumerate(self.parents):
-            if not -1 <= parent < i:
-                raise InvalidValueError(f"parents[{i}]", parent, f"an index from -1 to {i - 1}")
-        if not -1 <= self.tip_parent < n:
-            raise InvalidValueError("tip_parent", self.tip_parent, f"an index from -1 to {n - 1}")
+        self._require_sense()
+
+    def _require_sense(self) -> None:
+        """Lengths, limits, masses and the order of bodies."""
+        require_shape("joint_kinds", (len(self.joint_kinds),), (self.n,))
+        require_shape("parents", (len(self.parents),), (self.n,))
+        for i, name in enumerate(self.joint_names):
+            require_known("joint kind", self.joint_kinds[i], JOINT_KINDS)
+            if not -1 <= self.parents[i] < i:
+                raise InvalidValueError(f"parents[{i}]", self.parents[i], f"an index from -1 to {i - 1}")
+            if not self.lower[i] <= self.upper[i]:
+                raise RobotError(
+                    f"joint '{name}' has limits [{self.lower[i]:g}, {self.upper[i]:g}], expected lower <= upper"
+                )
+            if self.masses[i] < 0:
+                raise RobotError(f"the body moved by joint '{name}' has mass {self.masses[i]:g} kg, expected >= 0")
+        if not -1 <= self.tip_parent < self.n:
+            raise InvalidValueError("tip_parent", self.tip_parent, f"an index from -1 to {self.n - 1}")
 
     @property
     def n(self) -> int:
