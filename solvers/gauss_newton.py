@@ -33,8 +33,8 @@ class GaussNewton:
             raise InvalidValueError("tolerance", self.tolerance, "a number >= 0")
 
     def coarser(self) -> "GaussNewton":
-        """At most 10 iterations."""
-        return replace(self, max_iterations=min(10, self.max_iterations))
+        """At most 10 iterations, and done when a step gains less than half a per cent."""
+        return replace(self, max_iterations=min(10, self.max_iterations), tolerance=max(5e-3, self.tolerance))
 
     def minimise(self, objective: Objective, theta0: Array, monitor: Monitor = silent, stage: str = "") -> SolveResult:
         """Minimise from theta0.
@@ -72,12 +72,13 @@ class _Run:
             self.evaluations += 1
             if not np.isfinite(self.value):
                 return Status.FAILED
-            before = self.value
+            before, damping = self.value, self.damping
             if not self._step(gradient, H):
                 return Status.STALLED if np.any(gradient) else Status.CONVERGED
             self.iterations += 1
             monitor(Progress(stage, self.iterations / self.settings.max_iterations, f"loss {self.value:.5g}"))
-            if before - self.value <= self.settings.tolerance * before:
+            cautious = self.damping > damping  # a step after rejections is short: its small gain says little
+            if not cautious and before - self.value <= self.settings.tolerance * before:
                 return Status.CONVERGED
         return Status.ITERATION_LIMIT
 
