@@ -24,6 +24,7 @@ from orthocas.parametrisations import (
     LinearFamily,
     Parametrisation,
     Polynomial,
+    Term,
     embed,
 )
 from orthocas.problem import Problem, ProblemCheck, check
@@ -131,33 +132,32 @@ class _Run:
         """Degree continuation: solve a low degree from a spectral start, embed, solve the next, ..."""
         self._require_memory(target, r)
         stages: list[Stage] = []
-        reached, theta = target, None
+        reached = target
+        terms: tuple[Term, ...] = ()
         for degree in range(min(target.degree, 2), target.degree + 1):
-            current = target.of_degree(degree)
-            family = current.family(self.space, r)
-            if len(family.terms) < r:
-                continue
-            start = None if theta is None else embed(theta, r, reached.family(self.space, r).terms, family.terms)
+            family = target.of_degree(degree).family(self.space, r)
+            start = embed(stages[-1].result.theta, r, terms, family.terms) if stages else None
             minimiser = solver if degree == target.degree else solver.coarser()
             try:
-                stages.append(self.stage(current, family, start, minimiser, degree))
+                stages.append(self.stage(target.of_degree(degree), family, start, minimiser, degree))
             except KeyboardInterrupt:  # between minimisations: the last degree is the best so far
                 if not stages:
                     raise
                 stages[-1] = stages[-1].interrupted()
                 break
-            reached, theta = current, stages[-1].result.theta
+            reached, terms = target.of_degree(degree), family.terms
             if stages[-1].result.status is Status.INTERRUPTED:
                 break
-        if theta is None:
-            raise InvalidValueError("degree", target.degree, f"a basis with at least r = {r} functions")
-        return stages, reached, theta
+        return stages, reached, stages[-1].result.theta
 
     def stage(
         self, parametrisation: Parametrisation, family: Family, theta: Array | None, solver: Solver, degree: int
     ) -> Stage:
         """Draw samples, find a start if there is none, and minimise."""
-        count = self.samples or self._sample_count(family)
+        if isinstance(family, LinearFamily):
+            count = self._sample_count(len(family.terms), family.outputs)
+        else:
+            count = self.samples or MLP_SAMPLES
         self.monitor(Progress(parametrisation.label, 0.0, f"sampling {count} points"))
         points = sample_evenly(self.problem.domain, count, (self.seed, 1 + degree))
         samples = samples_at(self.problem, points).restricted_to(self.active)
@@ -180,11 +180,9 @@ class _Run:
             raise InvalidValueError("base", base.tolist(), "a joint position where no task gradient vanishes")
         return parametrisation.normal_vectors(at_base.raised(at_base.task_jacobian)[0]).ravel()
 
-    def _sample_count(self, family: Family) -> int:
-        """Enough samples that every coefficient sees about 140 residuals."""
-        if not isinstance(family, LinearFamily):
-            return MLP_SAMPLES
-        return 1000 + ceil(140 * len(family.terms) / (self.problem.m + family.outputs - 1))
+    def _sample_count(self, terms: int, r: int) -> int:
+        """Samples for a linear family: enough that every coefficient sees about 140 residuals."""
+        return self.samples or 1000 + ceil(140 * terms / (self.problem.m + r - 1))
 
     def _require_graph_memory(self, label: str, family: Family, count: int) -> None:
         """Refuse a network whose parameters and minimiser memory do not fit."""
@@ -193,7 +191,7 @@ class _Run:
     def _require_memory(self, target: GradedParametrisation, r: int) -> None:
         """Refuse a degree that does not fit, before building anything."""
         K = target.term_count(self.space.n)
-        N = self.samples or 1000 + 140 * K / (self.problem.m + r - 1)
+        N = self._sample_count(K, r)
         needed = 8 * (N * self.space.n * K + 4 * (r * K) ** 2)
         require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)
 

@@ -89,7 +89,11 @@ class _Run:
         for _ in range(_MAX_REJECTIONS):
             damped = H.copy()
             damped[np.diag_indices_from(H)] += self.damping * scale
-            candidate = self.theta - np.linalg.solve(damped, gradient)
+            try:
+                candidate = self.theta - np.linalg.solve(damped, gradient)
+            except np.linalg.LinAlgError:
+                self.damping *= 10
+                continue
             value = self.objective.value(candidate)
             self.evaluations += 1
             if value < self.value:

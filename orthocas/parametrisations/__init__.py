@@ -5,7 +5,7 @@ from orthocas.parametrisations.fourier import Fourier
 from orthocas.parametrisations.linear import Linear
 from orthocas.parametrisations.mlp import MLP
 from orthocas.parametrisations.polynomial import Polynomial
-from orthocas.parametrisations.product_basis import GradedParametrisation, LinearFamily
+from orthocas.parametrisations.product_basis import GradedParametrisation, LinearFamily, Term
 from orthocas.parametrisations.registry import (
     PARAMETRISATIONS,
     parametrisation_from_data,
@@ -24,6 +24,7 @@ __all__ = [
     "LinearFamily",
     "Parametrisation",
     "Polynomial",
+    "Term",
     "embed",
     "joint_derivatives",
     "parametrisation_from_data",
