@@ -18,7 +18,7 @@ from orthocas.quality import Report
 
 PAPER = (2.06, 3.44)
 LAMBDA2 = (1.0, 3.0, 10.0, 20.0, 30.0, 60.0, 100.0, 300.0)
-LAMBDA3 = (0.0, 120.0, 500.0, 2000.0, 8000.0)
+LAMBDA3 = (0.0, 150.0, 500.0, 2000.0, 8000.0)
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
