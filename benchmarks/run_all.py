@@ -1,10 +1,10 @@
-"""Run every benchmark one after the other (about 8 minutes on 2 cores); docs/performance.md holds the results."""
+"""Run every benchmark one after the other (about 12 minutes on 2 cores); docs/performance.md holds the results."""
 
 import subprocess
 import sys
 from pathlib import Path
 
-SCRIPTS = ("dynamics", "command", "fits", "scaling", "against_torch")
+SCRIPTS = ("dynamics", "command", "fits", "choices", "scaling", "against_torch")
 
 if __name__ == "__main__":
     for name in SCRIPTS:
