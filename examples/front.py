@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.plotting import save_figure
 from orthocas.quality import Report
 
 PAPER = (2.06, 3.44)
@@ -46,7 +45,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     left, right = figure.subplots(1, 2)
     _draw_fronts(figure, left, lambda2, fronts)
     _draw_regularity(right, degrees[-1], lambda3, regular)
-    save_figure(figure, out / "front.png")
+    figure.savefig(out / "front.png", dpi=150)
     first = fronts[degrees[0]]
     return {
         "task_std_small_lambda2": first[0].task_angle.std,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.plotting import quality_figure, save_figure, self_motion_figure
+from orthocas.plotting import quality_figure, self_motion_figure
 from orthocas.progress import terminal_monitor
 
 PAPER = {"task": 2.06, "mutual": 3.44, "minutes": 100.64}
@@ -29,8 +29,8 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
         fit = oc.fit(problems.get("iiwa"), oc.Polynomial(degree=3 if quick else 4), monitor=monitor)
     report = oc.evaluate(fit.chart, samples=5_000 if quick else 100_000)
     fit.chart.save(out / "iiwa.orthocas")
-    save_figure(quality_figure(report), out / "iiwa_quality.png")
-    save_figure(self_motion_figure(fit.chart), out / "iiwa_self_motion.png")
+    quality_figure(report).savefig(out / "iiwa_quality.png", dpi=150)
+    self_motion_figure(fit.chart).savefig(out / "iiwa_self_motion.png", dpi=150)
     return {
         "task_std_deg": report.task_angle.std,
         "mutual_std_deg": report.mutual_angle.std,

@@ -72,7 +72,7 @@ class Coordinates:
         return ca.vertcat(*rows)
 
     def xi(self, points: Array) -> Array:
-        """Xi at points (N, n), (N, r)."""
+        """Values xi(q) at points (N, n), (N, r)."""
         if self.family.as_matrices:
             return evaluate_columns(self._column_functions["xi"], _COLUMNS, points)[0]
         return self._batched["xi"](points)[0]
@@ -86,7 +86,7 @@ class Coordinates:
 
     @cached_property
     def functions(self) -> dict[str, ca.Function]:
-        """Xi (r, 1) and jacobian (r, n) of one joint position q (n, 1)."""
+        """For one joint position q (n, 1): xi, (r, 1), and jacobian, (r, n)."""
         q = self._symbols(1)
         xi = self.expression(q)
         return {"xi": dense_function("xi", [q], [xi]), "jacobian": dense_function("J_xi", [q], [ca.jacobian(xi, q)])}
@@ -97,7 +97,7 @@ class Coordinates:
 
     @cached_property
     def _column_functions(self) -> dict[str, ca.Function]:
-        """Xi and vec(J_xi) of many joint positions side by side: what dense products are fast at."""
+        """Functions xi and vec(J_xi) of many joint positions side by side: what dense products are fast at."""
         q = self._symbols(_COLUMNS)
         xi = self.expression(q)
         J_xi = ca.vertcat(*joint_derivatives(xi, q))

@@ -1,6 +1,5 @@
 """Figures of charts: histograms of angles as in [AS2023] Figs. 20 and 27, and leaves of the coordinates."""
 
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -50,12 +49,6 @@ def self_motion_figure(chart: Chart, postures: int = 9, reach: float = 0.4) -> F
         panel.set_title(rf"$\xi_{j + 1}$ from {-reach:g} to {reach:g}" + f"\ntask moves {_bound(moved)}", fontsize=10)
         _equal_axes(panel, everything)
     return figure
-
-
-def save_figure(figure: Figure, path: Path, dpi: int = 150) -> Path:
-    """Write a figure, in the format of the path's ending."""
-    figure.savefig(path, dpi=dpi)
-    return path
 
 
 def _draw_angles(axes: Axes, angles: AngleStatistics, colour: str, label: str) -> None:

@@ -10,7 +10,6 @@ from orthocas.checks import Array, require_count, require_memory
 from orthocas.domains import sample_uniform
 from orthocas.errors import SingularTaskError
 from orthocas.loss import pairs
-from orthocas.metrics import metric_matrices
 from orthocas.samples import Samples, samples_at
 
 DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
@@ -141,17 +140,17 @@ def _judge(chart: Chart, points: Array) -> tuple[Array, Array, Array, Array, Arr
     products = np.einsum("spn,spn->sp", raised[:, first], J[:, second])
     mutual = products / (np.linalg.norm(raised, axis=2)[:, first] * lengths[:, second])
     signs = np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1)))
-    return task, mutual, _smallest_singular_values(chart, samples, J, raised), signs, samples.points
+    return task, mutual, _smallest_singular_values(samples, J, raised), signs, samples.points
 
 
-def _smallest_singular_values(chart: Chart, samples: Samples, J: Array, raised: Array) -> Array:
-    """Singular values through the Gram matrix of task basis and unit gradients in the metric A^-1."""
-    unit = 1 / np.sqrt(np.einsum("sjn,sjn->sj", J, raised))
+def _smallest_singular_values(samples: Samples, J: Array, raised: Array) -> Array:
+    """From the Gram matrix of task basis and unit gradients in the metric: [[I, E v], [v^T E^T, v^T A^-1 v]]."""
+    unit = 1 / np.sqrt(np.einsum("sjn,sjn->sj", J, raised))[:, :, None]
     basis = samples.task_basis
-    if not chart.problem.metric.is_identity:  # lower the index: e^T A
-        basis = basis @ metric_matrices(chart.problem.metric, samples.points)
-    task_raised = samples.raised(basis)
-    rows = np.concatenate([basis, J * unit[:, :, None]], axis=1)
-    raised_rows = np.concatenate([task_raised, raised * unit[:, :, None]], axis=1)
-    gram = rows @ raised_rows.transpose(0, 2, 1)
-    return np.sqrt(np.maximum(np.linalg.eigvalsh((gram + gram.transpose(0, 2, 1)) / 2)[:, 0], 0.0))
+    leaning = basis @ (J * unit).transpose(0, 2, 1)  # (N, m, r)
+    mutual = (raised * unit) @ (J * unit).transpose(0, 2, 1)  # (N, r, r)
+    identity = np.broadcast_to(np.eye(basis.shape[1]), (len(J), basis.shape[1], basis.shape[1]))
+    above = np.concatenate([identity, leaning], axis=2)
+    below = np.concatenate([leaning.transpose(0, 2, 1), mutual], axis=2)
+    gram = np.concatenate([above, below], axis=1)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[:, 0], 0.0))

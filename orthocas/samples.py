@@ -18,7 +18,6 @@ class Samples:
     points: Array  #: q, (N, n)
     task_jacobian: Array  #: J_x, (N, m, n)
     metric_inverse: Array | None  #: A^-1, (N, n, n); None for the identity
-    dropped: int = 0  #: samples left out because a task gradient vanishes there
 
     def __len__(self) -> int:
         return len(self.points)
@@ -26,7 +25,7 @@ class Samples:
     def restricted_to(self, joints: list[int]) -> "Samples":
         """Only some joints; the metric must not couple them to the others."""
         inverse = None if self.metric_inverse is None else self.metric_inverse[:, joints][:, :, joints]
-        return Samples(self.points[:, joints], self.task_jacobian[:, :, joints], inverse, self.dropped)
+        return Samples(self.points[:, joints], self.task_jacobian[:, :, joints], inverse)
 
     def raised(self, covectors: Array) -> Array:
         """A^-1 v for covectors v (N, k, n): gradients in the metric ([AS2023] eq. (16))."""
@@ -94,4 +93,4 @@ def samples_at(problem: Problem, points: Array) -> Samples:
     inverse: Array | None = None
     if not problem.metric.is_identity:
         inverse = np.asarray(np.linalg.inv(metric_matrices(problem.metric, points)), dtype=float)
-    return Samples(points, J, inverse, dropped=int((~kept).sum()))
+    return Samples(points, J, inverse)

@@ -8,7 +8,7 @@ import pytest
 import orthocas as oc
 from orthocas.errors import InverseError
 from orthocas.fitting import Fit
-from orthocas.plotting import quality_figure, save_figure, self_motion_figure
+from orthocas.plotting import quality_figure, self_motion_figure
 
 
 def test_quality_figure_shows_both_deviations(planar_fit: Fit) -> None:
@@ -21,7 +21,8 @@ def test_quality_figure_shows_both_deviations(planar_fit: Fit) -> None:
 
 def test_quality_figure_without_mutual_angles(planar_xy: oc.Problem, tmp_path: Path) -> None:
     report = oc.evaluate(oc.fit(planar_xy, oc.Linear()).chart, 100)
-    assert save_figure(quality_figure(report), tmp_path / "q.png").stat().st_size > 5000
+    quality_figure(report).savefig(tmp_path / "q.png")
+    assert (tmp_path / "q.png").stat().st_size > 5000
 
 
 def test_self_motion_figure_has_a_panel_per_coordinate_and_a_line_per_posture(iiwa_fit: Fit) -> None:

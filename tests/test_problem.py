@@ -59,12 +59,11 @@ def test_task_that_is_not_finite_is_located() -> None:
         oc.check(oc.Problem(robot, root, domain=oc.Box([0.0, 0, 0], 0.5)))
 
 
-def test_samples_with_vanishing_gradient_are_dropped(planar_x: oc.Problem) -> None:
+def test_samples_with_vanishing_gradient_are_dropped() -> None:
     robot = arm(2)
     problem = oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Torus(2))
     samples = samples_at(problem, np.array([[0.0, 0.0], [0.5, 0.5]]))
-    assert len(samples) == 1
-    assert samples.dropped == 1
+    np.testing.assert_array_equal(samples.points, [[0.5, 0.5]])
 
 
 def test_task_basis_is_orthonormal_in_the_metric_and_spans_the_gradients(planar_xy: oc.Problem) -> None:

@@ -72,7 +72,7 @@ def fit(
 
 
 def parse_weights(text: str) -> tuple[float, float] | tuple[float, float, float]:
-    """Read "1000,30" or "1000,30,120"."""
+    """Read "1000,30" or "1000,30,150"."""
     values = parse_numbers("--weights", text).tolist()
     if len(values) == 2:
         return values[0], values[1]

@@ -53,7 +53,7 @@ class LinearFamily:
         return C.ravel()
 
     def basis_gradients(self, points: Array) -> Array:
-        """D psi / dq at points (N, n), (N, n, K)."""
+        """Gradients d psi / dq at points (N, n), (N, n, K)."""
         return self._batched_gradients(points)[0].transpose(0, 2, 1)  # contiguous: CasADi fills columns
 
     @cached_property
