@@ -86,7 +86,7 @@ class Coordinates:
 
     @cached_property
     def functions(self) -> dict[str, ca.Function]:
-        """For one joint position q (n, 1): xi, (r, 1), and jacobian, (r, n)."""
+        """CasADi functions of one joint position (n, 1): its coordinates (r, 1) and their jacobian (r, n)."""
         q = self._symbols(1)
         xi = self.expression(q)
         return {"xi": dense_function("xi", [q], [xi]), "jacobian": dense_function("J_xi", [q], [ca.jacobian(xi, q)])}
