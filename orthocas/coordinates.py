@@ -72,7 +72,7 @@ class Coordinates:
         return ca.vertcat(*rows)
 
     def xi(self, points: Array) -> Array:
-        """Values xi(q) at points (N, n), (N, r)."""
+        """Coordinates at points (N, n), (N, r)."""
         if self.family.as_matrices:
             return evaluate_columns(self._column_functions["xi"], _COLUMNS, points)[0]
         return self._batched["xi"](points)[0]
