@@ -11,7 +11,7 @@ from orthocas import problems, solvers
 from orthocas.api import fit, load
 from orthocas.chart import Chart
 from orthocas.domains import Box, Torus, contains
-from orthocas.parametrisations import MLP, Fourier, Linear, Polynomial
+from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial
 from orthocas.problem import Problem, check
 from orthocas.quality import Report, evaluate
 from orthocas.robots import Robot
@@ -20,9 +20,11 @@ from orthocas.tasks import Task
 __version__ = "0.1.0"
 __all__ = [
     "MLP",
+    "SEW",
     "Box",
     "Chart",
     "Fourier",
+    "Given",
     "Linear",
     "Polynomial",
     "Problem",

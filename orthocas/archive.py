@@ -7,30 +7,48 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from orthocas.checks import Array
-from orthocas.errors import ChartFileError
+from orthocas.errors import ArchiveError, ChartFileError
 
-FORMAT = "orthocas-chart"
-VERSION = 1
 _HEADER, _DIGEST = "header.json", "digest.txt"
 _LARGEST_FILE = 2**32  # bytes a file may unpack to
 
 
-def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+@dataclass(frozen=True)
+class Kind:
+    """What a file holds, and the error that names it."""
+
+    name: str  #: 'chart' or 'checkpoint'
+    version: int  #: newest format version
+    error: type[ArchiveError]
+
+    @property
+    def format(self) -> str:
+        """Name of the format in the header."""
+        return f"orthocas-{self.name}"
+
+
+def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
     """Write header and arrays to a file that appears whole or not at all.
 
     Raises:
-        ChartFileError: if the folder is missing or cannot be written.
+        ArchiveError: the kind's own, if the folder is missing or cannot be written.
     """
-    require_writable(Path(path))
+    require_writable(Path(path), kind.error)
     target = Path(path).resolve()  # a link stays a link
     entries = {f"{name}.npy": _npy_bytes(array) for name, array in arrays.items()}
-    full = {"format": FORMAT, "version": VERSION, **header, "sha256": {k: _digest(v) for k, v in entries.items()}}
+    full = {
+        "format": kind.format,
+        "version": kind.version,
+        **header,
+        "sha256": {k: _digest(v) for k, v in entries.items()},
+    }
     text = json.dumps(full, indent=1).encode()
     entries = {_HEADER: text, _DIGEST: _digest(text).encode(), **entries}
     try:
@@ -47,75 +65,77 @@ def write_archive(path: str | Path, header: Mapping[str, Any], arrays: Mapping[s
                 os.unlink(draft.name)
                 raise
     except OSError as error:
-        raise ChartFileError(f"cannot write {target}: {error.strerror}") from None
+        raise kind.error(f"cannot write {target}: {error.strerror}") from None
 
 
-def require_writable(path: Path) -> None:
+def require_writable(path: Path, error_type: type[ArchiveError] = ChartFileError) -> None:
     """Check early, before long work, that a file can be written.
 
     Raises:
-        ChartFileError: if its folder is missing or read-only, or something other than a writable file is there.
+        ArchiveError: if its folder is missing or read-only, or something other than a writable file is there.
     """
     try:
         if not path.parent.is_dir():
-            raise ChartFileError(f"cannot write {path}: folder {path.parent} does not exist")
+            raise error_type(f"cannot write {path}: folder {path.parent} does not exist")
         if path.is_dir():
-            raise ChartFileError(f"cannot write {path}: it is a folder, expected a file name")
+            raise error_type(f"cannot write {path}: it is a folder, expected a file name")
         if path.exists() and not (path.is_file() and os.access(path, os.W_OK)):
-            raise ChartFileError(f"cannot write {path}: it is not a writable file")
+            raise error_type(f"cannot write {path}: it is not a writable file")
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
-        raise ChartFileError(f"cannot write {str(path)[:200]}: {error.strerror}") from None
+        raise error_type(f"cannot write {str(path)[:200]}: {error.strerror}") from None
 
 
-def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, Array]]:
+def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str, Array]]:
     """Read header and arrays back.
 
     Raises:
-        ChartFileError: if the file is missing, truncated, not a chart, edited, or from a newer version.
+        ArchiveError: the kind's own, if the file is missing, truncated, foreign, edited, or from a newer version.
     """
     source = Path(path)
     try:
         with zipfile.ZipFile(source) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _LARGEST_FILE:
-                raise ChartFileError(f"{source} unpacks to more than {_LARGEST_FILE / 2**30:.0f} GiB, not a chart file")
+                raise kind.error(
+                    f"{source} unpacks to more than {_LARGEST_FILE / 2**30:.0f} GiB, not a {kind.name} file"
+                )
             entries = {name: archive.read(name) for name in archive.namelist()}
     except FileNotFoundError:
-        raise ChartFileError(f"chart file {source} does not exist") from None
+        raise kind.error(f"{kind.name} file {source} does not exist") from None
     except OSError as error:
-        raise ChartFileError(f"cannot read chart file {source}: {error.strerror}") from None
+        raise kind.error(f"cannot read {kind.name} file {source}: {error.strerror}") from None
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError):
-        raise ChartFileError(f"{source} is truncated, damaged or not a chart file") from None
-    header = _read_header(source, entries)
+        raise kind.error(f"{source} is truncated, damaged or not a {kind.name} file") from None
+    header = _read_header(source, kind, entries)
     for name, digest in header["sha256"].items():
         if name not in entries or _digest(entries[name]) != digest:
-            raise ChartFileError(f"{source} has been edited: entry {name} does not match its checksum")
+            raise kind.error(f"{source} has been edited: entry {name} does not match its checksum")
     try:
         arrays = {
             name.removesuffix(".npy"): np.load(io.BytesIO(entries[name]), allow_pickle=False)
             for name in header["sha256"]
         }
     except (ValueError, EOFError):
-        raise ChartFileError(f"{source} holds an array that cannot be read") from None
+        raise kind.error(f"{source} holds an array that cannot be read") from None
     return header, arrays
 
 
-def _read_header(source: Path, entries: Mapping[str, bytes]) -> dict[str, Any]:
+def _read_header(source: Path, kind: Kind, entries: Mapping[str, bytes]) -> dict[str, Any]:
     """Check format, version and checksum before anything else is believed."""
     try:
         header = json.loads(entries[_HEADER])
         name, version, sums = header["format"], int(header["version"]), dict(header["sha256"])
     except (KeyError, ValueError, TypeError, OverflowError, RecursionError):
-        raise ChartFileError(f"{source} is not an orthocas chart file") from None
-    if name != FORMAT:
-        raise ChartFileError(f"{source} has format '{name}', expected '{FORMAT}'")
+        raise kind.error(f"{source} is not an orthocas {kind.name} file") from None
+    if name != kind.format:
+        raise kind.error(f"{source} has format '{name}', expected '{kind.format}'")
     if version < 1:
-        raise ChartFileError(f"{source} has format version {version}, expected 1 to {VERSION}")
-    if version > VERSION:
-        raise ChartFileError(f"{source} has format version {version}, this orthocas reads up to {VERSION}: upgrade")
+        raise kind.error(f"{source} has format version {version}, expected 1 to {kind.version}")
+    if version > kind.version:
+        raise kind.error(f"{source} has format version {version}, this orthocas reads up to {kind.version}: upgrade")
     if entries.get(_DIGEST, b"").decode(errors="replace") != _digest(entries[_HEADER]):
-        raise ChartFileError(f"{source} has been edited: its header does not match its checksum")
+        raise kind.error(f"{source} has been edited: its header does not match its checksum")
     return {**header, "sha256": sums}
 
 

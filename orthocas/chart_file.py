@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.archive import read_archive, write_archive
+from orthocas.archive import Kind, read_archive, write_archive
 from orthocas.checks import Array, require_count, require_known
 from orthocas.coordinates import Coordinates, joint_space
 from orthocas.domains import Box, Domain, Torus
@@ -20,6 +20,7 @@ from orthocas.problem import Problem
 from orthocas.robots import KinematicTree, Robot
 from orthocas.tasks import Task
 
+CHART = Kind("chart", 1, ChartFileError)
 Notes = Mapping[str, str | float]
 
 
@@ -50,7 +51,7 @@ def write_chart(path: str | Path, problem: Problem, coordinates: Coordinates, no
         "coordinates": {**parametrisation_to_data(coordinates.parametrisation), "idle": list(coordinates.idle)},
         "notes": dict(notes),
     }
-    write_archive(path, header, arrays)
+    write_archive(path, CHART, header, arrays)
 
 
 def read_chart(path: str | Path) -> tuple[Problem, Coordinates, Notes]:
@@ -59,7 +60,7 @@ def read_chart(path: str | Path) -> tuple[Problem, Coordinates, Notes]:
     Raises:
         ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
     """
-    header, arrays = read_archive(path)
+    header, arrays = read_archive(path, CHART)
     try:
         robot = Robot(_tree(header["robot"], arrays))
         problem = _problem(robot, header["problem"], arrays)

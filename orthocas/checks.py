@@ -83,3 +83,9 @@ def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
         raise ShapeError(name, array.shape, (n,) if single else (None, n))
     require_finite(name, points)
     return points, single
+
+
+def require_at_least(name: str, value: float, least: float) -> None:
+    """Raise InvalidValueError unless value is a finite number >= least."""
+    if not least <= value < float("inf"):
+        raise InvalidValueError(name, value, f"a finite number >= {least:g}")

@@ -10,8 +10,9 @@ import numpy as np
 
 from orthocas.batch import Batched, dense_function, evaluate_columns
 from orthocas.checks import Array, frozen_array
+from orthocas.numpy_nodes import NumpyGraph
 from orthocas.parametrisations import Family, JointSpace, Parametrisation
-from orthocas.parametrisations.family import Expression, joint_derivatives
+from orthocas.parametrisations.family import Expression
 from orthocas.problem import Problem
 
 _COLUMNS = 256  # samples side by side in matrix-shaped graphs
@@ -74,20 +75,20 @@ class Coordinates:
     def xi(self, points: Array) -> Array:
         """Coordinates at points (N, n), (N, r)."""
         if self.family.as_matrices:
-            return evaluate_columns(self._column_functions["xi"], _COLUMNS, points)[0]
+            return evaluate_columns(self._column_graphs["xi"].function, _COLUMNS, points)[0]
         return self._batched["xi"](points)[0]
 
     def jacobian(self, points: Array) -> Array:
         """J_xi at points (N, n), (N, r, n)."""
         if self.family.as_matrices:
-            flat = evaluate_columns(self._column_functions["jacobian"], _COLUMNS, points)[0]
-            return flat.reshape(len(points), self.space.n, self.r).transpose(0, 2, 1)
+            flat = evaluate_columns(self._column_graphs["jacobian"].function, _COLUMNS, points)[0]
+            return flat.reshape(len(points), self.r, self.space.n)
         return self._batched["jacobian"](points)[0].reshape(len(points), self.r, self.space.n)
 
     @cached_property
     def functions(self) -> dict[str, ca.Function]:
         """CasADi functions of one joint position (n, 1): its coordinates (r, 1) and their jacobian (r, n)."""
-        q = self._symbols(1)
+        q: Any = (ca.MX if self.family.as_matrices else ca.SX).sym("q", self.space.n)
         xi = self.expression(q)
         return {"xi": dense_function("xi", [q], [xi]), "jacobian": dense_function("J_xi", [q], [ca.jacobian(xi, q)])}
 
@@ -96,16 +97,22 @@ class Coordinates:
         return {name: Batched(function) for name, function in self.functions.items()}
 
     @cached_property
-    def _column_functions(self) -> dict[str, ca.Function]:
-        """Functions xi and vec(J_xi) of many joint positions side by side: what dense products are fast at."""
-        q = self._symbols(_COLUMNS)
-        xi = self.expression(q)
-        J_xi = ca.vertcat(*joint_derivatives(xi, q))
-        return {"xi": dense_function("xi", [q], [xi]), "jacobian": dense_function("J_xi", [q], [J_xi])}
+    def _column_graphs(self) -> dict[str, NumpyGraph]:
+        """Functions xi and vec(J_xi^T) of many joint positions side by side: what dense products are fast at."""
+        q = ca.MX.sym("q", self.space.n, _COLUMNS)
+        J_xi = ca.vertcat(*self._gradients(q))
+        return {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}
 
-    def _symbols(self, columns: int) -> Any:
-        """Joint positions in the kind of graph that suits the family: SX for scalars, MX for matrices."""
-        return (ca.MX if self.family.as_matrices else ca.SX).sym("q", self.space.n, columns)
+    def _gradients(self, q: ca.MX) -> list[ca.MX]:
+        """Gradients of all coordinates, r matrices (n, N), for joint positions as columns (n, N)."""
+        N = q.shape[1]
+        unit = np.eye(self.space.n)
+        gradients: list[ca.MX] = []
+        if len(self.offset):
+            own = self.family.jacobian(q[self.active, :], ca.MX(ca.DM(self.theta)))
+            spread = ca.DM(unit[:, self.active])
+            gradients += [spread @ gradient * scale for gradient, scale in zip(own, self.scale, strict=True)]
+        return gradients + [ca.MX(_columns(unit[k], N)) for k in self.idle]
 
 
 def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:

@@ -72,9 +72,21 @@ class SolveError(OrthocasError, RuntimeError):
     """A minimiser stopped without a usable result."""
 
 
+class InfeasibleError(SolveError):
+    """Constraints of a fit cannot be met."""
+
+
 class InverseError(OrthocasError, RuntimeError):
     """The inverse map q(x, xi) has no solution near its start, or meets a singular Jacobian."""
 
 
-class ChartFileError(OrthocasError, ValueError):
+class ArchiveError(OrthocasError, ValueError):
+    """A file of ours cannot be written, or read back."""
+
+
+class CheckpointError(ArchiveError):
+    """A checkpoint is damaged, foreign, or belongs to another fit."""
+
+
+class ChartFileError(ArchiveError):
     """A chart file is missing, truncated, foreign, edited or too new."""

@@ -1,19 +1,21 @@
-"""CasADi SX expressions as plain data, so that files can hold custom tasks and metrics without running code.
+"""CasADi SX expressions as plain data, so that files can hold custom expressions without running code.
 
 A tape is a list of steps over numbered work slots. Only elementary operations exist: loading one rebuilds an
-expression and can do nothing else.
+expression and can do nothing else. The entries it is rebuilt at may be scalars, or whole rows of an MX matrix: then the
+expression of one sample becomes that of all samples side by side.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import casadi as ca
 
 from orthocas.errors import OrthocasError
 
 Tape = dict[str, Any]
+Entry = TypeVar("Entry", ca.SX, ca.MX)
 
-_UNARY: dict[str, Callable[[ca.SX], ca.SX]] = {
+_UNARY: dict[str, Callable[[Any], Any]] = {
     "neg": lambda a: -a,
     "exp": ca.exp,
     "log": ca.log,
@@ -43,7 +45,7 @@ _UNARY: dict[str, Callable[[ca.SX], ca.SX]] = {
     "atanh": ca.atanh,
     "assign": lambda a: a,
 }
-_BINARY: dict[str, Callable[[ca.SX, ca.SX], ca.SX]] = {
+_BINARY: dict[str, Callable[[Any, Any], Any]] = {
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
@@ -99,20 +101,30 @@ def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
     Raises:
         KeyError, IndexError, TypeError, ValueError: if the tape is malformed (the caller names the file).
     """
-    rows, columns = int(tape["rows"]), int(tape["columns"])
-    work: dict[int, ca.SX] = {}
-    result: dict[int, ca.SX] = {}
+    entries = replay(tape, [q[i] for i in range(q.shape[0])])
+    return ca.reshape(ca.vertcat(*entries), int(tape["rows"]), int(tape["columns"]))
+
+
+def replay(tape: Tape, inputs: Sequence[Entry]) -> list[Entry]:
+    """The entries of a tape's output, column by column, for the entries of its input.
+
+    Raises:
+        KeyError, IndexError, TypeError, ValueError: if the tape is malformed.
+    """
+    work: dict[int, Any] = {}
+    result: dict[int, Any] = {}
+    zero = 0 * inputs[0]  # constants take the shape of the entries
     for name, into, *of in tape["steps"]:
         if name == "const":
-            work[into] = ca.SX(float(of[0]))
+            work[into] = zero + float(of[0])
         elif name == "input":
-            if not 0 <= of[0] < q.shape[0]:
-                raise IndexError(f"input {of[0]} of {q.shape[0]} joints")
-            work[into] = q[of[0]]
+            if not 0 <= of[0] < len(inputs):
+                raise IndexError(f"input {of[0]} of {len(inputs)}")
+            work[into] = inputs[of[0]]
         elif name == "output":
             result[into] = work[of[0]]
         elif name in _UNARY:
             work[into] = _UNARY[name](work[of[0]])
         else:
             work[into] = _BINARY[name](work[of[0]], work[of[1]])
-    return ca.reshape(ca.vertcat(*(result[k] for k in range(rows * columns))), rows, columns)
+    return [result[k] for k in range(int(tape["rows"]) * int(tape["columns"]))]

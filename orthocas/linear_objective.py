@@ -1,20 +1,26 @@
 """The loss of families linear in theta: basis gradients are sampled once, then all is dense products (ours)."""
 
+from collections.abc import Iterator
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from typing import Self
+
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.batch import Batched
 from orthocas.checks import Array
-from orthocas.loss import LossShape, Weights, pairs, residual_functions
+from orthocas.loss import LossShape, Weights, loss_hessian_function, pairs, residual_functions
 from orthocas.parametrisations.product_basis import LinearFamily
-from orthocas.samples import Samples
+from orthocas.samples import Draw, Samples
 
 _CHUNK = 512  # samples per block of the Gauss-Newton matrix: the rows stay in the cache
 _STRIDE = 2  # the Gauss-Newton matrix is a mean too, and half of the samples tell it well enough
 
 
 class LinearObjective:
-    """Mean loss (25) of xi = C psi(q) on fixed samples, with gradient and Gauss-Newton matrix.
+    """Mean loss (25) of xi = C psi(q) on fixed samples, with gradient, Gauss-Newton matrix and Hessian.
 
     With G = d psi / dq sampled once, (N, n, K), the coordinate gradients are J_xi = C G^T. Residuals rho and their
     derivatives with respect to J_xi come from CasADi, sample by sample. The residual of task i and coordinate j
@@ -25,16 +31,37 @@ class LinearObjective:
         samples: fixed samples of the family's joints.
         weights: of the loss.
         start: parameters, (size,), whose orientation the regularity term keeps.
+        draw: where fresh samples come from.
     """
 
-    def __init__(self, family: LinearFamily, samples: Samples, weights: Weights, start: Array) -> None:
-        self.family = family
-        self.r, self.K, self.N = family.outputs, len(family.terms), len(samples)
+    def __init__(self, family: LinearFamily, samples: Samples, weights: Weights, start: Array, draw: Draw) -> None:
+        self.family, self._draw = family, draw
+        self.r, self.K = family.outputs, len(family.terms)
         m, self.n = samples.task_jacobian.shape[1:]
-        self.G = family.basis_gradients(samples.points)  # (N, n, K)
-        self._shape = LossShape(self.n, m, self.r, samples.metric_inverse is None, weights)
-        self._data = samples.loss_data(self.coordinate_jacobians(start) if self._shape.regular else None)
-        self._residuals, self._linearised = (Batched(function) for function in residual_functions(self._shape))
+        self._use(LossShape(self.n, m, self.r, samples.metric_inverse is None, weights))
+        self._put(samples)
+        self._orientation = samples.orientation(self.coordinate_jacobians(start)) if self._shape.regular else None
+        self._data = samples.loss_data(self._orientation)
+
+    def _use(self, shape: LossShape) -> None:
+        self._shape = shape
+        self._residuals, self._linearised = (Batched(function) for function in residual_functions(shape))
+
+    @cached_property
+    def _curvature(self) -> Batched:
+        return Batched(loss_hessian_function(self._shape))
+
+    def _put(self, samples: Samples) -> None:
+        self.N, self.G = len(samples), self.family.basis_gradients(samples.points)  # (N, n, K)
+
+    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
+        """The same loss on `count` fresh sample sets of `size` each."""
+        samples = self._draw(size * count, seed)
+        for start in range(0, len(samples), size):
+            part, other = samples[start : start + size], copy(self)
+            other._put(part)
+            other._data = part.loss_data(self._orientation)
+            yield other
 
     def coordinate_jacobians(self, theta: Array) -> Array:
         """J_xi at every sample, (N, r, n)."""
@@ -58,6 +85,33 @@ class LinearObjective:
         if self._shape.regular:
             H += self._regularity_matrix(derivatives[-1], rho[:, -1] > 0)
         return self._mean_loss(rho), self._gradient(rho, derivatives), H
+
+    def hessian(self, theta: Array) -> Array:
+        """d^2L/dtheta^2, exact, (size, size)."""
+        r, n, K = self.r, self.n, self.K
+        (W,) = self._curvature(self.coordinate_jacobians(theta), *self._data)
+        W = W.reshape(-1, r, n, r, n)
+        H = np.empty((r, K, r, K))
+        for i in range(r):
+            for j in range(i + 1):
+                raised = W[:, i, :, j] @ self.G  # (N, n, K)
+                H[i, :, j] = self.G.reshape(-1, K).T @ raised.reshape(-1, K) / self.N
+                H[j, :, i] = H[i, :, j].T
+        return H.reshape(r * K, r * K)
+
+    @property
+    def weights(self) -> Weights:
+        """Weights of the loss."""
+        return self._shape.weights
+
+    def reweighted(self, weights: Weights) -> Self:
+        """The same loss on the same samples with other weights; a regularity term cannot be added later."""
+        assert self._shape.regular or weights.regularity == 0
+        other = copy(self)
+        other.__dict__.pop("_curvature", None)
+        other._use(replace(self._shape, weights=weights))
+        other._data = self._data[: len(other._shape.symbols())]  # the null basis is the last
+        return other
 
     def _mean_loss(self, rho: Array) -> float:
         return float(np.vdot(rho, rho) / (2 * self.N))

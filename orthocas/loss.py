@@ -27,8 +27,8 @@ class Weights:
                 raise InvalidValueError(name, value, "a finite number >= 0")
         for name in ("task", "mutual", "regularity"):
             object.__setattr__(self, name, float(getattr(self, name)))
-        if self.task == 0:
-            raise InvalidValueError("lambda1", self.task, "a positive number")
+        if self.task == 0 and self.mutual == 0:
+            raise InvalidValueError("lambda1 and lambda2", self.task, "at least one positive number")
 
 
 def pairs(r: int) -> list[tuple[int, int]]:
@@ -164,3 +164,15 @@ def residual_functions(shape: LossShape) -> tuple[ca.Function, ca.Function]:
     return dense_function("residuals", inputs, [rho]), dense_function(
         "linearised_residuals", inputs, [rho, *derivatives]
     )
+
+
+def loss_hessian_function(shape: LossShape) -> ca.Function:
+    """Exact second derivatives of one sample's loss with respect to J_xi, taken row by row, (r n, r n).
+
+    Inputs: J_xi (r, n), then the data of `LossShape.symbols`.
+    """
+    rows, data = ca.SX.sym("v", shape.r * shape.n), shape.symbols()
+    loss = ca.sumsqr(shape.residuals(ca.reshape(rows, shape.n, shape.r).T, data)) / 2
+    by_rows = ca.Function("by_rows", [rows, *data], [ca.hessian(loss, rows)[0]])
+    J = ca.SX.sym("J", shape.r, shape.n)
+    return dense_function("loss_hessian", [J, *data], [by_rows(ca.vec(J.T), *data)])

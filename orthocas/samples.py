@@ -1,5 +1,6 @@
 """Sample sets of a problem: everything the loss needs that does not depend on the coordinates."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,6 +22,10 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __getitem__(self, part: slice) -> "Samples":
+        inverse = None if self.metric_inverse is None else self.metric_inverse[part]
+        return Samples(self.points[part], self.task_jacobian[part], inverse)
 
     def restricted_to(self, joints: list[int]) -> "Samples":
         """Only some joints; the metric must not couple them to the others."""
@@ -64,20 +69,27 @@ class Samples:
         Z[:, :, -1] *= np.where(np.linalg.det(stacked) < 0, -1.0, 1.0)[:, None]
         return Z
 
-    def loss_data(self, coordinate_jacobians: Array | None) -> list[Array]:
+    def orientation(self, coordinate_jacobians: Array) -> float:
+        """Sign +1 or -1, at most samples, of the volume that gradients J_xi, (N, r, n), span across the task."""
+        return 1.0 if np.median(np.linalg.det(coordinate_jacobians @ self.null_basis)) >= 0 else -1.0
+
+    def loss_data(self, orientation: float | None) -> list[Array]:
         """What the residuals need of every sample; see `orthocas.loss.LossShape.symbols`.
 
         Args:
-            coordinate_jacobians: J_xi of the starting coordinates, (N, r, n): the null basis is oriented like them, so
-                that the volume of their gradients is positive at most samples. None without a regularity residual.
+            orientation: of the coordinates, as `orientation` gives it for those a fit starts from: the null basis is
+                turned like them, so that the volume of their gradients is positive. None without a regularity residual.
         """
         data = [self.unit_task_gradients]
         data += [] if self.metric_inverse is None else [self.metric_inverse]
-        if coordinate_jacobians is not None:
+        if orientation is not None:
             Z = self.null_basis.copy()
-            Z[:, :, -1] *= 1.0 if np.median(np.linalg.det(coordinate_jacobians @ Z)) >= 0 else -1.0
+            Z[:, :, -1] *= orientation
             data.append(Z)
         return data
+
+
+Draw = Callable[[int, tuple[int, ...]], Samples]  #: a number of fresh samples of a problem, by seed
 
 
 def sample_problem(problem: Problem, samples: int, seed: int | tuple[int, ...]) -> Samples:

@@ -1,14 +1,23 @@
 """Minimisers behind one protocol (`orthocas.objective.Solver`)."""
 
+from orthocas.solvers.adam import Adam
 from orthocas.solvers.gauss_newton import GaussNewton
+from orthocas.solvers.gradient_flow import GradientFlow
+from orthocas.solvers.ipopt import Ipopt
 from orthocas.solvers.lbfgs import LBFGS
 
 from orthocas.checks import require_known
 from orthocas.objective import Solver
 
-__all__ = ["LBFGS", "SOLVERS", "GaussNewton", "get"]
+__all__ = ["LBFGS", "SOLVERS", "Adam", "GaussNewton", "GradientFlow", "Ipopt", "get"]
 
-SOLVERS: dict[str, type[GaussNewton] | type[LBFGS]] = {"gauss_newton": GaussNewton, "lbfgs": LBFGS}
+SOLVERS: dict[str, type[GaussNewton] | type[LBFGS] | type[Ipopt] | type[Adam] | type[GradientFlow]] = {
+    "gauss_newton": GaussNewton,
+    "lbfgs": LBFGS,
+    "ipopt": Ipopt,
+    "adam": Adam,
+    "gradient_flow": GradientFlow,
+}
 
 
 def get(name: str) -> Solver:

@@ -1,13 +1,13 @@
 """Gauss-Newton with Levenberg-Marquardt damping, for losses with a normal matrix."""
 
-import time
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orthocas.checks import Array, require_count
+from orthocas.best_point import BestPoint
+from orthocas.checks import Array, require_at_least, require_count
 from orthocas.errors import InvalidValueError
-from orthocas.objective import LeastSquaresObjective, Monitor, Objective, Progress, SolveResult, Status, silent
+from orthocas.objective import UNWATCHED, LeastSquaresObjective, Objective, SolveResult, Status, Watch
 
 _MAX_REJECTIONS = 10
 
@@ -29,14 +29,13 @@ class GaussNewton:
 
     def __post_init__(self) -> None:
         require_count("max_iterations", self.max_iterations)
-        if not self.tolerance >= 0:
-            raise InvalidValueError("tolerance", self.tolerance, "a number >= 0")
+        require_at_least("tolerance", self.tolerance, 0)
 
     def coarser(self) -> "GaussNewton":
         """At most 10 iterations, and done when a step gains less than half a per cent."""
         return replace(self, max_iterations=min(10, self.max_iterations), tolerance=max(5e-3, self.tolerance))
 
-    def minimise(self, objective: Objective, theta0: Array, monitor: Monitor = silent, stage: str = "") -> SolveResult:
+    def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
         """Minimise from theta0.
 
         Raises:
@@ -44,41 +43,40 @@ class GaussNewton:
         """
         if not isinstance(objective, LeastSquaresObjective):
             raise InvalidValueError(
-                "solver", self.name, "lbfgs for a parametrisation that is not linear in its parameters"
+                "solver", self.name, "lbfgs or adam for a parametrisation that is not linear in its parameters"
             )
-        run = _Run(self, objective, theta0)
+        run = _Run(self, objective, theta0, watch)
         try:
-            status = run.iterate(monitor, stage)
+            status = run.iterate()
         except KeyboardInterrupt:
-            if not np.isfinite(run.value):  # nothing found yet
+            if not run.best.found:
                 raise
             status = Status.INTERRUPTED
-        return run.result(status)
+        return run.best.result(status)
 
 
 class _Run:
     """State of one minimisation."""
 
-    def __init__(self, settings: GaussNewton, objective: LeastSquaresObjective, theta0: Array) -> None:
+    def __init__(self, settings: GaussNewton, objective: LeastSquaresObjective, theta0: Array, watch: Watch) -> None:
         self.settings, self.objective = settings, objective
-        self.theta, self.value = theta0, np.inf
-        self.damping = 1e-3
-        self.iterations = self.evaluations = 0
-        self.start = time.perf_counter()
+        self.best = BestPoint(objective, theta0, watch)
+        self.damping = float((self.best.restored or {}).get("damping", 1e-3))
 
-    def iterate(self, monitor: Monitor, stage: str) -> Status:
-        while self.iterations < self.settings.max_iterations:
-            self.value, gradient, H = self.objective.normal_equations(self.theta)
-            self.evaluations += 1
-            if not np.isfinite(self.value):
+    def iterate(self) -> Status:
+        best = self.best
+        while best.iterations < self.settings.max_iterations:
+            before, gradient, H = self.objective.normal_equations(best.theta)
+            best.evaluations += 1
+            best.offer(best.theta, before)
+            if not np.isfinite(before):
                 return Status.FAILED
-            before, damping = self.value, self.damping
+            damping = self.damping
             if not self._step(gradient, H):
                 return Status.STALLED if np.any(gradient) else Status.CONVERGED
-            self.iterations += 1
-            monitor(Progress(stage, self.iterations / self.settings.max_iterations, f"loss {self.value:.5g}"))
+            best.next_iteration(self.settings.max_iterations, damping=self.damping)
             cautious = self.damping > damping  # a step after rejections is short: its small gain says little
-            if not cautious and before - self.value <= self.settings.tolerance * before:
+            if not cautious and before - best.value <= self.settings.tolerance * before:
                 return Status.CONVERGED
         return Status.ITERATION_LIMIT
 
@@ -90,19 +88,13 @@ class _Run:
             damped = H.copy()
             damped[np.diag_indices_from(H)] += self.damping * scale
             try:
-                candidate = self.theta - np.linalg.solve(damped, gradient)
+                candidate = self.best.theta - np.linalg.solve(damped, gradient)
             except np.linalg.LinAlgError:
                 self.damping *= 10
                 continue
-            value = self.objective.value(candidate)
-            self.evaluations += 1
-            if value < self.value:
-                self.theta, self.value = candidate, value
+            self.best.evaluations += 1
+            if self.best.offer(candidate, self.objective.value(candidate)):
                 self.damping = max(self.damping / 5, 1e-7)
                 return True
             self.damping *= 4
         return False
-
-    def result(self, status: Status) -> SolveResult:
-        seconds = time.perf_counter() - self.start
-        return SolveResult(self.theta, self.value, status, self.iterations, self.evaluations, seconds)

@@ -9,7 +9,7 @@ import orthocas as oc
 from orthocas import solvers
 from orthocas.errors import InvalidValueError, MemoryNeedError, ShapeError
 from orthocas.fitting import Fit
-from orthocas.objective import Monitor, Objective, Progress, SolveResult, Status, silent
+from orthocas.objective import UNWATCHED, Objective, Progress, SolveResult, Status, Watch
 
 
 def test_default_fit_of_the_iiwa_beats_the_papers_network(iiwa: oc.Problem) -> None:
@@ -143,9 +143,7 @@ class StopsAfterFirstStage:
     def coarser(self) -> "StopsAfterFirstStage":
         return self
 
-    def minimise(
-        self, objective: Objective, theta0: np.ndarray, monitor: Monitor = silent, stage: str = ""
-    ) -> SolveResult:
+    def minimise(self, objective: Objective, theta0: np.ndarray, watch: Watch = UNWATCHED) -> SolveResult:
         self.stages += 1
         result = solvers.GaussNewton().minimise(objective, theta0)
         status = Status.INTERRUPTED if self.stages == 2 else result.status

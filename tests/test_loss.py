@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 import orthocas as oc
+from orthocas import graph_objective
 from orthocas.coordinates import joint_space
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.graph_objective import GraphObjective
 from orthocas.linear_objective import LinearObjective
 from orthocas.loss import REGULAR_VOLUME, Weights, mutual_cosines, pairs, task_cosines
-from orthocas.samples import Samples, sample_problem, samples_at
+from orthocas.samples import Draw, Samples, sample_problem, samples_at
 from orthocas.spectral import spectral_start
 
 WEIGHTS = Weights(1000.0, 30.0)
@@ -39,13 +40,18 @@ def loss_by_hand(J_x: np.ndarray, J_xi: np.ndarray, B: np.ndarray, weights: Weig
     return float(total + weights.regularity / 2 * max(REGULAR_VOLUME - volume, 0) ** 2)
 
 
+def draw_from(problem: oc.Problem) -> Draw:
+    return lambda count, seed: sample_problem(problem, count, seed)
+
+
 def objectives(
     problem: oc.Problem, parametrisation: oc.Polynomial, weights: Weights = WEIGHTS
 ) -> tuple[LinearObjective, GraphObjective, Samples]:
     samples = sample_problem(problem, 60, 9)
     family = parametrisation.family(joint_space(problem), problem.r)
     theta = family.initial(3)
-    return LinearObjective(family, samples, weights, theta), GraphObjective(family, samples, weights, theta), samples
+    settings = (family, samples, weights, theta, draw_from(problem))
+    return LinearObjective(*settings), GraphObjective(*settings), samples
 
 
 @pytest.fixture(params=["planar_x", "planar_xy", "iiwa"])
@@ -73,10 +79,52 @@ def test_gradients_of_both_objectives_agree(problem: oc.Problem) -> None:
     np.testing.assert_allclose(linear.normal_equations(theta)[1], graph.value_and_gradient(theta)[1], atol=1e-9)
 
 
+def test_hessian_is_the_derivative_of_the_gradient(problem: oc.Problem) -> None:
+    linear, _, _ = objectives(problem, oc.Polynomial(2), REGULAR)
+    theta = linear.family.initial(3)
+    direction = 1e-6 * np.random.default_rng(8).normal(size=theta.size)
+    ahead, behind = (linear.value_and_gradient(theta + sign * direction)[1] for sign in (1, -1))
+    H = linear.hessian(theta)
+    np.testing.assert_allclose(H @ direction, (ahead - behind) / 2, atol=1e-8 * np.abs(H @ direction).max())
+    np.testing.assert_allclose(H, H.T, atol=1e-12 * np.abs(H).max())
+
+
+def test_weights_split_the_loss_into_its_terms(problem: oc.Problem) -> None:
+    linear, _, _ = objectives(problem, oc.Polynomial(2), REGULAR)
+    theta = linear.family.initial(3)
+    terms = [linear.reweighted(Weights(*w)) for w in ((1000.0, 0.0, 0.0), (0.0, 30.0, 0.0), (1000.0, 0.0, 120.0))]
+    task, mutual, regular = (term.value(theta) for term in terms)
+    np.testing.assert_allclose(regular + mutual, linear.value(theta), rtol=1e-12)
+    assert task < regular
+
+
+def test_fresh_batches_are_new_samples_of_the_same_loss(problem: oc.Problem) -> None:
+    for objective in objectives(problem, oc.Polynomial(2), REGULAR)[:2]:
+        theta = oc.Polynomial(2).family(joint_space(problem), problem.r).initial(3)
+        first, second = ([part.value(theta) for part in objective.batches(400, 3, (seed,))] for seed in (0, 1))
+        assert len(first) == 3
+        assert len({*first, *second}) == 6
+        assert first == [part.value(theta) for part in objective.batches(400, 3, (0,))]
+        many = np.mean([part.value(theta) for part in objective.batches(400, 10, (2,))])
+        whole = next(iter(objective.batches(20_000, 1, (3,)))).value(theta)
+        np.testing.assert_allclose(many, whole, rtol=0.1)  # both means over thousands of samples
+
+
+def test_graph_cut_into_blocks_gives_the_same_loss(planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    family = oc.MLP((6, 5)).family(joint_space(planar_x), 2)
+    settings = (family, sample_problem(planar_x, 50, 2), REGULAR, family.initial(1), draw_from(planar_x))
+    value, gradient = GraphObjective(*settings).value_and_gradient(family.initial(1))
+    monkeypatch.setattr(graph_objective, "_CHUNK_ENTRIES", 7 * 2 * family.width)  # blocks of 7, 1 left over
+    blocked = GraphObjective(*settings)
+    assert len(blocked._blocks) == 8
+    np.testing.assert_allclose(blocked.value_and_gradient(family.initial(1))[0], value, rtol=1e-13)
+    np.testing.assert_allclose(blocked.value_and_gradient(family.initial(1))[1], gradient, atol=1e-11)
+
+
 @pytest.mark.parametrize("parametrisation", [oc.Polynomial(2), oc.Fourier(1), oc.MLP((6,))], ids=lambda p: p.label)
 def test_taylor_remainder_falls_with_the_square_of_the_step(planar_x: oc.Problem, parametrisation: object) -> None:
     family = parametrisation.family(joint_space(planar_x), planar_x.r)
-    objective = GraphObjective(family, sample_problem(planar_x, 40, 2), REGULAR, family.initial(1))
+    objective = GraphObjective(family, sample_problem(planar_x, 40, 2), REGULAR, family.initial(1), draw_from(planar_x))
     theta = family.initial(1)
     direction = np.random.default_rng(2).normal(size=family.size)
     value, gradient = objective.value_and_gradient(theta)
@@ -90,7 +138,7 @@ def test_gauss_newton_matrix_is_that_of_the_residuals(planar_x: oc.Problem) -> N
     twice = samples_at(planar_x, np.repeat(sample_problem(planar_x, 40, 9).points, 2, axis=0))  # every second is used
     family = oc.Polynomial(2).family(joint_space(planar_x), 2)
     theta = family.initial(3)
-    objective = LinearObjective(family, twice, REGULAR, theta)
+    objective = LinearObjective(family, twice, REGULAR, theta, draw_from(planar_x))
     assert (objective._residuals(objective.coordinate_jacobians(theta), *objective._data)[0][:, -1] > 0).any()
 
     def residuals(theta: np.ndarray) -> np.ndarray:
@@ -156,6 +204,6 @@ def test_spectral_start_finds_an_exact_linear_coordinate() -> None:
     problem = oc.Problem(robot, task, domain=oc.Box([0.0, 0.0], 1.0))
     family = oc.Polynomial(2).family(joint_space(problem), 1)
     theta = spectral_start(family, sample_problem(problem, 100, 0))
-    objective = LinearObjective(family, sample_problem(problem, 100, 1), WEIGHTS, theta)
+    objective = LinearObjective(family, sample_problem(problem, 100, 1), WEIGHTS, theta, draw_from(problem))
     directions = objective.coordinate_jacobians(theta)[:, 0]
     np.testing.assert_allclose(directions @ np.array([1.0, 2.0]), 0, atol=1e-6 * np.abs(directions).max())

@@ -7,12 +7,13 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, SingularTaskError, UnknownNameError
-from orthocas.parametrisations import JointSpace, embed, joint_derivatives, parse_parametrisation
+from orthocas.parametrisations import JointSpace, component_gradients, embed, parse_parametrisation
 from orthocas.parametrisations.product_basis import LinearFamily
 
 SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))
 SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE.joint_names)
-ALL = [oc.Linear(), oc.Polynomial(3), oc.Fourier(2), oc.MLP((5, 4))]
+GIVEN = oc.Given.from_function("by hand", 3, lambda q: ca.vertcat(ca.sin(q[0]) * q[1], q[2] + 2))
+ALL = [oc.Linear(), oc.Polynomial(3), oc.Fourier(2), oc.MLP((5, 4)), GIVEN]
 
 
 def values(parametrisation: object, space: JointSpace, points: np.ndarray, theta: np.ndarray, r: int = 2) -> np.ndarray:
@@ -26,13 +27,22 @@ def test_jacobian_by_ad_matches_central_differences(parametrisation: object) -> 
     family = parametrisation.family(SPACE, 2)
     theta = family.initial(seed=4)
     points = np.random.default_rng(5).uniform(-0.5, 0.5, (6, 3))
-    q = ca.MX.sym("q", 3, 6)
-    J = ca.Function("J", [q], joint_derivatives(family.expression(q, ca.MX(ca.DM(theta))), q))(points.T)
+    q, p = ca.MX.sym("q", 3, 6), ca.MX(ca.DM(theta))
+    J = np.array(ca.Function("J", [q], family.jacobian(q, p))(points.T))  # (r, n, N)
     step = 1e-6
     for k, e in enumerate(np.eye(3)):
         ahead = values(parametrisation, SPACE, points + step * e, theta)
         behind = values(parametrisation, SPACE, points - step * e, theta)
-        np.testing.assert_allclose(np.array(J[k]).T, (ahead - behind) / (2 * step), atol=1e-8)
+        np.testing.assert_allclose(J[:, k], ((ahead - behind) / (2 * step)).T, atol=1e-8)
+
+
+def test_chain_rule_of_the_network_is_that_of_automatic_differentiation() -> None:
+    family = oc.MLP((5, 4, 3)).family(SLIDING, 2)
+    q, theta = ca.MX.sym("q", 3, 6), ca.MX(ca.DM(family.initial(seed=4)))
+    points = np.random.default_rng(5).uniform(-0.5, 0.5, (6, 3))
+    by_hand, by_ad = family.jacobian(q, theta), component_gradients(family.expression(q, theta), q)
+    ours, theirs = (np.array(ca.Function("J", [q], J)(points.T)) for J in (by_hand, by_ad))
+    np.testing.assert_allclose(ours, theirs, atol=1e-14)
 
 
 @pytest.mark.parametrize("parametrisation", ALL, ids=lambda p: p.label)
@@ -131,13 +141,14 @@ def test_labels_are_read_back(label: str) -> None:
 @pytest.mark.parametrize(
     ("label", "error", "message"),
     [
-        ("spline:3", UnknownNameError, "known: linear, polynomial, fourier, mlp"),
+        ("spline:3", UnknownNameError, "known: linear, polynomial, fourier, mlp, sew"),
         ("polynomial", InvalidValueError, "whole numbers"),
         ("polynomial:x", InvalidValueError, "whole numbers"),
         ("polynomial:0", InvalidValueError, "degree is 0"),
         ("fourier:-1", InvalidValueError, "degree is -1"),
         ("mlp:64x", InvalidValueError, "whole numbers"),
         ("mlp:0", InvalidValueError, "hidden is 0"),
+        ("sew:left", UnknownNameError, "known: conventional, stereographic"),
         ("linear:2", InvalidValueError, "'linear' without a number"),
     ],
 )

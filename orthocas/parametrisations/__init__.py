@@ -1,7 +1,8 @@
 """Parametrisations xi_theta(q): linear, polynomial, Fourier, MLP."""
 
-from orthocas.parametrisations.family import Family, JointSpace, Parametrisation, embed, joint_derivatives
+from orthocas.parametrisations.family import Family, JointSpace, Parametrisation, component_gradients, embed
 from orthocas.parametrisations.fourier import Fourier
+from orthocas.parametrisations.given import Given
 from orthocas.parametrisations.linear import Linear
 from orthocas.parametrisations.mlp import MLP
 from orthocas.parametrisations.polynomial import Polynomial
@@ -12,12 +13,15 @@ from orthocas.parametrisations.registry import (
     parametrisation_to_data,
     parse_parametrisation,
 )
+from orthocas.parametrisations.sew import SEW
 
 __all__ = [
     "MLP",
     "PARAMETRISATIONS",
+    "SEW",
     "Family",
     "Fourier",
+    "Given",
     "GradedParametrisation",
     "JointSpace",
     "Linear",
@@ -25,8 +29,8 @@ __all__ = [
     "Parametrisation",
     "Polynomial",
     "Term",
+    "component_gradients",
     "embed",
-    "joint_derivatives",
     "parametrisation_from_data",
     "parametrisation_to_data",
     "parse_parametrisation",

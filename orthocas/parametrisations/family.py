@@ -54,8 +54,17 @@ class Family(Protocol):
         """Whether the family is made of dense products: MX graphs with samples as columns suit it, SX does not."""
         ...
 
+    @property
+    def width(self) -> int:
+        """Largest number of intermediate values of one sample: how many samples fit side by side into the cache."""
+        ...
+
     def expression(self, q: Expression, theta: Expression) -> Expression:
         """xi_theta(q), (r, N), for N joint positions side by side as columns (n, N); theta (size, 1)."""
+        ...
+
+    def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
+        """Gradients of the components, r matrices (n, N): column s of the j-th is dxi_j/dq at joint position s."""
         ...
 
     def initial(self, seed: int) -> Array:
@@ -77,19 +86,19 @@ class Parametrisation(Protocol):
         ...
 
 
-def joint_derivatives(xi: Expression, q: Expression) -> list[Expression]:
-    """dxi/dq_k for every joint k by forward automatic differentiation, n matrices (r, N).
+def component_gradients(xi: Expression, q: Expression) -> list[Expression]:
+    """dxi_j/dq of every component j by reverse automatic differentiation, r matrices (n, N).
 
     Args:
         xi: (r, N), whose column s depends on column s of q only.
         q: symbols (n, N).
     """
-    derivatives = []
-    for k in range(q.shape[0]):
-        seed = type(q)(q.shape[0], q.shape[1])
-        seed[k, :] = 1
-        derivatives.append(ca.jtimes(xi, q, seed))
-    return derivatives
+    gradients = []
+    for j in range(xi.shape[0]):
+        seed = type(q)(*xi.shape)
+        seed[j, :] = 1
+        gradients.append(ca.jtimes(xi, q, seed, True))
+    return gradients
 
 
 def embed(theta: Array, outputs: int, coarse: Sequence[tuple[int, ...]], fine: Sequence[tuple[int, ...]]) -> Array:

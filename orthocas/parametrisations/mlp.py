@@ -55,20 +55,65 @@ class MLPFamily:
         """Number of weights and biases."""
         return sum(out * (width + 1) for width, out in pairwise(self.widths))
 
+    @property
+    def width(self) -> int:
+        """Width of the widest layer."""
+        return max(self.widths)
+
     def expression(self, q: Expression, theta: Expression) -> Expression:
         """xi_theta(q), (r, N), for q (n, N)."""
-        turning = [i for i, slides in enumerate(self.space.prismatic) if not slides]
-        sliding = [i for i, slides in enumerate(self.space.prismatic) if slides]
-        layer = ca.vertcat(ca.sin(q[turning, :]), ca.cos(q[turning, :]), q[sliding, :])
-        start = 0
-        for depth, (width, out) in enumerate(pairwise(self.widths)):
+        return self._forward(q, self._layers(theta))[0]
+
+    def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
+        """Gradients of the components, r matrices (n, N), by the chain rule from the outputs to the inputs.
+
+        The gradients of all components go through the layers side by side, as one matrix (width, r N): large products
+        are what BLAS is fast at.
+        """
+        layers = self._layers(theta)
+        slopes = self._forward(q, layers)[1]
+        N = q.shape[1]
+        W_out = layers[-1][0]
+        gradients = ca.horzcat(*(ca.repmat(W_out[j, :].T, 1, N) for j in range(self.outputs)))
+        for (W, _), slope in zip(layers[-2::-1], reversed(slopes), strict=True):
+            gradients = W.T @ (gradients * ca.repmat(slope, 1, self.outputs))
+        t = len(self._turning)
+        by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[self._turning, :]), 1, self.outputs)
+        by_angle -= gradients[t : 2 * t, :] * ca.repmat(ca.sin(q[self._turning, :]), 1, self.outputs)
+        rows = np.argsort([*self._turning, *self._sliding]).tolist()  # back to the order of the joints
+        stacked = ca.vertcat(by_angle, gradients[2 * t :, :])[rows, :]
+        return [stacked[:, j * N : (j + 1) * N] for j in range(self.outputs)]
+
+    @property
+    def _turning(self) -> list[int]:
+        return [i for i, slides in enumerate(self.space.prismatic) if not slides]
+
+    @property
+    def _sliding(self) -> list[int]:
+        return [i for i, slides in enumerate(self.space.prismatic) if slides]
+
+    def _layers(self, theta: Expression) -> list[tuple[Expression, Expression]]:
+        """Weights and biases of every layer."""
+        layers, start = [], 0
+        for width, out in pairwise(self.widths):
             W = ca.reshape(theta[start : start + out * width], out, width)
-            b = theta[start + out * width : start + out * (width + 1)]
+            layers.append((W, theta[start + out * width : start + out * (width + 1)]))
             start += out * (width + 1)
+        return layers
+
+    def _forward(
+        self, q: Expression, layers: list[tuple[Expression, Expression]]
+    ) -> tuple[Expression, list[Expression]]:
+        """Outputs (r, N), and the slopes 1 - tanh^2 of the hidden layers, (width, N) each."""
+        angles = q[self._turning, :]
+        layer = ca.vertcat(ca.sin(angles), ca.cos(angles), q[self._sliding, :])
+        slopes = []
+        for depth, (W, b) in enumerate(layers):
             layer = W @ layer + ca.repmat(b, 1, q.shape[1])
             if depth < len(self.hidden):
                 layer = ca.tanh(layer)
-        return layer
+                slopes.append(1 - layer**2)
+        return layer, slopes
 
     def initial(self, seed: int) -> Array:
         """Glorot-uniform weights and zero biases, (size,)."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from orthocas.batch import Batched, dense_function
 from orthocas.checks import Array
-from orthocas.parametrisations.family import Expression, JointSpace
+from orthocas.parametrisations.family import Expression, JointSpace, component_gradients
 
 Term = tuple[int, ...]  #: for every joint, which one-joint function the term takes; 0 is the constant 1
 
@@ -33,6 +33,11 @@ class LinearFamily:
         """Number of coefficients r K."""
         return self.outputs * len(self.terms)
 
+    @property
+    def width(self) -> int:
+        """Number of basis functions K."""
+        return len(self.terms)
+
     def basis(self, q: Expression) -> Expression:
         """psi(q), (K, N), for q (n, N)."""
         tables = [self.one_joint_functions(i, q[i, :]) for i in range(self.space.n)]
@@ -45,6 +50,10 @@ class LinearFamily:
     def expression(self, q: Expression, theta: Expression) -> Expression:
         """xi_theta(q), (r, N), for q (n, N)."""
         return ca.reshape(theta, len(self.terms), self.outputs).T @ self.basis(q)
+
+    def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
+        """Gradients of the components, r matrices (n, N)."""
+        return component_gradients(self.expression(q, theta), q)
 
     def initial(self, seed: int) -> Array:
         """Random coefficients that fall with the degree, (size,)."""

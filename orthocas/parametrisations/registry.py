@@ -8,9 +8,11 @@ from orthocas.checks import require_known
 from orthocas.errors import InvalidValueError
 from orthocas.parametrisations.family import Parametrisation
 from orthocas.parametrisations.fourier import Fourier
+from orthocas.parametrisations.given import Given
 from orthocas.parametrisations.linear import Linear
 from orthocas.parametrisations.mlp import MLP
 from orthocas.parametrisations.polynomial import Polynomial
+from orthocas.parametrisations.sew import SEW
 
 
 def _whole(label: str, text: str) -> int:
@@ -28,16 +30,17 @@ def _linear(label: str, text: str) -> Linear:
     return Linear()
 
 
-PARAMETRISATIONS: dict[str, Callable[[str, str], Parametrisation]] = {
+PARAMETRISATIONS: dict[str, Callable[[str, str], Parametrisation | SEW]] = {
     "linear": _linear,
     "polynomial": lambda label, text: Polynomial(_whole(label, text)),
     "fourier": lambda label, text: Fourier(_whole(label, text)),
     "mlp": lambda label, text: MLP(tuple(_whole(label, width) for width in text.split("x"))),
+    "sew": lambda label, text: SEW(text or "stereographic"),
 }
 
 
-_CLASSES: dict[str, type[Linear] | type[Polynomial] | type[Fourier] | type[MLP]] = {
-    kind.__name__: kind for kind in (Linear, Polynomial, Fourier, MLP)
+_CLASSES: dict[str, type[Linear] | type[Polynomial] | type[Fourier] | type[MLP] | type[Given]] = {
+    kind.__name__: kind for kind in (Linear, Polynomial, Fourier, MLP, Given)
 }
 
 
@@ -47,7 +50,7 @@ def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
     Raises:
         InvalidValueError: if it is not one of ours, so that it could not be read back.
     """
-    if not isinstance(parametrisation, Linear | Polynomial | Fourier | MLP):
+    if not isinstance(parametrisation, Linear | Polynomial | Fourier | MLP | Given):
         known = ", ".join(_CLASSES)
         raise InvalidValueError(
             "parametrisation", type(parametrisation).__name__, f"one that chart files know: {known}"
@@ -65,8 +68,8 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
     return _CLASSES[data["parametrisation"]](**data["settings"])
 
 
-def parse_parametrisation(label: str) -> Parametrisation:
-    """Read 'polynomial:4', 'fourier:2', 'mlp:64x64' or 'linear'.
+def parse_parametrisation(label: str) -> Parametrisation | SEW:
+    """Read 'polynomial:4', 'fourier:2', 'mlp:64x64', 'linear' or 'sew:stereographic'.
 
     Raises:
         UnknownNameError: if there is no such parametrisation.

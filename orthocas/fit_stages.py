@@ -1,0 +1,137 @@
+"""The minimisations a fit is made of: samples, a start, an objective, a solver."""
+
+from dataclasses import dataclass
+from math import ceil
+
+import numpy as np
+
+from orthocas.bounded_mutual import BoundedMutual
+from orthocas.checkpoint import Checkpoint, Stage
+from orthocas.checks import Array, require_memory
+from orthocas.domains import sample_evenly
+from orthocas.errors import InfeasibleError, InvalidValueError
+from orthocas.graph_objective import GraphObjective
+from orthocas.linear_objective import LinearObjective
+from orthocas.loss import Weights, pairs
+from orthocas.objective import Monitor, Objective, Progress, Solver, SolveResult, Status, Watch
+from orthocas.parametrisations import Family, GradedParametrisation, JointSpace, LinearFamily, Parametrisation, embed
+from orthocas.problem import Problem
+from orthocas.samples import Samples, sample_problem, samples_at
+from orthocas.spectral import spectral_start
+
+MLP_SAMPLES = 2000  #: default sample count of families that are not linear in theta
+_FRESH = 2000  # tag of samples drawn while a solver runs, apart from those of the stages
+
+
+@dataclass(frozen=True, eq=False)
+class StageRunner:
+    """What the stages of one fit share."""
+
+    problem: Problem
+    space: JointSpace  #: active joints only
+    active: list[int]
+    weights: Weights
+    max_mutual: float | None  #: bound on the root mean square mutual cosine, over all pairs of coordinates
+    samples: int | None
+    seed: int
+    monitor: Monitor
+    checkpoint: Checkpoint
+
+    def graded(
+        self, target: GradedParametrisation, r: int, solver: Solver
+    ) -> tuple[list[Stage], GradedParametrisation]:
+        """Degree continuation: solve a low degree from a spectral start, embed, solve the next, ..."""
+        self._require_memory(target, r)
+        stages: list[Stage] = []
+        lower = None
+        for degree in range(min(target.degree, 2), target.degree + 1):
+            current = target.of_degree(degree)
+            family = current.family(self.space, r)
+            start = None if lower is None else embed(stages[-1].result.theta, r, lower.terms, family.terms)
+            minimiser = solver if degree == target.degree else solver.coarser()
+            try:
+                stages.append(self.stage(current, family, start, minimiser, degree))
+            except KeyboardInterrupt:  # between minimisations: the last degree is the best so far
+                if not stages:
+                    raise
+                return [*stages[:-1], stages[-1].interrupted()], target.of_degree(degree - 1)
+            lower = family
+            if stages[-1].result.status is Status.INTERRUPTED:
+                return stages, current
+        return stages, target
+
+    def stage(
+        self, parametrisation: Parametrisation, family: Family, theta: Array | None, solver: Solver, degree: int = 0
+    ) -> Stage:
+        """Draw samples, find a start if there is none, and minimise; or take the stage from the checkpoint."""
+        label = parametrisation.label
+        done = self.checkpoint.finished(label)
+        if done is not None:
+            return done
+        count = self._sample_count(family)
+        self.monitor(Progress(label, 0.0, f"sampling {count} points"))
+        points = sample_evenly(self.problem.domain, count, (self.seed, 1 + degree))
+        samples = samples_at(self.problem, points).restricted_to(self.active)
+        objective, theta = self._objective(label, family, samples, theta)
+        watch = Watch(self.monitor, label, self.checkpoint.keeper(label))
+        result = solver.minimise(objective, theta, watch)
+        if isinstance(objective, BoundedMutual):
+            self._require_feasible(label, objective, result)
+        stage = Stage(label, family.size, count, result.raise_if_failed())
+        self.checkpoint.add(stage)
+        return stage
+
+    def _objective(self, label: str, family: Family, samples: Samples, theta: Array | None) -> tuple[Objective, Array]:
+        """The loss of a family on samples, and where to start."""
+        if not isinstance(family, LinearFamily):
+            if self.max_mutual is not None:
+                raise InvalidValueError(
+                    "max_mutual_deg", f"given with {label}", "a parametrisation linear in its parameters, as polynomial"
+                )
+            self._require_graph_memory(label, family, len(samples))
+            theta = family.initial(self.seed) if theta is None else theta
+            return GraphObjective(family, samples, self.weights, theta, self._draw), theta
+        theta = spectral_start(family, samples) if theta is None else theta
+        objective = LinearObjective(family, samples, self.weights, theta, self._draw)
+        if self.max_mutual is None:
+            return objective, theta
+        fitted, all_pairs = len(pairs(family.outputs)), len(pairs(self.problem.r))
+        if not fitted:
+            raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
+        # pairs with an idle joint are exactly orthogonal, so the others may use their share
+        bounded = BoundedMutual(objective, self.max_mutual * (all_pairs / fitted) ** 0.5)
+        return bounded, bounded.in_gauge(theta)
+
+    def _require_feasible(self, label: str, objective: BoundedMutual, result: SolveResult) -> None:
+        """Say how far a bound was missed."""
+        if result.status is not Status.INFEASIBLE:
+            return
+        assert self.max_mutual is not None
+        reached = np.degrees(self.max_mutual) * objective.constraints(result.theta)[0][0] ** 0.5
+        raise InfeasibleError(
+            f"no {label} coordinates with mutual angles within {np.degrees(self.max_mutual):.4g} deg found, "
+            f"best {reached:.4g} deg: raise max_mutual_deg or the degree"
+        )
+
+    def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
+        return sample_problem(self.problem, count, (self.seed, _FRESH, *seed)).restricted_to(self.active)
+
+    def _sample_count(self, family: Family) -> int:
+        if isinstance(family, LinearFamily):
+            return self._linear_sample_count(len(family.terms), family.outputs)
+        return self.samples or MLP_SAMPLES
+
+    def _linear_sample_count(self, terms: int, r: int) -> int:
+        """Samples for a linear family: enough that every coefficient sees about 140 residuals."""
+        return self.samples or 1000 + ceil(140 * terms / (self.problem.m + r - 1))
+
+    def _require_graph_memory(self, label: str, family: Family, count: int) -> None:
+        """Refuse a network whose parameters and minimiser memory do not fit."""
+        require_memory(f"{label} with {family.size} parameters", 8.0 * (60 * family.size + 100 * count * self.space.n))
+
+    def _require_memory(self, target: GradedParametrisation, r: int) -> None:
+        """Refuse a degree that does not fit, before building anything."""
+        K = target.term_count(self.space.n)
+        N = self._linear_sample_count(K, r)
+        needed = 8 * (N * self.space.n * K + 4 * (r * K) ** 2)
+        require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)

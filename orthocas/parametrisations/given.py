@@ -1,0 +1,76 @@
+"""Coordinates given in closed form: nothing to fit, but a chart to judge, save and use like any other."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from orthocas.batch import dense_function
+from orthocas.checks import Array, require_shape
+from orthocas.custom_expression import expression_of
+from orthocas.expression_tape import Tape, replay, to_tape
+from orthocas.parametrisations.family import Expression, JointSpace, component_gradients
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """Coordinates xi(q) of elementary operations, without parameters. Use `from_function`.
+
+    Args:
+        label: a name for reports.
+        tape: the expression as plain data; see `orthocas.expression_tape`.
+    """
+
+    label: str
+    tape: Tape
+
+    @classmethod
+    def from_function(cls, name: str, n: int, function: Callable[[ca.SX], ca.SX] | ca.Function) -> "Given":
+        """From a map of an SX column q (n, 1) to xi (r, 1).
+
+        Raises:
+            ShapeError: if xi is not a column.
+        """
+        q = ca.SX.sym("q", n)
+        xi = expression_of(f"coordinates '{name}'", function, q)
+        require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
+        return cls(name, to_tape(dense_function("xi", [q], [xi])))
+
+    def family(self, space: JointSpace, outputs: int) -> "GivenFamily":
+        """The coordinates as a family without parameters.
+
+        Raises:
+            ShapeError: if there are not as many of them as the problem has redundant joints.
+        """
+        require_shape(f"coordinates '{self.label}'", (int(self.tape["rows"]), 1), (outputs, 1))
+        return GivenFamily(self, outputs)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenFamily:
+    """The one function of a `Given`."""
+
+    given: Given
+    outputs: int
+    size: int = 0
+    as_matrices: bool = False
+
+    @cached_property
+    def width(self) -> int:
+        """Number of steps."""
+        return len(self.given.tape["steps"])
+
+    def expression(self, q: Expression, theta: Expression) -> Expression:
+        """xi(q), (r, N), for q (n, N)."""
+        xi: Expression = ca.vertcat(*replay(self.given.tape, [q[i, :] for i in range(q.shape[0])]))
+        return xi
+
+    def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
+        """Gradients of the components, r matrices (n, N)."""
+        return component_gradients(self.expression(q, theta), q)
+
+    def initial(self, seed: int) -> Array:
+        """No parameters, (0,)."""
+        return np.zeros(0)

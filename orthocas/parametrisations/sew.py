@@ -1,0 +1,41 @@
+"""The shoulder-elbow-wrist angle as a coordinate: what 7-joint arms with a pose task use today."""
+
+from dataclasses import dataclass
+
+from orthocas.checks import require_known
+from orthocas.errors import InvalidValueError
+from orthocas.parametrisations.given import Given
+from orthocas.problem import Problem
+from orthocas.shoulder_elbow_wrist import SEW_KINDS, sew_angle
+
+
+@dataclass(frozen=True)
+class SEW:
+    """xi(q) = psi(q), the turn of the elbow about the line from shoulder to wrist [EW2024].
+
+    A baseline: it names the self-motion well, but nothing makes its gradient orthogonal to the task's.
+
+    Args:
+        kind: "conventional" or "stereographic"; see `orthocas.shoulder_elbow_wrist.sew_angle`.
+    """
+
+    kind: str = "stereographic"
+
+    def __post_init__(self) -> None:
+        require_known("SEW angle", self.kind, SEW_KINDS)
+
+    @property
+    def label(self) -> str:
+        """'sew:KIND'."""
+        return f"sew:{self.kind}"
+
+    def for_problem(self, problem: Problem) -> Given:
+        """The angle of the problem's arm.
+
+        Raises:
+            InvalidValueError: if the problem does not leave exactly one degree of redundancy.
+            RobotError: if the arm has no shoulder, elbow and wrist.
+        """
+        if problem.r != 1:
+            raise InvalidValueError("r", problem.r, "1, one SEW angle: take the task pose of a 7-joint arm")
+        return Given.from_function(self.label, problem.n, sew_angle(problem.robot, self.kind))

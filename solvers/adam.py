@@ -1,0 +1,103 @@
+"""Adam on fresh samples, as the paper trains its network ([AS2023] Sec. 6)."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import repeat
+
+import numpy as np
+
+from orthocas.best_point import BestPoint
+from orthocas.checks import Array, require_at_least, require_count
+from orthocas.objective import UNWATCHED, Objective, SampledObjective, SolveResult, Status, Watch
+
+_MOMENT, _SQUARE, _SMALL = 0.9, 0.999, 1e-8  # the usual constants of [KB2015]
+
+
+@dataclass(frozen=True)
+class Adam:
+    """Adam [KB2015]: steps along the mean gradient over the root of its mean square, on new samples every time.
+
+    After every epoch the loss on the fixed samples is taken, and the best point so far kept. The learning rate falls to
+    zero along half a cosine; with that, the last epochs are the best ones. Objectives without samples are taken whole.
+
+    Args:
+        epochs: number of epochs; the paper's network took 200.
+        steps: steps in an epoch; the paper's 50.
+        batch: fresh samples in every step; the paper's 200.
+        learning_rate: of the first step (the paper does not print it).
+    """
+
+    epochs: int = 200
+    steps: int = 50
+    batch: int = 200
+    learning_rate: float = 1e-3
+    name: str = "adam"
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "steps", "batch"):
+            require_count(name, getattr(self, name))
+        require_at_least("learning_rate", self.learning_rate, 1e-300)
+
+    def coarser(self) -> "Adam":
+        """A quarter of the epochs."""
+        return replace(self, epochs=max(1, self.epochs // 4))
+
+    def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
+        """Minimise from theta0; the planned number of epochs ends with status ITERATION_LIMIT."""
+        run = _Run(self, objective, theta0, watch)
+        try:
+            status = run.iterate()
+        except KeyboardInterrupt:
+            if not run.best.found:
+                raise
+            status = Status.INTERRUPTED
+        return run.best.result(status)
+
+
+class _Run:
+    """State of one minimisation."""
+
+    def __init__(self, settings: Adam, objective: Objective, theta0: Array, watch: Watch) -> None:
+        self.settings, self.objective = settings, objective
+        self.best = BestPoint(objective, theta0, watch)
+        kept = self.best.restored or {}
+        self.theta = np.array(kept.get("theta", theta0), dtype=float)
+        self.mean = np.array(kept.get("mean", np.zeros_like(theta0)))
+        self.square = np.array(kept.get("square", np.zeros_like(theta0)))
+
+    def iterate(self) -> Status:
+        best, epochs = self.best, self.settings.epochs
+        if not best.found and not self._judge():
+            return Status.FAILED
+        while best.iterations < epochs:
+            for k, part in enumerate(self._parts(best.iterations)):
+                gradient = part.value_and_gradient(self.theta)[1]
+                best.evaluations += 1
+                if not np.isfinite(gradient).all():
+                    return Status.STALLED
+                self._step(gradient, best.iterations * self.settings.steps + k)
+            self._judge()
+            best.next_iteration(epochs, theta=self.theta, mean=self.mean, square=self.square)
+        return Status.ITERATION_LIMIT
+
+    def _parts(self, epoch: int) -> Iterable[Objective]:
+        """The objectives of the steps of an epoch."""
+        if isinstance(self.objective, SampledObjective):
+            return self.objective.batches(self.settings.batch, self.settings.steps, (epoch,))
+        return repeat(self.objective, self.settings.steps)
+
+    def _step(self, gradient: Array, k: int) -> None:
+        """Step k = 0, 1, ... of all epochs."""
+        total = self.settings.epochs * self.settings.steps
+        rate = self.settings.learning_rate * 0.5 * (1 + np.cos(np.pi * k / total))
+        self.mean += (1 - _MOMENT) * (gradient - self.mean)
+        self.square += (1 - _SQUARE) * (gradient**2 - self.square)
+        unbiased = np.sqrt(self.square / (1 - _SQUARE ** (k + 1))) + _SMALL
+        self.theta = self.theta - rate / (1 - _MOMENT ** (k + 1)) * self.mean / unbiased
+
+    def _judge(self) -> bool:
+        """Take the loss on the fixed samples; whether it is finite."""
+        value = self.objective.value(self.theta)
+        self.best.evaluations += 1
+        self.best.offer(self.theta, value)
+        return bool(np.isfinite(value))

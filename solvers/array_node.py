@@ -1,0 +1,96 @@
+"""CasADi nodes around NumPy functions, for the solvers that CasADi brings."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.checks import Array
+
+
+class ArrayNode(ca.Callback):
+    """A function of columns whose outputs NumPy computes.
+
+    An exception, Ctrl-C included, cannot pass through the solver's own code: it is kept in `error`, the evaluation
+    fails, and all later ones do too, so that the solver soon gives up.
+
+    Args:
+        name: of the function.
+        rows: length of each input column.
+        shapes: shape of each output.
+        compute: maps arrays (rows,) to one array for each output.
+        options: of the CasADi function.
+        jacobian: derivative of the first output with respect to the first input, where a solver asks for it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        rows: Sequence[int],
+        shapes: Sequence[tuple[int, int]],
+        compute: Callable[..., Sequence[Any]],
+        options: dict[str, Any] | None = None,
+        jacobian: "ArrayNode | None" = None,
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._rows, self._shapes, self._compute, self._jacobian = tuple(rows), tuple(shapes), compute, jacobian
+        self.error: BaseException | None = None
+        self.construct(name, options or {})
+
+    def get_n_in(self) -> int:
+        """Number of input columns."""
+        return len(self._rows)
+
+    def get_n_out(self) -> int:
+        """Number of outputs."""
+        return len(self._shapes)
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Dense columns."""
+        return ca.Sparsity.dense(self._rows[i], 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Dense."""
+        return ca.Sparsity.dense(*self._shapes[i])
+
+    def has_eval_buffer(self) -> bool:
+        """Buffers, so that nothing is copied twice."""
+        return True
+
+    def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
+        """Evaluate; 1 tells CasADi that it failed."""
+        if self.error is not None:
+            return 1
+        try:
+            results = self._compute(*(self._array(i, memory) for i, memory in enumerate(arg)))
+            for memory, result in zip(res, results, strict=True):
+                if memory is not None:
+                    np.frombuffer(memory)[:] = np.asarray(result, dtype=float).ravel(order="F")
+        except BaseException as error:
+            self.error = error
+            return 1
+        return 0
+
+    def _array(self, i: int, memory: Any) -> Array:
+        """Input i; CasADi passes nothing for zeros."""
+        return np.zeros(self._rows[i]) if memory is None else np.frombuffer(memory).copy()
+
+    def has_jacobian(self) -> bool:
+        """Whether a derivative was given."""
+        return self._jacobian is not None
+
+    def get_jacobian(
+        self, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
+    ) -> ca.Function:
+        """The derivative, in CasADi's form: inputs and an unused output come in."""
+        if self._jacobian is None:
+            raise NotImplementedError(name)
+        inputs = [ca.MX.sym("x", rows) for rows in self._rows]
+        unused = ca.MX.sym("y", *self._shapes[0])
+        return ca.Function(name, [*inputs, unused], [self._jacobian(*inputs)], list(inames), list(onames), dict(opts))
+
+    def reraise(self) -> None:
+        """Raise the exception that stopped an evaluation, if there was one."""
+        if self.error is not None:
+            raise self.error

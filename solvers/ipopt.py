@@ -1,0 +1,176 @@
+"""Ipopt through CasADi's nlpsol: interior points, with exact Hessians where there are some, and with constraints."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from orthocas.solvers.array_node import ArrayNode
+
+from orthocas.best_point import BestPoint
+from orthocas.checks import Array, require_at_least, require_count
+from orthocas.objective import UNWATCHED, ConstrainedObjective, Objective, SmoothObjective, SolveResult, Status, Watch
+
+_EXACT = 1500  # largest number of parameters for exact, dense Hessians
+_FEASIBLE = 1e-6  # violation of constraints that counts as none
+_STATUS = {
+    "Solve_Succeeded": Status.CONVERGED,
+    "Solved_To_Acceptable_Level": Status.CONVERGED,
+    "Search_Direction_Becomes_Too_Small": Status.STALLED,
+    "Restoration_Failed": Status.STALLED,
+    "Maximum_Iterations_Exceeded": Status.ITERATION_LIMIT,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+}
+
+
+@dataclass(frozen=True)
+class Ipopt:
+    """Primal-dual interior points [WB2006]: Newton steps on the Lagrangian with a filter line search.
+
+    The Hessian is exact for objectives that have one and up to 1,500 parameters, of limited memory otherwise. A
+    restored run starts from the best point.
+
+    Args:
+        max_iterations: largest number of iterations.
+        tolerance: on the scaled optimality conditions.
+    """
+
+    max_iterations: int = 300
+    tolerance: float = 1e-6
+    name: str = "ipopt"
+
+    def __post_init__(self) -> None:
+        require_count("max_iterations", self.max_iterations)
+        require_at_least("tolerance", self.tolerance, 1e-300)
+
+    def coarser(self) -> "Ipopt":
+        """A quarter of the iterations and a looser tolerance."""
+        return replace(self, max_iterations=max(1, self.max_iterations // 4), tolerance=max(1e-3, self.tolerance))
+
+    def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
+        """Minimise from theta0, subject to the objective's constraints if it has some."""
+        return _Run(self, objective, theta0, watch).result()
+
+
+class _Run:
+    """One minimisation: CasADi functions around the objective, and what they find."""
+
+    def __init__(self, settings: Ipopt, objective: Objective, theta0: Array, watch: Watch) -> None:
+        self.settings, self.objective = settings, objective
+        self.constrained = objective if isinstance(objective, ConstrainedObjective) else None
+        self.best = BestPoint(objective, theta0, watch)
+        self.size = theta0.size
+        self._nodes: list[ArrayNode] = []
+        self._at: tuple[bytes, float, Array] | None = None
+        self._count = 0
+
+    def result(self) -> SolveResult:
+        start = {"x0": ca.DM(self.best.theta)}
+        if self.constrained:
+            start |= {name: ca.DM(bound) for name, bound in zip(("lbg", "ubg"), self.constrained.bounds, strict=True)}
+        if self.best.iterations >= self.settings.max_iterations:
+            return self.best.result(Status.ITERATION_LIMIT)
+        solver = self._solver()
+        try:
+            end = solver(**start)["x"]
+            for node in self._nodes:
+                node.reraise()
+        except KeyboardInterrupt:
+            if not self.best.found:
+                raise
+            return self.best.result(Status.INTERRUPTED)
+        status = _STATUS.get(solver.stats()["return_status"], Status.STALLED)
+        if status is Status.INFEASIBLE:
+            self.best.theta = np.asarray(end.nonzeros())
+        return self.best.result(status)
+
+    def _solver(self) -> ca.Function:
+        x, p = ca.MX.sym("x", self.size), ca.MX.sym("p", 0)
+        value = self._node("f", [self.size], [(1, 1)], lambda theta: [self._evaluate(theta)[0]])
+        both = self._node("grad_f", [self.size], [(1, 1), (self.size, 1)], self._evaluate)
+        problem: dict[str, Any] = {"x": x, "f": value(x)}
+        options: dict[str, Any] = {"grad_f": ca.Function("nlp_grad_f", [x, p], list(both(x)))}
+        if self.constrained:
+            rows = len(self.constrained.bounds[0])
+            constraints, jacobian = (
+                self._node("g", [self.size], [(rows, 1)], lambda theta: [self._constraints(theta)[0]]),
+                self._node("jac_g", [self.size], [(rows, 1), (rows, self.size)], self._constraints),
+            )
+            problem["g"] = constraints(x)
+            options["jac_g"] = ca.Function("nlp_jac_g", [x, p], list(jacobian(x)))
+        options |= self._hessian_options(x, p)
+        options |= {
+            "iteration_callback": self._watcher(),
+            "print_time": False,
+            "error_on_fail": False,
+            "no_nlp_grad": True,
+        }
+        settings = {
+            "print_level": 0,
+            "sb": "yes",
+            "tol": self.settings.tolerance,
+            "max_iter": self.settings.max_iterations - self.best.iterations,
+        }
+        options |= {f"ipopt.{name}": value for name, value in settings.items()}
+        return ca.nlpsol("ipopt", "ipopt", problem, options)
+
+    def _hessian_options(self, x: ca.MX, p: ca.MX) -> dict[str, Any]:
+        """An exact Hessian of the Lagrangian, or the limited-memory approximation."""
+        known = self.constrained or isinstance(self.objective, SmoothObjective)
+        if not known or self.size > _EXACT:
+            return {"ipopt.hessian_approximation": "limited-memory", "ipopt.limited_memory_max_history": 20}
+        rows = len(self.constrained.bounds[0]) if self.constrained else 0
+        lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", rows)
+        node = self._node("hessian", [self.size, 1, rows], [(self.size, self.size)], self._hessian)
+        upper = ca.triu(node(x, lam_f, lam_g))
+        return {"hess_lag": ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [upper])}
+
+    def _node(self, name: str, rows: list[int], shapes: list[tuple[int, int]], compute: Any) -> ArrayNode:
+        node = ArrayNode(name, rows, shapes, compute)
+        self._nodes.append(node)
+        return node
+
+    def _evaluate(self, theta: Array) -> tuple[float, Array]:
+        """Value and gradient; Ipopt asks for both at the same point, one after the other."""
+        key = theta.tobytes()
+        if self._at is None or self._at[0] != key:
+            value, gradient = self.objective.value_and_gradient(theta)
+            self.best.evaluations += 1
+            self._at = key, value, gradient
+            if self._feasible(theta):
+                self.best.offer(theta, value)
+        return self._at[1], self._at[2]
+
+    def _constraints(self, theta: Array) -> tuple[Array, Array]:
+        assert self.constrained is not None
+        return self.constrained.constraints(theta)
+
+    def _feasible(self, theta: Array) -> bool:
+        if self.constrained is None:
+            return True
+        lower, upper = self.constrained.bounds
+        values = self._constraints(theta)[0]
+        return bool(np.all(values >= lower - _FEASIBLE) and np.all(values <= upper + _FEASIBLE))
+
+    def _hessian(self, theta: Array, factor: Array, multipliers: Array) -> list[Array]:
+        if self.constrained:
+            return [self.constrained.lagrangian_hessian(theta, float(factor[0]), multipliers)]
+        assert isinstance(self.objective, SmoothObjective)
+        return [factor[0] * self.objective.hessian(theta)]
+
+    def _watcher(self) -> ca.Callback:
+        """Called by Ipopt at the start and after every iteration; an error stops it."""
+        rows = [ca.nlpsol_out(i) for i in range(ca.nlpsol_n_out())]
+        lengths = {"x": self.size, "f": 1, "g": self._rows(), "lam_x": self.size, "lam_g": self._rows()}
+        node = ArrayNode("watch", [lengths.get(name, 0) for name in rows], [(1, 1)], self._iterated)
+        self._nodes.append(node)
+        return node
+
+    def _rows(self) -> int:
+        return len(self.constrained.bounds[0]) if self.constrained else 0
+
+    def _iterated(self, *_: Array) -> list[float]:
+        if self._count:
+            self.best.next_iteration(self.settings.max_iterations)
+        self._count += 1
+        return [1.0 if any(node.error for node in self._nodes) else 0.0]
