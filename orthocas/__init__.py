@@ -8,7 +8,7 @@ if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
 from orthocas import problems, solvers
-from orthocas.api import fit, load
+from orthocas.api import compare, fit, load
 from orthocas.chart import Chart
 from orthocas.domains import Box, Torus, contains
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial
@@ -33,6 +33,7 @@ __all__ = [
     "Task",
     "Torus",
     "check",
+    "compare",
     "contains",
     "evaluate",
     "fit",

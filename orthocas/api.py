@@ -1,23 +1,30 @@
-"""The front door: fit, with a default parametrisation and solver, and load."""
+"""The front door: fit, with a default parametrisation and solver, compare, and load."""
 
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from itertools import product
 from pathlib import Path
 
 from orthocas.chart import Chart
-from orthocas.checks import as_float_array
+from orthocas.checks import as_float_array, require_count
+from orthocas.comparison import Cell, CellResult, run_cells
+from orthocas.comparison_report import Comparison
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import Fit, fit_chart
 from orthocas.loss import DEFAULT_WEIGHTS, Weights
 from orthocas.objective import Monitor, Solver, silent
-from orthocas.parametrisations import SEW, GradedParametrisation, Linear, Parametrisation, Polynomial
+from orthocas.parametrisations import SEW, Given, GradedParametrisation, Linear, Parametrisation, Polynomial
 from orthocas.problem import Problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt
+
+WeightNumbers = tuple[float, float] | tuple[float, float, float]
 
 
 def fit(
     problem: Problem,
     parametrisation: Parametrisation | SEW | None = None,
     solver: Solver | None = None,
-    weights: tuple[float, float] | tuple[float, float, float] = DEFAULT_WEIGHTS,
+    weights: WeightNumbers = DEFAULT_WEIGHTS,
     samples: int | None = None,
     seed: int = 0,
     monitor: Monitor = silent,
@@ -40,8 +47,8 @@ def fit(
         samples: number of samples; default grows with the number of parameters.
         seed: seed of samples and of random starts.
         monitor: called with progress.
-        max_mutual_deg: the constrained form: the smallest task term at mutual angles of this standard deviation
-            [deg] on the samples, found by Ipopt; lambda2 is not used then.
+        max_mutual_deg: the constrained form: the smallest task term while mutual angles deviate from 90 degrees by at
+            most this much (root mean square over the samples) [deg], found by Ipopt; lambda2 is not used then.
         checkpoint: a file that keeps the state of a long fit. If it exists, the fit goes on from there.
 
     Returns:
@@ -58,19 +65,82 @@ def fit(
     if not isinstance(parametrisation, Parametrisation | SEW):
         raise InvalidValueError("parametrisation", repr(parametrisation), "an object such as Polynomial(degree=4)")
     if solver is None:
-        linear = isinstance(parametrisation, GradedParametrisation | Linear)
-        solver = (GaussNewton() if linear else LBFGS()) if max_mutual_deg is None else Ipopt()
+        solver = Ipopt() if max_mutual_deg is not None else default_solver(parametrisation)
     if not isinstance(solver, Solver):
         raise InvalidValueError("solver", repr(solver), "an object such as GaussNewton()")
     if max_mutual_deg is not None and not isinstance(solver, Ipopt):
         raise InvalidValueError("solver", solver.name, "ipopt, which alone can keep max_mutual_deg")
-    values = as_float_array("weights", weights)
+    loss = _weights(weights)
+    return fit_chart(problem, parametrisation, solver, loss, samples, seed, monitor, max_mutual_deg, checkpoint)
+
+
+def compare(
+    problem: Problem,
+    parametrisations: Sequence[Parametrisation | SEW],
+    solvers: Sequence[Solver] | None = None,
+    seeds: int = 1,
+    weights: WeightNumbers = DEFAULT_WEIGHTS,
+    samples: int | None = None,
+    held_out: int = 100_000,
+    executor: Executor | None = None,
+    jobs: int | None = None,
+    charts: Path | None = None,
+    monitor: Monitor = silent,
+) -> Comparison:
+    """Fit every parametrisation with every solver and seed, and judge all on the same held-out samples.
+
+    A fit that fails is reported as such; the others go on. Ctrl-C returns the fits that are done. Coordinates in closed
+    form need no solver and no seed, and come once.
+
+    Args:
+        problem: robot, task, metric and domain.
+        parametrisations: what to fit.
+        solvers: default for each parametrisation what `fit` takes.
+        seeds: number of seeds 0, 1, ... of samples and random starts.
+        weights: of the loss; see `fit`.
+        samples: number of training samples; default grows with the number of parameters.
+        held_out: number of held-out samples.
+        executor: any `concurrent.futures.Executor` (of processes or threads, Dask, MPI, ...); default processes of this
+            machine. Those use one thread each, so seconds are those of one core.
+        jobs: number of such processes, default one for each core.
+        charts: folder to save charts in.
+        monitor: called with progress.
+    """
+    count, loss = require_count("seeds", seeds), _weights(weights)
+    jobs = None if jobs is None else require_count("jobs", jobs)
+    held_out = require_count("held_out", held_out)
+    cells = []
+    for parametrisation in parametrisations:
+        closed = isinstance(parametrisation, Linear | Given | SEW)
+        fitting = [default_solver(parametrisation)] if closed or solvers is None else solvers
+        for solver, seed in product(fitting, range(1 if closed else count)):
+            name = f"{parametrisation.label}_{solver.name}_{seed}.orthocas".replace(":", "-")
+            file = None if charts is None else charts / name
+            cells.append(Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file))
+    order = {(cell.parametrisation.label, cell.solver.name, cell.seed): k for k, cell in enumerate(cells)}
+    results: list[CellResult] = []
+    interrupted = False
+    try:
+        results.extend(run_cells(cells, executor, jobs, monitor))
+    except KeyboardInterrupt:
+        interrupted = True
+    results.sort(key=lambda result: order.get((result.parametrisation, result.solver, result.seed), 0))
+    return Comparison(tuple(results), interrupted)
+
+
+def default_solver(parametrisation: Parametrisation | SEW) -> Solver:
+    """Gauss-Newton for families linear in their parameters, L-BFGS for others."""
+    return GaussNewton() if isinstance(parametrisation, GradedParametrisation | Linear) else LBFGS()
+
+
+def _weights(numbers: WeightNumbers) -> Weights:
+    values = as_float_array("weights", numbers)
     if values.shape not in ((2,), (3,)):
         raise ShapeError("weights", values.shape, (3,))
-    loss = Weights(*values.tolist())
-    if loss.task == 0:
-        raise InvalidValueError("lambda1", loss.task, "a positive number")
-    return fit_chart(problem, parametrisation, solver, loss, samples, seed, monitor, max_mutual_deg, checkpoint)
+    weights = Weights(*values.tolist())
+    if weights.task == 0:
+        raise InvalidValueError("lambda1", weights.task, "a positive number")
+    return weights
 
 
 def load(path: str | Path) -> Chart:

@@ -15,7 +15,17 @@ from orthocas.checks import Array
 
 _CHUNKS = (1, 64, 512)  # samples evaluated in one call: the smallest that holds the set, or the largest
 _THREADED = 512  # chunks of this size are worth starting threads for
-_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _threads() -> int:
+    """All cores this process may use, or what OMP_NUM_THREADS says, as other libraries do."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isdigit() and int(wanted) > 0:
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+_THREADS = _threads()
 
 
 def dense_function(

@@ -16,7 +16,8 @@ class BoundedMutual:
     s.t. E[mean of mutual cosines^2] <= bound^2  and  E|grad xi_j|^2 = 1 for every coordinate j.
 
     The scales of the coordinates change neither term; the gauge condition fixes them, so that the solution is an
-    isolated point. `sqrt(E cos^2)` is the standard deviation of the mutual angle in radians, up to its third power.
+    isolated point. sqrt(E cos^2) is, up to its third power, the root mean square deviation of mutual angles from a
+    right angle [rad].
 
     Args:
         objective: the weighted loss on its samples; its lambda2 is not used.

@@ -34,14 +34,13 @@ class Checkpoint:
     Args:
         path: the file; it is read if it exists.
         fit: settings that tell this fit from others; a file of another fit is refused.
-        seconds: time between two writes of a running stage.
 
     Raises:
         CheckpointError: if the file cannot be written, is damaged, or belongs to another fit (the setting is named).
     """
 
-    def __init__(self, path: Path | None, fit: Mapping[str, str], seconds: float = _SECONDS) -> None:
-        self._path, self._fit, self._seconds = path, dict(fit), seconds
+    def __init__(self, path: Path | None, fit: Mapping[str, str]) -> None:
+        self._path, self._fit = path, dict(fit)
         self._stages: list[Stage] = []
         self._running: tuple[str, State] | None = None
         if path is None:
@@ -65,7 +64,7 @@ class Checkpoint:
     def keeper(self, label: str) -> "StageKeeper":
         """Where the solver of a stage keeps its state."""
         state = self._running[1] if self._running and self._running[0] == label else None
-        return StageKeeper(state, self._seconds, lambda new: self._keep(label, new))
+        return StageKeeper(state, lambda new: self._keep(label, new))
 
     def _keep(self, label: str, state: State) -> None:
         self._running = label, state
@@ -102,8 +101,8 @@ class Checkpoint:
 class StageKeeper:
     """Keeper of one stage: writes at most once in a while."""
 
-    def __init__(self, state: State | None, seconds: float, write: Callable[[State], None]) -> None:
-        self._state, self._between, self._write = state, seconds, write
+    def __init__(self, state: State | None, write: Callable[[State], None]) -> None:
+        self._state, self._write = state, write
         self._last = time.monotonic()
 
     def restored(self) -> State | None:
@@ -112,7 +111,7 @@ class StageKeeper:
 
     def keep(self, state: Callable[[], State]) -> None:
         """Write the state if the last write is long enough ago."""
-        if time.monotonic() - self._last >= self._between:
+        if time.monotonic() - self._last >= _SECONDS:
             self._write(state())
             self._last = time.monotonic()
 

@@ -63,7 +63,7 @@ def fit_chart(
     idle = [] if in_closed_form else idle_joints(problem, first)[-problem.r :]
     active = [i for i in range(problem.n) if i not in idle]
     settings = {
-        "problem": _digest(first),
+        "problem": _digest(sample_problem(problem, 20, (0, _FIRST_SAMPLES))),
         "parametrisation": parametrisation.label,
         "solver": repr(solver),
         "weights": repr(weights),
@@ -125,7 +125,7 @@ def _in_radians(max_mutual_deg: float | None) -> float | None:
 
 
 def _digest(samples: Samples) -> str:
-    """A fingerprint of a problem: task, metric and domain as they act on its first samples."""
+    """A fingerprint of a problem: task, metric and domain as they act on some samples."""
     parts = [samples.points, samples.task_jacobian]
     parts += [] if samples.metric_inverse is None else [samples.metric_inverse]
     return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]

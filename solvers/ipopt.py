@@ -63,6 +63,7 @@ class _Run:
         self._nodes: list[ArrayNode] = []
         self._at: tuple[bytes, float, Array] | None = None
         self._count = 0
+        self._finite = False
 
     def result(self) -> SolveResult:
         start = {"x0": ca.DM(self.best.theta)}
@@ -80,8 +81,8 @@ class _Run:
                 raise
             return self.best.result(Status.INTERRUPTED)
         status = _STATUS.get(solver.stats()["return_status"], Status.STALLED)
-        if status is Status.INFEASIBLE:
-            self.best.theta = np.asarray(end.nonzeros())
+        if self.constrained and not self.best.found and self._finite:
+            status, self.best.theta = Status.INFEASIBLE, np.asarray(end.nonzeros())
         return self.best.result(status)
 
     def _solver(self) -> ca.Function:
@@ -137,6 +138,7 @@ class _Run:
             value, gradient = self.objective.value_and_gradient(theta)
             self.best.evaluations += 1
             self._at = key, value, gradient
+            self._finite = self._finite or bool(np.isfinite(value))
             if self._feasible(theta):
                 self.best.offer(theta, value)
         return self._at[1], self._at[2]

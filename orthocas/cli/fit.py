@@ -7,7 +7,7 @@ import typer
 
 from orthocas import api
 from orthocas.archive import require_writable
-from orthocas.cli.output import AsJson, note, print_json, print_rows, report_rows, whole_number
+from orthocas.cli.output import AsJson, note, number, print_json, print_rows, report_rows, whole_number
 from orthocas.cli.problem_argument import (
     CentreText,
     HalfWidth,
@@ -28,7 +28,7 @@ from orthocas.progress import terminal_monitor
 from orthocas.quality import Report, evaluate
 from orthocas.solvers import get as get_solver
 
-_WEIGHTS = ",".join(f"{value:g}" for value in DEFAULT_WEIGHTS)
+WEIGHTS_TEXT = ",".join(f"{value:g}" for value in DEFAULT_WEIGHTS)
 
 
 def fit(
@@ -37,9 +37,12 @@ def fit(
     task: TaskName = None,
     metric: MetricName = None,
     param: Annotated[
-        str, typer.Option("--param", help="polynomial:4, fourier:2, mlp:64x64 or linear.")
+        str, typer.Option("--param", help="polynomial:4, fourier:2, mlp:64x64, linear or sew.")
     ] = "polynomial:4",
-    solver: Annotated[str | None, typer.Option("--solver", help="gauss_newton or lbfgs; default what suits.")] = None,
+    solver: Annotated[
+        str | None,
+        typer.Option("--solver", help="gauss_newton, lbfgs, ipopt, adam or gradient_flow; default what suits."),
+    ] = None,
     centre: CentreText = None,
     half_width: HalfWidth = None,
     samples: Annotated[
@@ -48,7 +51,19 @@ def fit(
     seed: Annotated[int, typer.Option("--seed", parser=whole_number, help="Seed of samples and random starts.")] = 0,
     weights: Annotated[
         str, typer.Option("--weights", help='"lambda1,lambda2" or "lambda1,lambda2,lambda3".')
-    ] = _WEIGHTS,
+    ] = WEIGHTS_TEXT,
+    max_mutual_deg: Annotated[
+        float | None,
+        typer.Option(
+            "--max-mutual-deg",
+            parser=number,
+            help="Bound on the mutual angles' deviation from 90 deg (rms): the smallest task angle under it, by Ipopt.",
+        ),
+    ] = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option("--checkpoint", help="File that keeps the state of a long fit; one that exists is gone on with."),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Chart file; default PROBLEM.orthocas here.")] = None,
     json: AsJson = False,
 ) -> None:
@@ -58,8 +73,9 @@ def fit(
     require_writable(target)
     parametrisation = parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
+    loss = parse_weights(weights)
     with terminal_monitor() as monitor:
-        result = api.fit(built, parametrisation, minimiser, parse_weights(weights), samples, seed, monitor)
+        result = api.fit(built, parametrisation, minimiser, loss, samples, seed, monitor, max_mutual_deg, checkpoint)
     result.chart.save(target)
     report = evaluate(result.chart, seed=seed + 1)
     if json:

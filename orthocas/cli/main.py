@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import typer
 
+from orthocas.cli.compare import compare
 from orthocas.cli.evaluate import evaluate
 from orthocas.cli.fit import fit
 from orthocas.cli.info import info
@@ -23,6 +24,7 @@ app = typer.Typer(
 app.command()(fit)
 app.command()(evaluate)
 app.command()(info)
+app.command()(compare)
 
 
 def _complain(text: str) -> None:

@@ -1,7 +1,7 @@
 """What commands print: aligned text for people, or one JSON object."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -38,6 +38,15 @@ def print_rows(rows: Mapping[str, str]) -> None:
     width = max(len(name) for name in rows) + 2
     for name, value in rows.items():
         typer.echo(f"{name:<{width}}{value}")
+
+
+def print_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print rows in aligned columns; the last cell of a short row may be long."""
+    head = rows[0]
+    aligned = [row if len(row) == len(head) else row[:-1] for row in rows]
+    widths = [max(len(row[k]) for row in aligned if k < len(row)) for k in range(len(head))]
+    for row in rows:
+        typer.echo("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=False)).rstrip())
 
 
 def note(text: str) -> None:

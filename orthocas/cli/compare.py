@@ -1,0 +1,98 @@
+"""`orthocas compare`: parametrisations and solvers side by side."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from orthocas import api
+from orthocas.cli.fit import WEIGHTS_TEXT, parse_weights
+from orthocas.cli.output import AsJson, note, print_json, print_table, whole_number
+from orthocas.cli.problem_argument import (
+    CentreText,
+    HalfWidth,
+    MetricName,
+    ProblemName,
+    ProblemOptions,
+    TaskName,
+    TipName,
+    build_problem,
+)
+from orthocas.comparison_figures import convergence_figure, front_figure
+from orthocas.comparison_report import Comparison
+from orthocas.errors import InvalidValueError
+from orthocas.parametrisations import parse_parametrisation
+from orthocas.progress import terminal_monitor
+from orthocas.solvers import get as get_solver
+
+_PARAMETRISATIONS = ["linear", "polynomial:2", "polynomial:3", "polynomial:4", "mlp:32x32"]
+
+
+def compare(
+    problem: ProblemName,
+    tip: TipName = None,
+    task: TaskName = None,
+    metric: MetricName = None,
+    param: Annotated[
+        list[str] | None, typer.Option("--param", help="A parametrisation; repeat for more. Default: a small choice.")
+    ] = None,
+    solver: Annotated[
+        list[str] | None, typer.Option("--solver", help="A solver; repeat for more. Default: what suits each.")
+    ] = None,
+    seeds: Annotated[int, typer.Option("--seeds", parser=whole_number, help="Number of seeds of every fit.")] = 1,
+    centre: CentreText = None,
+    half_width: HalfWidth = None,
+    samples: Annotated[
+        int | None, typer.Option("--samples", parser=whole_number, help="Training samples; default by size.")
+    ] = None,
+    held_out: Annotated[
+        int, typer.Option("--held-out", parser=whole_number, help="Held-out samples that judge every fit.")
+    ] = 100_000,
+    weights: Annotated[
+        str, typer.Option("--weights", help='"lambda1,lambda2" or "lambda1,lambda2,lambda3".')
+    ] = WEIGHTS_TEXT,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", parser=whole_number, help="Processes, one thread each; default all cores.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder for tables, pictures and charts.")] = Path("comparison"),
+    json: AsJson = False,
+) -> None:
+    """Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts."""
+    built = build_problem(problem, ProblemOptions(tip, task, metric, centre, half_width))
+    parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
+    minimisers = [get_solver(name) for name in solver] if solver else None
+    loss = parse_weights(weights)
+    charts = _made(out)
+    with terminal_monitor() as monitor:
+        grid = (built, parametrisations, minimisers, seeds, loss, samples, held_out)
+        found = api.compare(*grid, jobs=jobs, charts=charts, monitor=monitor)
+    save(found, out)
+    if json:
+        print_json(found.as_dict())
+    else:
+        print_table(found.rows())
+        typer.echo(f"\ntables, pictures and charts are in {out}")
+    failed = sum(result.failed for result in found.results)
+    if failed:
+        note(f"{failed} of {len(found.results)} fits failed, see comparison.csv")
+    if found.interrupted:
+        note(f"interrupted after {len(found.results)} fits")
+        raise typer.Exit(130)
+
+
+def save(found: Comparison, out: Path) -> None:
+    """Write tables and pictures."""
+    found.write(out)
+    if all(result.failed for result in found.results):
+        return
+    front_figure(found).savefig(out / "front.png", dpi=150)
+    convergence_figure(found).savefig(out / "convergence.png", dpi=150)
+
+
+def _made(out: Path) -> Path:
+    """The output folder with its folder for charts."""
+    try:
+        (out / "charts").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidValueError("--out", str(out), f"a folder that can be written ({error.strerror})") from None
+    return out / "charts"

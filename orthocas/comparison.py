@@ -1,0 +1,188 @@
+"""Fits side by side: a grid of parametrisations, solvers and seeds, judged on the same held-out samples."""
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from orthocas.fitting import fit_chart
+from orthocas.loss import Weights
+from orthocas.objective import Monitor, Progress, Solver, Status, silent
+from orthocas.parametrisations import SEW, Parametrisation
+from orthocas.problem import Problem
+from orthocas.quality import evaluate
+
+HELD_OUT_SEED = 2**31  #: seed of the held-out samples: no fit has it
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One fit of a grid: plain settings that can be sent to another process."""
+
+    problem: Problem
+    parametrisation: Parametrisation | SEW
+    solver: Solver
+    seed: int
+    weights: Weights
+    samples: int | None
+    held_out: int
+    chart_file: Path | None  #: where to save the chart
+
+    @property
+    def label(self) -> str:
+        """Short name for progress displays."""
+        return f"{self.parametrisation.label}, {self.solver.name}, seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """What one fit gave, or the error that stopped it; numbers of a failed one are NaN."""
+
+    problem: str
+    parametrisation: str
+    solver: str
+    seed: int
+    status: str
+    error: str = ""
+    seconds: float = float("nan")  #: of the fit
+    parameters: int = 0
+    samples: int = 0
+    iterations: int = 0
+    evaluations: int = 0
+    task_std_deg: float = float("nan")
+    mutual_std_deg: float = float("nan")
+    conditioning_min: float = float("nan")
+    conditioning_p01: float = float("nan")
+    conditioning_mean: float = float("nan")
+    folded_samples: int = 0
+    history: tuple[tuple[float, float], ...] = ()  #: seconds and training loss as the fit went on
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no chart."""
+        return bool(self.error)
+
+
+def run_cell(cell: Cell) -> CellResult:
+    """Fit and judge; an error becomes part of the result."""
+    history: list[tuple[float, float]] = []
+    start = time.perf_counter()
+
+    def record(progress: Progress) -> None:
+        if progress.value == progress.value:
+            history.append((time.perf_counter() - start, progress.value))
+
+    try:
+        fit = fit_chart(cell.problem, cell.parametrisation, cell.solver, cell.weights, cell.samples, cell.seed, record)
+        if cell.chart_file is not None:
+            fit.chart.save(cell.chart_file)
+        report = evaluate(fit.chart, cell.held_out, HELD_OUT_SEED)
+    except Exception as error:
+        return failure(cell, f"{type(error).__name__}: {error}")
+    results = [stage.result for stage in fit.stages]
+    return CellResult(
+        problem=cell.problem.name,
+        parametrisation=cell.parametrisation.label,
+        solver=str(fit.chart.notes["solver"]),
+        seed=cell.seed,
+        status=fit.status.value,
+        seconds=fit.seconds,
+        parameters=int(fit.chart.coordinates.theta.size),
+        samples=int(fit.chart.notes["samples"]),
+        iterations=sum(result.iterations for result in results),
+        evaluations=sum(result.evaluations for result in results),
+        task_std_deg=report.task_angle.std,
+        mutual_std_deg=report.mutual_angle.std,
+        conditioning_min=report.conditioning.min,
+        conditioning_p01=report.conditioning.p01,
+        conditioning_mean=report.conditioning.mean,
+        folded_samples=report.folded_samples,
+        history=tuple(history),
+    )
+
+
+def failure(cell: Cell, error: str) -> CellResult:
+    """The result of a fit that did not come to its end."""
+    text = " ".join(error.split())
+    return CellResult(
+        cell.problem.name, cell.parametrisation.label, cell.solver.name, cell.seed, Status.FAILED.value, text
+    )
+
+
+def run_cells(
+    cells: Sequence[Cell], executor: Executor | None = None, jobs: int | None = None, monitor: Monitor = silent
+) -> Iterator[CellResult]:
+    """Results of cells as they come in; a failing cell, or one that kills its process, fails alone.
+
+    Args:
+        cells: what to run.
+        executor: where to run them; default processes of this machine with one thread each.
+        jobs: number of such processes, default one for each core.
+        monitor: called with the share of cells that are done.
+    """
+    results = _own_processes(cells, jobs) if executor is None else _submitted(cells, executor)
+    for done, result in enumerate(results, start=1):
+        detail = f"{result.parametrisation}, {result.solver}"
+        monitor(Progress("comparing", done / len(cells), f"{done} of {len(cells)}, {detail}"))
+        yield result
+
+
+def _submitted(cells: Sequence[Cell], executor: Executor) -> Iterator[CellResult]:
+    """All cells on a given executor."""
+    futures = {executor.submit(run_cell, cell): cell for cell in cells}
+    try:
+        for future in as_completed(futures):
+            yield _outcome(future, futures[future])
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _outcome(future: Future[CellResult], cell: Cell) -> CellResult:
+    error = future.exception()
+    if error is None:
+        return future.result()
+    died = isinstance(error, BrokenExecutor)
+    return failure(cell, "its process died" if died else f"{type(error).__name__}: {error}")
+
+
+def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResult]:
+    """All cells in processes of our own. If one dies, all that were left are run again, each in a pool of its own."""
+    left: list[Cell] = []
+    with single_threaded():
+        with _pool(jobs or os.cpu_count() or 1) as pool:
+            futures = {pool.submit(run_cell, cell): cell for cell in cells}
+            try:
+                for future in as_completed(futures):
+                    if isinstance(future.exception(), BrokenExecutor):
+                        left.append(futures[future])
+                    else:
+                        yield _outcome(future, futures[future])
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
+        for cell in left:
+            with _pool(1) as pool:
+                yield _outcome(pool.submit(run_cell, cell), cell)
+
+
+def _pool(jobs: int) -> ProcessPoolExecutor:
+    """New interpreters: forked ones would inherit threads that no longer run."""
+    return ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """Processes started meanwhile use one thread each, so that they do not fight for cores and seconds compare."""
+    before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = before

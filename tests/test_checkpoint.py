@@ -1,0 +1,158 @@
+"""A killed fit goes on from its checkpoint; files of other fits, damaged or foreign ones, are refused."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas import checkpoint, solvers
+from orthocas.checkpoint import Checkpoint
+from orthocas.errors import CheckpointError
+from orthocas.objective import Progress, Status
+
+
+@pytest.fixture(autouse=True)
+def write_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkpoint, "_SECONDS", 0.0)
+
+
+class Killed(BaseException):
+    """Stands for a process that is gone: nothing catches it."""
+
+
+def kill_in(stage: str, fraction: float) -> object:
+    def monitor(progress: Progress) -> None:
+        if progress.stage == stage and progress.fraction >= fraction:
+            raise Killed
+
+    return monitor
+
+
+@pytest.mark.parametrize(
+    ("parametrisation", "solver", "stage"),
+    [
+        (oc.Polynomial(4), solvers.GaussNewton(tolerance=1e-5), "polynomial:4"),
+        (oc.Polynomial(3), solvers.Adam(epochs=6, steps=10), "polynomial:3"),
+        (oc.MLP((6, 5)), solvers.Adam(epochs=6, steps=10), "mlp:6x5"),
+    ],
+    ids=["gauss_newton", "adam", "adam on a network"],
+)
+def test_killed_fit_ends_as_the_whole_one(
+    planar_x: oc.Problem, tmp_path: Path, parametrisation: object, solver: object, stage: str
+) -> None:
+    settings = {"solver": solver, "samples": 300, "weights": (1000.0, 30.0)}
+    whole = oc.fit(planar_x, parametrisation, **settings)
+    file = tmp_path / "run.checkpoint"
+    with pytest.raises(Killed):
+        oc.fit(planar_x, parametrisation, **settings, checkpoint=file, monitor=kill_in(stage, 0.03))
+    started: list[str] = []
+    resumed = oc.fit(
+        planar_x, parametrisation, **settings, checkpoint=file, monitor=lambda progress: started.append(progress.stage)
+    )
+    assert set(started) == {stage}  # finished stages are not run again
+    np.testing.assert_array_equal(resumed.chart.coordinates.theta, whole.chart.coordinates.theta)
+    assert [s.result.iterations for s in resumed.stages] == [s.result.iterations for s in whole.stages]
+
+
+def test_finished_fit_is_not_run_again(planar_x: oc.Problem, tmp_path: Path) -> None:
+    file = tmp_path / "run.checkpoint"
+    first = oc.fit(planar_x, oc.Polynomial(3), checkpoint=file)
+    told: list[Progress] = []
+    again = oc.fit(planar_x, oc.Polynomial(3), checkpoint=file, monitor=told.append)
+    assert told == []
+    assert again.status is first.status
+    np.testing.assert_array_equal(again.chart.coordinates.theta, first.chart.coordinates.theta)
+
+
+def test_interrupted_fit_can_go_on(planar_x: oc.Problem, tmp_path: Path) -> None:
+    file = tmp_path / "run.checkpoint"
+
+    def press(progress: Progress) -> None:
+        if progress.stage == "polynomial:3" and progress.fraction > 0:
+            raise KeyboardInterrupt
+
+    stopped = oc.fit(planar_x, oc.Polynomial(4), checkpoint=file, monitor=press)
+    assert stopped.status is Status.INTERRUPTED
+    resumed = oc.fit(planar_x, oc.Polynomial(4), checkpoint=file)
+    assert resumed.status is Status.CONVERGED
+    assert resumed.chart.coordinates.parametrisation.label == "polynomial:4"
+    assert resumed.stages[-1].result.value <= oc.fit(planar_x, oc.Polynomial(4)).stages[-1].result.value * 1.01
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"seed": 1}, "seed"),
+        ({"parametrisation": oc.Polynomial(3)}, "parametrisation"),
+        ({"solver": solvers.LBFGS()}, "solver"),
+        ({"weights": (1000.0, 1.0)}, "weights"),
+    ],
+)
+def test_checkpoint_of_another_fit_is_refused(
+    planar_x: oc.Problem, tmp_path: Path, change: dict[str, object], name: str
+) -> None:
+    file = tmp_path / "run.checkpoint"
+    settings = {"parametrisation": oc.Polynomial(2), "samples": 100, "checkpoint": file}
+    oc.fit(planar_x, **settings)
+    before = file.read_bytes()
+    with pytest.raises(CheckpointError, match=f"another fit: its {name} is"):
+        oc.fit(planar_x, **{**settings, **change})
+    assert file.read_bytes() == before
+
+
+def test_checkpoint_of_another_problem_is_refused(planar_x: oc.Problem, planar_xy: oc.Problem, tmp_path: Path) -> None:
+    oc.fit(planar_x, oc.Polynomial(2), samples=100, checkpoint=tmp_path / "run")
+    with pytest.raises(CheckpointError, match="its problem is"):
+        oc.fit(planar_xy, oc.Polynomial(2), samples=100, checkpoint=tmp_path / "run")
+
+
+def test_bad_files_are_refused(planar_x: oc.Problem, planar_fit: object, tmp_path: Path) -> None:
+    garbage, chart, cut = tmp_path / "garbage", tmp_path / "chart", tmp_path / "cut"
+    garbage.write_bytes(b"not a zip")
+    planar_fit.chart.save(chart)
+    oc.fit(planar_x, oc.Polynomial(2), samples=100, checkpoint=cut)
+    cut.write_bytes(cut.read_bytes()[:-40])
+    for file, message in (
+        (garbage, "not a checkpoint file"),
+        (chart, "has format 'orthocas-chart', expected 'orthocas-checkpoint'"),
+        (cut, "truncated, damaged or not a checkpoint"),
+        (tmp_path / "missing" / "file", "folder .* does not exist"),
+    ):
+        with pytest.raises(CheckpointError, match=message):
+            oc.fit(planar_x, oc.Polynomial(2), samples=100, checkpoint=file)
+
+
+def test_without_a_path_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    keeper = Checkpoint(None, {}).keeper("stage")
+    assert keeper.restored() is None
+    keeper.keep(lambda: {"theta": np.zeros(1)})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_killed_process_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None:
+    """The real thing: a process killed by the system, and a new one."""
+    file = tmp_path / "run.checkpoint"
+    code = (
+        "import orthocas as oc; from orthocas import checkpoint, problems, solvers; "
+        "checkpoint._SECONDS = 0.0; "
+        "fit = oc.fit(problems.get('planar_3r_xy'), oc.MLP((8, 8)), solvers.Adam(epochs=150, steps=20), samples=200, "
+        f"checkpoint={str(file)!r}); "
+        "print(fit.stages[0].result.iterations, fit.stages[0].result.evaluations)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    deadline = time.monotonic() + 60
+    while not file.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.3)
+    process.kill()
+    process.wait()
+    header, arrays = checkpoint.read_archive(file, checkpoint.CHECKPOINT)
+    assert header["running"] == "mlp:8x8"
+    assert 0 < arrays["state_iterations"] < 150
+    again = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert again.stdout.split() == ["150", str(1 + 150 * 21)]  # one start, 20 steps and one judgement an epoch
