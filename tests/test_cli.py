@@ -219,3 +219,60 @@ def test_ctrl_c_saves_the_best_chart_so_far(tmp_path: Path) -> None:
     assert "best coordinates found so far" in err
     chart = oc.load(tmp_path / "c.orthocas")
     assert chart.notes["status"] == "interrupted"
+
+
+def test_fit_under_a_bound_on_mutual_angles(run) -> None:
+    code, out, err = run(
+        "fit", "planar_3r_x", "--param", "polynomial:2", "--samples", "300", "--max-mutual-deg", "2.0", "--json"
+    )
+    data = json.loads(out)
+    assert (code, err) == (0, "")
+    assert data["mutual_angle_deg"]["std"] < 2.2
+    code, out, err = run("fit", "planar_3r_x", "--param", "polynomial:1", "--samples", "60", "--max-mutual-deg", "1e-4")
+    assert (code, out) == (2, "")
+    assert "mutual angles within 0.0001 deg found, best" in err
+    assert err.count("\n") == 1
+
+
+def test_fit_goes_on_from_its_checkpoint(run, tmp_path: Path) -> None:
+    words = ("fit", "planar_3r_x", "--param", "polynomial:2", "--samples", "100", "--checkpoint", "run.checkpoint")
+    assert run(*words)[0] == 0
+    first = (tmp_path / "planar_3r_x.orthocas").read_bytes()
+    assert run(*words)[0] == 0
+    assert (tmp_path / "planar_3r_x.orthocas").read_bytes() == first
+    code, _, err = run(*words, "--seed", "4")
+    assert code == 2
+    assert "another fit: its seed is 0, expected 4" in err
+
+
+def test_compare_writes_tables_pictures_and_charts(run, tmp_path: Path) -> None:
+    words = ("compare", "planar_3r_x", "--samples", "100", "--held-out", "300", "--param", "linear")
+    code, out, err = run(
+        *words, "--param", "mlp:3", "--solver", "gauss_newton", "--solver", "lbfgs", "--jobs", "1", "--out", "grid"
+    )
+    assert code == 0
+    assert "linear" in out
+    assert "failed: InvalidValueError" in out
+    assert err == "note: 1 of 3 fits failed, see comparison.csv\n"
+    names = {path.name for path in (tmp_path / "grid").iterdir()}
+    assert names == {"charts", "comparison.csv", "comparison.json", "front.png", "convergence.png"}
+    assert oc.load(tmp_path / "grid" / "charts" / "mlp-3_lbfgs_0.orthocas").r == 2
+    code, out, err = run(*words, "--jobs", "1", "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["summaries"][0]["solver"] == "closed form"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("compare", "iiwa", "--param", "spline:2"), "unknown parametrisation 'spline'"),
+        (("compare", "iiwa", "--solver", "sgd"), "unknown solver 'sgd'"),
+        (("compare", "iiwa", "--seeds", "0"), "seeds is 0"),
+        (("compare", "iiwa", "--out", "file"), "--out is file, expected a folder"),
+    ],
+)
+def test_bad_grids_are_refused_before_any_work(run, tmp_path: Path, words: tuple[str, ...], message: str) -> None:
+    (tmp_path / "file").write_text("in the way")
+    code, out, err = run(*words)
+    assert (code, out) == (2, "")
+    assert message in err

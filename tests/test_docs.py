@@ -34,7 +34,7 @@ def test_python_quickstart_runs(checkout: Path) -> None:
 
 def test_shell_quickstart_runs(checkout: Path) -> None:
     commands = [shlex.split(line) for line in blocks("sh")[1].splitlines()]
-    assert len(commands) == 5
+    assert len(commands) == 7
     for words in commands:
         assert words[0] == "orthocas"
         done = subprocess.run([sys.executable, "-m", *words], cwd=checkout, capture_output=True, text=True, check=False)

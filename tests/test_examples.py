@@ -4,12 +4,16 @@ from pathlib import Path
 
 import c_timing
 import casadi as ca
+import compare_parametrisations
 import fits
 import front
 import iiwa_demo
+import ipopt_front
 import numpy as np
+import paper_network
 import pytest
 import scaling
+import starts
 
 
 def test_demo_saves_chart_and_pictures(tmp_path: Path) -> None:
@@ -47,3 +51,36 @@ def test_front_shows_the_trade_and_the_trap(tmp_path: Path) -> None:
     assert found["p01_with_regularity"] > found["p01_without_regularity"]
     assert found["folded_with_regularity"] == 0
     assert (tmp_path / "front.png").stat().st_size > 10_000
+
+
+def test_comparison_example_draws_and_returns_the_best(tmp_path: Path) -> None:
+    best = compare_parametrisations.main(tmp_path, quick=True)
+    assert 5 < best["planar_3r_xy"] < 8
+    for name in ("front.png", "convergence.png", "comparison.csv", "table.txt"):
+        assert (tmp_path / "planar_3r_xy" / name).stat().st_size > 100
+
+
+def test_comparison_example_knows_every_problem() -> None:
+    assert set(compare_parametrisations.BASES) == set(compare_parametrisations.NETWORKS)
+    problem = compare_parametrisations.build("iiwa_pose")
+    assert (problem.m, problem.r) == (6, 1)
+
+
+def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[str]) -> None:
+    found = ipopt_front.main(quick=True)
+    assert found["iiwa_domination"] < 0.02
+    assert found["planar_3r_xy_domination"] < 0.02
+    assert capsys.readouterr().out.count("\n") == 4
+
+
+def test_benchmarks_of_networks_and_starts_print_rows(capsys: pytest.CaptureFixture[str]) -> None:
+    assert len([paper_network.row((1000.0, 30.0), quick=True)]) == 1
+    starts.main(quick=True)
+    assert "| polynomial:4 | gauss_newton |" in capsys.readouterr().out
+
+
+def test_gradients_agree_with_pytorch() -> None:
+    pytest.importorskip("torch")
+    import gradients  # noqa: PLC0415, needs the optional torch
+
+    assert len(gradients.main(quick=True)) == 2  # it checks values and gradients before timing

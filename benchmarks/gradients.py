@@ -1,0 +1,102 @@
+"""Loss and gradient against PyTorch (CPU) doing the same mathematics, in one run: networks and bases of the 7-DoF arm.
+
+n = 7, m = 3, r = 4, no joint split off, lambda = (1000, 30). Implementations take turns, medians of several rounds;
+values and gradients are checked to agree before any clock starts.
+"""
+
+import argparse
+import time
+from statistics import median
+
+import numpy as np
+import torch
+from torch_loss import WEIGHTS, Step, basis_step, network_step
+
+import orthocas as oc
+from orthocas import problems
+from orthocas.coordinates import joint_space
+from orthocas.graph_objective import GraphObjective
+from orthocas.linear_objective import LinearObjective
+from orthocas.loss import Weights
+from orthocas.parametrisations import LinearFamily
+from orthocas.samples import sample_problem
+
+HEADER = (
+    "| what | samples | orthocas [ms] | PyTorch float64, forward / reverse | float32, forward / reverse | ratio to "
+    "float64 forward / best |\n| --- | --- | --- | --- | --- | --- |"
+)
+CASES = (((64, 64), 2000), ((1024, 512), 200))
+BASES = ((oc.Polynomial(3), 4000), (oc.Polynomial(4), 8000), (oc.Fourier(2), 4000))
+
+
+def main(quick: bool = False) -> list[str]:
+    """All rows; quick: small sizes, one round."""
+    rounds = 1 if quick else 9
+    rows = [network_row(*case, rounds) for case in ((((8, 8), 100),) if quick else CASES)]
+    return rows + [basis_row(*case, rounds) for case in (((oc.Polynomial(2), 100),) if quick else BASES)]
+
+
+def network_row(hidden: tuple[int, ...], samples: int, rounds: int) -> str:
+    """One network."""
+    problem = problems.get("iiwa")
+    family = oc.MLP(hidden).family(joint_space(problem), problem.r)
+    drawn, theta = sample_problem(problem, samples, 0), family.initial(0)
+    ours = GraphObjective(family, drawn, Weights(*WEIGHTS), theta, lambda count, seed: drawn)
+    peers = {
+        f"{mode} {dtype}": network_step(hidden, theta, drawn.points, drawn.unit_task_gradients, problem.r, dtype, mode)
+        for dtype in (torch.float64, torch.float32)
+        for mode in ("forward", "reverse")
+    }
+    times = _times({"ours": lambda: ours.value_and_gradient(theta), **peers}, rounds)
+    f64 = [times["forward torch.float64"], times["reverse torch.float64"]]
+    f32 = [times["forward torch.float32"], times["reverse torch.float32"]]
+    return (
+        f"| mlp {'x'.join(map(str, hidden))} | {samples} | {times['ours']:.1f} | {f64[0]:.1f} / {f64[1]:.1f} "
+        f"| {f32[0]:.1f} / {f32[1]:.1f} | {times['ours'] / f64[0]:.2f} / {times['ours'] / min(f64):.2f} |"
+    )
+
+
+def basis_row(parametrisation: oc.Polynomial | oc.Fourier, samples: int, rounds: int) -> str:
+    """One basis, its gradients sampled before the clock starts for both."""
+    problem = problems.get("iiwa")
+    family = parametrisation.family(joint_space(problem), problem.r)
+    assert isinstance(family, LinearFamily)
+    drawn, theta = sample_problem(problem, samples, 0), family.initial(0)
+    ours = LinearObjective(family, drawn, Weights(*WEIGHTS), theta, lambda count, seed: drawn)
+    C = theta.reshape(problem.r, -1)
+    peers = {
+        str(dtype): basis_step(C, ours.G, drawn.unit_task_gradients, dtype) for dtype in (torch.float64, torch.float32)
+    }
+    times = _times({"ours": lambda: ours.value_and_gradient(theta), **peers}, rounds)
+    f64, f32 = times["torch.float64"], times["torch.float32"]
+    return (
+        f"| {parametrisation.label}, {len(family.terms)} functions | {samples} | {times['ours']:.1f} | {f64:.1f} "
+        f"| {f32:.1f} | {times['ours'] / f64:.2f} |"
+    )
+
+
+def _times(steps: dict[str, Step], rounds: int) -> dict[str, float]:
+    """Median milliseconds of each; all must agree first."""
+    value, gradient = steps["ours"]()
+    for name, step in steps.items():
+        tolerance = 1e-3 if "32" in name else 1e-9
+        peer_value, peer_gradient = step()
+        np.testing.assert_allclose(peer_value, value, rtol=tolerance)
+        np.testing.assert_allclose(peer_gradient, gradient, atol=tolerance * np.abs(gradient).max())
+    seconds: dict[str, list[float]] = {name: [] for name in steps}
+    for _ in range(rounds):
+        for name, step in steps.items():
+            step()  # threads and caches are its own again
+            start = time.perf_counter()
+            for _ in range(3):
+                step()
+            seconds[name].append((time.perf_counter() - start) / 3)
+    return {name: 1e3 * median(values) for name, values in seconds.items()}
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    print(HEADER)
+    for line in main(parser.parse_args().quick):
+        print(line, flush=True)

@@ -1,0 +1,80 @@
+"""Which parametrisation, which solver: the named problems, and the 7-DoF arm with a pose task against the SEW angle.
+
+Every fit runs in a process of its own with one thread; all together take about 10 minutes on 2 cores (quick: one small
+grid, 10 s). Writes a front and a convergence picture, a CSV and a JSON for every problem.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import orthocas as oc
+from orthocas import problems, solvers
+from orthocas.comparison_figures import convergence_figure, front_figure
+from orthocas.comparison_report import Comparison
+from orthocas.objective import Monitor, Solver, silent
+from orthocas.progress import terminal_monitor
+
+Parametrisations = Sequence[oc.parametrisations.Parametrisation | oc.SEW]
+
+ADAM = solvers.Adam(epochs=60, learning_rate=5e-3)
+FOR_BASES: tuple[Solver, ...] = (solvers.GaussNewton(), solvers.LBFGS(), solvers.Ipopt(), ADAM)
+FOR_NETWORKS: tuple[Solver, ...] = (solvers.LBFGS(), ADAM)
+BASES: dict[str, Parametrisations] = {
+    "planar_2r": (oc.Linear(), oc.Polynomial(4), oc.Fourier(1), oc.Fourier(2), oc.Fourier(3)),
+    "planar_3r_x": (oc.Linear(), oc.Polynomial(2), oc.Polynomial(4), oc.Polynomial(6), oc.Fourier(2)),
+    "planar_3r_xy": (oc.Linear(), oc.Polynomial(2), oc.Polynomial(4), oc.Polynomial(6), oc.Fourier(2)),
+    "iiwa": (oc.Linear(), oc.Polynomial(2), oc.Polynomial(3), oc.Polynomial(4), oc.Fourier(1), oc.Fourier(2)),
+    "iiwa_pose": (oc.SEW("conventional"), oc.SEW(), oc.Linear(), oc.Polynomial(2), oc.Polynomial(3), oc.Polynomial(4)),
+}
+NETWORKS: dict[str, Parametrisations] = {
+    "planar_2r": (oc.MLP((16, 16)), oc.MLP((32, 32))),
+    "planar_3r_x": (oc.MLP((16, 16)), oc.MLP((32, 32))),
+    "planar_3r_xy": (oc.MLP((16, 16)), oc.MLP((32, 32))),
+    "iiwa": (oc.MLP((16, 16)), oc.MLP((32, 32)), oc.MLP((64, 64))),
+    "iiwa_pose": (oc.MLP((16, 16)), oc.MLP((32, 32))),
+}
+
+
+def build(name: str) -> oc.Problem:
+    """A named problem, or the 7-DoF arm with the pose of its flange as the task: one extra coordinate."""
+    if name != "iiwa_pose":
+        return problems.get(name)
+    base = problems.get("iiwa")
+    task = oc.Task.named(base.robot, "pose", base.domain.centre)
+    return oc.Problem(base.robot, task, base.metric, base.domain, name)
+
+
+def compared(name: str, quick: bool, monitor: Monitor) -> Comparison:
+    """Bases with every solver, networks with those that can."""
+    problem = build(name)
+    if quick:
+        return oc.compare(problem, BASES[name][:2], samples=200, held_out=2_000, monitor=monitor)
+    bases = oc.compare(problem, BASES[name], FOR_BASES, monitor=monitor)
+    networks = oc.compare(problem, NETWORKS[name], FOR_NETWORKS, monitor=monitor)
+    return Comparison(bases.results + networks.results)
+
+
+def main(out: Path, quick: bool = False, monitor: Monitor = silent) -> dict[str, float]:
+    """Compare, draw, and return the best task deviation of every problem [deg]."""
+    best = {}
+    for name in ("planar_3r_xy",) if quick else BASES:
+        found = compared(name, quick, monitor)
+        folder = out / name
+        folder.mkdir(parents=True, exist_ok=True)
+        found.write(folder)
+        front_figure(found).savefig(folder / "front.png", dpi=110)
+        convergence_figure(found).savefig(folder / "convergence.png", dpi=110)
+        (folder / "table.txt").write_text("\n".join(" | ".join(row) for row in found.rows()) + "\n")
+        best[name] = found.summaries()[0].task_std_deg
+    return best
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/comparison"))
+    parser.add_argument("--quick", action="store_true")
+    arguments = parser.parse_args()
+    with terminal_monitor() as shown:
+        for problem_name, value in main(arguments.out, arguments.quick, shown).items():
+            print(f"{problem_name:>14}: best task deviation {value:.3f} deg")
