@@ -63,10 +63,8 @@ def basis_row(parametrisation: oc.Polynomial | oc.Fourier, samples: int, rounds:
     assert isinstance(family, LinearFamily)
     drawn, theta = sample_problem(problem, samples, 0), family.initial(0)
     ours = LinearObjective(family, drawn, Weights(*WEIGHTS), theta, lambda count, seed: drawn)
-    C = theta.reshape(problem.r, -1)
-    peers = {
-        str(dtype): basis_step(C, ours.G, drawn.unit_task_gradients, dtype) for dtype in (torch.float64, torch.float32)
-    }
+    C, G = theta.reshape(problem.r, -1), family.dense_gradients(ours.G, samples)
+    peers = {str(dtype): basis_step(C, G, drawn.unit_task_gradients, dtype) for dtype in (torch.float64, torch.float32)}
     times = _times({"ours": lambda: ours.value_and_gradient(theta), **peers}, rounds)
     f64, f32 = times["torch.float64"], times["torch.float32"]
     return (

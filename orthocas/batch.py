@@ -25,7 +25,7 @@ def _threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_THREADS = _threads()
+THREADS = _threads()  #: of the mapped functions of this process
 
 
 def dense_function(
@@ -55,7 +55,7 @@ class Batched:
         """Evaluate N samples."""
         chunk = next((size for size in _CHUNKS if size >= len(arguments[0])), _CHUNKS[-1])
         if chunk not in self._mapped:
-            how = ("thread", _THREADS) if chunk >= _THREADED and _THREADS > 1 else ()
+            how = ("thread", THREADS) if chunk >= _THREADED and THREADS > 1 else ()
             self._mapped[chunk] = self.function.map(chunk, *how)
         return evaluate_columns(self._mapped[chunk], chunk, *arguments)
 

@@ -1,7 +1,5 @@
 """The constrained form: the smallest task term at a bounded mutual term, a point of the front (ours)."""
 
-from functools import cached_property
-
 import numpy as np
 
 from orthocas.checks import Array
@@ -31,6 +29,7 @@ class BoundedMutual:
         weights = objective.weights
         self._task = objective.reweighted(Weights(weights.task, 0.0, weights.regularity))
         self._mutual = objective.reweighted(Weights(0.0, 2.0))  # twice a half: the mean of squares itself
+        self._gram = objective.gram
         self._r, self._K, self._bound = objective.r, objective.K, bound
 
     def value(self, theta: Array) -> float:
@@ -70,10 +69,3 @@ class BoundedMutual:
         C = theta.reshape(self._r, self._K)
         scaled: Array = C / np.sqrt(((C @ self._gram) * C).sum(axis=1))[:, None]
         return scaled.ravel()
-
-    @cached_property
-    def _gram(self) -> Array:
-        """E[d psi^T d psi], (K, K)."""
-        G = self._task.G.reshape(-1, self._K)
-        product: Array = G.T @ G / self._task.N
-        return product

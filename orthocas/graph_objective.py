@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 
 from orthocas.checks import Array
-from orthocas.expression_tape import Tape, replay, to_tape
-from orthocas.loss import LossShape, Weights
+from orthocas.expression_tape import replay
+from orthocas.loss import LossShape, Weights, loss_columns
 from orthocas.numpy_nodes import NumpyGraph
 from orthocas.parametrisations import Family
 from orthocas.samples import Draw, Samples
@@ -91,9 +91,10 @@ class _LossGraph:
         data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in shape.symbols()))
         share = ca.MX.sym("share", columns)
         gradients = family.jacobian(q, theta)
-        entries = [entry for gradient in gradients for entry in ca.horzsplit(gradient.T)]
-        loss, *slopes = replay(_sample_tape(shape), [*entries, *ca.horzsplit(data)])
-        weighted = [ca.horzcat(*(share * s for s in slopes[j * shape.n : (j + 1) * shape.n])) for j in range(shape.r)]
+        by_component = [ca.horzsplit(gradient.T) for gradient in gradients]  # r times n columns of samples
+        entries = [column for by_joint in zip(*by_component, strict=True) for column in by_joint]
+        loss, *slopes = replay(loss_columns(shape).tape, [*entries, *ca.horzsplit(data)])
+        weighted = [ca.horzcat(*(share * slope for slope in slopes[j :: shape.r])) for j in range(shape.r)]
         # the chain rule, cut at J_xi: slopes of the loss come from one sample's graph, replayed on columns
         by_theta = ca.jtimes(ca.horzcat(*gradients), theta, ca.horzcat(*(part.T for part in weighted)), True)
         value, inputs = ca.dot(share, loss), [theta, q, data, share]
@@ -130,13 +131,3 @@ def _orientation(family: Family, theta: Array, samples: Samples) -> float:
     gradients = NumpyGraph("J_xi", [q, parameters], [ca.vertcat(*family.jacobian(q, parameters))])
     (J,) = gradients(np.ascontiguousarray(samples.points), np.ascontiguousarray(theta))  # (N, r n)
     return samples.orientation(J.reshape(len(samples), family.outputs, -1))
-
-
-def _sample_tape(shape: LossShape) -> Tape:
-    """Loss of one sample and its slopes dL/dJ_xi, row by row, from J_xi row by row and the sample's data."""
-    column, data = ca.SX.sym("v", shape.r * shape.n), shape.symbols()
-    J = ca.reshape(column, shape.n, shape.r).T
-    loss = ca.sumsqr(shape.residuals(J, data)) / 2
-    outputs = ca.densify(ca.vertcat(loss, ca.gradient(loss, column)))
-    inputs = ca.vertcat(column, *(ca.vec(symbol) for symbol in data))
-    return to_tape(ca.Function("sample_loss", [inputs], [ca.cse(outputs)]))

@@ -1,12 +1,13 @@
 """The loss of [AS2023] (24) and (25) as CasADi expressions and least squares, and a regularity term (ours)."""
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 
 import casadi as ca
 
-from orthocas.batch import dense_function
 from orthocas.checks import require_shape
+from orthocas.columns import ColumnFunction
 from orthocas.errors import InvalidValueError
 
 DEFAULT_WEIGHTS = (1000.0, 30.0, 150.0)  #: lambda1, lambda2, lambda3; at the paper's 1000 : 1 the optimum can lose rank
@@ -147,32 +148,49 @@ class LossShape:
         ]
 
 
-def residual_functions(shape: LossShape) -> tuple[ca.Function, ca.Function]:
-    """The residuals of one sample, without and with their derivatives with respect to J_xi.
+@cache
+def loss_columns(shape: LossShape) -> ColumnFunction:
+    """Loss of one sample and its slopes dL/dJ_xi.
 
-    Inputs: J_xi (r, n), then the data of `LossShape.symbols`.
-    Outputs: rho (p, 1); then for every coordinate j the derivative of the residuals `rows_of(j)` with respect to row j
-    of J_xi, (rows, n); then, with a regularity residual, its derivative with respect to J_xi, (r, n).
+    Inputs: J_xi (r, n), then the data of `LossShape.symbols`. Outputs: loss (1, 1), slopes (r, n).
+    """
+    J, data = ca.SX.sym("J", shape.r, shape.n), shape.symbols()
+    loss = ca.sumsqr(shape.residuals(J, data)) / 2
+    return ColumnFunction(ca.Function("loss", [J, *data], [loss, ca.gradient(loss, J)]))
+
+
+@cache
+def value_columns(shape: LossShape) -> ColumnFunction:
+    """Loss of one sample; inputs as for `loss_columns`."""
+    J, data = ca.SX.sym("J", shape.r, shape.n), shape.symbols()
+    return ColumnFunction(ca.Function("value", [J, *data], [ca.sumsqr(shape.residuals(J, data)) / 2]))
+
+
+@cache
+def residual_columns(shape: LossShape) -> ColumnFunction:
+    """Derivatives of the residuals of one sample with respect to J_xi, for the Gauss-Newton matrix.
+
+    Inputs as for `loss_columns`. Outputs: for every coordinate j the derivative of the residuals `rows_of(j)` with
+    respect to row j of J_xi, (rows, n); then, with a regularity residual, that residual (1, 1) and its derivative with
+    respect to J_xi, (r, n).
     """
     J, data = ca.SX.sym("J", shape.r, shape.n), shape.symbols()
     rho = shape.residuals(J, data)
     by_entry = ca.jacobian(rho, ca.vec(J))  # columns: J_xi column by column
-    derivatives = [by_entry[shape.rows_of(j), j :: shape.r] for j in range(shape.r)]
+    outputs = [by_entry[shape.rows_of(j), j :: shape.r] for j in range(shape.r)]
     if shape.regular:
-        derivatives.append(ca.reshape(by_entry[-1, :], shape.r, shape.n))
-    inputs = [J, *data]
-    return dense_function("residuals", inputs, [rho]), dense_function(
-        "linearised_residuals", inputs, [rho, *derivatives]
-    )
+        outputs += [rho[-1], ca.reshape(by_entry[-1, :], shape.r, shape.n)]
+    return ColumnFunction(ca.Function("residuals", [J, *data], outputs))
 
 
-def loss_hessian_function(shape: LossShape) -> ca.Function:
-    """Exact second derivatives of one sample's loss with respect to J_xi, taken row by row, (r n, r n).
+@cache
+def curvature_columns(shape: LossShape) -> ColumnFunction:
+    """Second derivatives of the loss of one sample with respect to J_xi column by column, (n r, n r).
 
-    Inputs: J_xi (r, n), then the data of `LossShape.symbols`.
+    Inputs as for `loss_columns`.
     """
-    rows, data = ca.SX.sym("v", shape.r * shape.n), shape.symbols()
-    loss = ca.sumsqr(shape.residuals(ca.reshape(rows, shape.n, shape.r).T, data)) / 2
-    by_rows = ca.Function("by_rows", [rows, *data], [ca.hessian(loss, rows)[0]])
-    J = ca.SX.sym("J", shape.r, shape.n)
-    return dense_function("loss_hessian", [J, *data], [by_rows(ca.vec(J.T), *data)])
+    J, data = ca.SX.sym("J", shape.r, shape.n), shape.symbols()
+    column = ca.SX.sym("v", shape.r * shape.n)
+    loss = ca.sumsqr(shape.residuals(ca.reshape(column, shape.r, shape.n), data)) / 2
+    second = ca.Function("second", [column, *data], [ca.hessian(loss, column)[0]])
+    return ColumnFunction(ca.Function("curvature", [J, *data], [second(ca.vec(J), *data)]))

@@ -21,7 +21,7 @@ def spectral_start(family: LinearFamily, samples: Samples) -> Array:
     Source:
         ours, docs/derivations.md#spectral-start.
     """
-    G = family.basis_gradients(samples.points)
+    G = family.dense_gradients(family.basis_gradients(samples.points), len(samples))  # (N, n, K)
     N, _, K = G.shape
     along_task = (samples.task_basis @ G).reshape(-1, K)  # e_i^T d psi, the components along the task gradients
     S = along_task.T @ along_task / N

@@ -12,7 +12,7 @@ from orthocas.coordinates import joint_space
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.graph_objective import GraphObjective
 from orthocas.linear_objective import LinearObjective
-from orthocas.loss import REGULAR_VOLUME, Weights, mutual_cosines, pairs, task_cosines
+from orthocas.loss import REGULAR_VOLUME, LossShape, Weights, mutual_cosines, pairs, task_cosines
 from orthocas.samples import Draw, Samples, sample_problem, samples_at
 from orthocas.spectral import spectral_start
 
@@ -139,11 +139,16 @@ def test_gauss_newton_matrix_is_that_of_the_residuals(planar_x: oc.Problem) -> N
     family = oc.Polynomial(2).family(joint_space(planar_x), 2)
     theta = family.initial(3)
     objective = LinearObjective(family, twice, REGULAR, theta, draw_from(planar_x))
-    assert (objective._residuals(objective.coordinate_jacobians(theta), *objective._data)[0][:, -1] > 0).any()
+    shape = LossShape(3, 1, 2, False, REGULAR)
+    J, data = ca.SX.sym("J", 2, 3), shape.symbols()
+    rho = ca.Function("rho", [J, *data], [shape.residuals(J, data)])
+    parts = twice.loss_data(twice.orientation(objective.coordinate_jacobians(theta)))
 
     def residuals(theta: np.ndarray) -> np.ndarray:
-        return objective._residuals(objective.coordinate_jacobians(theta), *objective._data)[0].ravel()
+        rows = zip(objective.coordinate_jacobians(theta), *parts, strict=True)
+        return np.array([rho(*row).full() for row in rows]).ravel()
 
+    assert (residuals(theta).reshape(80, -1)[:, -1] > 0).any()  # the regularity residual takes part
     step = 1e-6
     jacobian = np.array(
         [(residuals(theta + step * e) - residuals(theta - step * e)) / (2 * step) for e in np.eye(len(theta))]

@@ -104,10 +104,14 @@ def test_basis_gradients_match_differences_of_the_basis() -> None:
     point = np.array([0.2, 0.1, -0.1])
     q = ca.SX.sym("q", 3)
     psi = ca.Function("psi", [q], [family.basis(q)])
-    G = family.basis_gradients(point[None])[0]  # (n, K)
+    G = family.dense_gradients(family.basis_gradients(point[None]), 1)[0]  # (n, K)
     step = 1e-6
     want = [np.array(psi(point + step * e) - psi(point - step * e)).ravel() / (2 * step) for e in np.eye(3)]
     np.testing.assert_allclose(G, want, atol=1e-7)
+    for i, places in enumerate(family.terms_of_joints):
+        others = np.setdiff1d(np.arange(len(family.terms)), places)
+        assert not np.any(G[i, others])
+        assert np.all(np.array(family.terms)[places, i] > 0)
 
 
 def test_linear_normals_of_the_paper() -> None:

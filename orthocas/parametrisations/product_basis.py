@@ -7,9 +7,10 @@ from typing import Any, Protocol, Self, runtime_checkable
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
-from orthocas.batch import Batched, dense_function
 from orthocas.checks import Array
+from orthocas.columns import ColumnFunction, blocked
 from orthocas.parametrisations.family import Expression, JointSpace, component_gradients
 
 Term = tuple[int, ...]  #: for every joint, which one-joint function the term takes; 0 is the constant 1
@@ -61,14 +62,45 @@ class LinearFamily:
         C = np.random.default_rng(seed).normal(size=(self.outputs, len(self.terms))) * 0.3**order
         return C.ravel()
 
+    @cached_property
+    def terms_of_joints(self) -> NDArray[np.int_]:
+        """For every joint the places of the terms that depend on it, (n, W); a shorter row ends with -1.
+
+        For n joints and total degree d that is a share of d / (n + d) of all polynomials: most gradients are zero.
+        """
+        rows = [[k for k, term in enumerate(self.terms) if term[i]] for i in range(self.space.n)]
+        width = max(len(row) for row in rows)
+        return np.array([row + [-1] * (width - len(row)) for row in rows])
+
     def basis_gradients(self, points: Array) -> Array:
-        """Gradients d psi / dq at points (N, n), (N, n, K)."""
-        return self._batched_gradients(points)[0].transpose(0, 2, 1)  # contiguous: CasADi fills columns
+        """The gradients d psi_k / dq_i that are not zero, at points (N, n), in blocks of c samples, (B, n, W, c).
+
+        Entry w of joint i belongs to term `terms_of_joints[i, w]`; blocks as in `orthocas.columns`.
+        """
+        gradients = self._gradient_columns(blocked(points))[0]
+        return gradients.reshape(len(gradients), self.space.n, -1, gradients.shape[2])
+
+    def dense_gradients(self, gradients: Array, samples: int, every: int = 1) -> Array:
+        """All gradients sample by sample, zeros included, (N, n, K), from those of `basis_gradients`.
+
+        Args:
+            gradients: (B, n, W, c).
+            samples: number of samples, without the copies that fill the last block.
+            every: take only every second, third, ... sample.
+        """
+        stack = gradients.transpose(0, 3, 1, 2).reshape(-1, *gradients.shape[1:3])[:samples:every]
+        dense = np.zeros((len(stack), self.space.n, len(self.terms)), dtype=gradients.dtype)
+        for i, places in enumerate(self.terms_of_joints):
+            known = places[places >= 0]
+            dense[:, i, known] = stack[:, i, : len(known)]
+        return dense
 
     @cached_property
-    def _batched_gradients(self) -> Batched:
+    def _gradient_columns(self) -> ColumnFunction:
         q = ca.SX.sym("q", self.space.n)
-        return Batched(dense_function("basis_gradients", [q], [ca.jacobian(self.basis(q), q)]))
+        J = ca.densify(ca.jacobian(self.basis(q), q))
+        entries = [J[int(k), i] if k >= 0 else 0 for i, row in enumerate(self.terms_of_joints) for k in row]
+        return ColumnFunction(ca.Function("basis_gradients", [q], [ca.densify(ca.vertcat(*entries))]))
 
     @classmethod
     def _product(cls, term: Term, tables: list[list[Any]], products: dict[Term, Any]) -> Any:
