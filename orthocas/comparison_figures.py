@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -14,7 +15,6 @@ from orthocas.comparison_report import Comparison, Summary
 
 Colour = tuple[float, float, float, float]
 _HUES = {"linear": "Greys", "polynomial": "Blues", "fourier": "Greens", "mlp": "Oranges", "sew": "Purples"}
-_NEAR = 0.06  # relative distance at which labels would overlap
 _MARKERS = "osD^vPX*"
 _STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)))
 
@@ -22,11 +22,12 @@ _STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)))
 def front_figure(comparison: Comparison) -> Figure:
     """Task angle against mutual angle of all fits: down and left is better.
 
-    Colour tells the parametrisation, marker the solver, size the number of parameters; labels are seconds (medians over
-    seeds). With one extra coordinate there is no mutual angle, and the 1 % quantile of the conditioning takes its
-    place.
+    Colour tells the parametrisation, marker the solver, size the number of parameters; labels beside the picture name
+    both with the seconds, lines lead to the medians over seeds. With one extra coordinate there is no mutual angle, and
+    the 1 % quantile of the conditioning takes its place.
     """
-    figure = Figure(figsize=(8.6, 5.2), layout="constrained")
+    summaries = [summary for summary in comparison.summaries() if summary.failed < summary.seeds]
+    figure = Figure(figsize=(9.6, max(4.6, 1.2 + 0.21 * len(summaries))), layout="constrained")
     axes = figure.add_subplot()
     good = [result for result in comparison.results if not result.failed]
     single = all(math.isnan(result.mutual_std_deg) for result in good)
@@ -42,13 +43,13 @@ def front_figure(comparison: Comparison) -> Figure:
             edgecolor="black",
             linewidth=0.4,
         )
-    _annotate(axes, comparison.summaries(), single)
     axes.set_xlabel("task angle, standard deviation [deg]")
     axes.set_ylabel("conditioning, 1 % quantile (1 is best)" if single else "mutual angle, standard deviation [deg]")
     _scale(axes, [r.task_std_deg for r in good], [] if single else [r.mutual_std_deg for r in good])
-    _legends(axes, colours, markers)
-    axes.set_title(f"{_problem(comparison)}: held-out quality; labels are seconds, size is the number of parameters")
-    axes.title.set_fontsize(10)
+    _label(axes, summaries, single, colours)
+    handles = [Line2D([], [], marker=m, linestyle="", color="0.4", label=name) for name, m in markers.items()]
+    axes.legend(handles=handles, fontsize=8)
+    axes.set_title(f"{_problem(comparison)}: held-out quality; size is the number of parameters", fontsize=10)
     axes.grid(alpha=0.3, which="both")
     return figure
 
@@ -98,17 +99,28 @@ def _size(parameters: int) -> float:
     return 30 + 25 * math.log10(1 + parameters)
 
 
-def _annotate(axes: Axes, summaries: Sequence[Summary], single: bool) -> None:
-    """Seconds beside the medians, those of neighbours one below the other."""
-    placed: list[tuple[float, float]] = []
-    for summary in summaries:
-        x, y = summary.task_std_deg, summary.conditioning_p01 if single else summary.mutual_std_deg
-        if not (x > 0 and y > 0):
-            continue
-        below = sum(abs(math.log(x / a)) + abs(math.log(y / b)) < _NEAR for a, b in placed)
-        offset = (9, 3 - 9 * below)
-        axes.annotate(f"{summary.seconds:.2g} s", (x, y), xytext=offset, textcoords="offset points", fontsize=8)
-        placed.append((x, y))
+def _label(axes: Axes, summaries: Sequence[Summary], single: bool, colours: Mapping[str, Colour]) -> None:
+    """Names and seconds in a column beside the axes, from top to bottom as the points lie, with lines to them."""
+    places = {(s.parametrisation, s.solver): s.conditioning_p01 if single else s.mutual_std_deg for s in summaries}
+    ordered = sorted(summaries, key=lambda s: (-places[s.parametrisation, s.solver], s.task_std_deg))
+    for k, summary in enumerate(ordered):
+        axes.annotate(
+            f"{summary.parametrisation}, {summary.solver}: {summary.seconds:.2g} s",
+            (summary.task_std_deg, places[summary.parametrisation, summary.solver]),
+            xytext=(1.04, 1 - (k + 0.5) / len(ordered)),
+            textcoords="axes fraction",
+            fontsize=7.5,
+            color=colours[summary.parametrisation],
+            verticalalignment="center",
+            arrowprops={
+                "arrowstyle": "-",
+                "relpos": (0, 0.5),
+                "shrinkA": 1,
+                "color": colours[summary.parametrisation],
+                "linewidth": 0.5,
+                "alpha": 0.6,
+            },
+        )
 
 
 def _scale(axes: Axes, *values: Sequence[float]) -> None:
@@ -121,12 +133,8 @@ def _scale(axes: Axes, *values: Sequence[float]) -> None:
             axis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.7)))
 
 
-def _legends(axes: Axes, colours: dict[str, Colour], solvers: Mapping[str, object]) -> None:
+def _legends(axes: Axes, colours: Mapping[str, Colour], styles: Mapping[str, Any]) -> None:
     """One legend for parametrisations and solvers, beside the picture."""
-    handles = [Line2D([], [], marker="o", linestyle="", color=colour, label=name) for name, colour in colours.items()]
-    for name, style in solvers.items():
-        if isinstance(style, str) and style in _MARKERS:
-            handles.append(Line2D([], [], marker=style, linestyle="", color="0.3", label=name))
-        else:
-            handles.append(Line2D([], [], linestyle=style, color="0.3", label=name))  # type: ignore[arg-type]
+    handles = [Line2D([], [], color=colour, linewidth=3, label=name) for name, colour in colours.items()]
+    handles += [Line2D([], [], linestyle=style, color="0.3", label=name) for name, style in styles.items()]
     axes.legend(handles=handles, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)

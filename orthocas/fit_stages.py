@@ -91,6 +91,7 @@ class StageRunner:
             self._require_graph_memory(label, family, len(samples))
             theta = family.initial(self.seed) if theta is None else theta
             return GraphObjective(family, samples, self.weights, theta, self._draw), theta
+        fresh = theta is None
         theta = spectral_start(family, samples) if theta is None else theta
         objective = LinearObjective(family, samples, self.weights, theta, self._draw)
         if self.max_mutual is None:
@@ -100,7 +101,7 @@ class StageRunner:
             raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
         # pairs with an idle joint are exactly orthogonal, so the others may use their share
         bounded = BoundedMutual(objective, self.max_mutual * (all_pairs / fitted) ** 0.5)
-        return bounded, bounded.in_gauge(theta)
+        return bounded, bounded.in_gauge(bounded.weighted_start(theta) if fresh else theta)
 
     def _require_feasible(self, label: str, objective: BoundedMutual, result: SolveResult) -> None:
         """Say how far a bound was missed."""
