@@ -5,6 +5,7 @@ from concurrent.futures import Executor
 from itertools import product
 from pathlib import Path
 
+from orthocas.archive import require_writable
 from orthocas.chart import Chart
 from orthocas.checks import as_float_array, require_count
 from orthocas.comparison import Cell, CellResult, run_cells
@@ -71,7 +72,10 @@ def fit(
     if max_mutual_deg is not None and not isinstance(solver, Ipopt):
         raise InvalidValueError("solver", solver.name, "ipopt, which alone can keep max_mutual_deg")
     loss = _weights(weights)
-    return fit_chart(problem, parametrisation, solver, loss, samples, seed, monitor, max_mutual_deg, checkpoint)
+    starter = None if max_mutual_deg is None else GaussNewton()
+    return fit_chart(
+        problem, parametrisation, solver, loss, samples, seed, monitor, max_mutual_deg, checkpoint, starter
+    )
 
 
 def compare(
@@ -84,7 +88,7 @@ def compare(
     held_out: int = 100_000,
     executor: Executor | None = None,
     jobs: int | None = None,
-    charts: Path | None = None,
+    charts: str | Path | None = None,
     monitor: Monitor = silent,
 ) -> Comparison:
     """Fit every parametrisation with every solver and seed, and judge all on the same held-out samples.
@@ -105,10 +109,20 @@ def compare(
         jobs: number of such processes, default one for each core.
         charts: folder to save charts in.
         monitor: called with progress.
+
+    Call it under `if __name__ == "__main__"` in scripts, as all that starts processes.
+
+    Raises:
+        InvalidValueError: if the grid is empty, or two of its parametrisations or solvers have the same name.
+        ChartFileError: if the folder for charts cannot be written.
     """
     count, loss = require_count("seeds", seeds), _weights(weights)
     jobs = None if jobs is None else require_count("jobs", jobs)
     held_out = require_count("held_out", held_out)
+    _require_grid(parametrisations, solvers)
+    if charts is not None:
+        charts = Path(charts)
+        require_writable(charts / "chart")
     cells = []
     for parametrisation in parametrisations:
         closed = isinstance(parametrisation, Linear | Given | SEW)
@@ -117,20 +131,39 @@ def compare(
             name = f"{parametrisation.label}_{solver.name}_{seed}.orthocas".replace(":", "-")
             file = None if charts is None else charts / name
             cells.append(Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file))
-    order = {(cell.parametrisation.label, cell.solver.name, cell.seed): k for k, cell in enumerate(cells)}
+    order = {(cell.parametrisation.label, cell.solver_name, cell.seed): k for k, cell in enumerate(cells)}
     results: list[CellResult] = []
     interrupted = False
     try:
         results.extend(run_cells(cells, executor, jobs, monitor))
     except KeyboardInterrupt:
         interrupted = True
-    results.sort(key=lambda result: order.get((result.parametrisation, result.solver, result.seed), 0))
+    results.sort(key=lambda result: order[result.parametrisation, result.solver, result.seed])
     return Comparison(tuple(results), interrupted)
 
 
 def default_solver(parametrisation: Parametrisation | SEW) -> Solver:
     """Gauss-Newton for families linear in their parameters, L-BFGS for others."""
     return GaussNewton() if isinstance(parametrisation, GradedParametrisation | Linear) else LBFGS()
+
+
+def _require_grid(parametrisations: Sequence[Parametrisation | SEW], solvers: Sequence[Solver] | None) -> None:
+    """Refuse grids that are empty, hold something else, or whose results could not be told apart."""
+    for name, members, kinds, example in (
+        ("parametrisations", parametrisations, Parametrisation | SEW, "Polynomial(degree=4)"),
+        ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
+    ):
+        if not members:
+            raise InvalidValueError(name, "empty", f"at least one, as [{example}]")
+        for member in members:
+            if not isinstance(member, kinds):
+                raise InvalidValueError(name, repr(member), f"objects such as {example}")
+        labels = [getattr(member, "label", getattr(member, "name", "")) for member in members]
+        twice = [label for label in labels if labels.count(label) > 1]
+        if twice:
+            raise InvalidValueError(
+                name, f"holding two called '{twice[0]}'", "different ones; compare those in two grids"
+            )
 
 
 def _weights(numbers: WeightNumbers) -> Weights:

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.checks import Array
+from orthocas.interrupts import deferred
 
 _CHUNKS = (1, 64, 512)  # samples evaluated in one call: the smallest that holds the set, or the largest
 _THREADED = 512  # chunks of this size are worth starting threads for
@@ -79,7 +80,8 @@ def evaluate_columns(function: ca.Function, chunk: int, *arguments: Array) -> li
         for array, argument in zip(inputs, arguments, strict=True):
             array[:count] = argument[start : start + count]
             array[count:] = argument[start]  # pad the last chunk with a valid sample
-        run()
+        with deferred():
+            run()
         for result, out in zip(results, outputs, strict=True):
             result[start : start + count] = out[:count]
     return [_row_major(result) for result in results]

@@ -76,4 +76,4 @@ class BestPoint:
             "seconds": self.seconds,
             **state,
         }
-        return {name: np.asarray(value, dtype=float) for name, value in numbers.items()}
+        return {name: np.array(value, dtype=float) for name, value in numbers.items()}

@@ -26,10 +26,9 @@ class BoundedMutual:
     """
 
     def __init__(self, objective: LinearObjective, bound: float) -> None:
-        weights = objective.weights
+        weights, self._gram = objective.weights, objective.gram  # sampled once, shared by what follows
         self._task = objective.reweighted(Weights(weights.task, 0.0, weights.regularity))
         self._mutual = objective.reweighted(Weights(0.0, 2.0))  # twice a half: the mean of squares itself
-        self._gram = objective.gram
         self._r, self._K, self._bound = objective.r, objective.K, bound
 
     def value(self, theta: Array) -> float:

@@ -103,6 +103,7 @@ class StageKeeper:
 
     def __init__(self, state: State | None, write: Callable[[State], None]) -> None:
         self._state, self._write = state, write
+        self._newest: State | None = None
         self._last = time.monotonic()
 
     def restored(self) -> State | None:
@@ -111,9 +112,15 @@ class StageKeeper:
 
     def keep(self, state: Callable[[], State]) -> None:
         """Write the state if the last write is long enough ago."""
+        self._newest = state()
         if time.monotonic() - self._last >= _SECONDS:
-            self._write(state())
-            self._last = time.monotonic()
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the newest state now."""
+        if self._newest is not None:
+            self._write(self._newest)
+            self._newest, self._last = None, time.monotonic()
 
 
 def _numbers(stage: Stage) -> dict[str, str | float]:

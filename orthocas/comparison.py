@@ -1,22 +1,28 @@
 """Fits side by side: a grid of parametrisations, solvers and seeds, judged on the same held-out samples."""
 
+import math
 import os
+import signal
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
+from multiprocessing.synchronize import Event
 from pathlib import Path
 
+from orthocas.batch import THREADS
 from orthocas.fitting import fit_chart
 from orthocas.loss import Weights
 from orthocas.objective import Monitor, Progress, Solver, Status, silent
-from orthocas.parametrisations import SEW, Parametrisation
+from orthocas.parametrisations import SEW, Given, Linear, Parametrisation
 from orthocas.problem import Problem
 from orthocas.quality import evaluate
 
-HELD_OUT_SEED = 2**31  #: seed of the held-out samples: no fit has it
+HELD_OUT_SEED = 2**31  #: seed of the held-out samples: no fit of a grid has it
+_DIED = "its process died: out of memory, or a script that calls compare outside `if __name__ == '__main__'`"
+_stops: list[Event] = []  # in processes of ours: set when the parent does not want results any more
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +39,9 @@ class Cell:
     chart_file: Path | None  #: where to save the chart
 
     @property
-    def label(self) -> str:
-        """Short name for progress displays."""
-        return f"{self.parametrisation.label}, {self.solver.name}, seed {self.seed}"
+    def solver_name(self) -> str:
+        """Name of the solver; coordinates in closed form need none."""
+        return "closed form" if isinstance(self.parametrisation, Linear | Given | SEW) else self.solver.name
 
 
 @dataclass(frozen=True)
@@ -73,9 +79,13 @@ def run_cell(cell: Cell) -> CellResult:
     start = time.perf_counter()
 
     def record(progress: Progress) -> None:
-        if progress.value == progress.value:
+        if _cancelled():
+            raise KeyboardInterrupt
+        if math.isfinite(progress.value):
             history.append((time.perf_counter() - start, progress.value))
 
+    if _cancelled():
+        return failure(cell, "cancelled")
     try:
         fit = fit_chart(cell.problem, cell.parametrisation, cell.solver, cell.weights, cell.samples, cell.seed, record)
         if cell.chart_file is not None:
@@ -87,7 +97,7 @@ def run_cell(cell: Cell) -> CellResult:
     return CellResult(
         problem=cell.problem.name,
         parametrisation=cell.parametrisation.label,
-        solver=str(fit.chart.notes["solver"]),
+        solver=cell.solver_name,
         seed=cell.seed,
         status=fit.status.value,
         seconds=fit.seconds,
@@ -109,7 +119,7 @@ def failure(cell: Cell, error: str) -> CellResult:
     """The result of a fit that did not come to its end."""
     text = " ".join(error.split())
     return CellResult(
-        cell.problem.name, cell.parametrisation.label, cell.solver.name, cell.seed, Status.FAILED.value, text
+        cell.problem.name, cell.parametrisation.label, cell.solver_name, cell.seed, Status.FAILED.value, text
     )
 
 
@@ -121,7 +131,7 @@ def run_cells(
     Args:
         cells: what to run.
         executor: where to run them; default processes of this machine with one thread each.
-        jobs: number of such processes, default one for each core.
+        jobs: number of such processes, default one for each core this process may use.
         monitor: called with the share of cells that are done.
     """
     results = _own_processes(cells, jobs) if executor is None else _submitted(cells, executor)
@@ -147,14 +157,20 @@ def _outcome(future: Future[CellResult], cell: Cell) -> CellResult:
     if error is None:
         return future.result()
     died = isinstance(error, BrokenExecutor)
-    return failure(cell, "its process died" if died else f"{type(error).__name__}: {error}")
+    return failure(cell, _DIED if died else f"{type(error).__name__}: {error}")
 
 
 def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResult]:
     """All cells in processes of our own. If one dies, all that were left are run again, each in a pool of its own."""
     left: list[Cell] = []
+    context = get_context("spawn")  # new interpreters: forked ones would inherit threads that no longer run
+    stop = context.Event()
+
+    def pool_of(size: int) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(size, mp_context=context, initializer=_begin, initargs=(stop,))
+
     with single_threaded():
-        with _pool(jobs or os.cpu_count() or 1) as pool:
+        with pool_of(jobs or THREADS) as pool:
             futures = {pool.submit(run_cell, cell): cell for cell in cells}
             try:
                 for future in as_completed(futures):
@@ -162,16 +178,23 @@ def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResu
                         left.append(futures[future])
                     else:
                         yield _outcome(future, futures[future])
-            finally:
+            except BaseException:  # Ctrl-C, or nobody wants the rest: fits that are running end at their next step
+                stop.set()
                 pool.shutdown(wait=False, cancel_futures=True)
+                raise
         for cell in left:
-            with _pool(1) as pool:
+            with pool_of(1) as pool:
                 yield _outcome(pool.submit(run_cell, cell), cell)
 
 
-def _pool(jobs: int) -> ProcessPoolExecutor:
-    """New interpreters: forked ones would inherit threads that no longer run."""
-    return ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
+def _begin(stop: Event) -> None:
+    """In a new process: leave Ctrl-C to the parent, who says when to stop."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _stops.append(stop)
+
+
+def _cancelled() -> bool:
+    return any(stop.is_set() for stop in _stops)
 
 
 @contextmanager

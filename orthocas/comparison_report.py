@@ -1,6 +1,7 @@
 """What a comparison leaves behind: a table, a CSV, a JSON."""
 
 import csv
+import io
 import json
 import math
 from collections.abc import Sequence
@@ -49,12 +50,13 @@ class Comparison:
     def write(self, folder: Path) -> None:
         """Write comparison.csv (one line a fit) and comparison.json (with histories)."""
         names = [field.name for field in fields(CellResult) if field.name != "history"]
-        with (folder / "comparison.csv").open("w", newline="") as file:
-            writer = csv.DictWriter(file, names)
-            writer.writeheader()
-            for result in self.results:
-                writer.writerow({name: getattr(result, name) for name in names})
-        (folder / "comparison.json").write_text(json.dumps(self.as_dict(), allow_nan=False, indent=1))
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, names)
+        writer.writeheader()
+        for result in self.results:
+            writer.writerow({name: getattr(result, name) for name in names})
+        _write(folder / "comparison.csv", text.getvalue())
+        _write(folder / "comparison.json", json.dumps(self.as_dict(), allow_nan=False, indent=1))
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON; NaN becomes None."""
@@ -118,6 +120,13 @@ def _row(s: Summary) -> list[str]:
         str(s.folded_samples),
         f"{s.seconds:.2f}",
     ]
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file that appears whole or not at all."""
+    draft = path.with_name(f".{path.name}.draft")
+    draft.write_text(text, newline="")
+    draft.replace(path)
 
 
 def _without_nan(data: dict[str, Any]) -> dict[str, Any]:

@@ -9,10 +9,11 @@ from orthocas.bounded_mutual import BoundedMutual
 from orthocas.checkpoint import Checkpoint, Stage
 from orthocas.checks import Array, require_memory
 from orthocas.domains import sample_evenly
-from orthocas.errors import InfeasibleError, InvalidValueError
+from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
 from orthocas.graph_objective import GraphObjective
+from orthocas.interrupts import deferred
 from orthocas.linear_objective import LinearObjective
-from orthocas.loss import Weights, pairs
+from orthocas.loss import DEFAULT_WEIGHTS, Weights, pairs
 from orthocas.objective import Monitor, Objective, Progress, Solver, SolveResult, Status, Watch
 from orthocas.parametrisations import Family, GradedParametrisation, JointSpace, LinearFamily, Parametrisation, embed
 from orthocas.problem import Problem
@@ -36,6 +37,7 @@ class StageRunner:
     seed: int
     monitor: Monitor
     checkpoint: Checkpoint
+    starter: Solver | None = None  #: solves the weighted problem before a bounded one: minima far from it are worse
 
     def graded(
         self, target: GradedParametrisation, r: int, solver: Solver
@@ -48,9 +50,10 @@ class StageRunner:
             current = target.of_degree(degree)
             family = current.family(self.space, r)
             start = None if lower is None else embed(stages[-1].result.theta, r, lower.terms, family.terms)
-            minimiser = solver if degree == target.degree else solver.coarser()
+            final = degree == target.degree
             try:
-                stages.append(self.stage(current, family, start, minimiser, degree))
+                minimiser = solver if final else solver.coarser()
+                stages.append(self.stage(current, family, start, minimiser, degree, final))
             except KeyboardInterrupt:  # between minimisations: the last degree is the best so far
                 if not stages:
                     raise
@@ -61,9 +64,19 @@ class StageRunner:
         return stages, target
 
     def stage(
-        self, parametrisation: Parametrisation, family: Family, theta: Array | None, solver: Solver, degree: int = 0
+        self,
+        parametrisation: Parametrisation,
+        family: Family,
+        theta: Array | None,
+        solver: Solver,
+        degree: int = 0,
+        final: bool = True,
     ) -> Stage:
-        """Draw samples, find a start if there is none, and minimise; or take the stage from the checkpoint."""
+        """Draw samples, find a start if there is none, and minimise; or take the stage from the checkpoint.
+
+        Raises:
+            SolveError: if there is no usable point. A bound on mutual angles has to be kept by the final stage only.
+        """
         label = parametrisation.label
         done = self.checkpoint.finished(label)
         if done is not None:
@@ -72,12 +85,19 @@ class StageRunner:
         self.monitor(Progress(label, 0.0, f"sampling {count} points"))
         points = sample_evenly(self.problem.domain, count, (self.seed, 1 + degree))
         samples = samples_at(self.problem, points).restricted_to(self.active)
-        objective, theta = self._objective(label, family, samples, theta)
-        watch = Watch(self.monitor, label, self.checkpoint.keeper(label))
+        with deferred():  # CasADi may swallow Ctrl-C while graphs are built
+            objective, theta = self._objective(label, family, samples, theta)
+        keeper = self.checkpoint.keeper(label)
+        watch = Watch(self.monitor, label, keeper)
         result = solver.minimise(objective, theta, watch)
-        if isinstance(objective, BoundedMutual):
-            self._require_feasible(label, objective, result)
-        stage = Stage(label, family.size, count, result.raise_if_failed())
+        if result.status is Status.INTERRUPTED:
+            keeper.flush()
+        if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
+            if final:
+                raise self._missed(label, objective, result)
+        else:
+            result.raise_if_failed()
+        stage = Stage(label, family.size, len(samples), result)
         self.checkpoint.add(stage)
         return stage
 
@@ -101,17 +121,24 @@ class StageRunner:
             raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
         # pairs with an idle joint are exactly orthogonal, so the others may use their share
         bounded = BoundedMutual(objective, self.max_mutual * (all_pairs / fitted) ** 0.5)
-        return bounded, bounded.in_gauge(bounded.weighted_start(theta) if fresh else theta)
+        if fresh and self.starter is not None:
+            weighted = Weights(self.weights.task, DEFAULT_WEIGHTS[1], self.weights.regularity)
+            theta = self.starter.minimise(objective.reweighted(weighted), theta).theta
+        return bounded, bounded.in_gauge(theta)
 
-    def _require_feasible(self, label: str, objective: BoundedMutual, result: SolveResult) -> None:
-        """Say how far a bound was missed."""
-        if result.status is not Status.INFEASIBLE:
-            return
+    def _missed(self, label: str, objective: BoundedMutual, result: SolveResult) -> SolveError:
+        """The error that says how far a bound was missed, and why."""
         assert self.max_mutual is not None
-        reached = np.degrees(self.max_mutual) * objective.constraints(result.theta)[0][0] ** 0.5
-        raise InfeasibleError(
-            f"no {label} coordinates with mutual angles within {np.degrees(self.max_mutual):.4g} deg found, "
-            f"best {reached:.4g} deg: raise max_mutual_deg or the degree"
+        wanted = np.degrees(self.max_mutual)
+        reached = wanted * objective.constraints(result.theta)[0][0] ** 0.5
+        found = f"{label} coordinates with mutual angles within {wanted:.4g} deg"
+        if result.status is Status.INFEASIBLE:
+            return InfeasibleError(
+                f"there are no {found} near, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
+            )
+        return SolveError(
+            f"no {found} found in {result.iterations} iterations, the closest have {reached:.4g} deg: "
+            "raise max_mutual_deg, the degree, or the number of iterations"
         )
 
     def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
@@ -134,5 +161,6 @@ class StageRunner:
         """Refuse a degree that does not fit, before building anything."""
         K = target.term_count(self.space.n)
         N = self._linear_sample_count(K, r)
-        needed = 8 * (N * self.space.n * K + 4 * (r * K) ** 2)
+        curvature = (self.space.n * r) ** 2 if self.max_mutual is not None else 0
+        needed = 8 * (N * (2 * self.space.n * K + 2 * curvature) + 4 * (r * K) ** 2)
         require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)

@@ -31,7 +31,7 @@ class Fit:
     stages: tuple[Stage, ...]
     problem_check: ProblemCheck
     idle_joints: tuple[str, ...]  #: joints that are exact coordinates themselves
-    seconds: float
+    seconds: float  #: of this run; those of stages count what ran before a checkpoint too
 
     @property
     def status(self) -> Status:
@@ -49,6 +49,7 @@ def fit_chart(
     monitor: Monitor = silent,
     max_mutual_deg: float | None = None,
     checkpoint: str | Path | None = None,
+    starter: Solver | None = None,
 ) -> Fit:
     """Fit coordinates; see `orthocas.fit`, which fills in the default solver."""
     start = time.perf_counter()
@@ -60,6 +61,8 @@ def fit_chart(
     space = joint_space(problem)
     parametrisation = parametrisation.for_problem(problem) if isinstance(parametrisation, SEW) else parametrisation
     in_closed_form = isinstance(parametrisation, Linear | Given)
+    if in_closed_form and max_mutual is not None:
+        raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", "a parametrisation to fit")
     idle = [] if in_closed_form else idle_joints(problem, first)[-problem.r :]
     active = [i for i in range(problem.n) if i not in idle]
     settings = {
@@ -71,9 +74,17 @@ def fit_chart(
         "seed": repr(seed),
         "max_mutual_deg": repr(max_mutual_deg),
     }
-    kept = Checkpoint(None if checkpoint is None else Path(checkpoint), settings)
     runner = StageRunner(
-        problem, space.restricted_to(active), active, weights, max_mutual, samples, seed, monitor, kept
+        problem,
+        space.restricted_to(active),
+        active,
+        weights,
+        max_mutual,
+        samples,
+        seed,
+        monitor,
+        Checkpoint(None if checkpoint is None else Path(checkpoint), settings),
+        starter,
     )
     stages, parametrisation, theta = _solved(runner, parametrisation, problem.r - len(idle), solver)
     coordinates = _normalised(problem, parametrisation, space, tuple(idle), theta, problem.r - len(idle), first)

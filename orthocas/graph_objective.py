@@ -14,7 +14,7 @@ from orthocas.expression_tape import replay
 from orthocas.loss import LossShape, Weights, loss_columns
 from orthocas.numpy_nodes import NumpyGraph
 from orthocas.parametrisations import Family
-from orthocas.samples import Draw, Samples
+from orthocas.samples import Draw, Samples, even_parts
 
 _ORIENTING = 200  # samples that tell the orientation of the start
 _CHUNK_ENTRIES = 2**20  # of the largest matrix in a graph: more leave the cache
@@ -36,7 +36,7 @@ class GraphObjective:
         shape = LossShape(n, m, family.outputs, samples.metric_inverse is None, weights)
         self._graphs, self._draw = _Graphs(family, shape), draw
         self._orientation = _orientation(family, start, samples[:_ORIENTING]) if shape.regular else None
-        self._put(samples)
+        self._put(samples, len(samples))
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
@@ -49,16 +49,16 @@ class GraphObjective:
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each; graphs are shared."""
-        samples = self._draw(size * count, seed)
-        for start in range(0, len(samples), size):
+        for part in even_parts(self._draw(size * count, seed), count):
             other = copy(self)
-            other._put(samples[start : start + size])
+            other._put(part, size)
             yield other
 
-    def _put(self, samples: Samples) -> None:
+    def _put(self, samples: Samples, room: int) -> None:
+        """Take samples; graphs are made for `room` of them, so that smaller sets share them."""
         data = samples.loss_data(self._orientation)
         entries = np.concatenate([part.transpose(0, 2, 1).reshape(len(samples), -1) for part in data], axis=1)
-        graph = self._graphs.of_size(len(samples))
+        graph = self._graphs.of_size(room)
         self._blocks = [
             _Block.filled(graph, samples.points[k : k + graph.columns], entries[k : k + graph.columns], len(samples))
             for k in range(0, len(samples), graph.columns)

@@ -20,7 +20,7 @@ from orthocas.loss import (
     value_columns,
 )
 from orthocas.parametrisations.product_basis import LinearFamily
-from orthocas.samples import Draw, Samples
+from orthocas.samples import Draw, Samples, even_parts
 
 _CHUNK = 512  # samples per block of the Gauss-Newton matrix: the rows stay in the cache
 _STRIDE = 2  # the Gauss-Newton matrix is a mean too, and half of the samples tell it well enough
@@ -59,9 +59,8 @@ class LinearObjective:
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each."""
-        samples = self._draw(size * count, seed)
-        for start in range(0, len(samples), size):
-            part, other = samples[start : start + size], copy(self)
+        for part in even_parts(self._draw(size * count, seed), count):
+            other = copy(self)
             for stale in ("_dense", "_half"):
                 other.__dict__.pop(stale, None)
             other._put(part)

@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.checks import Array
+from orthocas.interrupts import deferred
 
 
 class NumpyNode(ca.Callback):
@@ -90,7 +91,8 @@ class NumpyGraph:
 
     def __init__(self, name: str, inputs: Sequence[ca.MX], outputs: Sequence[ca.MX]) -> None:
         self._nodes: list[NumpyNode] = []
-        self.function = ca.Function(name, list(inputs), self._rewritten(inputs, ca.cse(list(outputs))))
+        with deferred():  # CasADi asks nodes for their shapes, and would swallow Ctrl-C there
+            self.function = ca.Function(name, list(inputs), self._rewritten(inputs, ca.cse(list(outputs))))
         buffer: Any  # the stub of set_arg and set_res asks for a size, the method takes none
         buffer, self._evaluate = self.function.buffer()
         self._buffer = buffer
@@ -105,7 +107,8 @@ class NumpyGraph:
         results = [np.empty(self.function.size_out(i)[::-1]) for i in range(self.function.n_out())]
         for i, array in enumerate(results):
             self._buffer.set_res(i, array.data)
-        self._evaluate()
+        with deferred():
+            self._evaluate()
         return results
 
     def _rewritten(self, inputs: Sequence[ca.MX], outputs: list[ca.MX]) -> list[ca.MX]:

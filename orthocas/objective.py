@@ -115,7 +115,7 @@ class SampledObjective(Objective, Protocol):
     """A mean over samples, of which fresh ones can be drawn."""
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Objective]:
-        """The same mean over `count` fresh sample sets of `size` each."""
+        """The same mean over `count` fresh sample sets, of `size` each or a little less."""
         ...
 
 

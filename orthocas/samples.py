@@ -1,8 +1,9 @@
 """Sample sets of a problem: everything the loss needs that does not depend on the coordinates."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -90,6 +91,13 @@ class Samples:
 
 
 Draw = Callable[[int, tuple[int, ...]], Samples]  #: a number of fresh samples of a problem, by seed
+
+
+def even_parts(samples: Samples, count: int) -> Iterator[Samples]:
+    """Samples in `count` parts of nearly the same size: some may have been left out where a gradient vanishes."""
+    edges = np.linspace(0, len(samples), count + 1).astype(int)
+    for start, stop in pairwise(edges):
+        yield samples[int(start) : int(stop)]
 
 
 def sample_problem(problem: Problem, samples: int, seed: int | tuple[int, ...]) -> Samples:

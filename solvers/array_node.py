@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.checks import Array
+from orthocas.interrupts import check
 
 
 class ArrayNode(ca.Callback):
@@ -21,7 +22,8 @@ class ArrayNode(ca.Callback):
         shapes: shape of each output.
         compute: maps arrays (rows,) to one array for each output.
         options: of the CasADi function.
-        jacobian: derivative of the first output with respect to the first input, where a solver asks for it.
+        jacobian: derivative of the one output with respect to the one input, where a solver asks for it.
+        forward: the same in one direction, as a function of input and direction; then no dense Jacobian is built.
     """
 
     def __init__(
@@ -32,9 +34,11 @@ class ArrayNode(ca.Callback):
         compute: Callable[..., Sequence[Any]],
         options: dict[str, Any] | None = None,
         jacobian: "ArrayNode | None" = None,
+        forward: "ArrayNode | None" = None,
     ) -> None:
         ca.Callback.__init__(self)
         self._rows, self._shapes, self._compute, self._jacobian = tuple(rows), tuple(shapes), compute, jacobian
+        self._forward = forward
         self.error: BaseException | None = None
         self.construct(name, options or {})
 
@@ -63,6 +67,7 @@ class ArrayNode(ca.Callback):
         if self.error is not None:
             return 1
         try:
+            check()
             results = self._compute(*(self._array(i, memory) for i, memory in enumerate(arg)))
             for memory, result in zip(res, results, strict=True):
                 if memory is not None:
@@ -89,6 +94,28 @@ class ArrayNode(ca.Callback):
         inputs = [ca.MX.sym("x", rows) for rows in self._rows]
         unused = ca.MX.sym("y", *self._shapes[0])
         return ca.Function(name, [*inputs, unused], [self._jacobian(*inputs)], list(inames), list(onames), dict(opts))
+
+    def has_forward(self, nfwd: int) -> bool:
+        """Whether there is a derivative in a direction."""
+        return self._forward is not None and nfwd == 1
+
+    def get_forward(
+        self, nfwd: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
+    ) -> ca.Function:
+        """The derivative in a direction, in CasADi's form: input, an unused output and the direction come in."""
+        if self._forward is None:
+            raise NotImplementedError(name)
+        x, unused, direction = (ca.MX.sym(letter, self._rows[0]) for letter in "xyd")
+        outputs = [self._forward(x, direction)]
+        return ca.Function(name, [x, unused, direction], outputs, list(inames), list(onames), dict(opts))
+
+    def has_jac_sparsity(self, oind: int, iind: int) -> bool:
+        """Whether to say something about the Jacobian without building it."""
+        return self._forward is not None
+
+    def get_jac_sparsity(self, oind: int, iind: int, symmetric: bool) -> ca.Sparsity:
+        """Nothing: a Krylov method asks for products with the Jacobian only."""
+        return ca.Sparsity(self._shapes[oind][0], self._rows[iind])
 
     def reraise(self) -> None:
         """Raise the exception that stopped an evaluation, if there was one."""

@@ -9,8 +9,10 @@ from orthocas.solvers.array_node import ArrayNode
 
 from orthocas.best_point import BestPoint
 from orthocas.checks import Array, require_at_least, require_count
+from orthocas.interrupts import deferred
 from orthocas.objective import UNWATCHED, LeastSquaresObjective, Objective, SolveResult, Status, Watch
 
+_DIFFERENCE = 1e-7  # step of finite differences, relative to theta
 _FIRST = 1e-3  # first stretch of time, in units of |theta0| / |grad L|
 
 
@@ -63,8 +65,7 @@ class _Run:
         kept = self.best.restored or {}
         self.theta = np.array(kept.get("theta", theta0), dtype=float)
         self.stretch = float(kept.get("stretch", 0.0))
-        self.node = self._flow_node()
-        self.integrator = self._integrator()
+        self._last = np.full_like(self.theta, np.nan), self.theta
 
     def iterate(self) -> Status:
         best = self.best
@@ -75,8 +76,11 @@ class _Run:
             return Status.CONVERGED
         if not self.stretch:
             self.stretch = _FIRST * max(float(np.linalg.norm(self.theta)), 1e-3) / float(np.linalg.norm(gradient))
+        with deferred():
+            node = self._flow_node()
+            integrator = self._integrator(node)
         while best.iterations < self.settings.max_iterations:
-            if not self._advance():
+            if not self._advance(integrator, node):
                 return Status.STALLED
             before, value = value, self.objective.value(self.theta)
             best.evaluations += 1
@@ -87,14 +91,15 @@ class _Run:
                 return Status.CONVERGED
         return Status.ITERATION_LIMIT
 
-    def _advance(self) -> bool:
+    def _advance(self, integrator: ca.Function, node: ArrayNode) -> bool:
         """Follow the flow for one stretch; whether the integrator got to its end."""
         try:
-            end = self.integrator(x0=self.theta, p=self.stretch)["xf"]
+            with deferred():
+                end = integrator(x0=self.theta, p=self.stretch)["xf"]
         except RuntimeError:
-            self.node.reraise()
+            node.reraise()
             return False
-        self.node.reraise()
+        node.reraise()
         self.theta = np.asarray(end.nonzeros())
         return bool(np.isfinite(self.theta).all())
 
@@ -102,25 +107,39 @@ class _Run:
         """-grad L as a CasADi function, with a Jacobian."""
         size, objective = self.theta.size, self.objective
         if not isinstance(objective, LeastSquaresObjective):
-            options = {"enable_fd": True, "fd_method": "forward"}
-            return ArrayNode("flow", [size], [(size, 1)], lambda theta: [self._descent(theta)], options)
+            along = ArrayNode("flow_along", [size, size], [(size, 1)], lambda *at: [self._curvature_along(*at)])
+            return ArrayNode("flow", [size], [(size, 1)], lambda theta: [self._descent(theta)], forward=along)
         jacobian = ArrayNode(
             "flow_jacobian", [size], [(size, size)], lambda theta: [-objective.normal_equations(theta)[2]]
         )
-        return ArrayNode("flow", [size], [(size, 1)], lambda theta: [self._descent(theta)], None, jacobian)
+        return ArrayNode("flow", [size], [(size, 1)], lambda theta: [self._descent(theta)], jacobian=jacobian)
 
     def _descent(self, theta: Array) -> Array:
-        return -self.best.value_and_gradient(theta)[1]
+        self._last = theta, -self.best.value_and_gradient(theta)[1]
+        return self._last[1]
 
-    def _integrator(self) -> ca.Function:
+    def _curvature_along(self, theta: Array, direction: Array) -> Array:
+        """Change of the descent along a direction, by one finite difference."""
+        length = float(np.linalg.norm(direction))
+        if length == 0:
+            return np.zeros_like(direction)
+        step = _DIFFERENCE * max(float(np.linalg.norm(theta)), 1.0) / length
+        at, here = self._last
+        if not np.array_equal(at, theta):
+            here = -self.best.value_and_gradient(theta)[1]
+        change: Array = (-self.best.value_and_gradient(theta + step * direction)[1] - here) / step
+        return change
+
+    def _integrator(self, node: ArrayNode) -> ca.Function:
         x, stretch = ca.MX.sym("x", self.theta.size), ca.MX.sym("stretch")
-        system: dict[str, Any] = {"x": x, "p": stretch, "ode": stretch * self.node(x)}
+        system: dict[str, Any] = {"x": x, "p": stretch, "ode": stretch * node(x)}
         direct = isinstance(self.objective, LeastSquaresObjective)
         options: dict[str, Any] = {
             "reltol": self.settings.accuracy,
             "abstol": self.settings.accuracy * 1e-2 * float(np.abs(self.theta).max() or 1.0),
             "newton_scheme": "direct" if direct else "gmres",
             "max_num_steps": 5000,
+            "disable_internal_warnings": True,
         }
         if direct:
             options["linear_solver"] = "lapacklu"

@@ -9,6 +9,7 @@ from orthocas.solvers.array_node import ArrayNode
 
 from orthocas.best_point import BestPoint
 from orthocas.checks import Array, require_at_least, require_count
+from orthocas.interrupts import deferred
 from orthocas.objective import UNWATCHED, ConstrainedObjective, Objective, SmoothObjective, SolveResult, Status, Watch
 
 _EXACT = 1500  # largest number of parameters for exact, dense Hessians
@@ -62,28 +63,38 @@ class _Run:
         self.size = theta0.size
         self._nodes: list[ArrayNode] = []
         self._at: tuple[bytes, float, Array] | None = None
+        self._constraints_at: tuple[bytes, Array, Array] | None = None
         self._count = 0
-        self._finite = False
+        self._current = self.best.theta
+        if self.best.restored and not self.best.found:  # killed before a point kept the constraints
+            self._current = np.array(self.best.restored["theta"], dtype=float)
+        self._least = np.inf, self._current  # violation of the constraints
 
     def result(self) -> SolveResult:
-        start = {"x0": ca.DM(self.best.theta)}
+        """Minimise; without a point that keeps the constraints, theta is the one that comes closest."""
+        start = {"x0": ca.DM(self._current)}
         if self.constrained:
             start |= {name: ca.DM(bound) for name, bound in zip(("lbg", "ubg"), self.constrained.bounds, strict=True)}
         if self.best.iterations >= self.settings.max_iterations:
-            return self.best.result(Status.ITERATION_LIMIT)
-        solver = self._solver()
+            self._evaluate(self._current)
+            return self._outcome(Status.ITERATION_LIMIT)
         try:
-            end = solver(**start)["x"]
+            with deferred():
+                solver = self._solver()
+                solver(**start)
             for node in self._nodes:
                 node.reraise()
         except KeyboardInterrupt:
             if not self.best.found:
                 raise
             return self.best.result(Status.INTERRUPTED)
-        status = _STATUS.get(solver.stats()["return_status"], Status.STALLED)
-        if self.constrained and not self.best.found and self._finite:
-            status, self.best.theta = Status.INFEASIBLE, np.asarray(end.nonzeros())
-        return self.best.result(status)
+        return self._outcome(_STATUS.get(solver.stats()["return_status"], Status.STALLED))
+
+    def _outcome(self, status: Status) -> SolveResult:
+        if self.best.found or not np.isfinite(self._least[0]):
+            return self.best.result(status)
+        self.best.theta = self._least[1]
+        return replace(self.best.result(Status.INFEASIBLE), status=status)
 
     def _solver(self) -> ca.Function:
         x, p = ca.MX.sym("x", self.size), ca.MX.sym("p", 0)
@@ -137,22 +148,29 @@ class _Run:
         if self._at is None or self._at[0] != key:
             value, gradient = self.objective.value_and_gradient(theta)
             self.best.evaluations += 1
-            self._at = key, value, gradient
-            self._finite = self._finite or bool(np.isfinite(value))
-            if self._feasible(theta):
+            self._at, self._current = (key, value, gradient), theta
+            violation = self._violation(theta) if np.isfinite(value) else np.inf
+            if violation < self._least[0]:
+                self._least = violation, theta
+            if violation <= _FEASIBLE:
                 self.best.offer(theta, value)
         return self._at[1], self._at[2]
 
     def _constraints(self, theta: Array) -> tuple[Array, Array]:
+        """Values and Jacobian; asked for several times at the same point."""
         assert self.constrained is not None
-        return self.constrained.constraints(theta)
+        key = theta.tobytes()
+        if self._constraints_at is None or self._constraints_at[0] != key:
+            self._constraints_at = key, *self.constrained.constraints(theta)
+        return self._constraints_at[1], self._constraints_at[2]
 
-    def _feasible(self, theta: Array) -> bool:
+    def _violation(self, theta: Array) -> float:
+        """By how much the worst constraint is broken; 0 if there are none."""
         if self.constrained is None:
-            return True
+            return 0.0
         lower, upper = self.constrained.bounds
         values = self._constraints(theta)[0]
-        return bool(np.all(values >= lower - _FEASIBLE) and np.all(values <= upper + _FEASIBLE))
+        return float(np.maximum(np.maximum(lower - values, values - upper), 0).max())
 
     def _hessian(self, theta: Array, factor: Array, multipliers: Array) -> list[Array]:
         if self.constrained:
@@ -173,6 +191,6 @@ class _Run:
 
     def _iterated(self, *_: Array) -> list[float]:
         if self._count:
-            self.best.next_iteration(self.settings.max_iterations)
+            self.best.next_iteration(self.settings.max_iterations, theta=self._current)
         self._count += 1
         return [1.0 if any(node.error for node in self._nodes) else 0.0]

@@ -7,9 +7,11 @@ import orthocas as oc
 from orthocas import problems, solvers
 from orthocas.bounded_mutual import BoundedMutual
 from orthocas.coordinates import joint_space
-from orthocas.errors import InfeasibleError, InvalidValueError
+from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
+from orthocas.fit_stages import StageRunner
 from orthocas.linear_objective import LinearObjective
 from orthocas.loss import Weights
+from orthocas.objective import SolveResult, Status
 from orthocas.samples import sample_problem
 
 
@@ -70,10 +72,37 @@ def test_point_of_the_weighted_front_is_found_again(planar_x: oc.Problem) -> Non
     assert constrained.mutual_angle.std <= 1.05 * weighted.mutual_angle.std
 
 
-def test_bound_out_of_reach_is_reported_with_the_best_value(planar_x: oc.Problem) -> None:
+def test_bound_out_of_reach_is_reported_with_the_closest_value(planar_x: oc.Problem) -> None:
     """Two planes cannot stay orthogonal in the inertia metric, which turns with q."""
-    with pytest.raises(InfeasibleError, match=r"no polynomial:1 coordinates .* within 0.01 deg found, best 0.\d+ deg"):
-        oc.fit(planar_x, oc.Polynomial(1), solvers.Ipopt(max_iterations=60), samples=200, max_mutual_deg=0.01)
+    few = solvers.Ipopt(max_iterations=60)
+    with pytest.raises(SolveError, match=r"polynomial:1 .* within 0.01 deg .* the closest have 0.\d+ deg"):
+        oc.fit(planar_x, oc.Polynomial(1), few, samples=200, max_mutual_deg=0.01)
+
+
+def test_status_decides_between_infeasible_and_not_found(bounded: BoundedMutual) -> None:
+    runner = object.__new__(StageRunner)
+    object.__setattr__(runner, "max_mutual", 0.05)
+    for status, error, words in (
+        (Status.INFEASIBLE, InfeasibleError, "there are no"),
+        (Status.ITERATION_LIMIT, SolveError, "found in 7 iterations"),
+    ):
+        result = SolveResult(theta_of(bounded), np.inf, status, 7, 7, 0.0)
+        found = runner._missed("polynomial:2", bounded, result)
+        assert type(found) is error
+        assert words in str(found)
+        assert "within 2.865 deg" in str(found)
+
+
+def test_degree_that_misses_the_bound_does_not_stop_the_next(planar_x: oc.Problem) -> None:
+    """One iteration does not get degree 2 under the bound; degree 3 goes on from there."""
+
+    class Hurried(solvers.Ipopt):
+        def coarser(self) -> solvers.Ipopt:
+            return solvers.Ipopt(max_iterations=1)
+
+    fit = oc.fit(planar_x, oc.Polynomial(3), Hurried(), samples=300, max_mutual_deg=0.5)
+    assert not np.isfinite(fit.stages[0].result.value)
+    assert oc.evaluate(fit.chart, 5000).mutual_angle.std < 0.7
 
 
 def test_bad_bounds_are_refused(planar_x: oc.Problem, planar_xy: oc.Problem) -> None:
@@ -82,6 +111,8 @@ def test_bad_bounds_are_refused(planar_x: oc.Problem, planar_xy: oc.Problem) -> 
             oc.fit(planar_x, oc.Polynomial(1), max_mutual_deg=bound)
     with pytest.raises(InvalidValueError, match="two or more coordinates"):
         oc.fit(planar_xy, oc.Polynomial(1), max_mutual_deg=1.0)
+    with pytest.raises(InvalidValueError, match="given with linear, expected a parametrisation to fit"):
+        oc.fit(planar_x, oc.Linear(), max_mutual_deg=1.0)
     with pytest.raises(InvalidValueError, match="linear in its parameters"):
         oc.fit(planar_x, oc.MLP((4,)), max_mutual_deg=1.0)
     with pytest.raises(InvalidValueError, match="solver is lbfgs, expected ipopt"):

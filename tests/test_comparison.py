@@ -3,7 +3,9 @@
 import csv
 import json
 import math
+import multiprocessing
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -18,7 +20,7 @@ from orthocas import batch, comparison, solvers
 from orthocas.comparison import Cell, CellResult, run_cell, run_cells
 from orthocas.comparison_figures import convergence_figure, front_figure
 from orthocas.comparison_report import Comparison
-from orthocas.errors import InvalidValueError
+from orthocas.errors import ChartFileError, InvalidValueError
 from orthocas.loss import Weights
 from orthocas.objective import Progress
 
@@ -163,7 +165,7 @@ def test_process_that_dies_fails_alone(planar_x: oc.Problem) -> None:
         planar_x, [oc.Polynomial(1), Kills(), Breaks(), oc.Polynomial(2)], jobs=2, monitor=told.append, **QUICK
     )
     by_label = {r.parametrisation: r for r in found.results}
-    assert by_label["kills"].error == "its process died"
+    assert by_label["kills"].error.startswith("its process died: out of memory, or")
     assert by_label["breaks"].error == "KeyError: 'a defect'"
     assert not by_label["polynomial:1"].failed
     assert not by_label["polynomial:2"].failed
@@ -216,7 +218,33 @@ def test_same_cell_same_result(planar_x: oc.Problem) -> None:
     assert isinstance(run_cell(cell), CellResult)
 
 
+def test_ctrl_c_stops_running_processes_too(planar_x: oc.Problem) -> None:
+    """Fits that would take minutes end at their next step, and none is started."""
+
+    def press(progress: Progress) -> None:
+        raise KeyboardInterrupt
+
+    slow = solvers.Adam(epochs=2000, steps=50)
+    start = time.monotonic()
+    networks = [oc.MLP((8, 8)), oc.MLP((9, 9)), oc.MLP((10, 10)), oc.MLP((11, 11))]
+    found = oc.compare(planar_x, [oc.Linear(), *networks], [slow], jobs=2, monitor=press, **QUICK)
+    assert found.interrupted
+    assert multiprocessing.active_children() == []
+    assert time.monotonic() - start < 60  # a single network would take longer
+
+
 def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
+    for grid, message in (
+        ({"parametrisations": []}, "parametrisations is empty"),
+        ({"parametrisations": ["polynomial:2"]}, "parametrisations is 'polynomial:2', expected objects such as"),
+        ({"parametrisations": [oc.Linear(), oc.Linear((0.6, 0.8, 0.8))]}, "two called 'linear'"),
+        ({"solvers": []}, "solvers is empty"),
+        ({"solvers": [solvers.LBFGS(), solvers.LBFGS(memory=5)]}, "two called 'lbfgs'"),
+    ):
+        with pytest.raises(InvalidValueError, match=message):
+            oc.compare(planar_x, **{"parametrisations": [oc.Linear()], **grid})
+    with pytest.raises(ChartFileError, match="folder missing does not exist"):
+        oc.compare(planar_x, [oc.Linear()], charts="missing")
     for settings in ({"seeds": 0}, {"jobs": 0}, {"held_out": 0}, {"weights": (0.0, 1.0)}):
         with pytest.raises(InvalidValueError):
             oc.compare(planar_x, [oc.Linear()], **settings)

@@ -212,3 +212,18 @@ def test_spectral_start_finds_an_exact_linear_coordinate() -> None:
     objective = LinearObjective(family, sample_problem(problem, 100, 1), WEIGHTS, theta, draw_from(problem))
     directions = objective.coordinate_jacobians(theta)[:, 0]
     np.testing.assert_allclose(directions @ np.array([1.0, 2.0]), 0, atol=1e-6 * np.abs(directions).max())
+
+
+def test_batches_share_out_what_is_left_of_dropped_samples() -> None:
+    """The task gradient vanishes on half of the box: fewer samples, but as many parts, on the same graph."""
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    task = oc.Task.custom(robot, "half", lambda q: ca.fmax(q[0], 0) ** 2)
+    problem = oc.Problem(robot, task, domain=oc.Box([0.0, 0.0], 1.0))
+    family = oc.MLP((3,)).family(joint_space(problem), 1)
+    theta = family.initial(0)
+    objective = GraphObjective(family, sample_problem(problem, 64, 1), WEIGHTS, theta, draw_from(problem))
+    for seed in range(5):
+        parts = list(objective.batches(20, 4, (seed,)))
+        assert len(parts) == 4
+        assert all(np.isfinite(part.value(theta)) for part in parts)
+    assert set(objective._graphs.known) <= {20, len(sample_problem(problem, 64, 1))}

@@ -6,7 +6,7 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas.errors import InvalidValueError, SingularTaskError, UnknownNameError
+from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
 from orthocas.parametrisations import JointSpace, component_gradients, embed, parse_parametrisation
 from orthocas.parametrisations.product_basis import LinearFamily
 
@@ -43,6 +43,13 @@ def test_chain_rule_of_the_network_is_that_of_automatic_differentiation() -> Non
     by_hand, by_ad = family.jacobian(q, theta), component_gradients(family.expression(q, theta), q)
     ours, theirs = (np.array(ca.Function("J", [q], J)(points.T)) for J in (by_hand, by_ad))
     np.testing.assert_allclose(ours, theirs, atol=1e-14)
+
+
+def test_given_coordinates_of_other_joints_are_refused() -> None:
+    with pytest.raises(ShapeError, match=r"q of coordinates 'by hand' has shape \(3,\), expected \(2,\)"):
+        GIVEN.family(SPACE.restricted_to([0, 1]), 2)
+    with pytest.raises(ShapeError, match="coordinates 'by hand'"):
+        GIVEN.family(SPACE, 1)
 
 
 @pytest.mark.parametrize("parametrisation", ALL, ids=lambda p: p.label)

@@ -1,5 +1,6 @@
 """`orthocas fit`: from a robot to a chart file."""
 
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -126,7 +127,7 @@ def _as_dict(result: Fit, report: Report, target: Path) -> dict[str, Any]:
                 "parametrisation": stage.label,
                 "parameters": stage.parameters,
                 "samples": stage.samples,
-                "loss": stage.result.value,
+                "loss": stage.result.value if isfinite(stage.result.value) else None,
                 "status": stage.result.status.value,
                 "iterations": stage.result.iterations,
                 "seconds": stage.result.seconds,

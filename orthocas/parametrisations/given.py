@@ -20,10 +20,12 @@ class Given:
 
     Args:
         label: a name for reports.
+        n: number of joints.
         tape: the expression as plain data; see `orthocas.expression_tape`.
     """
 
     label: str
+    n: int
     tape: Tape
 
     @classmethod
@@ -36,14 +38,15 @@ class Given:
         q = ca.SX.sym("q", n)
         xi = expression_of(f"coordinates '{name}'", function, q)
         require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
-        return cls(name, to_tape(dense_function("xi", [q], [xi])))
+        return cls(name, n, to_tape(dense_function("xi", [q], [xi])))
 
     def family(self, space: JointSpace, outputs: int) -> "GivenFamily":
         """The coordinates as a family without parameters.
 
         Raises:
-            ShapeError: if there are not as many of them as the problem has redundant joints.
+            ShapeError: if there are not as many of them as the problem has redundant joints, or the joints differ.
         """
+        require_shape(f"q of coordinates '{self.label}'", (self.n,), (space.n,))
         require_shape(f"coordinates '{self.label}'", (int(self.tape["rows"]), 1), (outputs, 1))
         return GivenFamily(self, outputs)
 

@@ -1,0 +1,86 @@
+"""A real Ctrl-C, at any moment, in any fit: the best point comes back, or KeyboardInterrupt; nothing else."""
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+import orthocas as oc
+from orthocas import interrupts, solvers
+from orthocas.objective import Status
+
+FITS = {
+    "network, lbfgs": (oc.MLP((32, 32)), solvers.LBFGS(max_iterations=100_000, tolerance=0.0), {}),
+    "network, adam": (oc.MLP((32, 32)), solvers.Adam(epochs=1000, steps=5), {}),
+    "network, ipopt": (oc.MLP((16, 16)), solvers.Ipopt(max_iterations=100_000, tolerance=1e-300), {}),
+    "network, flow": (oc.MLP((8, 8)), solvers.GradientFlow(max_iterations=1000, tolerance=0.0), {}),
+    "basis, flow": (oc.Polynomial(2), solvers.GradientFlow(max_iterations=1000, tolerance=0.0, accuracy=1e-9), {}),
+    "basis, bounded": (oc.Polynomial(2), solvers.Ipopt(tolerance=1e-300), {"max_mutual_deg": 0.5}),
+}
+
+
+def press_after(seconds: float) -> threading.Timer:
+    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    return timer
+
+
+@pytest.mark.parametrize("seconds", [0.15, 0.31, 0.57])
+@pytest.mark.parametrize("name", FITS)
+def test_ctrl_c_at_any_moment(planar_x: oc.Problem, name: str, seconds: float) -> None:
+    parametrisation, solver, settings = FITS[name]
+    timer = press_after(seconds)
+    start = time.monotonic()
+    try:
+        fit = oc.fit(planar_x, parametrisation, solver, **settings)
+        done = time.monotonic() - start
+        timer.join()
+        assert fit.status is Status.INTERRUPTED or done < seconds
+    except KeyboardInterrupt:
+        pass  # before there was a point, or after the fit
+    finally:
+        timer.cancel()
+    assert time.monotonic() - start < seconds + 10
+
+
+def test_deferred_interrupt_comes_at_the_end_and_the_handler_is_put_back() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    done = []
+
+    def block() -> None:
+        with interrupts.deferred():
+            signal.raise_signal(signal.SIGINT)
+            done.append("the block goes on")
+            with pytest.raises(KeyboardInterrupt):
+                interrupts.check()
+
+    with pytest.raises(KeyboardInterrupt):
+        block()
+    assert done == ["the block goes on"]
+    assert signal.getsignal(signal.SIGINT) is before
+    interrupts.check()
+
+
+def test_interrupt_counts_more_than_what_compiled_code_made_of_it() -> None:
+    def block() -> None:
+        with interrupts.deferred():
+            signal.raise_signal(signal.SIGINT)
+            raise RuntimeError("KeyboardInterrupt")
+
+    with pytest.raises(KeyboardInterrupt):
+        block()
+
+
+def test_other_threads_are_left_alone() -> None:
+    before, seen = signal.getsignal(signal.SIGINT), []
+
+    def work() -> None:
+        with interrupts.deferred():
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [before]
