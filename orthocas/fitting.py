@@ -65,15 +65,7 @@ def fit_chart(
         raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", "a parametrisation to fit")
     idle = [] if in_closed_form else idle_joints(problem, first)[-problem.r :]
     active = [i for i in range(problem.n) if i not in idle]
-    settings = {
-        "problem": _digest(sample_problem(problem, 20, (0, _FIRST_SAMPLES))),
-        "parametrisation": parametrisation.label,
-        "solver": repr(solver),
-        "weights": repr(weights),
-        "samples": repr(samples),
-        "seed": repr(seed),
-        "max_mutual_deg": repr(max_mutual_deg),
-    }
+    settings = _settings(problem, parametrisation, solver, weights, samples, seed, max_mutual_deg)
     runner = StageRunner(
         problem,
         space.restricted_to(active),
@@ -95,6 +87,27 @@ def fit_chart(
         idle_joints=tuple(problem.robot.joint_names[i] for i in idle),
         seconds=time.perf_counter() - start,
     )
+
+
+def _settings(
+    problem: Problem,
+    parametrisation: Parametrisation,
+    solver: Solver,
+    weights: Weights,
+    samples: int | None,
+    seed: int,
+    max_mutual_deg: float | None,
+) -> dict[str, str]:
+    """What tells one fit from another, for its checkpoint."""
+    return {
+        "problem": _digest(sample_problem(problem, 20, (0, _FIRST_SAMPLES))),
+        "parametrisation": parametrisation.label,
+        "solver": repr(solver),
+        "weights": repr(weights),
+        "samples": repr(samples),
+        "seed": repr(seed),
+        "max_mutual_deg": repr(max_mutual_deg),
+    }
 
 
 def _solved(

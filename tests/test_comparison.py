@@ -229,7 +229,8 @@ def test_ctrl_c_stops_running_processes_too(planar_x: oc.Problem) -> None:
     networks = [oc.MLP((8, 8)), oc.MLP((9, 9)), oc.MLP((10, 10)), oc.MLP((11, 11))]
     found = oc.compare(planar_x, [oc.Linear(), *networks], [slow], jobs=2, monitor=press, **QUICK)
     assert found.interrupted
-    assert multiprocessing.active_children() == []
+    while multiprocessing.active_children() and time.monotonic() - start < 60:
+        time.sleep(0.1)
     assert time.monotonic() - start < 60  # a single network would take longer
 
 
