@@ -1,10 +1,22 @@
-"""Run every benchmark one after the other (about 12 minutes on 2 cores); docs/performance.md holds the results."""
+"""Run every benchmark one after the other (about an hour on 2 cores); docs/performance.md holds the results."""
 
 import subprocess
 import sys
 from pathlib import Path
 
-SCRIPTS = ("dynamics", "command", "fits", "choices", "scaling", "against_torch")
+SCRIPTS = (
+    "dynamics",
+    "command",
+    "fits",
+    "choices",
+    "scaling",
+    "gradients",
+    "compiled_loss",
+    "ipopt_front",
+    "starts",
+    "against_torch",
+    "paper_network",
+)
 
 if __name__ == "__main__":
     for name in SCRIPTS:

@@ -13,6 +13,7 @@ from orthocas.interrupts import deferred
 from orthocas.objective import UNWATCHED, ConstrainedObjective, Objective, SmoothObjective, SolveResult, Status, Watch
 
 _EXACT = 1500  # largest number of parameters for exact, dense Hessians
+_BARRIER = 1e-4  # starts are good: a stronger barrier would push away from them, into worse minima
 _FEASIBLE = 1e-6  # violation of constraints that counts as none
 _STATUS = {
     "Solve_Succeeded": Status.CONVERGED,
@@ -121,6 +122,7 @@ class _Run:
             "print_level": 0,
             "sb": "yes",
             "tol": self.settings.tolerance,
+            "mu_init": _BARRIER,
             "max_iter": self.settings.max_iterations - self.best.iterations,
         }
         options |= {f"ipopt.{name}": value for name, value in settings.items()}

@@ -1,0 +1,35 @@
+"""Would a C compiler help the fits? Loss and slopes of one sample, 7-DoF arm: compiled against replayed on columns."""
+
+import time
+from statistics import median
+
+import casadi as ca
+import numpy as np
+from c_timing import nanoseconds_per_call
+
+from orthocas.columns import COLUMNS
+from orthocas.loss import LossShape, Weights, loss_columns
+
+BLOCKS = 16
+
+
+def main(rounds: int = 9) -> dict[str, float]:
+    """Nanoseconds a sample of both."""
+    shape = LossShape(7, 3, 4, True, Weights(1000.0, 30.0))
+    J, data = ca.SX.sym("J", shape.r, shape.n), shape.symbols()
+    loss = ca.sumsqr(shape.residuals(J, data)) / 2
+    compiled = ca.Function("loss", [J, *data], ca.cse([loss, ca.densify(ca.gradient(loss, J))]))
+    columns, rng = loss_columns(shape), np.random.default_rng(0)
+    inputs = [rng.normal(size=(BLOCKS, compiled.numel_in(i), COLUMNS)) for i in range(compiled.n_in())]
+    columns(*inputs)
+    times = []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        columns(*inputs)
+        times.append(time.perf_counter() - start)
+    return {**nanoseconds_per_call({"compiled": compiled}), "columns": 1e9 * median(times) / (BLOCKS * COLUMNS)}
+
+
+if __name__ == "__main__":
+    for name, value in main().items():
+        print(f"{name}: {value:.0f} ns a sample")
