@@ -8,7 +8,7 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from orthocas.comparison import CellResult
 from orthocas.comparison_report import Comparison, Summary
@@ -129,8 +129,9 @@ def _scale(axes: Axes, *values: Sequence[float]) -> None:
         if numbers and max(numbers) > 4 * min(numbers) > 1e-3 * max(numbers):
             getattr(axes, f"set_{name}scale")("log")
             axis = getattr(axes, f"{name}axis")
-            axis.set_major_formatter(ScalarFormatter())
-            axis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.7)))
+            axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.set_minor_formatter(NullFormatter())
 
 
 def _legends(axes: Axes, colours: Mapping[str, Colour], styles: Mapping[str, Any]) -> None:

@@ -116,6 +116,7 @@ class _Run:
             "iteration_callback": self._watcher(),
             "print_time": False,
             "error_on_fail": False,
+            "show_eval_warnings": False,
             "no_nlp_grad": True,
         }
         settings = {
