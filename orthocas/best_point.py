@@ -1,6 +1,7 @@
 """The best point of one minimisation, kept through interrupts and restarts: what all solvers share."""
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -60,6 +61,16 @@ class BestPoint:
     def keep(self, **state: Array | float) -> None:
         """Offer the state to the keeper: the best point, the counts, and what the solver adds."""
         self.watch.keeper.keep(lambda: self._state(**state))
+
+    def run(self, iterate: Callable[[], Status]) -> SolveResult:
+        """Iterate to the end, or to Ctrl-C: then the best point is the result, if there is one already."""
+        try:
+            status = iterate()
+        except KeyboardInterrupt:
+            if not self.found:
+                raise
+            status = Status.INTERRUPTED
+        return self.result(status)
 
     def result(self, status: Status) -> SolveResult:
         """What was found; FAILED if there is no finite value (of a point that keeps the constraints)."""

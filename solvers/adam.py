@@ -45,13 +45,7 @@ class Adam:
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
         """Minimise from theta0; the planned number of epochs ends with status ITERATION_LIMIT."""
         run = _Run(self, objective, theta0, watch)
-        try:
-            status = run.iterate()
-        except KeyboardInterrupt:
-            if not run.best.found:
-                raise
-            status = Status.INTERRUPTED
-        return run.best.result(status)
+        return run.best.run(run.iterate)
 
 
 class _Run:

@@ -46,13 +46,7 @@ class GaussNewton:
                 "solver", self.name, "lbfgs or adam for a parametrisation that is not linear in its parameters"
             )
         run = _Run(self, objective, theta0, watch)
-        try:
-            status = run.iterate()
-        except KeyboardInterrupt:
-            if not run.best.found:
-                raise
-            status = Status.INTERRUPTED
-        return run.best.result(status)
+        return run.best.run(run.iterate)
 
 
 class _Run:

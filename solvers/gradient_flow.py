@@ -47,13 +47,7 @@ class GradientFlow:
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
         """Flow from theta0."""
         run = _Run(self, objective, theta0, watch)
-        try:
-            status = run.iterate()
-        except KeyboardInterrupt:
-            if not run.best.found:
-                raise
-            status = Status.INTERRUPTED
-        return run.best.result(status)
+        return run.best.run(run.iterate)
 
 
 class _Run:

@@ -44,13 +44,11 @@ class LBFGS:
             best.next_iteration(self.max_iterations)
 
         options = {"maxiter": left, "maxfun": 2 * left, "ftol": self.tolerance, "maxcor": self.memory, "gtol": 0.0}
-        try:
+
+        def iterate() -> Status:
             outcome = scipy.optimize.minimize(
                 best.value_and_gradient, best.theta, jac=True, method="L-BFGS-B", callback=count, options=options
             )
-            status = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}.get(outcome.status, Status.STALLED)
-        except KeyboardInterrupt:
-            if not best.found:
-                raise
-            status = Status.INTERRUPTED
-        return best.result(status)
+            return {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}.get(outcome.status, Status.STALLED)
+
+        return best.run(iterate)
