@@ -11,10 +11,12 @@ from orthocas import problems, solvers
 from orthocas.api import compare, fit, load
 from orthocas.chart import Chart
 from orthocas.domains import Box, Torus, contains
+from orthocas.involutivity import Involutivity, involutivity
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial
 from orthocas.problem import Problem, check
 from orthocas.quality import Report, evaluate
 from orthocas.robots import Robot
+from orthocas.task_brackets import lie_bracket
 from orthocas.tasks import Task
 
 __version__ = "0.1.0"
@@ -25,6 +27,7 @@ __all__ = [
     "Chart",
     "Fourier",
     "Given",
+    "Involutivity",
     "Linear",
     "Polynomial",
     "Problem",
@@ -37,6 +40,8 @@ __all__ = [
     "contains",
     "evaluate",
     "fit",
+    "involutivity",
+    "lie_bracket",
     "load",
     "problems",
     "solvers",

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.chart_file import read_chart, write_chart
 from orthocas.checks import Array, as_point_set, require_known
-from orthocas.coordinates import Coordinates
+from orthocas.coordinates import CoordinateMap, InvertibleMap
 from orthocas.errors import InverseError, ShapeError
 from orthocas.problem import Problem, task_jacobians
 
@@ -23,13 +23,14 @@ _SINGULAR = 1e-8  # ratio of singular values of J where the inverse map is given
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """A problem with coordinates xi(q) found for it ([AS2023] eq. (27)).
+    """A problem with coordinates xi(q) found for it ([AS2023] eq. (27)), fitted or grown.
 
-    NumPy arguments are one joint position (n,) or a set (N, n), [rad] or [m].
+    NumPy arguments are one joint position (n,) or a set (N, n), [rad] or [m]. Grown coordinates are NaN at points from
+    where their flow does not reach the charted part of the base leaf.
     """
 
     problem: Problem
-    coordinates: Coordinates
+    coordinates: CoordinateMap
     notes: Mapping[str, str | float] = field(default_factory=dict)  #: how it was made: solver, weights, seed, ...
 
     def __post_init__(self) -> None:
@@ -73,11 +74,12 @@ class Chart:
         return J[0] if single else J
 
     def inverse(self, phi: ArrayLike, q_start: ArrayLike, tolerance: float = 1e-9) -> Array:
-        """Joint positions q with phi(q) = phi, by Newton's method with line search from q_start.
+        """Joint positions q with phi(q) = phi: by Newton's method with line search from q_start, or along the flow.
 
         Args:
             phi: wanted values, (n,) or (N, n).
-            q_start: where to start, (n,), or (N, n) with one start per row of phi.
+            q_start: where to start, (n,), or (N, n) with one start per row of phi; grown coordinates need no start,
+                there it tells which whole turns are wanted.
             tolerance: largest remaining |phi(q) - phi|.
 
         Returns:
@@ -91,7 +93,11 @@ class Chart:
         if len(starts) not in (1, len(targets)):
             raise ShapeError("q_start", starts.shape, targets.shape)
         starts = np.broadcast_to(starts, targets.shape)
-        solutions = np.array([self._solve(x0, p) for x0, p in zip(starts, targets, strict=True)]).reshape(-1, self.n)
+        if isinstance(self.coordinates, InvertibleMap):
+            solutions = self.coordinates.inverse(targets, starts)
+        else:
+            solutions = np.array([self._solve(x0, p) for x0, p in zip(starts, targets, strict=True)])
+        solutions = solutions.reshape(-1, self.n)
         self._require_solved(solutions, targets, tolerance)
         return solutions[0] if single else solutions
 
@@ -100,6 +106,7 @@ class Chart:
 
         Raises:
             UnknownNameError: if there is no such function.
+            NoExpressionError: if the coordinates are grown; `orthocas.distil` fits an expression to them.
         """
         require_known("chart function", name, FUNCTIONS)
         return self._functions[name]

@@ -1,4 +1,4 @@
-"""What a chart file holds: robot numbers, task, metric, domain, parametrisation and parameters."""
+"""What a chart file holds: robot numbers, task, metric, domain, and the fitted or grown coordinates."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -10,10 +10,11 @@ import numpy as np
 
 from orthocas.archive import Kind, read_archive, write_archive
 from orthocas.checks import Array, require_count, require_known
-from orthocas.coordinates import Coordinates, joint_space
+from orthocas.coordinates import CoordinateMap, Coordinates, joint_space
 from orthocas.domains import Box, Domain, Torus
 from orthocas.errors import ChartFileError, OrthocasError
 from orthocas.expression_tape import from_tape, to_tape
+from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
 from orthocas.parametrisations import parametrisation_from_data, parametrisation_to_data
 from orthocas.problem import Problem
@@ -22,9 +23,10 @@ from orthocas.tasks import Task
 
 CHART = Kind("chart", 1, ChartFileError)
 Notes = Mapping[str, str | float]
+_LEAF = "leaf_"  # of the names of arrays that belong to a base leaf
 
 
-def write_chart(path: str | Path, problem: Problem, coordinates: Coordinates, notes: Notes) -> None:
+def write_chart(path: str | Path, problem: Problem, coordinates: CoordinateMap, notes: Notes) -> None:
     """Write a chart; see `orthocas.archive` for the container.
 
     Raises:
@@ -33,13 +35,9 @@ def write_chart(path: str | Path, problem: Problem, coordinates: Coordinates, no
     tree = problem.robot.tree
     numbers = {f.name: getattr(tree, f.name) for f in fields(tree)}
     arrays = {f"robot_{name}": value for name, value in numbers.items() if isinstance(value, np.ndarray)}
-    arrays |= {
-        "theta": coordinates.theta,
-        "offset": coordinates.offset,
-        "scale": coordinates.scale,
-        "domain_centre": problem.domain.centre,
-        "domain_half_width": problem.domain.half_width,
-    }
+    arrays |= {"domain_centre": problem.domain.centre, "domain_half_width": problem.domain.half_width}
+    description, numbers_of_coordinates = _coordinates_to_data(coordinates)
+    arrays |= numbers_of_coordinates
     header = {
         "robot": {name: value for name, value in numbers.items() if not isinstance(value, np.ndarray)},
         "problem": {
@@ -48,13 +46,13 @@ def write_chart(path: str | Path, problem: Problem, coordinates: Coordinates, no
             "metric": _with_tape(problem.metric.recipe, problem.metric.function),
             "domain": problem.domain.name,
         },
-        "coordinates": {**parametrisation_to_data(coordinates.parametrisation), "idle": list(coordinates.idle)},
+        "coordinates": description,
         "notes": dict(notes),
     }
     write_archive(path, CHART, header, arrays)
 
 
-def read_chart(path: str | Path) -> tuple[Problem, Coordinates, Notes]:
+def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:
     """Read a chart back.
 
     Raises:
@@ -64,14 +62,7 @@ def read_chart(path: str | Path) -> tuple[Problem, Coordinates, Notes]:
     try:
         robot = Robot(_tree(header["robot"], arrays))
         problem = _problem(robot, header["problem"], arrays)
-        coordinates = Coordinates(
-            parametrisation_from_data(header["coordinates"]),
-            joint_space(problem),
-            _idle(header["coordinates"]["idle"], robot.n),
-            arrays["theta"],
-            arrays["offset"],
-            arrays["scale"],
-        )
+        coordinates = _coordinates(problem, header["coordinates"], arrays)
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
         return problem, coordinates, dict(header["notes"])
@@ -81,6 +72,30 @@ def read_chart(path: str | Path) -> tuple[Problem, Coordinates, Notes]:
         raise ChartFileError(f"{path} is inconsistent: {error}") from None
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
         raise ChartFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
+
+
+def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Coordinates as plain data and arrays."""
+    if isinstance(coordinates, GrownCoordinates):
+        arrays = {f"{_LEAF}{name}": array for name, array in coordinates.leaf.to_arrays().items()}
+        return {"leaf": coordinates.leaf.kind}, arrays
+    assert isinstance(coordinates, Coordinates)
+    data = {**parametrisation_to_data(coordinates.parametrisation), "idle": list(coordinates.idle)}
+    return data, {"theta": coordinates.theta, "offset": coordinates.offset, "scale": coordinates.scale}
+
+
+def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Array]) -> CoordinateMap:
+    if "leaf" in data:
+        own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
+        return GrownCoordinates(problem, leaf_from_arrays(problem, data["leaf"], own))
+    return Coordinates(
+        parametrisation_from_data(data),
+        joint_space(problem),
+        _idle(data["idle"], problem.n),
+        arrays["theta"],
+        arrays["offset"],
+        arrays["scale"],
+    )
 
 
 def _with_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:

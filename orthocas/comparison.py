@@ -101,7 +101,7 @@ def run_cell(cell: Cell) -> CellResult:
         seed=cell.seed,
         status=fit.status.value,
         seconds=fit.seconds,
-        parameters=int(fit.chart.coordinates.theta.size),
+        parameters=fit.chart.coordinates.size,
         samples=int(fit.chart.notes["samples"]),
         iterations=sum(result.iterations for result in results),
         evaluations=sum(result.evaluations for result in results),

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -22,6 +22,47 @@ def joint_space(problem: Problem) -> JointSpace:
     """The joints of a problem as parametrisations see them."""
     robot, domain = problem.robot, problem.domain
     return JointSpace(domain.centre, domain.half_width, robot.tree.prismatic, robot.joint_names)
+
+
+class CoordinateMap(Protocol):
+    """Coordinates xi(q), fitted or grown."""
+
+    @property
+    def r(self) -> int:
+        """Number of coordinates."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """Short name of how they are described, for example 'polynomial:4'."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Number of numbers that describe them."""
+        ...
+
+    @property
+    def functions(self) -> dict[str, ca.Function]:
+        """CasADi functions of one joint position (n, 1): its coordinates (r, 1) and their jacobian (r, n)."""
+        ...
+
+    def xi(self, points: Array) -> Array:
+        """Coordinates at points (N, n), (N, r)."""
+        ...
+
+    def jacobian(self, points: Array) -> Array:
+        """J_xi at points (N, n), (N, r, n)."""
+        ...
+
+
+@runtime_checkable
+class InvertibleMap(Protocol):
+    """Coordinates that know their way back."""
+
+    def inverse(self, phi: Array, q_start: Array) -> Array:
+        """Joint positions with given task values and coordinates (N, n), (N, n); NaN where there are none."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +90,16 @@ class Coordinates:
     def r(self) -> int:
         """Number of coordinates."""
         return len(self.offset) + len(self.idle)
+
+    @property
+    def label(self) -> str:
+        """Short name of the parametrisation."""
+        return self.parametrisation.label
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.theta.size
 
     @property
     def active(self) -> list[int]:

@@ -68,6 +68,23 @@ class MemoryNeedError(OrthocasError, MemoryError):
         )
 
 
+class NotADiskError(OrthocasError, ValueError):
+    """A surface mesh is not a topological disk."""
+
+    def __init__(self, components: int, loops: int, euler: int, clashing_edges: int) -> None:
+        super().__init__(
+            f"the mesh has {components} components, {loops} boundary loops, Euler characteristic {euler} and "
+            f"{clashing_edges} non-manifold edges, expected a disk: 1, 1, 1 and 0"
+        )
+
+
+class FoldedMapError(OrthocasError, ValueError):
+    """A map of a mesh to the plane turns triangles over."""
+
+    def __init__(self, folded: int, triangles: int) -> None:
+        super().__init__(f"the map folds {folded} of {triangles} triangles, expected 0: improve the mesh (more cells)")
+
+
 class SolveError(OrthocasError, RuntimeError):
     """A minimiser stopped without a usable result."""
 
@@ -90,3 +107,15 @@ class CheckpointError(ArchiveError):
 
 class ChartFileError(ArchiveError):
     """A chart file is missing, truncated, foreign, edited or too new."""
+
+
+class GrowError(OrthocasError, ValueError):
+    """Coordinates cannot be grown as asked."""
+
+
+class NotInvolutiveError(GrowError):
+    """The task gradients are not involutive: what would grow depends on the path."""
+
+
+class NoExpressionError(OrthocasError, TypeError):
+    """A chart has no closed expression in CasADi."""

@@ -59,7 +59,7 @@ class Report:
     mutual_angle: AngleStatistics
     conditioning: Conditioning
     worst_point: tuple[float, ...]  #: the sampled joint position with the smallest conditioning
-    singular_samples: int  #: samples left out because a gradient vanishes there
+    singular_samples: int  #: samples left out because a gradient vanishes there, or a grown coordinate has no value
     folded_samples: int  #: samples where det J has not the sign it has at most samples: the chart has folded over
 
     @property
@@ -108,7 +108,7 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
     parts = [_judge(chart, points[start : start + _CHUNK]) for start in range(0, samples, _CHUNK)]
     task, mutual, smallest, signs, kept = (np.concatenate([part[i] for part in parts]) for i in range(5))
     if len(kept) == 0:
-        raise SingularTaskError(f"a gradient vanishes at all {samples} samples, nothing to evaluate")
+        raise SingularTaskError(f"a gradient vanishes, or a coordinate has no value, at all {samples} samples: nothing to evaluate")
     worst = int(np.argmin(smallest))
     return Report(
         n=chart.n,
@@ -131,9 +131,8 @@ def _judge(chart: Chart, points: Array) -> tuple[Array, Array, Array, Array, Arr
     samples = samples_at(chart.problem, points)
     J = chart.coordinates.jacobian(samples.points)
     lengths = np.linalg.norm(J, axis=2)
-    alive = lengths.min(axis=1) > 0
-    if not alive.all():
-        return _judge(chart, samples.points[alive])
+    alive = lengths.min(axis=1) > 0  # false for NaN too: grown coordinates have no value there
+    samples, J, lengths = samples[alive], J[alive], lengths[alive]
     raised = samples.raised(J)
     task = samples.unit_task_gradients @ (J / lengths[:, :, None]).transpose(0, 2, 1)
     first, second = (np.array([pair[k] for pair in pairs(chart.r)], dtype=int) for k in (0, 1))

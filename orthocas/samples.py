@@ -6,6 +6,7 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
@@ -24,7 +25,7 @@ class Samples:
     def __len__(self) -> int:
         return len(self.points)
 
-    def __getitem__(self, part: slice) -> "Samples":
+    def __getitem__(self, part: slice | NDArray[np.bool_]) -> "Samples":
         inverse = None if self.metric_inverse is None else self.metric_inverse[part]
         return Samples(self.points[part], self.task_jacobian[part], inverse)
 

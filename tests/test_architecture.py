@@ -19,7 +19,13 @@ SOURCES = {
     for path in sorted((ROOT / folder).rglob("*.py"))
     for module in [".".join([package, *path.relative_to(ROOT / folder).with_suffix("").parts])]
 }
-TOP = ("orthocas.__init__", "orthocas.__main__", "orthocas.api", "orthocas.cli")  # may see problems and solvers
+TOP = (  # may see problems and solvers
+    "orthocas.__init__",
+    "orthocas.__main__",
+    "orthocas.api",
+    "orthocas.cli",
+    "orthocas.reproduce",
+)
 
 
 def imports_of(path: Path) -> set[str]:

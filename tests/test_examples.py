@@ -8,6 +8,7 @@ import compare_parametrisations
 import fits
 import front
 import iiwa_demo
+import involutivity
 import ipopt_front
 import numpy as np
 import paper_network
@@ -51,6 +52,17 @@ def test_front_shows_the_trade_and_the_trap(tmp_path: Path) -> None:
     assert found["p01_with_regularity"] > found["p01_without_regularity"]
     assert found["folded_with_regularity"] == 0
     assert (tmp_path / "front.png").stat().st_size > 10_000
+
+
+def test_involutivity_defect_tells_the_angles_of_fits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = involutivity.main(tmp_path, quick=True)
+    assert found["rank_correlation"] > 0.95
+    assert 0.7 < found["smallest_ratio"] < found["median_ratio"] < 1.2  # nothing is fitted to the expected angles
+    assert found["largest_ratio"] < 1.6
+    assert found["x_I"] < found["xy_I"] / 50  # same arm, same box: with and without exact coordinates
+    assert found["x_M"] < found["xy_M"] / 50
+    assert capsys.readouterr().out.count("\n") == 11
+    assert (tmp_path / "involutivity.png").stat().st_size > 10_000
 
 
 def test_comparison_example_draws_and_returns_the_best(tmp_path: Path) -> None:

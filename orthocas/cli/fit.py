@@ -101,7 +101,7 @@ def parse_weights(text: str) -> tuple[float, float] | tuple[float, float, float]
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     coordinates = result.chart.coordinates
     rows = report_rows(report)
-    rows["fit"] = f"{coordinates.parametrisation.label}, {result.seconds:.2f} s, {result.status.value}"
+    rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
     if result.idle_joints:
         rows["exact"] = f"joints the task does not feel: {', '.join(result.idle_joints)}"
     if result.problem_check.singular_samples:
@@ -116,7 +116,7 @@ def _as_dict(result: Fit, report: Report, target: Path) -> dict[str, Any]:
     check = result.problem_check
     return {
         "chart": str(target),
-        "parametrisation": result.chart.coordinates.parametrisation.label,
+        "parametrisation": result.chart.coordinates.label,
         "status": result.status.value,
         "seconds": result.seconds,
         "idle_joints": list(result.idle_joints),

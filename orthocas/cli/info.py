@@ -10,7 +10,8 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.cli.problem_argument import ProblemName, ProblemOptions, TipName, build_problem, is_robot_file
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.involutivity import involutivity
 from orthocas.problem import Problem, check
 from orthocas.robots import Robot
 
@@ -27,8 +28,8 @@ def info(target: ProblemName, tip: TipName = None, json: AsJson = False) -> None
         chart = Chart.load(_chart_path(target))
         data = {
             **_problem(chart.problem),
-            "parametrisation": chart.coordinates.parametrisation.label,
-            "parameters": int(chart.coordinates.theta.size),
+            "parametrisation": chart.coordinates.label,
+            "parameters": chart.coordinates.size,
             "notes": dict(chart.notes),
         }
     if json:
@@ -70,7 +71,20 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "half_width": problem.domain.half_width.tolist(),
         "near_singular_share": found.singular_share,
         "most_singular_point": list(found.most_singular_point),
+        **_involutivity(problem),
         **_robot(problem.robot),
+    }
+
+
+def _involutivity(problem: Problem) -> dict[str, Any]:
+    try:
+        found = involutivity(problem)
+    except SingularTaskError as error:
+        return {"verdict": f"unknown whether exact coordinates exist: {error}"}
+    return {
+        "involutivity_defect": {"mean": found.mean, "max": found.max},
+        "expected_angle_deg": found.expected_angle_deg,
+        "verdict": found.verdict,
     }
 
 

@@ -9,6 +9,7 @@ from orthocas.cli.compare import compare
 from orthocas.cli.evaluate import evaluate
 from orthocas.cli.fit import fit
 from orthocas.cli.info import info
+from orthocas.cli.reproduce import reproduce
 from orthocas.errors import OrthocasError
 
 INTERRUPTED = 130  #: exit code after Ctrl-C, as shells have it
@@ -25,6 +26,7 @@ app.command()(fit)
 app.command()(evaluate)
 app.command()(info)
 app.command()(compare)
+app.command()(reproduce)
 
 
 def _complain(text: str) -> None:

@@ -1,0 +1,74 @@
+"""Seconds for a disk chart of a planar 3R leaf: surface, harmonic map, closest points; libigl beside them."""
+
+import argparse
+import time
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from orthocas.growing.harmonic import circle_by_arc_length, harmonic_disk
+from orthocas.growing.level_surface import TriangleMesh, level_surface, require_disk
+from orthocas.growing.triangle_locator import TriangleLocator
+
+HEADER = (
+    "| triangles | surface [s] | harmonic map [s] | closest points [s] | libigl: harmonic map [s] "
+    "| libigl: closest points [s] |\n| --- | --- | --- | --- | --- | --- |"
+)
+OFF_SURFACE = 0.01  # [rad], standard deviation of the queries around the mesh
+IGL: Any = import_module("igl") if find_spec("igl") else None
+
+
+def leaf(cells: int) -> TriangleMesh:
+    """The leaf x = 0 of the planar 3R arm with unit links and q1 in (0, pi)."""
+    low, high = (0.0, -np.pi, -np.pi), (np.pi, np.pi, np.pi)
+    return level_surface(
+        lambda q: np.cos(np.cumsum(q, axis=1)).sum(axis=1),
+        lambda q: np.cumsum(-np.sin(np.cumsum(q, axis=1))[:, ::-1], axis=1)[:, ::-1],
+        *(0.0, low, high, cells),
+    )
+
+
+def seconds(work: Callable[[], Any]) -> tuple[float, Any]:
+    """Wall time and result."""
+    start = time.perf_counter()
+    result = work()
+    return time.perf_counter() - start, result
+
+
+def row(cells: int, queries: int = 100_000) -> str:
+    """Build one chart and print its times."""
+    rng = np.random.default_rng(7)
+    surface_time, mesh = seconds(lambda: leaf(cells))
+    map_time, disk = seconds(lambda: harmonic_disk(mesh))
+    corners = mesh.vertices[mesh.faces[rng.integers(len(mesh.faces), size=queries)]]
+    points = np.einsum("nc,ncd->nd", rng.dirichlet([1, 1, 1], queries), corners)
+    points += OFF_SURFACE * rng.normal(size=points.shape)
+    locate_time, found = seconds(lambda: TriangleLocator(mesh.vertices, mesh.faces).locate(points))
+    peers = "- | -"
+    if IGL is not None:
+        loop = require_disk(mesh)
+        circle = circle_by_arc_length(mesh.vertices[loop])
+        igl_map_time, igl_disk = seconds(lambda: IGL.harmonic(mesh.vertices, mesh.faces, loop, circle, 1))
+        igl_locate_time, (squares, _, _) = seconds(
+            lambda: IGL.point_mesh_squared_distance(points, mesh.vertices, mesh.faces)
+        )
+        assert np.abs(igl_disk - disk).max() < 1e-8
+        assert np.abs(np.sqrt(squares) - found.distance).max() < 1e-12
+        peers = f"{igl_map_time:.2f} | {igl_locate_time:.2f}"
+    return f"| {len(mesh.faces)} | {surface_time:.2f} | {map_time:.2f} | {locate_time:.2f} | {peers} |"
+
+
+def main(quick: bool = False) -> list[str]:
+    """Rows for grids of 60 to 300 cells; quick: one of 20 cells."""
+    return [row(20, 1_000)] if quick else [row(cells) for cells in (60, 100, 150, 204, 300)]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    print(HEADER)
+    for line in main(parser.parse_args().quick):
+        print(line)

@@ -1,0 +1,8 @@
+"""Growing exact coordinates: flows along the task gradients, charts of the base leaf, and both together."""
+
+from orthocas.growing.flow import Arrival, Moved, TaskFlow
+from orthocas.growing.grown import GrownCoordinates
+from orthocas.growing.leaf import LeafChart
+from orthocas.growing.leaves import leaf_from_arrays
+
+__all__ = ["Arrival", "GrownCoordinates", "LeafChart", "Moved", "TaskFlow", "leaf_from_arrays"]

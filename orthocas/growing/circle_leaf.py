@@ -1,0 +1,171 @@
+"""A closed base leaf of dimension one, charted by its arc length ([AS2023] Sec. 5.1)."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+from orthocas.checks import Array, frozen_array
+from orthocas.errors import GrowError
+from orthocas.growing.leaf import LeafValues
+from orthocas.interrupts import deferred
+from orthocas.problem import Problem
+
+SAMPLES = 2000  #: of the curve; the spline through them is good to about 1e-12
+_ON_CURVE = 1e-5  # distance [rad] beyond which a point belongs to another piece of the leaf
+_PIECE, _STEPS = 1.0, 100  # arc length and outputs of one call of the integrator
+_LONGEST = 200.0  # [rad]
+_CLOSINGS = 3  # corrections of the length
+_PROJECTIONS = 4  # Gauss-Newton steps from the nearest sample to the nearest point of the curve
+
+
+@dataclass(frozen=True, eq=False)
+class CircleLeaf:
+    """xi0 = 2 pi l / L on a closed curve of length L, l its arc length from the first sample, xi0 in (-pi, pi].
+
+    The point opposite to the first sample is the cut: a circle has no single smooth coordinate.
+    """
+
+    problem: Problem
+    level: Array  #: x0, (m,)
+    curve: Array  #: samples at equal arc lengths, (K + 1, n); the last is the first one, up to whole turns
+    length: Array  #: L, (1,)
+    kind = "circle"
+
+    def __post_init__(self) -> None:
+        for name, shape in (("level", (self.problem.m,)), ("curve", (None, self.problem.n)), ("length", (1,))):
+            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+
+    @property
+    def cut(self) -> Array:
+        """The point of the leaf where xi0 jumps from pi to -pi, (n,)."""
+        return np.asarray(self._spline(self.length[0] / 2) + self._drift / 2)
+
+    def values(self, points: Array) -> LeafValues:
+        """Coordinates of points on the leaf, (N, n)."""
+        nearest = self._tree.query(self._embedded(points))[1]
+        L = self.length[0]
+        samples = self.curve[nearest]
+        near = samples + _turned(self.problem, points - samples)
+        along = nearest * L / (len(self.curve) - 1)
+        for _ in range(_PROJECTIONS):
+            tangent = self._spline(along, 1) + self._drift / L
+            away = near - self._at(along)
+            along = along + (tangent * away).sum(axis=1) / (tangent**2).sum(axis=1)
+        tangent = self._spline(along, 1) + self._drift / L
+        inside = np.linalg.norm(near - self._at(along), axis=1) < _ON_CURVE
+        xi = np.pi - (np.pi - 2 * np.pi * along / L) % (2 * np.pi)
+        gradients = 2 * np.pi / L * tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
+        return LeafValues(xi[:, None], gradients[:, None, :], inside)
+
+    def points(self, xi: Array) -> Array:
+        """Points of the leaf with coordinates xi (N, 1) in (-pi, pi]; NaN for others."""
+        along = xi[:, 0] * self.length[0] / (2 * np.pi)
+        return np.where(np.abs(xi) <= np.pi, self._at(along), np.nan)
+
+    def to_arrays(self) -> Mapping[str, Array]:
+        """All numbers, for chart files."""
+        return {"level": self.level, "curve": self.curve, "length": self.length}
+
+    @cached_property
+    def _turning(self) -> Array:
+        return ~np.array(self.problem.robot.tree.prismatic, dtype=bool)
+
+    @cached_property
+    def _drift(self) -> Array:
+        """Whole turns of the joints along the curve, (n,) [rad]."""
+        return np.asarray(self.curve[-1] - self.curve[0])
+
+    @cached_property
+    def _spline(self) -> CubicSpline:
+        """The curve without its drift, periodic in the arc length."""
+        share = np.linspace(0.0, 1.0, len(self.curve))[:, None]
+        periodic = self.curve - share * self._drift
+        periodic[-1] = periodic[0]
+        return CubicSpline(share[:, 0] * self.length[0], periodic, bc_type="periodic")
+
+    def _at(self, along: Array) -> Array:
+        return np.asarray(self._spline(along) + along[:, None] / self.length[0] * self._drift)
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self._embedded(self.curve[:-1]))
+
+    def _embedded(self, points: Array) -> Array:
+        """Angles as points of circles, so that whole turns do not matter."""
+        turning = points[:, self._turning]
+        return np.concatenate([np.cos(turning), np.sin(turning), points[:, ~self._turning]], axis=1)
+
+
+def circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAMPLES) -> CircleLeaf:
+    """Trace the leaf from a point on it until it closes.
+
+    Args:
+        problem: with r = 1.
+        level: x0, (m,).
+        start: a point of the leaf, where xi0 = 0, (n,).
+        samples: number of samples kept.
+
+    Raises:
+        GrowError: if the leaf does not close within 200 rad, or runs into a singularity.
+    """
+    trace = _tracer(problem, level, _STEPS)
+    q, travelled, step = start, 0.0, _PIECE / _STEPS
+    while travelled < _LONGEST:
+        piece = trace(q, _PIECE)
+        away = _turned(problem, piece[1:] - start)
+        left = -(np.diff(piece, axis=0) * away).sum(axis=1) / step  # arc length to the start, along the curve
+        back = np.flatnonzero((np.linalg.norm(away, axis=1) < 2 * step) & (left >= 0))
+        if back.size:
+            k = int(back[-1])
+            return _closed(problem, level, start, travelled + (k + 1) * step + left[k], samples)
+        q, travelled = piece[-1], travelled + _PIECE
+    raise GrowError(f"the base leaf h(q) = {level.tolist()} does not close within {_LONGEST:g} rad of arc length")
+
+
+def _closed(problem: Problem, level: Array, start: Array, length: float, samples: int) -> CircleLeaf:
+    """Trace once around with the length made exact."""
+    trace = _tracer(problem, level, samples)
+    for _ in range(_CLOSINGS):
+        curve = trace(start, length)
+        last = curve[-1] - curve[-2]
+        length -= float(last @ _turned(problem, curve[-1] - start)) / float(np.linalg.norm(last))
+    return CircleLeaf(problem, level, trace(start, length), np.array([length]))
+
+
+def _turned(problem: Problem, differences: Array) -> Array:
+    """Differences of joint positions without whole turns."""
+    turning = ~np.array(problem.robot.tree.prismatic, dtype=bool)
+    return np.asarray(differences - 2 * np.pi * np.round(differences / (2 * np.pi)) * turning)
+
+
+def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, float], Array]:
+    """A map (point, length) -> points at equal arc lengths (steps + 1, n) along the leaf, by SUNDIALS.
+
+    The curve follows the unit vector across all task gradients, and is drawn to the leaf by -J_x^# (h - x0).
+    """
+    q, length = ca.SX.sym("q", problem.n), ca.SX.sym("length")
+    J = problem.task.jacobian_function(q)
+    others = [[k for k in range(problem.n) if k != i] for i in range(problem.n)]
+    across = ca.vertcat(*((-1) ** (i + 1) * ca.det(J[:, columns]) for i, columns in enumerate(others)))
+    home = J.T @ ca.solve(J @ J.T, problem.task.function(q) - level)
+    rate = length * (across / ca.norm_2(across) - home)
+    grid = np.linspace(0.0, 1.0, steps + 1)
+    options = {"abstol": 1e-12, "reltol": 1e-12, "max_num_steps": 100_000, "disable_internal_warnings": True}
+    integrator = ca.integrator("trace", "cvodes", {"x": q, "p": length, "ode": rate}, 0.0, grid[1:].tolist(), options)
+
+    def trace(start: Array, span: float) -> Array:
+        try:
+            with deferred():
+                points = np.asarray(integrator(x0=start, p=span)["xf"]).T
+        except RuntimeError:
+            points = np.full((steps, problem.n), np.nan)
+        if not np.isfinite(points).all():
+            raise GrowError(f"the base leaf h(q) = {level.tolist()} runs into a singularity of the task")
+        return np.vstack([start, points])
+
+    return trace

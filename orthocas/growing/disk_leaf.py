@@ -1,0 +1,150 @@
+"""A base leaf with the topology of a disk, three joints and one task, charted by a harmonic map ([AS2023] Sec. 5.2)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from orthocas.checks import Array, frozen_array
+from orthocas.domains import Box
+from orthocas.errors import GrowError
+from orthocas.growing.harmonic import harmonic_disk
+from orthocas.growing.leaf import LeafValues, covers, wrapped
+from orthocas.growing.level_surface import TriangleMesh, level_surface
+from orthocas.growing.triangle_locator import TriangleLocator
+from orthocas.problem import Problem
+
+CELLS = 60  #: marching cubes cells along the longest edge of the region
+_ROUNDS = 30  # Newton steps from a triangle to the leaf above it
+_ON_LEAF = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class DiskLeaf:
+    """xi0(q): the harmonic map of a triangulated leaf onto the unit disk, linear on every triangle.
+
+    A point of the leaf belongs to the nearest point of the mesh. The map is continuous; its gradient jumps from triangle
+    to triangle by about the size of a cell.
+    """
+
+    problem: Problem
+    level: Array  #: x0, (1,)
+    region_centre: Array  #: (3,)
+    region_half_width: Array  #: (3,)
+    vertices: Array  #: (V, 3), on the leaf
+    faces: Array  #: (F, 3), whole numbers
+    disk: Array  #: images of the vertices, (V, 2)
+    kind = "disk"
+
+    def __post_init__(self) -> None:
+        count = len(self.vertices)
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "level": (1,),
+            "region_centre": (3,),
+            "region_half_width": (3,),
+            "vertices": (count, 3),
+            "disk": (count, 2),
+            "faces": (None, 3),
+        }
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+
+    @property
+    def region(self) -> Box:
+        """The part of joint space that holds the leaf."""
+        return Box(self.region_centre, self.region_half_width)
+
+    @cached_property
+    def mesh(self) -> TriangleMesh:
+        """The leaf as triangles."""
+        return TriangleMesh(self.vertices, self.faces.astype(np.int64))
+
+    def values(self, points: Array) -> LeafValues:
+        """Coordinates of points on the leaf, (N, 3)."""
+        turning = ~np.array(self.problem.robot.tree.prismatic, dtype=bool)
+        points = wrapped(points, self.region, turning)
+        found = self._in_space.locate(points)
+        corners = self.disk[self.mesh.faces[found.face]]
+        xi = np.einsum("sk,skr->sr", found.barycentric, corners)
+        return LeafValues(xi, self._gradients[found.face], covers(self.region, points))
+
+    def points(self, xi: Array) -> Array:
+        """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for others.
+
+        The point of the triangle is moved along the triangle's normal onto the leaf, so that `values` leads back.
+        """
+        found = self._in_disk.locate(xi)
+        corners = self.mesh.faces[found.face]
+        feet = np.einsum("sk,skn->sn", found.barycentric, self.vertices[corners])
+        normals = self._normals[found.face]
+        height = np.zeros((len(xi), 1))
+        for _ in range(_ROUNDS):
+            q = feet + height * normals
+            residual = self.problem.task.batched(q)[0] - self.level
+            if np.abs(residual).max(initial=0.0) < _ON_LEAF:
+                break
+            slope = (self.problem.task.batched_jacobian(q)[0].reshape(-1, 3) * normals).sum(axis=1, keepdims=True)
+            height = height - residual / slope
+        return np.where((found.distance < _ON_LEAF)[:, None], feet + height * normals, np.nan)
+
+    def to_arrays(self) -> Mapping[str, Array]:
+        """All numbers, for chart files."""
+        names = ("level", "region_centre", "region_half_width", "vertices", "faces", "disk")
+        return {name: getattr(self, name) for name in names}
+
+    @cached_property
+    def _in_space(self) -> TriangleLocator:
+        return TriangleLocator(self.vertices, self.mesh.faces)
+
+    @cached_property
+    def _in_disk(self) -> TriangleLocator:
+        return TriangleLocator(self.disk, self.mesh.faces)
+
+    @cached_property
+    def _edges(self) -> tuple[Array, Array]:
+        """Two edges of every triangle in space, (F, 2, 3), and in the disk, (F, 2, 2)."""
+        first, *others = (self.mesh.faces[:, k] for k in range(3))
+        in_space = np.stack([self.vertices[other] - self.vertices[first] for other in others], axis=1)
+        in_disk = np.stack([self.disk[other] - self.disk[first] for other in others], axis=1)
+        return in_space, in_disk
+
+    @cached_property
+    def _normals(self) -> Array:
+        normals = np.cross(self._edges[0][:, 0], self._edges[0][:, 1])
+        return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+    @cached_property
+    def _gradients(self) -> Array:
+        """Gradients of the two coordinates on every triangle, (F, 2, 3): E G^T = edges in the disk, n G^T = 0."""
+        in_space, in_disk = self._edges
+        return np.asarray((np.linalg.pinv(in_space) @ in_disk).transpose(0, 2, 1))
+
+
+def disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -> DiskLeaf:
+    """Triangulate the part of a leaf inside a region, and map it onto the unit disk.
+
+    Args:
+        problem: with n = 3 and m = 1.
+        level: x0, (1,).
+        region: box whose part of the leaf is charted.
+        cells: number of cells along its longest edge.
+
+    Raises:
+        GrowError: if n or m differ.
+        NotADiskError: if that part of the leaf is not a disk; says what it is.
+    """
+    if (problem.n, problem.m) != (3, 1):
+        raise GrowError(f"a disk chart is for n = 3 joints and m = 1 task, got n = {problem.n} and m = {problem.m}")
+    low, high = region.centre - region.half_width, region.centre + region.half_width
+    task = problem.task
+    mesh = level_surface(
+        lambda q: task.batched(q)[0][:, 0],
+        lambda q: task.batched_jacobian(q)[0].reshape(-1, 3),
+        float(level[0]),
+        low,
+        high,
+        cells,
+    )
+    disk = harmonic_disk(mesh)
+    return DiskLeaf(problem, level, region.centre, region.half_width, mesh.vertices, mesh.faces.astype(float), disk)

@@ -1,0 +1,108 @@
+"""Coordinates grown from a base leaf: exact ones, evaluated by following a flow ([AS2023] Sec. 5)."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from orthocas.checks import Array
+from orthocas.errors import NoExpressionError
+from orthocas.growing.flow import TOLERANCE, Arrival, Moved, TaskFlow
+from orthocas.growing.leaf import LeafChart, LeafValues
+from orthocas.problem import Problem
+
+_INVERSE_TOLERANCE = 1e-12  # the inverse follows the flow back
+
+
+@dataclass(frozen=True, eq=False)
+class GrownCoordinates:
+    """xi(q) = xi0(q_hat): q_hat is where the flow along the task gradients meets the base leaf, xi0 the leaf's chart.
+
+    J_xi = Dxi0(q_hat) dq_hat/dq, with the derivative of the flow from forward sensitivities: [AS2023] Sec. 6 names the
+    missing Jacobian as a drawback of growing. Values are NaN where the flow runs into a singularity or ends outside the chart
+    of the leaf; `pull` tells which.
+    """
+
+    problem: Problem
+    leaf: LeafChart
+
+    @property
+    def r(self) -> int:
+        """Number of coordinates."""
+        return self.problem.r
+
+    @property
+    def label(self) -> str:
+        """Short name."""
+        return f"grown:{self.leaf.kind}"
+
+    @property
+    def size(self) -> int:
+        """Number of numbers that describe the chart of the leaf."""
+        return sum(array.size for array in self.leaf.to_arrays().values())
+
+    def pull(self, points: Array, tolerance: float = TOLERANCE) -> Moved:
+        """Where points (N, n) meet the base leaf, with the status of each.
+
+        Args:
+            points: joint positions.
+            tolerance: local error of a step of the flow.
+        """
+        moved = self.flow.pull(points, self.leaf.level, tolerance)
+        return Moved(moved.points, self._status(moved, self._on_leaf(moved)))
+
+    def xi(self, points: Array) -> Array:
+        """Coordinates at points (N, n), (N, r)."""
+        moved = self.flow.pull(points, self.leaf.level)
+        values = self._on_leaf(moved)
+        return self._where_known(moved, values, values.xi)
+
+    def jacobian(self, points: Array) -> Array:
+        """J_xi at points (N, n), (N, r, n)."""
+        moved, derivative = self.flow.pull_with_derivative(points, self.leaf.level)
+        values = self._on_leaf(moved)
+        return self._where_known(moved, values, values.gradients @ derivative)
+
+    def inverse(self, phi: Array, q_start: Array) -> Array:
+        """Joint positions with given task values and coordinates, (N, n): from the leaf back along the flow.
+
+        No search is needed; the start (N, n) only tells which whole turns are wanted. NaN where there is none.
+        """
+        m, n = self.problem.m, self.problem.n
+        on_leaf = self.leaf.points(phi[:, m:])
+        found = np.isfinite(on_leaf).all(axis=1)
+        solutions = np.full((len(phi), n), np.nan)
+        moved = self.flow.move(on_leaf[found], phi[found, :m] - self.leaf.level, _INVERSE_TOLERANCE)
+        solutions[found] = np.where(moved.reached[:, None], moved.points, np.nan)
+        turning = ~np.array(self.problem.robot.tree.prismatic, dtype=bool)
+        return np.asarray(solutions + 2 * np.pi * np.round((q_start - solutions) / (2 * np.pi)) * turning)
+
+    @property
+    def functions(self) -> dict[str, ca.Function]:
+        """None: they are not expressions.
+
+        Raises:
+            NoExpressionError: always.
+        """
+        raise NoExpressionError(
+            "grown coordinates are found by integration and have no CasADi expression: "
+            "evaluate them with chart.xi and chart.jacobian, or fit an expression to them with orthocas.distil"
+        )
+
+    @cached_property
+    def flow(self) -> TaskFlow:
+        """The flow along the task gradients."""
+        return TaskFlow(self.problem)
+
+    def _on_leaf(self, moved: Moved) -> LeafValues:
+        """The leaf's chart at end points; those that did not arrive stand in as any point."""
+        return self.leaf.values(np.where(moved.reached[:, None], moved.points, self.problem.domain.centre))
+
+    @staticmethod
+    def _status(moved: Moved, values: LeafValues) -> Array:
+        return np.where(moved.reached & ~values.inside, Arrival.OUTSIDE, moved.status)
+
+    def _where_known(self, moved: Moved, values: LeafValues, results: Array) -> Array:
+        known = self._status(moved, values) == Arrival.REACHED
+        return np.where(known.reshape(-1, *[1] * (results.ndim - 1)), results, np.nan)

@@ -1,0 +1,62 @@
+"""What a chart of the base leaf S0 = {h(q) = x0} offers; implementations lie beside this module."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from orthocas.checks import Array
+from orthocas.domains import Box
+
+
+@dataclass(frozen=True, eq=False)
+class LeafValues:
+    """Coordinates of points on the base leaf."""
+
+    xi: Array  #: (N, r)
+    gradients: Array  #: d xi0 / dq along the leaf, (N, r, n)
+    inside: Array  #: which points the chart covers, (N,); the other rows mean nothing
+
+
+class LeafChart(Protocol):
+    """A chart xi0 of the base leaf."""
+
+    @property
+    def kind(self) -> str:
+        """Short name: 'linear', 'circle' or 'disk'."""
+        ...
+
+    @property
+    def level(self) -> Array:
+        """Task value x0 of the leaf, (m,)."""
+        ...
+
+    def values(self, points: Array) -> LeafValues:
+        """Coordinates of points on the leaf, (N, n)."""
+        ...
+
+    def points(self, xi: Array) -> Array:
+        """Points of the leaf with coordinates xi (N, r), (N, n); NaN where there is none."""
+        ...
+
+    def to_arrays(self) -> Mapping[str, Array]:
+        """All numbers, for chart files."""
+        ...
+
+
+def wrapped(points: Array, region: Box, turning: Array) -> Array:
+    """The same joint positions with angles within half a turn of the region's centre.
+
+    Args:
+        points: (N, n).
+        region: where the chart lives.
+        turning: joints whose positions are angles, (n,) bool.
+    """
+    away = points - region.centre
+    return np.asarray(points - 2 * np.pi * np.round(away / (2 * np.pi)) * turning)
+
+
+def covers(region: Box, points: Array) -> Array:
+    """Which points lie in the region, up to rounding, (N,)."""
+    return np.asarray((np.abs(points - region.centre) <= region.half_width + 1e-9).all(axis=1))

@@ -1,0 +1,25 @@
+"""The kinds of base leaves by name, for chart files."""
+
+from collections.abc import Mapping
+
+from orthocas.checks import Array, require_known
+from orthocas.growing.circle_leaf import CircleLeaf
+from orthocas.growing.disk_leaf import DiskLeaf
+from orthocas.growing.leaf import LeafChart
+from orthocas.growing.linear_leaf import LinearLeaf
+from orthocas.problem import Problem
+
+LEAVES: dict[str, type[LinearLeaf] | type[CircleLeaf] | type[DiskLeaf]] = {
+    kind.kind: kind for kind in (LinearLeaf, CircleLeaf, DiskLeaf)
+}
+
+
+def leaf_from_arrays(problem: Problem, kind: str, arrays: Mapping[str, Array]) -> LeafChart:
+    """Build a leaf's chart from its numbers.
+
+    Raises:
+        UnknownNameError: if there is no such kind.
+        ShapeError: if an array has another shape.
+    """
+    require_known("leaf", kind, LEAVES)
+    return LEAVES[kind](problem, **arrays)

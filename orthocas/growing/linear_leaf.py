@@ -1,0 +1,69 @@
+"""Linear coordinates on the base leaf: the chart that exists for any number of joints."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthocas.checks import Array, frozen_array
+from orthocas.growing.leaf import LeafValues
+from orthocas.metrics import metric_matrices
+from orthocas.problem import Problem, task_jacobians
+from orthocas.samples import samples_at
+
+_ITERATIONS = 50
+_SOLVED = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class LinearLeaf:
+    """xi0(q) = N^T (q - q0) for q on the leaf of q0, as in [AS2023] eq. (21).
+
+    A chart where the leaf is a graph over its tangent space at q0. Its values are defined everywhere on the leaf; where
+    the leaf folds over, the Jacobian of the grown chart loses rank, and `evaluate` shows it.
+    """
+
+    problem: Problem
+    level: Array  #: x0 = h(q0), (m,)
+    centre: Array  #: q0, (n,)
+    normals: Array  #: N, (n, r), unit columns with J_x(q0) A^-1(q0) N = 0
+    kind = "linear"
+
+    def __post_init__(self) -> None:
+        n, m, r = self.problem.n, self.problem.m, self.problem.r
+        for name, shape in (("level", (m,)), ("centre", (n,)), ("normals", (n, r))):
+            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+
+    def values(self, points: Array) -> LeafValues:
+        """Coordinates of points on the leaf, (N, n)."""
+        gradients = np.broadcast_to(self.normals.T, (len(points), *self.normals.T.shape))
+        return LeafValues((points - self.centre) @ self.normals, gradients, np.ones(len(points), dtype=bool))
+
+    def points(self, xi: Array) -> Array:
+        """Points of the leaf with coordinates xi (N, r), by Newton's method from the tangent space."""
+        q = self.centre + xi @ np.linalg.pinv(self.normals)
+        N = np.broadcast_to(self.normals.T, (len(xi), *self.normals.T.shape))
+        for _ in range(_ITERATIONS):
+            residual = self._residual(q, xi)
+            if np.abs(residual).max(initial=0.0) < _SOLVED:
+                break
+            J = np.concatenate([task_jacobians(self.problem, q), N], axis=1)
+            q = q - (np.linalg.pinv(J) @ residual[:, :, None])[:, :, 0]
+        solved = np.abs(self._residual(q, xi)).max(axis=1) < 1e3 * _SOLVED
+        return np.where(solved[:, None], q, np.nan)
+
+    def to_arrays(self) -> Mapping[str, Array]:
+        """All numbers, for chart files."""
+        return {"level": self.level, "centre": self.centre, "normals": self.normals}
+
+    def _residual(self, q: Array, xi: Array) -> Array:
+        x = self.problem.task.batched(q)[0]
+        return np.concatenate([x - self.level, (q - self.centre) @ self.normals - xi], axis=1)
+
+
+def linear_leaf(problem: Problem, centre: Array) -> LinearLeaf:
+    """The leaf through a joint position (n,), with coordinates along its tangent space there."""
+    points = centre[None]
+    normals = (metric_matrices(problem.metric, points) @ samples_at(problem, points).null_basis)[0]
+    level = problem.task.batched(points)[0][0]
+    return LinearLeaf(problem, level, centre, normals / np.linalg.norm(normals, axis=0))

@@ -1,0 +1,122 @@
+"""Rounder triangles for a mesh on a surface: flips of edges towards Delaunay, and tangential smoothing."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+
+from orthocas.checks import Array
+from orthocas.growing.triangle_mesh import Indices, edge_keys, half_edges
+
+_MOST_ROUNDS = 200  # of flips; a few dozen are enough, but on a curved surface nothing proves that they end
+_SHARE = 0.7  # of the way to the mean; the whole way would swap short and long edges of a boundary
+_FLAT = -1e-9  # cot + cot of the angles opposite an edge below this asks for a flip
+
+
+def cotangents(vertices: Array, faces: Indices) -> Array:
+    """Cotangents of the corner angles, (F, 3); not finite where a triangle has no area.
+
+    cot = (a . b) / |a x b| with a, b the edges that leave the corner.
+    """
+    corners = vertices[faces]
+    twice_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    a, b = corners[:, [1, 2, 0]] - corners, corners[:, [2, 0, 1]] - corners
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cot: Array = np.einsum("fcd,fcd->fc", a, b) / twice_area[:, None]
+    return cot
+
+
+def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
+    """Flip edges until the angles opposite every inner edge add up to at most half a turn.
+
+    Then all weights cot(alpha) + cot(beta) are >= 0. An edge stays if the edge across exists already, or if a new
+    triangle would turn away from the old ones.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3) of an oriented mesh with at most two triangles at each edge.
+
+    Returns:
+        New faces (F, 3): same vertices, boundary and topology.
+
+    Source:
+        Ours, after [BS2007]: docs/derivations.md#disk-chart.
+    """
+    faces = faces.copy()
+    for _ in range(_MOST_ROUNDS):
+        keys, first, second = _inner_edges(faces, len(vertices))
+        cot = np.nan_to_num(cotangents(vertices, faces), nan=0.0, posinf=1e12, neginf=-1e12).T.ravel()
+        weight = cot[first] + cot[second]
+        wanted = np.flatnonzero(weight < _FLAT)
+        wanted = wanted[np.argsort(weight[wanted], kind="stable")]
+        if not _flip(vertices, faces, keys, first[wanted], second[wanted]):
+            break
+    return faces
+
+
+def steps_to_neighbours(points: Array, faces: Indices) -> Array:
+    """Steps that even out a mesh, (V, 3): from every vertex most of the way to the mean of its neighbours.
+
+    Vertices of the boundary follow only their neighbours there, so that a boundary that is a curve stays it.
+    """
+    size = len(points)
+    edges, count = np.unique(edge_keys(*half_edges(faces), size), return_counts=True)
+    ends, outer = np.stack(np.divmod(edges, size)), count == 1
+    on_boundary = np.zeros(size, dtype=bool)
+    on_boundary[ends[:, outer]] = True
+    row, column = np.concatenate([ends, ends[::-1]], axis=1)
+    used = np.tile(outer, 2) | ~on_boundary[row]
+    row, column = row[used], column[used]
+    neighbours = coo_array((np.ones(len(row)), (row, column)), shape=(size, size)).tocsr()
+    mean = (neighbours @ points) / np.maximum(np.bincount(row, minlength=size), 1)[:, None]
+    steps: Array = _SHARE * (mean - points)
+    return steps
+
+
+def _inner_edges(faces: Indices, count: int) -> tuple[Indices, Indices, Indices]:
+    """Sorted keys of all edges, and the two half-edges of each inner edge."""
+    keys = edge_keys(*half_edges(faces), count)
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    twin = np.flatnonzero(keys[1:] == keys[:-1])
+    return keys, order[twin], order[twin + 1]
+
+
+def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second: Indices) -> bool:
+    """Flip as many of the edges as do not share a triangle, in place; whether there were any."""
+    quads = _quads(faces, first, second)
+    allowed = _allowed(vertices, quads, keys)
+    quads, face, other = quads[allowed], first[allowed] % len(faces), second[allowed] % len(faces)
+    chosen = _independent(quads, face, other, len(vertices))
+    i, j, k, n = quads[chosen].T
+    faces[face[chosen]] = np.stack([i, n, k], axis=1)
+    faces[other[chosen]] = np.stack([n, j, k], axis=1)
+    return bool(chosen.any())
+
+
+def _quads(faces: Indices, first: Indices, second: Indices) -> Indices:
+    """Edge i -> j, the corner k opposite in its first triangle and the corner n opposite in its second, (N, 4)."""
+    face, corner = first % len(faces), first // len(faces)
+    i, j, k = (faces[face, (corner + shift) % 3] for shift in (1, 2, 0))
+    return np.stack([i, j, k, faces[second % len(faces), second // len(faces)]], axis=1)
+
+
+def _allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bool_]:
+    """Whether the edge k - n is new and the triangles i n k and n j k look the way the old ones do."""
+    wanted = edge_keys(quads[:, 2], quads[:, 3], len(vertices))
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    p, q, r, s = (vertices[quads[:, c]] for c in range(4))
+    one, other = np.cross(s - p, r - p), np.cross(q - s, r - s)
+    normal = np.cross(q - p, r - p) + np.cross(p - q, s - q)
+    ahead = (np.einsum("nd,nd->n", one, normal) > 0) & (np.einsum("nd,nd->n", other, normal) > 0)
+    result: NDArray[np.bool_] = (keys[place] != wanted) & ahead
+    return result
+
+
+def _independent(quads: Indices, face: Indices, other: Indices, count: int) -> NDArray[np.bool_]:
+    """Flips, best first, that are the first at both of their triangles and at their new edge."""
+    number = np.arange(len(face))
+    _, at_face = np.unique(np.stack([face, other], axis=1), return_index=True)
+    wins = np.bincount(at_face // 2, minlength=len(face)) == 2
+    new_edge = np.unique(edge_keys(quads[:, 2], quads[:, 3], count), return_index=True)[1]
+    result: NDArray[np.bool_] = wins & np.isin(number, new_edge)
+    return result

@@ -1,0 +1,133 @@
+"""Whether exact orthogonal coordinates exist for a task, and how far it is from having them."""
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.batch import Batched
+from orthocas.checks import Array, require_count, require_memory
+from orthocas.domains import sample_uniform
+from orthocas.errors import SingularTaskError
+from orthocas.problem import NEAR_SINGULAR, Problem, check, task_jacobians
+from orthocas.task_brackets import TaskBrackets
+
+_ROUNDING = 1e-7  # defects below this share of the terms they are differences of are zero
+_STRAIGHT = 1e-12  # [rad]; task gradients that turn less than this over the domain do not turn
+_LARGE = 20.0  # [deg]; expected angles beyond this are not predicted by the first order
+
+
+@dataclass(frozen=True, eq=False)
+class Involutivity:
+    """Involutivity defect d(q) of a task on uniform samples of its domain; see `involutivity`."""
+
+    function: ca.Function = field(repr=False)  #: q (n, 1) -> d (1, 1); NaN where J_x loses rank
+    mean: float
+    std: float
+    p99: float  #: 99 % quantile
+    max: float
+    worst_point: tuple[float, ...]  #: the sampled joint position with the largest d [rad] or [m]
+    expected_angle_deg: float  #: estimate of the root mean square task angle off 90 degrees of good coordinates
+    exact: bool  #: whether d = 0, up to rounding, at all samples: exact coordinates exist around regular points
+    samples: int
+    seed: int
+    singular_samples: int  #: left out: relative singular value of J_x below NEAR_SINGULAR
+
+    @property
+    def verdict(self) -> str:
+        """One sentence in words."""
+        if self.exact:
+            return "exact orthogonal coordinates exist locally: the task gradients span an involutive distribution"
+        angle = f"about {self.expected_angle_deg:.2g}" if self.expected_angle_deg < _LARGE else f"more than {_LARGE:g}"
+        return (
+            f"coordinates can only be as orthogonal as possible: mean involutivity defect {self.mean:.3g}, "
+            f"expect task angles {angle} degrees off 90 in the metric on this domain"
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON, without the function."""
+        data = {part.name: getattr(self, part.name) for part in fields(self) if part.name != "function"}
+        return {**data, "worst_point": list(self.worst_point), "verdict": self.verdict}
+
+
+def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involutivity:
+    """Whether span{grad_A h_i} is involutive, which decides whether exact coordinates exist ([AS2023] Theorem 1).
+
+    d(q) = sqrt(sum_{a<b} |P [e_a, e_b]|_A^2) for an A-orthonormal basis e_1..e_m of the span and P = I - J^#A J_x. It
+    does not depend on the choice of task coordinates, and is 0 for m = 1. Its unit is one over a length in the metric:
+    1/rad for A = I and revolute joints, 1/(sqrt(kg) m) for A = M. It counts as zero below 1e-7 of the terms it is a
+    difference of.
+
+    The expected angle is d times the size of the domain along the span, without a fitted constant: to first order
+    in that size, the root mean square deviation from right angles, in the metric, between the gradients of quadratic
+    coordinates and an A-orthonormal basis of the task gradients. Rich families come within a factor of two
+    (examples/involutivity.py). Exact coordinates exist locally: closed self-motion manifolds have none as a whole.
+
+    Args:
+        problem: robot, task, metric and domain.
+        samples: number of uniform samples of the domain.
+        seed: their seed.
+
+    Raises:
+        SingularTaskError: if the task is singular at all samples, or not twice differentiable at one.
+        MetricError: if A is not symmetric positive definite at a sample.
+
+    Source:
+        Theorem: [AS2023] Sec. 3. Defect, and expected angle: ours, docs/derivations.md#involutivity.
+    """
+    samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
+    require_memory(f"{samples} samples of the defect", 32.0 * samples * problem.n * problem.m**2)
+    points = _regular_points(problem, samples, seed)
+    brackets = TaskBrackets.of(problem)
+    across, size, basis = Batched(brackets.tensor_function())(points)
+    T = across.reshape(-1, problem.n, problem.m, problem.m)
+    d = np.sqrt((T**2).sum(axis=(1, 2, 3)) / 2)
+    if not np.isfinite(d).all():
+        at = np.round(points[np.flatnonzero(~np.isfinite(d))[0]], 4).tolist()
+        raise SingularTaskError(f"the second derivative of task '{problem.task.name}' is not finite at q = {at}")
+    turns = _squared_turns(T, basis.reshape(-1, problem.n, problem.m), problem.domain.half_width)
+    worst = int(np.argmax(d))
+    return Involutivity(
+        function=brackets.defect_function(),
+        mean=float(d.mean()),
+        std=float(d.std()),
+        p99=float(np.quantile(d, 0.99)),
+        max=float(d[worst]),
+        worst_point=tuple(points[worst].tolist()),
+        expected_angle_deg=float(np.degrees(np.sqrt(turns.mean() / (problem.m * problem.r)))),
+        exact=bool(np.all((d <= _ROUNDING * size[:, 0]) | (turns <= _STRAIGHT**2))),
+        samples=samples,
+        seed=seed,
+        singular_samples=samples - len(points),
+    )
+
+
+def _regular_points(problem: Problem, samples: int, seed: int) -> Array:
+    """Uniform samples of the domain without those that `check` counts as near-singular."""
+    check(problem, samples, seed)
+    points = sample_uniform(problem.domain, samples, seed)
+    J = task_jacobians(problem, points)
+    scale = np.sqrt((J**2).sum(axis=2).mean(axis=0))
+    regular = np.linalg.svd(J / scale[:, None], compute_uv=False)[:, -1] >= NEAR_SINGULAR
+    if not regular.any():
+        raise SingularTaskError(f"task '{problem.task.name}' is near-singular at all {samples} samples of the domain")
+    return points[regular]
+
+
+def _squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
+    """Sum over pairs of |T(e_a, e_b)|_A^2 / (k_a + k_b) [rad^2], (N,).
+
+    Here the basis is turned within the span such that it also diagonalises C^-1, C = diag(half_width^2 / 3) the
+    covariance of the domain, and k_a = e_a^T C^-1 e_a.
+
+    Args:
+        T: P [e_a, e_b] in coordinates where A = I, (N, n, m, m).
+        basis: columns e_1..e_m, (N, n, m).
+        half_width: of the domain, (n,).
+    """
+    k, V = np.linalg.eigh(basis.transpose(0, 2, 1) @ (3 / half_width[:, None] ** 2 * basis))
+    turned = V.transpose(0, 2, 1)[:, None] @ T @ V[:, None]
+    squared = (turned**2).sum(axis=1) / (k[:, :, None] + k[:, None, :])
+    total: Array = squared.sum(axis=(1, 2)) / 2
+    return total

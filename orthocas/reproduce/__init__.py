@@ -1,0 +1,7 @@
+"""The figures of [AS2023], drawn again with numbers that are printed and tested."""
+
+from orthocas.reproduce.drawing import Drawing, save
+from orthocas.reproduce.registry import FIGURES, Recipe, reproduce
+from orthocas.reproduce.scene import Scene
+
+__all__ = ["FIGURES", "Drawing", "Recipe", "Scene", "reproduce", "save"]

@@ -1,0 +1,71 @@
+"""What a recipe returns: pictures, numbers and meshes, and how they become files."""
+
+import json
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import trimesh
+from matplotlib.figure import Figure
+
+from orthocas.errors import InvalidValueError
+from orthocas.reproduce.style import DPI
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A figure of the paper, drawn again."""
+
+    figures: Mapping[str, Figure]  #: suffix of the file name -> picture, {"": ...} or {"a": ..., "b": ...}
+    numbers: Mapping[str, float]  #: what is printed, saved and tested; finite
+    meshes: Mapping[str, trimesh.Trimesh] = field(default_factory=dict)  #: suffix -> printable solid [mm]
+
+
+def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
+    """Write `<name><suffix>.png`, `<name>_<suffix>.stl` and `<name>.json`; each appears whole or not at all.
+
+    Args:
+        drawing: what to write.
+        name: how file names begin, for example "fig07".
+        out: a folder that exists.
+
+    Returns:
+        The files, numbers last.
+
+    Raises:
+        ValueError: if a number is not finite.
+        OSError: if a file cannot be written.
+    """
+    folder = Path(out)
+    text = json.dumps(dict(drawing.numbers), indent=1, allow_nan=False) + "\n"
+    writers: dict[str, Callable[[Path], object]] = {}
+    for suffix, figure in drawing.figures.items():
+        writers[f"{name}{suffix}.png"] = partial(figure.savefig, dpi=DPI)
+    for suffix, mesh in drawing.meshes.items():
+        writers[f"{name}_{suffix}.stl"] = mesh.export
+    writers[f"{name}.json"] = lambda draft: draft.write_text(text)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".reproduce-") as drafts:
+        for file, write in writers.items():
+            draft = Path(drafts) / file
+            write(draft)
+            os.replace(draft, folder / file)
+    return [folder / file for file in writers]
+
+
+def made_folder(name: str, out: str | Path) -> Path:
+    """The output folder, made if need be, after a check that files can be written there.
+
+    Raises:
+        InvalidValueError: if they cannot; `name` says which argument it was.
+    """
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InvalidValueError(name, str(folder), f"a folder that can be written ({error.strerror})") from None
+    return folder

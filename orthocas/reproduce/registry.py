@@ -1,0 +1,73 @@
+"""All figures that are drawn again, by name."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from orthocas.errors import UnknownNameError
+from orthocas.objective import Monitor, Progress, silent
+from orthocas.reproduce import fig06, fig07, fig08, fig11
+from orthocas.reproduce.drawing import Drawing, made_folder, save
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a figure is made."""
+
+    title: str
+    draw: Callable[[bool], Drawing]  #: takes `quick`: coarser, for tests
+
+
+FIGURES: dict[str, Recipe] = {
+    "fig06": Recipe("Leaves of the task x on the 2-torus", fig06.draw),
+    "fig07": Recipe("Leaves of the task x in the 3-torus", fig07.draw),
+    "fig08": Recipe("Self-motion curves of the task (x, y) in the 3-torus", fig08.draw),
+    "fig11": Recipe("Rows of the task Jacobian in Cartesian and polar coordinates", fig11.draw),
+}
+
+
+def chosen(name: str) -> list[str]:
+    """Names of figures that a word means: "all", or one of "fig07", "fig7", "07" and "7".
+
+    Raises:
+        UnknownNameError: if there is no such figure.
+    """
+    if name == "all":
+        return list(FIGURES)
+    number = re.fullmatch(r"(?:fig)?0*(\d{1,4})", name)
+    figure = f"fig{int(number[1]):02d}" if number else name
+    if figure not in FIGURES:
+        raise UnknownNameError("figure", name, [*FIGURES, "all"])
+    return [figure]
+
+
+def reproduce(
+    name: str, out: str | Path, quick: bool = False, monitor: Monitor = silent
+) -> dict[str, dict[str, float]]:
+    """Draw figures of [AS2023] again and save pictures, numbers and meshes.
+
+    Ctrl-C leaves the files of the figures that are finished.
+
+    Args:
+        name: a figure, or "all".
+        out: folder for the files, made if need be.
+        quick: coarser and faster, for tests.
+        monitor: called before each figure and at the end.
+
+    Returns:
+        The numbers of each figure.
+
+    Raises:
+        UnknownNameError: if there is no such figure.
+        InvalidValueError: if the folder cannot be written.
+    """
+    names, folder = chosen(name), made_folder("out", out)
+    numbers = {}
+    for done, figure in enumerate(names):
+        monitor(Progress("reproducing", done / len(names), f"{figure}: {FIGURES[figure].title}"))
+        drawing = FIGURES[figure].draw(quick)
+        save(drawing, figure, folder)
+        numbers[figure] = dict(drawing.numbers)
+    monitor(Progress("reproducing", 1.0, f"{len(names)} figures"))
+    return numbers

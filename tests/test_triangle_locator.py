@@ -1,0 +1,196 @@
+"""Closest points on triangle meshes: against all triangles, against libigl, in closed form."""
+
+from types import ModuleType
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.testing import assert_allclose
+from test_level_surface import arm_leaf, sphere
+
+from orthocas.checks import Array
+from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.growing import triangle_locator
+from orthocas.growing.harmonic import harmonic_disk
+from orthocas.growing.level_surface import TriangleMesh
+from orthocas.growing.triangle_locator import Located, TriangleLocator, closest_on_triangles
+
+ROUNDING = 1e-13  # of distances between points of size 1 to 10
+
+
+@pytest.fixture
+def igl() -> ModuleType:
+    return pytest.importorskip("igl")
+
+
+@pytest.fixture(scope="module")
+def leaf() -> TriangleMesh:
+    return arm_leaf(0.0, 30)
+
+
+def on_mesh(mesh: TriangleMesh, count: int) -> Array:
+    rng = np.random.default_rng(7)
+    corners = mesh.vertices[mesh.faces[rng.integers(len(mesh.faces), size=count)]]
+    return np.einsum("nc,ncd->nd", rng.dirichlet([1, 1, 1], count), corners)
+
+
+def checked(vertices: Array, faces: Array, points: Array) -> Located:
+    """Locate, and check that faces, barycentric coordinates and distances belong together."""
+    found = TriangleLocator(vertices, faces).locate(points)
+    assert found.face.shape == found.distance.shape == (len(points),)
+    assert found.barycentric.min(initial=0.0) >= 0
+    assert_allclose(found.barycentric.sum(axis=1), 1.0, rtol=0, atol=1e-15)
+    feet = np.einsum("nc,ncd->nd", found.barycentric, vertices[faces[found.face]])
+    assert_allclose(
+        np.linalg.norm(feet - points, axis=1),
+        found.distance,
+        rtol=0,
+        atol=1e-15 + 1e-15 * np.abs(points).max(initial=0.0),
+    )
+    return found
+
+
+def over_all(vertices: Array, faces: Array, points: Array) -> Array:
+    """Distances with every triangle tried."""
+    pairs = np.repeat(points, len(faces), axis=0), np.tile(vertices[faces], (len(points), 1, 1))
+    return closest_on_triangles(*pairs)[1].reshape(len(points), len(faces)).min(axis=1, initial=np.inf)
+
+
+def queries(mesh: TriangleMesh) -> dict[str, Array]:
+    rng = np.random.default_rng(8)
+    base = on_mesh(mesh, 400)
+    a, b = mesh.vertices[mesh.edges[:200]].transpose(1, 0, 2)
+    return {
+        "on": base,
+        "near": base + rng.normal(size=base.shape) * 0.02,
+        "off": base + rng.normal(size=base.shape) * 0.5,
+        "far": rng.normal(size=(60, 3)) * 100,
+        "vertex": mesh.vertices[:200],
+        "edge": a + rng.uniform(size=(200, 1)) * (b - a),
+    }
+
+
+@pytest.mark.parametrize("kind", ["on", "near", "off", "far", "vertex", "edge"])
+def test_distances_equal_those_of_libigl(igl: ModuleType, leaf: TriangleMesh, kind: str) -> None:
+    points = queries(leaf)[kind]
+    found = checked(leaf.vertices, leaf.faces, points)
+    squares, _, closest = igl.point_mesh_squared_distance(points, leaf.vertices, leaf.faces)
+    assert_allclose(found.distance, np.sqrt(squares), rtol=1e-13, atol=ROUNDING)
+    if kind == "near":  # far points may have two closest points
+        feet = np.einsum("nc,ncd->nd", found.barycentric, leaf.vertices[leaf.faces[found.face]])
+        assert_allclose(feet, closest, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["near", "off", "far", "vertex", "edge"])
+def test_no_other_triangle_is_closer(leaf: TriangleMesh, kind: str) -> None:
+    points = queries(leaf)[kind][:60]
+    found = checked(leaf.vertices, leaf.faces, points)
+    assert_allclose(found.distance, over_all(leaf.vertices, leaf.faces, points), rtol=1e-14, atol=1e-15)
+
+
+def test_points_of_the_disk_lie_in_their_triangles(leaf: TriangleMesh) -> None:
+    disk = harmonic_disk(leaf)
+    rng = np.random.default_rng(7)
+    weights, face = rng.dirichlet([1, 1, 1], 2000), rng.integers(len(leaf.faces), size=2000)
+    found = checked(disk, leaf.faces, np.einsum("nc,ncd->nd", weights, disk[leaf.faces[face]]))
+    assert np.array_equal(found.face, face)
+    assert_allclose(found.barycentric, weights, rtol=0, atol=1e-9)
+    assert found.distance.max() < ROUNDING
+
+
+def test_distance_to_a_disk_from_outside(leaf: TriangleMesh) -> None:
+    disk = harmonic_disk(leaf)
+    points = 3 * np.random.default_rng(7).normal(size=(200, 2))
+    found = checked(disk, leaf.faces, points)
+    assert_allclose(found.distance, np.maximum(np.linalg.norm(points, axis=1) - 1, 0), rtol=0, atol=2e-3)  # a polygon
+    assert_allclose(found.distance, over_all(disk, leaf.faces, points), rtol=1e-14, atol=1e-15)
+
+
+def test_centre_of_a_sphere_is_equally_far_from_everything() -> None:
+    ball = sphere(1.25, 20)
+    found = checked(ball.vertices, ball.faces, np.zeros((3, 3)))
+    assert_allclose(found.distance, over_all(ball.vertices, ball.faces, np.zeros((1, 3)))[0], rtol=1e-15)
+    assert 0.98 < found.distance[0] < 1
+
+
+def test_closest_points_of_one_triangle_in_every_region() -> None:
+    corners = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0]])
+    points = np.array([[0.5, 0.5], [-1, -1], [1, -3], [5, 0], [2, 2], [-2, 1], [0, 6]])
+    found = checked(corners, np.array([[0, 1, 2]]), points)
+    wanted = [[0.5, 0.25, 0.25], [1, 0, 0], [0.5, 0.5, 0], [0, 1, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [0, 0, 1]]
+    assert_allclose(found.barycentric, wanted, rtol=0, atol=1e-15)
+    assert_allclose(found.distance, [0, 2**0.5, 3, 3, 2**0.5, 2, 4], rtol=0, atol=1e-15)
+
+
+def test_wide_triangle_among_small_ones_is_not_missed() -> None:
+    rng = np.random.default_rng(7)
+    small = (rng.uniform(size=(500, 1, 3)) + 0.01 * rng.normal(size=(500, 3, 3))).reshape(-1, 3)
+    vertices = np.vstack([small, [[-100, -100, 0.5], [300, -100, 0.5], [-100, 300, 0.5]]])
+    faces = np.arange(len(vertices)).reshape(-1, 3)
+    points = rng.uniform(size=(100, 3))
+    found = checked(vertices, faces, points)
+    assert np.any(found.face == 500)
+    assert np.any(found.face != 500)
+    assert_allclose(found.distance, over_all(vertices, faces, points), rtol=1e-13, atol=ROUNDING)
+
+
+def test_triangles_without_area_are_segments_and_points() -> None:
+    vertices = np.array([[0.0, 0, 0], [2, 0, 0], [1, 0, 0], [9, 9, 9]])
+    faces = np.array([[0, 1, 2], [3, 3, 3]])
+    found = checked(vertices, faces, np.array([[1.5, 1, 0], [-3, 0, 4], [9, 9, 10]]))
+    assert_allclose(found.distance, [1, 5, 1], rtol=1e-15)
+    assert found.face.tolist() == [0, 0, 1]
+
+
+coordinate = st.floats(-1.0, 1.0, width=32)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    st.integers(2, 3).flatmap(
+        lambda d: st.tuples(
+            st.integers(1, 12).flatmap(lambda f: arrays(float, (3 * f, d), elements=coordinate)),
+            st.integers(1, 6).flatmap(lambda n: arrays(float, (n, d), elements=coordinate)),
+        )
+    ),
+    st.sampled_from([0.1, 1.0, 50.0]),
+)
+def test_any_triangles_and_points(mesh_and_points: tuple[Array, Array], spread: float) -> None:
+    vertices, points = mesh_and_points
+    faces = np.arange(len(vertices)).reshape(-1, 3)
+    found = checked(vertices, faces, spread * points)
+    assert_allclose(found.distance, over_all(vertices, faces, spread * points), rtol=1e-13, atol=1e-14)
+    # closest: no corner is nearer, and the way there makes no acute angle with the way on to any corner
+    corners = vertices[faces[found.face]]
+    feet = np.einsum("nc,ncd->nd", found.barycentric, corners)
+    ahead = np.einsum("ncd,nd->nc", corners - feet[:, None], spread * points - feet)
+    assert ahead.max() < 1e-6
+
+
+def test_result_does_not_depend_on_the_chunks(leaf: TriangleMesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = queries(leaf)["off"]
+    whole = checked(leaf.vertices, leaf.faces, points)
+    monkeypatch.setattr(triangle_locator, "_PAIRS", 50)
+    for one, other in zip(whole, checked(leaf.vertices, leaf.faces, points), strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_no_points_are_no_trouble(leaf: TriangleMesh) -> None:
+    assert checked(leaf.vertices, leaf.faces, np.zeros((0, 3))).barycentric.shape == (0, 3)
+
+
+def test_bad_input_is_named(leaf: TriangleMesh) -> None:
+    with pytest.raises(ShapeError, match=r"vertices has shape \(3, 4\)"):
+        TriangleLocator(np.zeros((3, 4)), [[0, 1, 2]])
+    with pytest.raises(ShapeError, match="faces has shape"):
+        TriangleLocator(np.eye(3), [[0, 1]])
+    with pytest.raises(InvalidValueError, match="faces is 0 triangles, expected at least one, of 3 vertices"):
+        TriangleLocator(np.eye(3), np.zeros((0, 3), dtype=int))
+    with pytest.raises(InvalidValueError, match="faces"):
+        TriangleLocator(np.eye(3), [[0, 1, 3]])
+    with pytest.raises(InvalidValueError, match="vertices"):
+        TriangleLocator(np.full((3, 3), np.nan), [[0, 1, 2]])
+    with pytest.raises(ShapeError, match="points has shape"):
+        TriangleLocator(leaf.vertices, leaf.faces).locate(np.zeros((5, 2)))
