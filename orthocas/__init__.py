@@ -8,9 +8,10 @@ if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
 from orthocas import problems, solvers
-from orthocas.api import compare, fit, load
+from orthocas.api import compare, distil, fit, load
 from orthocas.chart import Chart
 from orthocas.domains import Box, Torus, contains
+from orthocas.growing.grow import grow
 from orthocas.involutivity import Involutivity, involutivity
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial
 from orthocas.problem import Problem, check
@@ -38,8 +39,10 @@ __all__ = [
     "check",
     "compare",
     "contains",
+    "distil",
     "evaluate",
     "fit",
+    "grow",
     "involutivity",
     "lie_bracket",
     "load",

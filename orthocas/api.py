@@ -1,4 +1,4 @@
-"""The front door: fit, with a default parametrisation and solver, compare, and load."""
+"""The front door: fit and distil, with a default parametrisation and solver, compare, and load."""
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -12,9 +12,10 @@ from orthocas.comparison import Cell, CellResult, run_cells
 from orthocas.comparison_report import Comparison
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import Fit, fit_chart
+from orthocas.growing.distil import Distilled, distil_chart
 from orthocas.loss import DEFAULT_WEIGHTS, Weights
-from orthocas.objective import Monitor, Solver, silent
-from orthocas.parametrisations import SEW, Given, GradedParametrisation, Linear, Parametrisation, Polynomial
+from orthocas.objective import Monitor, Solver, Watch, silent
+from orthocas.parametrisations import MLP, SEW, Given, GradedParametrisation, Linear, Parametrisation, Polynomial
 from orthocas.problem import Problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt
 
@@ -76,6 +77,41 @@ def fit(
     return fit_chart(
         problem, parametrisation, solver, loss, samples, seed, monitor, max_mutual_deg, checkpoint, starter
     )
+
+
+def distil(
+    chart: Chart,
+    parametrisation: Parametrisation | None = None,
+    solver: Solver | None = None,
+    samples: int | None = None,
+    seed: int = 0,
+    monitor: Monitor = silent,
+) -> Distilled:
+    """Fit a closed expression to the values and gradients of a grown chart, for controllers and generated C.
+
+    Minimises the mean of |xi - xi_grown|^2 + w^2 |J_xi - J_grown|^2 over samples of the domain, with w the mean
+    half-width of the domain: bases linear in their parameters by least squares, networks by a minimiser.
+
+    Args:
+        chart: a grown chart.
+        parametrisation: default Polynomial(degree=6).
+        solver: for networks, default LBFGS.
+        samples: number of samples; default four for each parameter of a coordinate, 2000 to 20,000.
+        seed: of samples and random starts.
+        monitor: called with progress.
+
+    Returns:
+        The chart, and what was lost: errors of values and gradients, and quality before and after.
+
+    Raises:
+        InvalidValueError: if the chart is not grown, or the parametrisation is none to fit.
+        GrowError: if the grown chart has no values on its domain.
+    """
+    parametrisation = Polynomial(degree=6) if parametrisation is None else parametrisation
+    if not isinstance(parametrisation, GradedParametrisation | MLP):
+        raise InvalidValueError("parametrisation", repr(parametrisation), "Polynomial, Fourier or MLP")
+    solver = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
+    return distil_chart(chart, parametrisation, solver, samples, seed, Watch(monitor, f"distil {parametrisation.label}"))
 
 
 def compare(

@@ -157,10 +157,43 @@ def test_flips_keep_a_square_and_turn_its_bad_diagonal() -> None:
     assert np.array_equal(flip_to_delaunay(corners, rectangle), rectangle)
 
 
-def test_no_flip_makes_an_edge_twice() -> None:
-    flat = np.array([[0.0, 0, 0], [10, 0, 0], [5, 9, 0], [5, 0.2, 0]])  # vertex 3 has three edges: none can be flipped
-    faces = np.array([[0, 1, 3], [1, 2, 3], [2, 0, 3]])
-    assert np.array_equal(flip_to_delaunay(flat, faces), faces)
+KITE = np.array([[0.0, 0, 0], [4, 0, 0], [0, 0, 9], [4, 0, 9], [2, -1, 0], [2, 1, 0], [2, 0, 5]])
+
+
+def test_no_flip_makes_an_edge_that_exists() -> None:
+    taken = np.array([[0, 4, 1], [0, 1, 5], [5, 4, 6]])  # the edge 4 - 5 belongs to the third triangle
+    assert np.array_equal(flip_to_delaunay(KITE, taken), taken)
+
+
+def test_two_flips_do_not_make_the_same_edge() -> None:
+    above = KITE.copy()
+    above[[2, 3], 2] = 0.1
+    faces = np.array([[0, 4, 1], [0, 1, 5], [2, 4, 3], [2, 3, 5]])
+    flipped = TriangleMesh(above, flip_to_delaunay(above, faces))
+    assert flipped.clashing_edges == 0
+    assert sum({4, 5} <= set(face) for face in flipped.faces.tolist()) == 2
+
+
+def test_no_flip_turns_a_triangle_over() -> None:
+    bent = np.array([[-0.62, 1.23, -1.84], [1.64, -2.02, -0.04], [-1.08, 0.82, -0.77], [-1.13, -0.34, -0.41]])
+    folded = np.array([[0, 1, 2], [1, 0, 3]])  # opposite angles of more than half a turn, but both corners on one side
+    assert np.array_equal(flip_to_delaunay(bent, folded), folded)
+
+
+def test_vertices_that_cannot_slide_stay_on_the_surface() -> None:
+    def radius(q: Array) -> Array:
+        return np.linalg.norm(q, axis=1)
+
+    def steep(q: Array) -> Array:
+        return np.arctan(400 * (radius(q) - 1))
+
+    def slope(q: Array) -> Array:
+        r = radius(q)
+        return q * (400 / (1 + (400 * (r - 1)) ** 2) / r)[:, None]
+
+    mesh = level_surface(steep, slope, 0.0, [-1.25] * 3, [1.25] * 3, 6)
+    assert topology(mesh) == (1, 0, 2, 0)
+    assert_allclose(radius(mesh.vertices), 1.0, rtol=0, atol=ON_LEVEL)
 
 
 def test_bisection_takes_over_where_newton_runs_away() -> None:

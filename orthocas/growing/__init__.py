@@ -4,5 +4,6 @@ from orthocas.growing.flow import Arrival, Moved, TaskFlow
 from orthocas.growing.grown import GrownCoordinates
 from orthocas.growing.leaf import LeafChart
 from orthocas.growing.leaves import leaf_from_arrays
+from orthocas.growing.sundials import SundialsFlow
 
-__all__ = ["Arrival", "GrownCoordinates", "LeafChart", "Moved", "TaskFlow", "leaf_from_arrays"]
+__all__ = ["Arrival", "GrownCoordinates", "LeafChart", "Moved", "SundialsFlow", "TaskFlow", "leaf_from_arrays"]

@@ -13,12 +13,13 @@ from orthocas.checks import Array, frozen_array
 from orthocas.errors import GrowError
 from orthocas.growing.leaf import LeafValues
 from orthocas.interrupts import deferred
-from orthocas.problem import Problem
+from orthocas.problem import Problem, task_jacobians
 
 SAMPLES = 2000  #: of the curve; the spline through them is good to about 1e-12
 _ON_CURVE = 1e-5  # distance [rad] beyond which a point belongs to another piece of the leaf
 _PIECE, _STEPS = 1.0, 100  # arc length and outputs of one call of the integrator
 _LONGEST = 200.0  # [rad]
+_SINGULAR = 0.01  # smallest singular value of J_x on the curve, relative to the largest
 _CLOSINGS = 3  # corrections of the length
 _PROJECTIONS = 4  # Gauss-Newton steps from the nearest sample to the nearest point of the curve
 
@@ -134,7 +135,15 @@ def _closed(problem: Problem, level: Array, start: Array, length: float, samples
         curve = trace(start, length)
         last = curve[-1] - curve[-2]
         length -= float(last @ _turned(problem, curve[-1] - start)) / float(np.linalg.norm(last))
-    return CircleLeaf(problem, level, trace(start, length), np.array([length]))
+    curve = trace(start, length)
+    sizes = np.linalg.svd(task_jacobians(problem, curve), compute_uv=False)
+    if sizes[:, -1].min() < _SINGULAR * sizes[:, 0].max():  # the integrator may step across a singular point
+        raise _singular(level)
+    return CircleLeaf(problem, level, curve, np.array([length]))
+
+
+def _singular(level: Array) -> GrowError:
+    return GrowError(f"the base leaf h(q) = {level.tolist()} runs into a singularity of the task")
 
 
 def _turned(problem: Problem, differences: Array) -> Array:
@@ -165,7 +174,7 @@ def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, floa
         except RuntimeError:
             points = np.full((steps, problem.n), np.nan)
         if not np.isfinite(points).all():
-            raise GrowError(f"the base leaf h(q) = {level.tolist()} runs into a singularity of the task")
+            raise _singular(level)
         return np.vstack([start, points])
 
     return trace

@@ -90,12 +90,12 @@ class TaskFlow:
     def field(self) -> ca.Function:
         """Q (n, 1), dx (m, 1) -> J_x^#A dx (n, 1)."""
         q, dx = ca.SX.sym("q", self.problem.n), ca.SX.sym("dx", self.problem.m)
-        gradients = self._gradients(q)
+        gradients = self.gradients(q)
         J = self.problem.task.jacobian_function(q)
         return dense_function("field", [q, dx], [gradients @ _spd_solve(J @ gradients, dx)])
 
-    def _gradients(self, q: ca.SX) -> ca.SX:
-        """Gradients of the task in the metric, A^-1 J_x^T (n, m), [AS2023] eq. (16)."""
+    def gradients(self, q: ca.SX) -> ca.SX:
+        """Gradients of the task in the metric, A^-1 J_x^T (n, m), for a symbol q ([AS2023] eq. (16))."""
         J = self.problem.task.jacobian_function(q)
         return J.T if self.problem.metric.is_identity else _spd_solve(self.problem.metric.function(q), J.T)
 

@@ -8,7 +8,6 @@ from orthocas.checks import Array
 from orthocas.growing.triangle_mesh import Indices, edge_keys, half_edges
 
 _MOST_ROUNDS = 200  # of flips; a few dozen are enough, but on a curved surface nothing proves that they end
-_SHARE = 0.7  # of the way to the mean; the whole way would swap short and long edges of a boundary
 _FLAT = -1e-9  # cot + cot of the angles opposite an edge below this asks for a flip
 
 
@@ -54,21 +53,13 @@ def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
 
 
 def steps_to_neighbours(points: Array, faces: Indices) -> Array:
-    """Steps that even out a mesh, (V, 3): from every vertex most of the way to the mean of its neighbours.
-
-    Vertices of the boundary follow only their neighbours there, so that a boundary that is a curve stays it.
-    """
+    """Steps that even out a mesh, (V, 3): from every vertex to the mean of its neighbours."""
     size = len(points)
-    edges, count = np.unique(edge_keys(*half_edges(faces), size), return_counts=True)
-    ends, outer = np.stack(np.divmod(edges, size)), count == 1
-    on_boundary = np.zeros(size, dtype=bool)
-    on_boundary[ends[:, outer]] = True
-    row, column = np.concatenate([ends, ends[::-1]], axis=1)
-    used = np.tile(outer, 2) | ~on_boundary[row]
-    row, column = row[used], column[used]
+    edges = np.stack(np.divmod(np.unique(edge_keys(*half_edges(faces), size)), size))
+    row, column = np.concatenate([edges, edges[::-1]], axis=1)
     neighbours = coo_array((np.ones(len(row)), (row, column)), shape=(size, size)).tocsr()
     mean = (neighbours @ points) / np.maximum(np.bincount(row, minlength=size), 1)[:, None]
-    steps: Array = _SHARE * (mean - points)
+    steps: Array = mean - points
     return steps
 
 

@@ -1,0 +1,124 @@
+"""Where grown coordinates must break: singular points of a task, and what xi does there."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from scipy.spatial import cKDTree
+
+from orthocas.batch import Batched, dense_function
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.domains import contains, sample_evenly
+from orthocas.errors import GrowError
+from orthocas.growing.grown import GrownCoordinates
+from orthocas.metrics import metric_matrices
+from orthocas.problem import Problem, task_jacobians
+
+_NEWTON_STEPS = 40
+_FLAT = 1e-10  # |J_x| of a singular point
+_SAME = 1e-6  # distance of two that are one
+_STARTS = 500
+
+
+@dataclass(frozen=True, eq=False)
+class SingularPoint:
+    """A joint position where the gradient of a one-dimensional task vanishes."""
+
+    point: Array  #: (n,)
+    kind: str  #: maximum, minimum or saddle
+    task_value: float
+    curvatures: Array  #: eigenvalues of A^-1 d^2h/dq^2, rising, (n,)
+    directions: Array  #: their eigenvectors as columns, A-orthonormal, (n, n)
+
+
+@dataclass(frozen=True)
+class Jump:
+    """What a grown coordinate on a circle does at a singular point."""
+
+    singular_point: SingularPoint
+    values: tuple[float, float]  #: limits of xi on the two sides of a saddle, or smallest and largest at an extremum
+    size: float  #: between them, along the circle [rad]; at an extremum all values meet, and this is the full turn
+
+
+def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...]:
+    """Isolated singular points of a task with m = 1 in the domain, by Newton's method on grad h = 0 from 500 starts.
+
+    Angles are given within half a turn of the domain's centre; points that differ by whole turns count once.
+
+    Args:
+        problem: with m = 1.
+        seed: of the starts.
+
+    Raises:
+        GrowError: if m > 1.
+    """
+    if problem.m != 1:
+        raise GrowError(f"singular points are found for m = 1 tasks, got m = {problem.m}")
+    hessian = _hessian(problem)
+    q = sample_evenly(problem.domain, _STARTS, seed)
+    for _ in range(_NEWTON_STEPS):
+        J = task_jacobians(problem, q)
+        step = np.linalg.pinv(hessian(q)[0].reshape(-1, problem.n, problem.n)) @ J.transpose(0, 2, 1)
+        q = q - step[:, :, 0]
+    turning = ~np.array(problem.robot.tree.prismatic)
+    away = q - problem.domain.centre
+    q = q - 2 * np.pi * np.floor(away / (2 * np.pi) + 0.5 - _SAME) * turning  # half a turn counts as +pi
+    flat = np.abs(task_jacobians(problem, q)).max(axis=(1, 2)) < _FLAT
+    found = _distinct(q[flat & contains(problem.domain, q)])
+    return tuple(_classified(problem, point, hessian) for point in found)
+
+
+def jumps(chart: Chart, radius: float = 0.02) -> tuple[Jump, ...]:
+    """Discontinuities of a grown coordinate with r = 1 on a circle, at the singular points of its task.
+
+    Flow lines that pass a saddle on its two sides reach the leaf at different points: beyond the saddle xi jumps across
+    the line that flows into it. At an extremum all flow lines, and so all values of a circle around it, meet.
+
+    Args:
+        chart: n = 2, m = 1, grown from a circle.
+        radius: distance from a saddle where the two sides are taken [rad].
+
+    Raises:
+        GrowError: if the chart is not grown from a circle for n = 2.
+    """
+    grown = chart.coordinates
+    if not isinstance(grown, GrownCoordinates) or grown.leaf.kind != "circle" or chart.n != 2:
+        raise GrowError("jumps are found for charts with n = 2 that are grown from a circle")
+    return tuple(_jump(chart, singular, grown.leaf.level[0], radius) for singular in singular_points(chart.problem))
+
+
+def _jump(chart: Chart, singular: SingularPoint, level: float, radius: float) -> Jump:
+    if singular.kind != "saddle":
+        around = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+        ring = singular.point + radius * np.stack([np.cos(around), np.sin(around)], axis=1) @ singular.directions.T
+        xi = chart.xi(ring)
+        return Jump(singular, (float(np.nanmin(xi)), float(np.nanmax(xi))), 2 * np.pi)
+    leaving = singular.directions[:, -1 if level > singular.task_value else 0]  # the flow to the leaf moves away along it
+    sides = chart.xi(singular.point + radius * np.stack([leaving, -leaving]))[:, 0]
+    apart = abs(sides[1] - sides[0])
+    return Jump(singular, (float(sides[0]), float(sides[1])), float(min(apart, 2 * np.pi - apart)))
+
+
+def _hessian(problem: Problem) -> Batched:
+    q = ca.SX.sym("q", problem.n)
+    return Batched(dense_function("hessian", [q], [ca.hessian(problem.task.function(q), q)[0]]))
+
+
+def _classified(problem: Problem, point: Array, hessian: Batched) -> SingularPoint:
+    H = hessian(point[None])[0].reshape(problem.n, problem.n)
+    factor = np.linalg.inv(np.linalg.cholesky(metric_matrices(problem.metric, point[None])[0]))
+    curvatures, vectors = np.linalg.eigh(factor @ H @ factor.T)
+    kind = "minimum" if curvatures[0] > 0 else "maximum" if curvatures[-1] < 0 else "saddle"
+    value = float(problem.task.batched(point[None])[0][0, 0])
+    return SingularPoint(point, kind, value, curvatures, factor.T @ vectors)
+
+
+def _distinct(points: Array) -> Array:
+    """One of each group of equal points, sorted."""
+    kept: list[int] = []
+    if len(points):
+        groups = cKDTree(points).query_ball_point(points, _SAME)
+        kept = sorted({min(group) for group in groups})
+    chosen = points[kept]
+    return np.asarray(chosen[np.lexsort(np.round(chosen, 4).T[::-1])])

@@ -1,0 +1,73 @@
+"""Meshes that show what lies on them: their own triangles, or isolines of several functions."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.colors import to_rgb
+
+from orthocas.checks import Array
+from orthocas.reproduce.painting import Isolines, Numbers, paint
+from orthocas.reproduce.scene import Scene
+
+_SAME = 9  # decimals of corners that are one [rad]
+
+
+def add_with_lines(
+    scene: Scene, vertices: Array, faces: Numbers, colour: str, families: Sequence[Isolines], alpha: float = 1.0
+) -> None:
+    """Add a triangle mesh with several families of isolines; later families cross over earlier ones.
+
+    Args:
+        scene: where to add it.
+        vertices: (V, 3).
+        faces: (F, 3).
+        colour: of the mesh.
+        families: values at its vertices, levels and looks.
+        alpha: opacity, of lines too.
+    """
+    corners, colours = vertices[faces], np.tile((*to_rgb(colour), 1.0), (len(faces), 1))
+    values = [lines.values[faces] for lines in families]
+    for k, lines in enumerate(families):
+        own = Isolines(values[k].ravel(), lines.levels, lines.colours, lines.width)
+        pieces, colours, source = paint(corners, np.arange(3 * len(corners)).reshape(-1, 3), own, colours)
+        shares = _shares(corners[source], pieces)
+        values = [np.einsum("fij,fj->fi", shares, value[source]) for value in values]
+        corners = pieces
+    _, first, number = np.unique(
+        np.round(corners.reshape(-1, 3), _SAME), axis=0, return_index=True, return_inverse=True
+    )
+    scene.add_surface(corners.reshape(-1, 3)[first], number.reshape(-1, 3), colours, alpha)
+
+
+def add_with_edges(scene: Scene, vertices: Array, faces: Numbers, colours: Array, edge: Array, width: float) -> None:
+    """Add a triangle mesh with its edges drawn as borders within the triangles, which stay flat.
+
+    Args:
+        scene: where to add it.
+        vertices: (V, 3).
+        faces: (F, 3).
+        colours: of the triangles, RGB (F, 3).
+        edge: colour of edges, RGB (3,).
+        width: of an edge, the borders of both its triangles together.
+    """
+    corners = vertices[faces]
+    opposite = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)  # (F, 3)
+    around = opposite.sum(axis=1)
+    centre = np.einsum("fk,fki->fi", opposite, corners) / around[:, None]  # of the inscribed circle
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    shrunk = np.clip(1 - width / 2 * around / (2 * area), 0, 1)[:, None, None]
+    inner = centre[:, None] + shrunk * (corners - centre[:, None])
+    here, after = np.arange(3), (np.arange(3) + 1) % 3
+    outside = [corners[:, here], corners[:, after], inner[:, after]], [corners[:, here], inner[:, after], inner[:, here]]
+    borders = [np.stack(three, axis=2).reshape(-1, 3, 3) for three in outside]
+    triangles = np.concatenate([inner, *borders])
+    looks = np.concatenate([colours, np.tile(edge, (6 * len(faces), 1))])
+    scene.add_surface(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), looks)
+
+
+def _shares(corners: Array, points: Array) -> Array:
+    """Barycentric coordinates of three points in each triangle (F, 3, 3), (F, 3, 3)."""
+    edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=1)  # (F, 2, 3)
+    two = (points - corners[:, :1]) @ np.linalg.pinv(edges)
+    shares: Array = np.concatenate([1 - two.sum(axis=2, keepdims=True), two], axis=2)
+    return shares

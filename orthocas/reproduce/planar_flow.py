@@ -1,0 +1,129 @@
+"""Flow lines of the planar arm with two joints, and what the figures of this arm share.
+
+With links of 1 m the task x = cos q1 + cos(q1 + q2) has its maximum 2 m at (0, 0), its minimum -2 m at (pi, 0), and two
+saddles of height 0 at (0, pi) and (pi, pi).
+"""
+
+from typing import Any
+
+import numpy as np
+
+from orthocas import problems
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.domains import Torus
+from orthocas.growing.flow import TaskFlow
+from orthocas.growing.grow import grow
+from orthocas.growing.singularities import SingularPoint
+from orthocas.problem import Problem
+from orthocas.reproduce.self_motion import pieces_in_cube, wrapped
+from orthocas.reproduce.style import INK
+from orthocas.samples import samples_at
+
+NAMES = {"euclidean": "A = I", "inertia": "A = M"}
+LEVEL = 1.0  #: task value of the base leaf S0 [m]
+EXTREME = 2.0 - 1e-8  #: task value [m] where flow lines end: 1e-4 rad from the maximum or the minimum
+_ORIGIN = (np.pi / 3, 0.0)  # on S0, so that both metrics have the same chart of it
+_MARKS = {"maximum": "^", "minimum": "v", "saddle": "X"}
+
+
+def planar_problem(metric: str) -> Problem:
+    """The arm of `orthocas.problems.planar_2r` on the whole torus, with A = I or A = M."""
+    plain = problems.get("planar_2r")
+    return Problem(plain.robot, plain.task, metric, Torus(2), f"planar_2r_{metric}")
+
+
+def grown_chart(problem: Problem) -> Chart:
+    """Coordinates grown from S0, charted by arc length from (pi/3, 0)."""
+    return grow(problem, LEVEL, origin=_ORIGIN)
+
+
+def flow_lines(problem: Problem, starts: Array, goals: Array, steps: int) -> list[Array]:
+    """Curves of +-grad_A h from points to given task values.
+
+    Task values of their points are close together near 2, 0 and -2 m, where the curves are fast.
+
+    Args:
+        problem: made by `planar_problem`.
+        starts: (N, 2).
+        goals: task values at the ends, (N,), within +-2 m.
+        steps: number of steps of each.
+
+    Returns:
+        One curve per start, (steps + 1, 2) without wrapping, or shorter if it runs into a singular point.
+    """
+    flow, first, last = TaskFlow(problem), _stage(problem.task.batched(starts)[0][:, 0]), _stage(goals)
+    curves, running = [[q] for q in starts], np.arange(len(starts))
+    for k in range(1, steps + 1):
+        here = np.array([curves[i][-1] for i in running]).reshape(-1, 2)
+        wanted = _height(first + (last - first) * k / steps)[running]
+        moved = flow.pull(here, wanted[:, None])
+        running = running[moved.reached]
+        for i, q in zip(running, moved.points[moved.reached], strict=True):
+            curves[i].append(q)
+    return [np.array(curve) for curve in curves]
+
+
+def _stage(height: Array) -> Array:
+    """0 at -2 m, 1 at 0, 2 at 2 m, such that equal stages are short in height near these values."""
+    upper = (height > 0).astype(float)
+    stage: Array = upper + np.arccos(np.clip(2 * upper - 1 - height, -1, 1)) / np.pi
+    return stage
+
+
+def _height(stage: Array) -> Array:
+    """The inverse of `_stage` [m]."""
+    upper = (stage > 1).astype(float)
+    height: Array = 2 * upper - 1 - np.cos(np.pi * (stage - upper))
+    return height
+
+
+def task_grid(problem: Problem, cells: int, half: float = np.pi) -> tuple[Array, Array, Array]:
+    """Edges of a square grid (cells + 1,), its points ((cells + 1)^2, 2), and h there (cells + 1, cells + 1)."""
+    q = np.linspace(-half, half, cells + 1)
+    points = np.stack(np.meshgrid(q, q), axis=-1).reshape(-1, 2)
+    return q, points, problem.task.batched(points)[0].reshape(cells + 1, cells + 1)
+
+
+def cell_centres(cells: int) -> Array:
+    """Centres of the cells of a grid over the torus, row by row with q1 running first, (cells^2, 2)."""
+    q = (np.arange(cells) + 0.5) * 2 * np.pi / cells - np.pi
+    return np.stack(np.meshgrid(q, q), axis=-1).reshape(-1, 2)
+
+
+def deviations(problem: Problem, points: Array, J_xi: Array) -> Array:
+    """Angle between grad_A h and dxi ([AS2023] eq. (24)) as deviation from 90 degrees [deg], (N,).
+
+    Args:
+        problem: with n = 2 and m = 1.
+        points: (N, 2), none of them singular.
+        J_xi: gradients of xi, (N, 2).
+    """
+    gradients = samples_at(problem, points).unit_task_gradients[:, 0]
+    cosines = (gradients * J_xi).sum(axis=1) / np.linalg.norm(J_xi, axis=1)
+    return np.degrees(np.arcsin(np.clip(np.abs(cosines), 0, 1)))
+
+
+def plot_wrapped(axes: Any, curves: list[Array], **style: Any) -> None:
+    """Draw curves (P, 2) in the square |q_i| <= pi, cut at its edges; only the first piece carries the label."""
+    pieces = [piece for curve in curves for piece in pieces_in_cube(curve)]
+    for k, piece in enumerate(pieces):
+        axes.plot(*piece.T, **(style if k == 0 else style | {"label": None}))
+
+
+def mark_singular(axes: Any, points: tuple[SingularPoint, ...], labels: bool = True, size: float = 7.0) -> None:
+    """Mark maxima, minima and saddles, at the edges of the square too."""
+    shifts = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]) * 2 * np.pi
+    for kind, mark in _MARKS.items():
+        copies = np.concatenate([p.point + shifts for p in points if p.kind == kind])
+        shown = copies[np.abs(copies).max(axis=1) < np.pi + 1e-6]
+        style = {"color": "white", "markeredgecolor": INK, "markersize": size, "markeredgewidth": 0.9}
+        label = f"{kind} of $h$" if labels else None
+        axes.plot(*shown.T, mark, **style, clip_on=False, zorder=6, label=label)
+
+
+def distance_to(points: Array, singular: tuple[SingularPoint, ...]) -> Array:
+    """Distance of points (N, 2) from the nearest singular point on the torus [rad], (N,)."""
+    apart = np.stack([np.linalg.norm(wrapped(points - s.point), axis=1) for s in singular])
+    nearest: Array = apart.min(axis=0)
+    return nearest

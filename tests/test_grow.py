@@ -1,0 +1,208 @@
+"""Grown charts: exact coordinates with the interface of fitted ones."""
+
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas import problems
+from orthocas.errors import (
+    ChartFileError,
+    GrowError,
+    InverseError,
+    NoExpressionError,
+    NotADiskError,
+    NotInvolutiveError,
+    ShapeError,
+    UnknownNameError,
+)
+from orthocas.growing import Arrival, GrownCoordinates, TaskFlow
+from orthocas.metrics import metric_matrices
+
+ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+CELL = oc.Box([np.pi / 2, 0, 0], [np.pi / 2, np.pi, np.pi])
+ON_LEAF = [np.pi / 3, 0.0]  # x = 1 of planar_2r
+
+
+def planar_2r(metric: str) -> oc.Problem:
+    known = problems.get("planar_2r")
+    return oc.Problem(known.robot, known.task, metric, known.domain)
+
+
+def planar_3r(metric: str) -> oc.Problem:
+    return oc.Problem(ARM, oc.Task.position(ARM, "x"), metric, CELL)
+
+
+def iiwa_height() -> oc.Problem:
+    arm = problems.get("iiwa")
+    return oc.Problem(arm.robot, oc.Task.position(arm.robot, "z"), "euclidean", oc.Box(arm.domain.centre, 0.3))
+
+
+CHARTS = {
+    "circle_I": lambda: oc.grow(planar_2r("euclidean"), 1.0, origin=ON_LEAF),
+    "circle_M": lambda: oc.grow(planar_2r("inertia"), 1.0, origin=ON_LEAF),
+    "disk_I": lambda: oc.grow(planar_3r("euclidean"), 0.0, cells=40),
+    "disk_M": lambda: oc.grow(planar_3r("inertia"), 0.0, cells=40),
+    "linear": lambda: oc.grow(iiwa_height()),
+}
+
+
+@pytest.fixture(scope="module", params=CHARTS)
+def chart(request: pytest.FixtureRequest) -> oc.Chart:
+    return CHARTS[request.param]()
+
+
+def known_points(chart: oc.Chart, count: int = 100, seed: int = 7) -> np.ndarray:
+    """Random points of the domain where the chart has values and is not nearly singular."""
+    unit = np.random.default_rng(seed).uniform(-1, 1, (4 * count, chart.n))
+    points = chart.problem.domain.centre + chart.problem.domain.half_width * unit
+    gradients = np.linalg.norm(chart.jacobian(points)[:, chart.m :], axis=2).min(axis=1)
+    return points[gradients > 1e-3][:count]  # NaN counts as false
+
+
+def test_coordinates_do_not_change_along_flow_lines(chart: oc.Chart) -> None:
+    points = known_points(chart)
+    for dx in (0.02, -0.02):
+        moved = TaskFlow(chart.problem).move(points, np.full((len(points), 1), dx), 1e-12)
+        values = chart.xi(moved.points)
+        kept = moved.reached & np.isfinite(values).all(axis=1)
+        assert kept.mean() > 0.9
+        change = np.abs(values - chart.xi(points))[kept]
+        change = np.minimum(change, 2 * np.pi - change) if chart.coordinates.label == "grown:circle" else change
+        size = 1 + np.abs(chart.jacobian(points)[kept]).max(axis=(1, 2))
+        assert (change.max(axis=1) / size).max() < 1e-6
+
+
+def test_gradients_are_orthogonal_to_the_task(chart: oc.Chart) -> None:
+    points = known_points(chart)
+    J, A = chart.jacobian(points), metric_matrices(chart.problem.metric, points)
+    raised = np.linalg.solve(A, J[:, : chart.m].transpose(0, 2, 1))
+    assert np.abs(J[:, chart.m :] @ raised).max() < 1e-6
+    assert oc.evaluate(chart, 300).task_angle.max < 1e-4
+
+
+def test_jacobian_agrees_with_differences_of_values(chart: oc.Chart) -> None:
+    """An independent look at orthogonality too: differences know nothing of sensitivities."""
+    points, step = known_points(chart, 40), 1e-6
+    J = chart.jacobian(points)[:, chart.m :]
+    differences = np.stack(
+        [(chart.xi(points + step * unit) - chart.xi(points - step * unit)) / (2 * step) for unit in np.eye(chart.n)], 2
+    )
+    error = np.abs(J - differences).max(axis=(1, 2)) / (1 + np.abs(J).max(axis=(1, 2)))
+    # on a mesh the nearest triangle may change within a step: a few points may miss, the others agree
+    assert np.mean(error < 1e-3) > (0.8 if chart.coordinates.label == "grown:disk" else 0.97)
+    assert np.median(error) < 1e-5
+
+
+def test_inverse_leads_back(chart: oc.Chart) -> None:
+    points = known_points(chart, 20)
+    wanted = chart.phi(points)
+    found = chart.coordinates.inverse(wanted, points)
+    error = np.abs(chart.phi(found) - wanted).max(axis=1)
+    assert np.median(error) < 1e-8
+    good = error < 1e-9
+    assert good.sum() >= 10
+    np.testing.assert_allclose(chart.task(chart.inverse(wanted[good], points[good])), wanted[good, : chart.m], atol=1e-9)
+
+
+def test_files_hold_everything(chart: oc.Chart, tmp_path: Path) -> None:
+    chart.save(tmp_path / "grown.orthocas")
+    again = oc.load(tmp_path / "grown.orthocas")
+    points = known_points(chart, 20)
+    np.testing.assert_array_equal(again.phi(points), chart.phi(points))
+    np.testing.assert_array_equal(again.jacobian(points), chart.jacobian(points))
+    assert again.coordinates.label == chart.coordinates.label
+
+
+def test_one_point_and_many_have_the_usual_shapes(chart: oc.Chart) -> None:
+    point = known_points(chart, 1)[0]
+    assert chart.xi(point).shape == (chart.r,)
+    assert chart.phi(point[None]).shape == (1, chart.n)
+    assert chart.jacobian(point).shape == (chart.n, chart.n)
+    with pytest.raises(ShapeError):
+        chart.xi(np.zeros(chart.n + 1))
+
+
+def test_there_is_no_expression_but_a_pointer(chart: oc.Chart) -> None:
+    with pytest.raises(NoExpressionError, match=r"orthocas\.distil"):
+        chart.function("phi")
+
+
+def test_both_metrics_agree_on_the_base_leaf() -> None:
+    charts = [oc.grow(planar_2r(metric), 1.0, origin=ON_LEAF) for metric in ("euclidean", "inertia")]
+    leaves = [chart.coordinates.leaf for chart in charts]
+    np.testing.assert_allclose(leaves[0].curve, leaves[1].curve, atol=1e-7)
+    on_leaf = leaves[0].points(np.linspace(-3, 3, 50)[:, None])
+    np.testing.assert_allclose(charts[0].xi(on_leaf), charts[1].xi(on_leaf), atol=1e-6)
+
+
+def test_points_that_leave_the_chart_get_a_status() -> None:
+    chart = oc.grow(planar_3r("euclidean"), 0.0, cells=20)
+    points = CELL.centre + CELL.half_width * np.random.default_rng(0).uniform(-1, 1, (500, 3))
+    assert isinstance(chart.coordinates, GrownCoordinates)
+    pulled = chart.coordinates.pull(points)
+    outside = pulled.status == Arrival.OUTSIDE
+    assert 0 < outside.mean() < 0.5
+    np.testing.assert_array_equal(np.isnan(chart.xi(points)).any(axis=1), outside)
+    assert (np.abs(pulled.points[outside, 0] - np.pi / 2) > np.pi / 2).all()  # q1 has left (0, pi)
+    assert oc.evaluate(chart, 500, seed=0).singular_samples > 0
+
+
+def test_a_box_domain_gets_a_leaf_large_enough() -> None:
+    box = oc.Problem(ARM, oc.Task.position(ARM, "x"), "euclidean", problems.get("planar_3r_x").domain)
+    chart = oc.grow(box, cells=30)
+    report = oc.evaluate(chart, 500)
+    assert report.singular_samples <= 5
+    assert report.conditioning.p01 > 0.8
+
+
+def test_non_involutive_tasks_are_refused() -> None:
+    with pytest.raises(NotInvolutiveError, match="depend on the path"):
+        oc.grow(problems.get("planar_3r_xy"))
+
+
+def test_involutive_tasks_of_two_components_grow() -> None:
+    arm = oc.Robot.planar(lengths=[1.0] * 4, masses=[1.0] * 4)
+    task = oc.Task.custom(arm, "disjoint", lambda q: ca.vertcat(ca.sin(q[0] + q[1]), ca.sin(q[2]) + q[3] ** 2))
+    problem = oc.Problem(arm, task, "euclidean", oc.Box([0.3, 0.4, 0.2, 0.5], 0.2))
+    chart = oc.grow(problem)
+    points = known_points(chart)
+    J = chart.jacobian(points)
+    assert np.abs(J[:, 2:] @ J[:, :2].transpose(0, 2, 1)).max() < 1e-9
+    assert oc.evaluate(chart, 200).conditioning.min > 0.8
+
+
+def test_leaves_that_are_no_disk_say_what_they_are() -> None:
+    whole = oc.Problem(ARM, oc.Task.position(ARM, "x"), "euclidean", oc.Box([0, 0, 0], np.pi))
+    with pytest.raises(NotADiskError, match="2 boundary loops"):
+        oc.grow(whole, 0.0, cells=20)
+
+
+def test_bad_arguments_name_what_came() -> None:
+    problem = planar_2r("euclidean")
+    with pytest.raises(UnknownNameError, match="unknown leaf 'sphere'"):
+        oc.grow(problem, leaf="sphere")
+    with pytest.raises(GrowError, match="cannot be reached"):
+        oc.grow(problem, 2.5)
+    with pytest.raises(ShapeError, match="level"):
+        oc.grow(problem, [1.0, 2.0])
+    with pytest.raises(GrowError, match="n = 3 joints"):
+        oc.grow(problem, 1.0, leaf="disk")
+    with pytest.raises(GrowError, match="r = 1"):
+        oc.grow(planar_3r("euclidean"), 0.0, leaf="circle")
+    with pytest.raises(GrowError, match="singularity of the task"):
+        oc.grow(problem, 0.0)  # the leaf through the saddles is no circle
+    chart = oc.grow(problem, 1.0, origin=ON_LEAF)
+    with pytest.raises(InverseError, match="no q"):
+        chart.inverse([1.0, 4.0], [0.0, 0.0])  # beyond pi
+
+
+def test_damaged_files_of_grown_charts_are_refused(tmp_path: Path) -> None:
+    chart = oc.grow(planar_2r("euclidean"), 1.0, origin=ON_LEAF)
+    chart.save(tmp_path / "grown.orthocas")
+    content = (tmp_path / "grown.orthocas").read_bytes()
+    (tmp_path / "short.orthocas").write_bytes(content[: len(content) // 2])
+    with pytest.raises(ChartFileError):
+        oc.load(tmp_path / "short.orthocas")
