@@ -11,7 +11,7 @@ from orthocas import problems, solvers
 from orthocas.api import compare, distil, fit, load
 from orthocas.chart import Chart
 from orthocas.domains import Box, Torus, contains
-from orthocas.growing.grow import grow
+from orthocas.growing.grow import GrownChart, grow
 from orthocas.involutivity import Involutivity, involutivity
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial
 from orthocas.problem import Problem, check
@@ -28,6 +28,7 @@ __all__ = [
     "Chart",
     "Fourier",
     "Given",
+    "GrownChart",
     "Involutivity",
     "Linear",
     "Polynomial",

@@ -111,7 +111,9 @@ def distil(
     if not isinstance(parametrisation, GradedParametrisation | MLP):
         raise InvalidValueError("parametrisation", repr(parametrisation), "Polynomial, Fourier or MLP")
     solver = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
-    return distil_chart(chart, parametrisation, solver, samples, seed, Watch(monitor, f"distil {parametrisation.label}"))
+    return distil_chart(
+        chart, parametrisation, solver, samples, seed, Watch(monitor, f"distil {parametrisation.label}")
+    )
 
 
 def compare(

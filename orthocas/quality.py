@@ -108,7 +108,9 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
     parts = [_judge(chart, points[start : start + _CHUNK]) for start in range(0, samples, _CHUNK)]
     task, mutual, smallest, signs, kept = (np.concatenate([part[i] for part in parts]) for i in range(5))
     if len(kept) == 0:
-        raise SingularTaskError(f"a gradient vanishes, or a coordinate has no value, at all {samples} samples: nothing to evaluate")
+        raise SingularTaskError(
+            f"a gradient vanishes, or a coordinate has no value, at all {samples} samples: nothing to evaluate"
+        )
     worst = int(np.argmin(smallest))
     return Report(
         n=chart.n,

@@ -104,7 +104,9 @@ def test_inverse_leads_back(chart: oc.Chart) -> None:
     assert np.median(error) < 1e-8
     good = error < 1e-9
     assert good.sum() >= 10
-    np.testing.assert_allclose(chart.task(chart.inverse(wanted[good], points[good])), wanted[good, : chart.m], atol=1e-9)
+    np.testing.assert_allclose(
+        chart.task(chart.inverse(wanted[good], points[good])), wanted[good, : chart.m], atol=1e-9
+    )
 
 
 def test_files_hold_everything(chart: oc.Chart, tmp_path: Path) -> None:

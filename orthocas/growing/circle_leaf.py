@@ -6,12 +6,13 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from orthocas.checks import Array, frozen_array
 from orthocas.errors import GrowError
-from orthocas.growing.leaf import LeafValues
+from orthocas.growing.leaf import LeafValues, turning_joints, without_turns
 from orthocas.interrupts import deferred
 from orthocas.problem import Problem, task_jacobians
 
@@ -51,7 +52,7 @@ class CircleLeaf:
         nearest = self._tree.query(self._embedded(points))[1]
         L = self.length[0]
         samples = self.curve[nearest]
-        near = samples + _turned(self.problem, points - samples)
+        near = samples + without_turns(self.problem, points - samples)
         along = nearest * L / (len(self.curve) - 1)
         for _ in range(_PROJECTIONS):
             tangent = self._spline(along, 1) + self._drift / L
@@ -73,8 +74,8 @@ class CircleLeaf:
         return {"level": self.level, "curve": self.curve, "length": self.length}
 
     @cached_property
-    def _turning(self) -> Array:
-        return ~np.array(self.problem.robot.tree.prismatic, dtype=bool)
+    def _turning(self) -> NDArray[np.bool_]:
+        return turning_joints(self.problem)
 
     @cached_property
     def _drift(self) -> Array:
@@ -118,7 +119,7 @@ def circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAM
     q, travelled, step = start, 0.0, _PIECE / _STEPS
     while travelled < _LONGEST:
         piece = trace(q, _PIECE)
-        away = _turned(problem, piece[1:] - start)
+        away = without_turns(problem, piece[1:] - start)
         left = -(np.diff(piece, axis=0) * away).sum(axis=1) / step  # arc length to the start, along the curve
         back = np.flatnonzero((np.linalg.norm(away, axis=1) < 2 * step) & (left >= 0))
         if back.size:
@@ -134,7 +135,7 @@ def _closed(problem: Problem, level: Array, start: Array, length: float, samples
     for _ in range(_CLOSINGS):
         curve = trace(start, length)
         last = curve[-1] - curve[-2]
-        length -= float(last @ _turned(problem, curve[-1] - start)) / float(np.linalg.norm(last))
+        length -= float(last @ without_turns(problem, curve[-1] - start)) / float(np.linalg.norm(last))
     curve = trace(start, length)
     sizes = np.linalg.svd(task_jacobians(problem, curve), compute_uv=False)
     if sizes[:, -1].min() < _SINGULAR * sizes[:, 0].max():  # the integrator may step across a singular point
@@ -144,12 +145,6 @@ def _closed(problem: Problem, level: Array, start: Array, length: float, samples
 
 def _singular(level: Array) -> GrowError:
     return GrowError(f"the base leaf h(q) = {level.tolist()} runs into a singularity of the task")
-
-
-def _turned(problem: Problem, differences: Array) -> Array:
-    """Differences of joint positions without whole turns."""
-    turning = ~np.array(problem.robot.tree.prismatic, dtype=bool)
-    return np.asarray(differences - 2 * np.pi * np.round(differences / (2 * np.pi)) * turning)
 
 
 def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, float], Array]:

@@ -10,7 +10,7 @@ from orthocas.checks import Array, frozen_array
 from orthocas.domains import Box
 from orthocas.errors import GrowError
 from orthocas.growing.harmonic import harmonic_disk
-from orthocas.growing.leaf import LeafValues, covers, wrapped
+from orthocas.growing.leaf import LeafValues, covers, without_turns
 from orthocas.growing.level_surface import TriangleMesh, level_surface
 from orthocas.growing.triangle_locator import TriangleLocator
 from orthocas.problem import Problem
@@ -24,8 +24,8 @@ _ON_LEAF = 1e-12
 class DiskLeaf:
     """xi0(q): the harmonic map of a triangulated leaf onto the unit disk, linear on every triangle.
 
-    A point of the leaf belongs to the nearest point of the mesh. The map is continuous; its gradient jumps from triangle
-    to triangle by about the size of a cell.
+    A point of the leaf belongs to the nearest point of the mesh. From triangle to triangle the gradient jumps by about
+    the size of a cell, and the value by about its third power.
     """
 
     problem: Problem
@@ -62,8 +62,7 @@ class DiskLeaf:
 
     def values(self, points: Array) -> LeafValues:
         """Coordinates of points on the leaf, (N, 3)."""
-        turning = ~np.array(self.problem.robot.tree.prismatic, dtype=bool)
-        points = wrapped(points, self.region, turning)
+        points = self.region_centre + without_turns(self.problem, points - self.region_centre)
         found = self._in_space.locate(points)
         corners = self.disk[self.mesh.faces[found.face]]
         xi = np.einsum("sk,skr->sr", found.barycentric, corners)

@@ -65,11 +65,13 @@ def distil_chart(
     else:
         theta, offset = _minimised(family, targets, solver, seed, watch)
     coordinates = Coordinates(parametrisation, space, (), theta, offset, np.ones(chart.r))
-    return _judged(chart, Chart(chart.problem, coordinates, {"distilled from": chart.coordinates.label}), targets, count)
+    return _judged(
+        chart, Chart(chart.problem, coordinates, {"distilled from": chart.coordinates.label}), targets, count
+    )
 
 
 def _targets(chart: Chart, points: Array) -> _Targets:
-    """Grown values and gradients where there are any; they are centred, since a constant is free."""
+    """Grown values and gradients, where there are any."""
     xi, gradients = chart.coordinates.xi(points), chart.coordinates.jacobian(points)
     known = np.isfinite(xi).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
     if not known.any():
@@ -111,13 +113,11 @@ def _least_squares(family: LinearFamily, targets: _Targets) -> tuple[Array, Arra
         wanted = np.vstack([targets.xi[part], targets.gradients[part].transpose(0, 2, 1).reshape(-1, family.outputs)])
         normal += rows.T @ rows
         right += rows.T @ wanted
-    solution = np.linalg.lstsq(normal, right, rcond=1e-14)[0]
+    solution: Array = np.asarray(np.linalg.lstsq(normal, right, rcond=1e-14)[0], dtype=float)
     return solution[:-1].T.ravel(), -solution[-1]
 
 
-def _minimised(
-    family: Family, targets: _Targets, solver: Solver, seed: int, watch: Watch
-) -> tuple[Array, Array]:
+def _minimised(family: Family, targets: _Targets, solver: Solver, seed: int, watch: Watch) -> tuple[Array, Array]:
     """Parameters by a minimiser; the output bias of a network takes up the offset, so that stays 0."""
     result = solver.minimise(_Distance(family, targets), family.initial(seed), watch).raise_if_failed()
     return result.theta, np.zeros(family.outputs)

@@ -10,6 +10,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from orthocas.batch import Batched, dense_function
@@ -36,7 +37,7 @@ class BatchedFlow:
     field: ca.Function
     scale: Array
 
-    def end_points(self, starts: Array, parameters: Array, tolerance: float) -> tuple[Array, Array]:
+    def end_points(self, starts: Array, parameters: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
         """States at s = 1, (N, k), and which trajectories got there, (N,).
 
         The others stopped where their step size fell below 1e-9 or the field was not finite; their last state is

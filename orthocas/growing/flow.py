@@ -6,6 +6,7 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.batch import dense_function
 from orthocas.checks import Array
@@ -31,17 +32,17 @@ class Moved:
     """End points of trajectories."""
 
     points: Array  #: (N, n); where SINGULAR, the last point before
-    status: Array  #: `Arrival` of each, (N,), int
+    status: NDArray[np.int_]  #: `Arrival` of each, (N,), int
 
     @property
-    def reached(self) -> Array:
+    def reached(self) -> NDArray[np.bool_]:
         """Which trajectories arrived, (N,)."""
         return np.asarray(self.status == Arrival.REACHED)
 
 
 @dataclass(frozen=True, eq=False)
 class TaskFlow:
-    """The flow dq/ds = J_x^#A dx, s in [0, 1], of a problem: task values change by exactly dx, A-orthogonally to leaves.
+    """The flow dq/ds = J_x^#A dx, s in [0, 1]: task values change by exactly dx, A-orthogonally to the leaves.
 
     For m = 1 it is dq/ds = dx grad_A h / (dh(grad_A h)), the curve of [AS2023] eq. (23) with the task value as its
     parameter: it ends on the wanted leaf without a stopping rule (ours, docs/derivations.md#growing). For m >= 2 it
@@ -69,13 +70,14 @@ class TaskFlow:
         """As `pull`, with d q_hat / dq, (N, n, n), by forward sensitivities.
 
         The flow carries leaves to leaves, so r vectors v that start tangent to the leaf of q stay tangent to leaves;
-        dv/ds = (df/dq) v. They are kept as direction and logarithm of length: where flow lines converge, lengths fall by
-        many orders of magnitude and directions would drown in rounding. Along the flow q_hat does not change, so with an
-        A-orthonormal basis Z of ker J_x(q) the derivative is [v_1 ... v_r] Z^T A.
+        dv/ds = (df/dq) v. They are kept as direction and logarithm of length: where flow lines converge, lengths fall
+        by many orders of magnitude and directions would drown in rounding. Along the flow q_hat does not change, so
+        with an A-orthonormal basis Z of ker J_x(q) the derivative is [v_1 ... v_r] Z^T A.
         """
         n, r = self.problem.n, self.problem.r
         A = metric_matrices(self.problem.metric, points)
-        samples = Samples(points, task_jacobians(self.problem, points), np.linalg.inv(A))
+        inverse = np.asarray(np.linalg.inv(A), dtype=float)
+        samples = Samples(points, task_jacobians(self.problem, points), inverse)
         Z = samples.null_basis
         lengths = np.linalg.norm(Z, axis=1)
         directions = (Z / lengths[:, None, :]).transpose(0, 2, 1).reshape(-1, r * n)

@@ -1,5 +1,7 @@
 """Growing a chart: choose a base leaf, chart it, and carry its coordinates along the task gradients."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -11,15 +13,24 @@ from orthocas.growing.circle_leaf import circle_leaf
 from orthocas.growing.disk_leaf import CELLS, disk_leaf
 from orthocas.growing.flow import TaskFlow
 from orthocas.growing.grown import GrownCoordinates
-from orthocas.growing.leaf import LeafChart
+from orthocas.growing.leaf import LeafChart, turning_joints
 from orthocas.growing.leaves import LEAVES
 from orthocas.growing.linear_leaf import linear_leaf
 from orthocas.involutivity import involutivity
 from orthocas.problem import Problem
 
-
 _PROBES = 1000  # samples of the domain that are pulled to see where a leaf has to reach
 _MARGIN = 1.15  # of that region
+
+
+@dataclass(frozen=True, eq=False)
+class GrownChart(Chart):
+    """A chart with grown coordinates, apart from `function` with the interface of fitted ones.
+
+    `coordinates` tells more: its base `leaf`, and where points meet it (`pull`), with a status for each.
+    """
+
+    coordinates: GrownCoordinates
 
 
 def grow(
@@ -29,15 +40,15 @@ def grow(
     origin: ArrayLike | None = None,
     region: Box | None = None,
     cells: int = CELLS,
-) -> Chart:
+) -> GrownChart:
     """Exact coordinates, J_x A^-1 J_xi^T = 0, carried from a base leaf along the task gradients ([AS2023] Sec. 5).
 
     Args:
         problem: with m = 1, or with a task whose gradients are involutive in the metric.
         level: task value x0 of the base leaf, a number or (m,); default that of the origin.
         leaf: how the base leaf is charted. "linear": xi0 = N^T (q - origin), any n. "circle": by arc length, scaled to
-            (-pi, pi], for a closed leaf with r = 1. "disk": by a harmonic map of a triangle mesh onto the unit disk, for
-            n = 3, m = 1. Default: "circle" for r = 1 on a torus, "disk" for n = 3 and m = 1, otherwise "linear".
+            (-pi, pi], for a closed leaf with r = 1. "disk": by a harmonic map of a triangle mesh onto the unit disk,
+            for n = 3, m = 1. Default: "circle" for r = 1 on a torus, "disk" for n = 3 and m = 1, otherwise "linear".
         origin: joint position (n,) whose end on the leaf is the origin of "linear" and "circle"; default the centre of
             the domain, or, if the flow from there is singular, a point of the domain from where it is not.
         region: for "disk", the box whose part of the leaf is charted; default the domain if it spans whole turns,
@@ -45,8 +56,8 @@ def grow(
         cells: for "disk", number of mesh cells along the longest edge of the region.
 
     Returns:
-        A chart with the interface of fitted ones, apart from `function`. Values are NaN where a flow runs into a
-        singularity or ends outside the chart of the leaf: `chart.coordinates.pull(points).status` tells.
+        The chart. Values are NaN where a flow runs into a singularity or ends outside the chart of the leaf:
+        `chart.coordinates.pull(points).status` tells.
 
     Raises:
         NotInvolutiveError: if m >= 2 and the task gradients are not involutive, so that the result would depend on
@@ -59,7 +70,7 @@ def grow(
     cells = require_count("cells", cells, least=2)
     require_involutive(problem)
     x0 = _level(problem, level, origin)
-    chart = Chart(problem, GrownCoordinates(problem, _leaf_chart(problem, leaf, x0, origin, region, cells)))
+    chart = GrownChart(problem, GrownCoordinates(problem, _leaf_chart(problem, leaf, x0, origin, region, cells)))
     if not np.isfinite(chart.coordinates.xi(sample_evenly(problem.domain, 50, 0))).any():
         raise GrowError(f"no sample of the domain reaches the charted part of the leaf h(q) = {x0.tolist()}")
     return chart
@@ -122,7 +133,7 @@ def _start(problem: Problem, x0: Array, origin: ArrayLike | None) -> Array:
 def _region(problem: Problem, x0: Array) -> Box:
     """A box that holds the part of the leaf that the domain is pulled to."""
     domain = problem.domain
-    whole = (domain.half_width >= np.pi - 1e-9) & ~np.array(problem.robot.tree.prismatic)
+    whole = (domain.half_width >= np.pi - 1e-9) & turning_joints(problem)
     if whole.any():
         return Box(domain.centre, domain.half_width)
     pulled = TaskFlow(problem).pull(sample_evenly(domain, _PROBES, 0), x0)

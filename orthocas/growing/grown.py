@@ -5,11 +5,12 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.checks import Array
 from orthocas.errors import NoExpressionError
 from orthocas.growing.flow import TOLERANCE, Arrival, Moved, TaskFlow
-from orthocas.growing.leaf import LeafChart, LeafValues
+from orthocas.growing.leaf import LeafChart, LeafValues, without_turns
 from orthocas.problem import Problem
 
 _INVERSE_TOLERANCE = 1e-12  # the inverse follows the flow back
@@ -20,8 +21,8 @@ class GrownCoordinates:
     """xi(q) = xi0(q_hat): q_hat is where the flow along the task gradients meets the base leaf, xi0 the leaf's chart.
 
     J_xi = Dxi0(q_hat) dq_hat/dq, with the derivative of the flow from forward sensitivities: [AS2023] Sec. 6 names the
-    missing Jacobian as a drawback of growing. Values are NaN where the flow runs into a singularity or ends outside the chart
-    of the leaf; `pull` tells which.
+    missing Jacobian as a drawback of growing. Values are NaN where the flow runs into a singularity or ends outside the
+    chart of the leaf; `pull` tells which.
     """
 
     problem: Problem
@@ -75,8 +76,7 @@ class GrownCoordinates:
         solutions = np.full((len(phi), n), np.nan)
         moved = self.flow.move(on_leaf[found], phi[found, :m] - self.leaf.level, _INVERSE_TOLERANCE)
         solutions[found] = np.where(moved.reached[:, None], moved.points, np.nan)
-        turning = ~np.array(self.problem.robot.tree.prismatic, dtype=bool)
-        return np.asarray(solutions + 2 * np.pi * np.round((q_start - solutions) / (2 * np.pi)) * turning)
+        return q_start + without_turns(self.problem, solutions - q_start)
 
     @property
     def functions(self) -> dict[str, ca.Function]:
@@ -100,7 +100,7 @@ class GrownCoordinates:
         return self.leaf.values(np.where(moved.reached[:, None], moved.points, self.problem.domain.centre))
 
     @staticmethod
-    def _status(moved: Moved, values: LeafValues) -> Array:
+    def _status(moved: Moved, values: LeafValues) -> NDArray[np.int_]:
         return np.where(moved.reached & ~values.inside, Arrival.OUTSIDE, moved.status)
 
     def _where_known(self, moved: Moved, values: LeafValues, results: Array) -> Array:

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.checks import Array
 from orthocas.domains import Box
+from orthocas.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +18,7 @@ class LeafValues:
 
     xi: Array  #: (N, r)
     gradients: Array  #: d xi0 / dq along the leaf, (N, r, n)
-    inside: Array  #: which points the chart covers, (N,); the other rows mean nothing
+    inside: NDArray[np.bool_]  #: which points the chart covers, (N,); the other rows mean nothing
 
 
 class LeafChart(Protocol):
@@ -45,18 +47,16 @@ class LeafChart(Protocol):
         ...
 
 
-def wrapped(points: Array, region: Box, turning: Array) -> Array:
-    """The same joint positions with angles within half a turn of the region's centre.
-
-    Args:
-        points: (N, n).
-        region: where the chart lives.
-        turning: joints whose positions are angles, (n,) bool.
-    """
-    away = points - region.centre
-    return np.asarray(points - 2 * np.pi * np.round(away / (2 * np.pi)) * turning)
+def turning_joints(problem: Problem) -> NDArray[np.bool_]:
+    """Which joint positions are angles, (n,)."""
+    return ~np.array(problem.robot.tree.prismatic, dtype=np.bool_)
 
 
-def covers(region: Box, points: Array) -> Array:
+def without_turns(problem: Problem, differences: Array) -> Array:
+    """Differences of joint positions, (..., n), with angles within half a turn of 0."""
+    return np.asarray(differences - 2 * np.pi * np.round(differences / (2 * np.pi)) * turning_joints(problem))
+
+
+def covers(region: Box, points: Array) -> NDArray[np.bool_]:
     """Which points lie in the region, up to rounding, (N,)."""
     return np.asarray((np.abs(points - region.centre) <= region.half_width + 1e-9).all(axis=1))

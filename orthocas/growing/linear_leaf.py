@@ -11,7 +11,8 @@ from orthocas.metrics import metric_matrices
 from orthocas.problem import Problem, task_jacobians
 from orthocas.samples import samples_at
 
-_ITERATIONS = 50
+_STAGES = 8  # on the way to the wanted coordinates
+_ITERATIONS = 10  # Newton steps at each
 _SOLVED = 1e-12
 
 
@@ -40,15 +41,19 @@ class LinearLeaf:
         return LeafValues((points - self.centre) @ self.normals, gradients, np.ones(len(points), dtype=bool))
 
     def points(self, xi: Array) -> Array:
-        """Points of the leaf with coordinates xi (N, r), by Newton's method from the tangent space."""
-        q = self.centre + xi @ np.linalg.pinv(self.normals)
+        """Points of the leaf with coordinates xi (N, r), NaN where there is none.
+
+        Newton's method along the straight way from 0 to xi, so that the sheet of the leaf that q0 lies on is kept.
+        """
+        q = np.broadcast_to(self.centre, (len(xi), len(self.centre)))
         N = np.broadcast_to(self.normals.T, (len(xi), *self.normals.T.shape))
-        for _ in range(_ITERATIONS):
-            residual = self._residual(q, xi)
-            if np.abs(residual).max(initial=0.0) < _SOLVED:
-                break
-            J = np.concatenate([task_jacobians(self.problem, q), N], axis=1)
-            q = q - (np.linalg.pinv(J) @ residual[:, :, None])[:, :, 0]
+        for share in np.linspace(0.0, 1.0, _STAGES + 1)[1:]:
+            for _ in range(_ITERATIONS):
+                residual = self._residual(q, share * xi)
+                if np.abs(residual).max(initial=0.0) < _SOLVED:
+                    break
+                J = np.concatenate([task_jacobians(self.problem, q), N], axis=1)
+                q = q - (np.linalg.pinv(J) @ residual[:, :, None])[:, :, 0]
         solved = np.abs(self._residual(q, xi)).max(axis=1) < 1e3 * _SOLVED
         return np.where(solved[:, None], q, np.nan)
 

@@ -12,6 +12,7 @@ from orthocas.checks import Array
 from orthocas.domains import contains, sample_evenly
 from orthocas.errors import GrowError
 from orthocas.growing.grown import GrownCoordinates
+from orthocas.growing.leaf import turning_joints
 from orthocas.metrics import metric_matrices
 from orthocas.problem import Problem, task_jacobians
 
@@ -61,9 +62,10 @@ def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...
         J = task_jacobians(problem, q)
         step = np.linalg.pinv(hessian(q)[0].reshape(-1, problem.n, problem.n)) @ J.transpose(0, 2, 1)
         q = q - step[:, :, 0]
-    turning = ~np.array(problem.robot.tree.prismatic)
     away = q - problem.domain.centre
-    q = q - 2 * np.pi * np.floor(away / (2 * np.pi) + 0.5 - _SAME) * turning  # half a turn counts as +pi
+    q = q - 2 * np.pi * np.floor(away / (2 * np.pi) + 0.5 - _SAME) * turning_joints(
+        problem
+    )  # half a turn counts as +pi
     flat = np.abs(task_jacobians(problem, q)).max(axis=(1, 2)) < _FLAT
     found = _distinct(q[flat & contains(problem.domain, q)])
     return tuple(_classified(problem, point, hessian) for point in found)
@@ -94,7 +96,9 @@ def _jump(chart: Chart, singular: SingularPoint, level: float, radius: float) ->
         ring = singular.point + radius * np.stack([np.cos(around), np.sin(around)], axis=1) @ singular.directions.T
         xi = chart.xi(ring)
         return Jump(singular, (float(np.nanmin(xi)), float(np.nanmax(xi))), 2 * np.pi)
-    leaving = singular.directions[:, -1 if level > singular.task_value else 0]  # the flow to the leaf moves away along it
+    leaving = singular.directions[
+        :, -1 if level > singular.task_value else 0
+    ]  # the flow to the leaf moves away along it
     sides = chart.xi(singular.point + radius * np.stack([leaving, -leaving]))[:, 0]
     apart = abs(sides[1] - sides[0])
     return Jump(singular, (float(sides[0]), float(sides[1])), float(min(apart, 2 * np.pi - apart)))

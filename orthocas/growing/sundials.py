@@ -36,8 +36,8 @@ class SundialsFlow:
     def gradient_flow(self, points: Array, level: float, change: float = CHANGE) -> Moved:
         """Follow dq/dt = (x0 - h(q)) grad_A h(q), [AS2023] eq. (23), until q changes by less than `change` in a step.
 
-        A step lasts 1 / (mean J A^-1 J^T), about the time in which the distance to the leaf falls by e. A trajectory that
-        comes to rest away from the leaf has run into a singularity.
+        A step lasts 1 / (mean J A^-1 J^T), about the time in which the distance to the leaf falls by e. A trajectory
+        that comes to rest away from the leaf has run into a singularity.
 
         Args:
             points: (N, n).

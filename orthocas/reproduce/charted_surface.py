@@ -6,14 +6,14 @@ import numpy as np
 from matplotlib.colors import to_rgb
 
 from orthocas.checks import Array
-from orthocas.reproduce.painting import Isolines, Numbers, paint
+from orthocas.reproduce.painting import Isolines, Numbers, cut, paint
 from orthocas.reproduce.scene import Scene
 
 _SAME = 9  # decimals of corners that are one [rad]
 
 
 def add_with_lines(
-    scene: Scene, vertices: Array, faces: Numbers, colour: str, families: Sequence[Isolines], alpha: float = 1.0
+    scene: Scene, vertices: Array, faces: Numbers, colour: str, families: Sequence[Isolines]
 ) -> None:
     """Add a triangle mesh with several families of isolines; later families cross over earlier ones.
 
@@ -23,7 +23,6 @@ def add_with_lines(
         faces: (F, 3).
         colour: of the mesh.
         families: values at its vertices, levels and looks.
-        alpha: opacity, of lines too.
     """
     corners, colours = vertices[faces], np.tile((*to_rgb(colour), 1.0), (len(faces), 1))
     values = [lines.values[faces] for lines in families]
@@ -33,10 +32,29 @@ def add_with_lines(
         shares = _shares(corners[source], pieces)
         values = [np.einsum("fij,fj->fi", shares, value[source]) for value in values]
         corners = pieces
-    _, first, number = np.unique(
-        np.round(corners.reshape(-1, 3), _SAME), axis=0, return_index=True, return_inverse=True
-    )
-    scene.add_surface(corners.reshape(-1, 3)[first], number.reshape(-1, 3), colours, alpha)
+    points, triangles = _welded(corners)
+    scene.add_surface(points[:, :3], triangles, colours)
+
+
+def part_below(
+    vertices: Array, faces: Numbers, height: Array, level: float, values: Array
+) -> tuple[Array, Numbers, Array]:
+    """The part of a triangle mesh where a function, linear on triangles, is below a level.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+        height: that function at the vertices, (V,).
+        level: where the mesh is cut.
+        values: more functions at the vertices, (V, k).
+
+    Returns:
+        Vertices, faces and values of the part.
+    """
+    corners = np.concatenate([vertices, height[:, None], values], axis=1)[faces]
+    pieces, _ = cut(corners, np.arange(len(faces)), np.full(len(faces), level))
+    points, triangles = _welded(pieces[pieces[:, :, 3].mean(axis=1) < level])
+    return points[:, :3], triangles, points[:, 4:]
 
 
 def add_with_edges(scene: Scene, vertices: Array, faces: Numbers, colours: Array, edge: Array, width: float) -> None:
@@ -71,3 +89,10 @@ def _shares(corners: Array, points: Array) -> Array:
     two = (points - corners[:, :1]) @ np.linalg.pinv(edges)
     shares: Array = np.concatenate([1 - two.sum(axis=2, keepdims=True), two], axis=2)
     return shares
+
+
+def _welded(corners: Array) -> tuple[Array, Numbers]:
+    """Points (P, k) and faces (F, 3) of triangles (F, 3, k): equal corners become one point."""
+    flat = corners.reshape(-1, corners.shape[2])
+    _, first, number = np.unique(np.round(flat, _SAME), axis=0, return_index=True, return_inverse=True)
+    return flat[first], number.reshape(-1, 3)

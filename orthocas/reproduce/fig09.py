@@ -1,36 +1,102 @@
 """[AS2023] Fig. 9: orthogonal foliations of the plane of two joints for dynamic consistency, A = M.
 
-M^-1 J_x^T is tangent to the leaves of xi, to which J_xi is orthogonal; M^-1 J_xi^T is tangent to the leaves of the task,
-to which J_x is orthogonal. Arrows have one length: their sizes differ by an order of magnitude and more.
+M^-1 J_x^T is tangent to the leaves of xi, to which J_xi is orthogonal; M^-1 J_xi^T is tangent to the leaves of the
+task, to which J_x is orthogonal. Arrows have one length, as if the rows had been scaled.
 """
 
 from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.reproduce.drawing import Drawing
-from orthocas.reproduce.planar_flow import (
-    EXTREME,
-    cell_centres,
-    flow_lines,
-    grown_chart,
-    planar_problem,
-    task_grid,
-)
+from orthocas.reproduce.planar_flow import LEVEL, cosines_by_differences, flow_lines, grown_chart, planar_problem
 from orthocas.reproduce.style import INK, LABEL, TASK, TICK, joint_axis, new_figure
 from orthocas.samples import samples_at
 
-_CENTRE, _HALF = np.array([3 * np.pi / 8, np.pi / 4]), np.pi / 4  # of the patch [rad]
-_LEVELS = np.array([-0.2, 0.2, 0.6, 1.0, 1.4])  # of S_-3 to S_1 [m]
-_VALUES = np.array([0.7, 1.05, 1.4, 1.75, 2.1, 2.45])  # of xi [rad]
-_CROSSINGS = ((1.0, 0.7), (0.6, 1.75), (0.2, 1.05), (-0.2, 1.75))  # (x, xi) where arrows stand
-_LENGTH = 0.26  # of arrows [rad]
+_LOW, _HIGH = np.array([1, -1]) * np.pi / 12, np.array([6, 4]) * np.pi / 12  # corners of the patch [rad]
+_LEVELS = {-0.2: "-3", 0.2: "-2", 0.6: "-1", LEVEL: "0", 1.4: "1"}  # task value [m] -> name of the leaf
+_VALUES = np.linspace(-1.2, 1.2, 19)  # of xi on the leaves drawn [rad]
+_CROSSINGS = ((1.0, -0.5), (1.0, 0.0), (0.6, 0.4), (0.2, 0.1))  # (x, xi) where arrows stand
+_LENGTH = 0.16  # of arrows [rad]
 _ARROWS = {  # text -> colour, as in the paper
     r"$J_x$": "#0b2f6b",
     r"$M^{-1}J_x^\mathsf{T}$": INK,
     r"$J_\xi$": "#f28e2b",
     r"$M^{-1}J_\xi^\mathsf{T}$": "#c8102e",
 }
+
+
+def draw(quick: bool) -> Drawing:
+    """Leaves and arrows; numbers tell how exact the right angles are, and that the gradients are not parallel."""
+    chart = grown_chart(planar_problem("inertia"))
+    figure = new_figure(3.9, layout=None)
+    axes = figure.add_axes((0.1, 0.12, 0.54, 0.86))
+    _draw_leaves(axes, chart, 20 if quick else 100)
+    crossings = chart.inverse(_CROSSINGS, np.tile((_LOW + _HIGH) / 2, (len(_CROSSINGS), 1)))
+    for vectors, colour in zip(_vectors(chart, crossings), _ARROWS.values(), strict=True):
+        unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        for start, along in zip(crossings, _LENGTH * unit, strict=True):
+            arrow = {"arrowstyle": "-|>,head_width=0.22,head_length=0.45", "color": colour, "linewidth": 1.7}
+            axes.annotate("", start + along, start, arrowprops=arrow | {"shrinkA": 0, "shrinkB": 0}, zorder=5)
+    axes.plot(*crossings.T, "o", color="white", markeredgecolor=INK, markersize=4, zorder=6)
+    _add_legend(figure)
+    for k, letter in enumerate("xy"):
+        joint_axis(axes, letter, k + 1, float(_LOW[k]), float(_HIGH[k]), parts=5)
+    axes.set_aspect("equal")
+    return Drawing({"": figure}, _numbers(chart, 400 if quick else 20_000))
+
+
+def _draw_leaves(axes: Any, chart: Chart, steps: int) -> None:
+    """Leaves of the task with their names, and leaves of xi, which are flow lines through the base leaf."""
+    q = np.stack(np.meshgrid(*np.linspace(_LOW, _HIGH, 121).T), axis=-1)
+    h = chart.task(q.reshape(-1, 2)).reshape(121, 121)
+    widths = [2.4 if level == LEVEL else 1.4 for level in _LEVELS]
+    lines = axes.contour(q[..., 0], q[..., 1], h, levels=list(_LEVELS), colors=TASK, linewidths=widths, linestyles="-")
+    diagonal = np.linspace(_LOW, _HIGH, 200)
+    values = chart.task(diagonal)[:, 0]
+    places = [tuple(diagonal[np.argmin(np.abs(values - level))]) for level in _LEVELS]
+    names = {level: f"$S_{{{name}}}$: $x={level:g}$ m" for level, name in _LEVELS.items()}
+    texts = axes.clabel(lines, fmt=names, fontsize=TICK, inline_spacing=3, manual=places)
+    for text in texts:
+        text.set_path_effects([withStroke(linewidth=2, foreground="white")])
+    seeds = chart.coordinates.leaf.points(_VALUES[:, None])
+    for goal in (1.999, -1.5):
+        for curve in flow_lines(chart.problem, seeds, np.full(len(seeds), goal), steps):
+            axes.plot(*curve.T, color=INK, linewidth=1.0)
+
+
+def _vectors(chart: Chart, points: Array) -> list[Array]:
+    """J_x, M^-1 J_x^T, J_xi and M^-1 J_xi^T at points (N, 2), each (N, 2)."""
+    J = chart.jacobian(points)
+    raised = samples_at(chart.problem, points).raised(J)
+    return [J[:, 0], raised[:, 0], J[:, 1], raised[:, 1]]
+
+
+def _add_legend(figure: Any) -> None:
+    arrows = [Line2D([], [], color=colour, linewidth=2.2, label=text) for text, colour in _ARROWS.items()]
+    task = Line2D([], [], color=TASK, linewidth=1.4, label="leaves $S_i$ of the task")
+    extra = Line2D([], [], color=INK, linewidth=1.0, label=r"leaves of $\xi$")
+    figure.legend(
+        handles=[task, extra, *arrows], loc="center left", bbox_to_anchor=(0.67, 0.5), fontsize=LABEL, frameon=False
+    )
+
+
+def _numbers(chart: Chart, samples: int) -> dict[str, float]:
+    """Facts at random points of the patch."""
+    points = np.random.default_rng(0).uniform(_LOW, _HIGH, (samples, 2))
+    vectors = _vectors(chart, points)
+    J_x, _, J_xi, raised_xi = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in vectors)
+    by_differences = np.abs(cosines_by_differences(chart, points))
+    angles = np.degrees(np.arccos((J_xi * raised_xi).sum(axis=1)))
+    return {
+        "largest_cosine_J_x_and_raised_J_xi": float(np.abs((J_x * raised_xi).sum(axis=1)).max()),
+        "median_cosine_from_differences_of_xi": float(np.median(by_differences)),
+        "mean_angle_J_xi_and_raised_J_xi_deg": float(angles.mean()),
+        "largest_angle_J_xi_and_raised_J_xi_deg": float(angles.max()),
+        "least_angle_J_xi_and_raised_J_xi_deg": float(angles.min()),
+        "mean_cosine_J_x_and_J_xi": float(np.abs((J_x * J_xi).sum(axis=1)).mean()),
+    }

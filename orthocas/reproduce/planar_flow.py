@@ -17,14 +17,14 @@ from orthocas.growing.grow import grow
 from orthocas.growing.singularities import SingularPoint
 from orthocas.problem import Problem
 from orthocas.reproduce.self_motion import pieces_in_cube, wrapped
-from orthocas.reproduce.style import INK
+from orthocas.reproduce.style import INK, TURN
 from orthocas.samples import samples_at
 
 NAMES = {"euclidean": "A = I", "inertia": "A = M"}
 LEVEL = 1.0  #: task value of the base leaf S0 [m]
 EXTREME = 2.0 - 1e-8  #: task value [m] where flow lines end: 1e-4 rad from the maximum or the minimum
 _ORIGIN = (np.pi / 3, 0.0)  # on S0, so that both metrics have the same chart of it
-_MARKS = {"maximum": "^", "minimum": "v", "saddle": "X"}
+MARKS = {"maximum": "^", "minimum": "v", "saddle": "X"}
 
 
 def planar_problem(metric: str) -> Problem:
@@ -78,16 +78,15 @@ def _height(stage: Array) -> Array:
     return height
 
 
-def task_grid(problem: Problem, cells: int, half: float = np.pi) -> tuple[Array, Array, Array]:
-    """Edges of a square grid (cells + 1,), its points ((cells + 1)^2, 2), and h there (cells + 1, cells + 1)."""
-    q = np.linspace(-half, half, cells + 1)
-    points = np.stack(np.meshgrid(q, q), axis=-1).reshape(-1, 2)
-    return q, points, problem.task.batched(points)[0].reshape(cells + 1, cells + 1)
+def corners(cells: int) -> tuple[Array, Array]:
+    """Angles (cells + 1,) of a grid over the torus, and its points row by row, ((cells + 1)^2, 2)."""
+    q = np.linspace(-np.pi, np.pi, cells + 1)
+    return q, np.stack(np.meshgrid(q, q), axis=-1).reshape(-1, 2)
 
 
 def cell_centres(cells: int) -> Array:
     """Centres of the cells of a grid over the torus, row by row with q1 running first, (cells^2, 2)."""
-    q = (np.arange(cells) + 0.5) * 2 * np.pi / cells - np.pi
+    q = (np.arange(cells) + 0.5) * TURN / cells - np.pi
     return np.stack(np.meshgrid(q, q), axis=-1).reshape(-1, 2)
 
 
@@ -104,22 +103,43 @@ def deviations(problem: Problem, points: Array, J_xi: Array) -> Array:
     return np.degrees(np.arcsin(np.clip(np.abs(cosines), 0, 1)))
 
 
+def cosines_by_differences(chart: Chart, points: Array, step: float = 1e-4) -> Array:
+    """Cosine between grad_A h and dxi with central differences of xi instead of J_xi, (N,); NaN where xi is.
+
+    Independent of J_xi, which is orthogonal by construction: its tangent vectors start on the leaf of q.
+
+    Args:
+        chart: with n = 2, grown from a circle.
+        points: (N, 2).
+        step: half the distance of the values [rad].
+    """
+    shifts = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    xi = chart.xi((points[:, None] + shifts).reshape(-1, 2)).reshape(-1, 2, 2)
+    rises = wrapped(xi[..., 0] - xi[..., 1])
+    gradients = samples_at(chart.problem, points).unit_task_gradients[:, 0]
+    cosines: Array = (gradients * rises).sum(axis=1) / np.linalg.norm(rises, axis=1)
+    return cosines
+
+
 def plot_wrapped(axes: Any, curves: list[Array], **style: Any) -> None:
-    """Draw curves (P, 2) in the square |q_i| <= pi, cut at its edges; only the first piece carries the label."""
-    pieces = [piece for curve in curves for piece in pieces_in_cube(curve)]
-    for k, piece in enumerate(pieces):
-        axes.plot(*piece.T, **(style if k == 0 else style | {"label": None}))
+    """Draw curves (P, 2) in the square |q_i| <= pi, cut at its edges."""
+    for curve in curves:
+        for piece in pieces_in_cube(curve):
+            axes.plot(*piece.T, **style)
 
 
-def mark_singular(axes: Any, points: tuple[SingularPoint, ...], labels: bool = True, size: float = 7.0) -> None:
-    """Mark maxima, minima and saddles, at the edges of the square too."""
-    shifts = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]) * 2 * np.pi
-    for kind, mark in _MARKS.items():
-        copies = np.concatenate([p.point + shifts for p in points if p.kind == kind])
-        shown = copies[np.abs(copies).max(axis=1) < np.pi + 1e-6]
-        style = {"color": "white", "markeredgecolor": INK, "markersize": size, "markeredgewidth": 0.9}
-        label = f"{kind} of $h$" if labels else None
-        axes.plot(*shown.T, mark, **style, clip_on=False, zorder=6, label=label)
+def mark(axes: Any, kind: str, points: Array, size: float = 7.0) -> None:
+    """Mark singular points (N, 2) of a kind, "maximum", "minimum" or "saddle"."""
+    style = {"color": "white", "markeredgecolor": INK, "markersize": size, "markeredgewidth": 0.9}
+    axes.plot(*points.T, MARKS[kind], **style, clip_on=False, zorder=6)
+
+
+def mark_singular(axes: Any, singular: tuple[SingularPoint, ...], size: float = 7.0) -> None:
+    """Mark singular points in the square |q_i| <= pi, at its edges too."""
+    shifts = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]) * TURN
+    for one in singular:
+        copies = one.point + shifts
+        mark(axes, one.kind, copies[np.abs(copies).max(axis=1) < np.pi + 1e-6], size)
 
 
 def distance_to(points: Array, singular: tuple[SingularPoint, ...]) -> Array:

@@ -1,0 +1,161 @@
+"""[AS2023] Fig. 15: coordinates grown from the leaf x = 0 of the planar arm with three joints, 0 <= q1 <= pi, A = I.
+
+The first joint is kept to half a turn as in the paper, so that the leaf is a disk. Panel (d) cuts the leaves in front
+away in steps along lines of constant xi2, for else they would hide the others.
+"""
+
+from collections.abc import Mapping
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb, to_rgba
+
+from orthocas import problems
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.domains import Box, sample_uniform
+from orthocas.growing.disk_leaf import DiskLeaf, disk_leaf
+from orthocas.growing.flow import TaskFlow
+from orthocas.growing.grow import grow
+from orthocas.growing.harmonic import signed_areas
+from orthocas.growing.level_surface import level_surface
+from orthocas.problem import Problem, task_jacobians
+from orthocas.reproduce.charted_surface import add_with_edges, add_with_lines, part_below
+from orthocas.reproduce.drawing import Drawing
+from orthocas.reproduce.painting import Isolines
+from orthocas.reproduce.scene import Scene
+from orthocas.reproduce.style import INK, LABEL, TICK, add_3d, joint_cube, line_legend, new_figure
+from orthocas.tasks import Task
+
+FIRST, SECOND = "#c8102e", "#f2b701"  #: lines and leaves of constant xi1, xi2
+_LOW, _HIGH = np.array([0.0, -np.pi, -np.pi]), np.full(3, np.pi)
+_COARSE = 15  # cells along an edge in (a) and (b)
+_STEP = 0.3  # of x between leaves [m]
+_LEVELS = np.linspace(-0.8, 0.8, 9)  # of xi1 and xi2
+_COLOURS = {0.0: "#3a64a8", _STEP: "#a9d1f2", -_STEP: "#c3c6cc"}  # of leaves
+_CUTS = {0.0: 0.3, _STEP: np.inf, -_STEP: -0.3}  # xi2 where leaves of (d) end
+_NAMES = {f"$x = {x:g}$ m": colour for x, colour in _COLOURS.items()}
+_SAMPLES = 1000
+_COVER_CELLS = 40
+_ZOOM = 1.0
+_TINTS = np.array([to_rgb(c) for c in ("#cfe0f3", "#f6d9bd", "#d3ebd0", "#e4d3ee")])  # of the quadrants of the disk
+_VIEW = (24, 32)
+
+
+def half_torus() -> Problem:
+    """Planar arm with three joints, task x, A = I, on 0 <= q1 <= pi: [AS2023] Sec. 5.2."""
+    robot = problems.get("planar_3r_x").robot
+    return Problem(robot, Task.position(robot, "x"), "euclidean", Box((_LOW + _HIGH) / 2, (_HIGH - _LOW) / 2), "half")
+
+
+def draw(quick: bool) -> Drawing:
+    """Triangles, their image, isolines on the base leaf and on others; numbers tell how exact the coordinates are."""
+    problem = half_torus()
+    start = perf_counter()
+    chart = grow(problem, 0.0, cells=24 if quick else 70)
+    seconds = perf_counter() - start
+    fine, coarse = chart.coordinates.leaf, disk_leaf(problem, np.zeros(1), problem.domain, _COARSE)
+    figure = new_figure(6.7, layout=None)
+    _draw_triangles(_cube_axes(figure, 0.0, 0.545, "(a) triangles of $S_0$"), coarse)
+    _draw_disk(figure, coarse)
+    _draw_leaves(_cube_axes(figure, 0.0, 0.06, "(c) isolines on $S_0$"), fine, {0.0: np.inf})
+    _draw_leaves(_cube_axes(figure, 0.5, 0.06, "(d) other leaves, cut away in steps"), fine, _CUTS)
+    line_legend(figure, {r"$\xi_1$ = const": FIRST, r"$\xi_2$ = const": SECOND} | _NAMES)
+    numbers = {"triangles": float(len(fine.faces)), "seconds_to_grow": seconds} | _mesh_numbers(fine, coarse)
+    return Drawing({"": figure}, numbers | _chart_numbers(chart))
+
+
+def moved_leaf(leaf: DiskLeaf, dx: float) -> Array:
+    """Vertices of a base leaf, carried along the task gradients to the leaf whose task value differs by dx, (V, 3)."""
+    return TaskFlow(leaf.problem).move(leaf.vertices, np.full((len(leaf.vertices), 1), dx)).points
+
+
+def _cube_axes(figure: Any, left: float, bottom: float, title: str) -> Any:
+    axes = add_3d(figure, left, bottom, 0.5, 0.415)
+    joint_cube(axes, _LOW, _HIGH)
+    axes.text2D(0.5, 1.0, title, fontsize=LABEL, ha="center", transform=axes.transAxes)
+    return axes
+
+
+def _draw_triangles(axes: Any, leaf: DiskLeaf) -> None:
+    scene = Scene()
+    scene.add_cube(_LOW, _HIGH, 0.02)
+    add_with_edges(scene, leaf.vertices, leaf.mesh.faces, _quadrants(leaf), np.array(to_rgb(INK)), 0.03)
+    scene.draw(axes, _VIEW, _LOW, _HIGH, _ZOOM)
+
+
+def _draw_disk(figure: Any, leaf: DiskLeaf) -> None:
+    axes = figure.add_axes((0.6, 0.595, 0.36, 0.36 * 6.3 / 6.7))
+    triangles = PolyCollection(leaf.disk[leaf.mesh.faces], facecolors=_quadrants(leaf), edgecolors=INK, linewidths=0.4)
+    axes.add_collection(triangles)
+    axes.set(xlim=(-1.04, 1.04), ylim=(-1.04, 1.04), aspect="equal")
+    axes.set_title("(b) the same in the unit disk", fontsize=LABEL)
+    axes.set_xlabel(r"$\xi_1$", fontsize=LABEL, labelpad=2)
+    axes.set_ylabel(r"$\xi_2$", fontsize=LABEL, labelpad=-4)
+    axes.set(xticks=(-1, 0, 1), yticks=(-1, 0, 1))
+    axes.tick_params(labelsize=TICK)
+
+
+def _quadrants(leaf: DiskLeaf) -> Array:
+    """Colours of triangles by the quadrant of the disk their middles lie in, (F, 3)."""
+    right, upper = (leaf.disk[leaf.mesh.faces].mean(axis=1) > 0).T
+    tints: Array = _TINTS[2 * right + upper]
+    return tints
+
+
+def _draw_leaves(axes: Any, leaf: DiskLeaf, cuts: Mapping[float, float]) -> None:
+    """Leaves with isolines; `cuts` tells for each x where it is drawn, xi2 < cut."""
+    scene = Scene()
+    scene.add_cube(_LOW, _HIGH, 0.02)
+    for x, cut in cuts.items():
+        vertices, faces, xi = part_below(moved_leaf(leaf, x), leaf.mesh.faces, leaf.disk[:, 1], cut, leaf.disk)
+        families = [
+            Isolines(xi[:, k], _LEVELS, np.tile(to_rgba(colour), (len(_LEVELS), 1)), 0.055)
+            for k, colour in enumerate((FIRST, SECOND))
+        ]
+        add_with_lines(scene, vertices, faces, _COLOURS[x], families)
+    scene.draw(axes, _VIEW, _LOW, _HIGH, _ZOOM)
+
+
+def _mesh_numbers(fine: DiskLeaf, coarse: DiskLeaf) -> dict[str, float]:
+    flipped = [np.sum(signed_areas(leaf.disk, leaf.mesh.faces) <= 0) for leaf in (fine, coarse)]
+    off = fine.problem.task.batched(fine.vertices)[0]
+    return {
+        "coarse_triangles": float(len(coarse.faces)),
+        "boundary_loops": float(fine.mesh.boundary_loops),
+        "euler_characteristic": float(fine.mesh.euler_characteristic),
+        "flipped_triangles": float(sum(flipped)),
+        "task_error_at_vertices": float(np.abs(off).max()),
+    }
+
+
+def _chart_numbers(chart: Chart) -> dict[str, float]:
+    """How orthogonal, how constant along the flow, and how far the coordinates reach."""
+    problem = chart.problem
+    points = sample_uniform(problem.domain, _SAMPLES, 3)
+    pulled = chart.coordinates.pull(points)
+    points, on_leaf = points[pulled.reached], pulled.points[pulled.reached]
+    J_xi, J_x = chart.coordinates.jacobian(points), task_jacobians(problem, points)
+    lengths = np.linalg.norm(J_xi, axis=2) * np.linalg.norm(J_x, axis=2)
+    cosines = (J_xi @ J_x.transpose(0, 2, 1))[:, :, 0] / lengths
+    moved = [TaskFlow(problem).move(on_leaf, np.full((len(on_leaf), 1), dx)).points for dx in (_STEP, -_STEP)]
+    return {
+        "samples_with_coordinates": len(points) / _SAMPLES,
+        "largest_cosine": float(np.abs(cosines).max()),
+        "largest_change_along_flow": float(np.abs([chart.xi(q) - chart.xi(on_leaf) for q in moved]).max()),
+        "covered_at_0.3": _covered(chart, _STEP),
+        "covered_at_-0.3": _covered(chart, -_STEP),
+    }
+
+
+def _covered(chart: Chart, x: float) -> float:
+    """Share of the area of a leaf in the domain where coordinates have values."""
+    task, low, high = chart.problem.task, _LOW, _HIGH
+    mesh = level_surface(
+        lambda q: task.batched(q)[0][:, 0], lambda q: task.batched_jacobian(q)[0][:, 0], x, low, high, _COVER_CELLS
+    )
+    corners = mesh.vertices[mesh.faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return float(areas[np.isfinite(chart.xi(corners.mean(axis=1))[:, 0])].sum() / areas.sum())

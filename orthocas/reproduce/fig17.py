@@ -1,0 +1,116 @@
+"""[AS2023] Fig. 17: coordinates of the planar arm with two joints, fitted on the whole torus, for A = I and A = M.
+
+No smooth function parametrises closed leaves with one number, so there are regions of bad fit: along the lines that flow
+into singular points, and along folds, where xi has its extrema on the leaves. Equal parts of the torus lie between
+neighbouring isolines of xi, and as much of it where xi > 0 as where xi < 0.
+"""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.lines import Line2D
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.growing.circle_leaf import circle_leaf
+from orthocas.growing.flow import TaskFlow
+from orthocas.growing.singularities import singular_points
+from orthocas.reproduce.drawing import Drawing
+from orthocas.reproduce.planar_fit import fitted_chart
+from orthocas.reproduce.planar_flow import (
+    MARKS,
+    NAMES,
+    cell_centres,
+    corners,
+    deviations,
+    grown_chart,
+    mark_singular,
+    planar_problem,
+)
+from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, TICK, joint_plane, new_figure
+
+_LEAVES = (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5)  # task values where values of xi are counted [m]
+_INSIDE = (0.3, 0.8)  # a point from where all leaves are reached [rad]
+_SHADES = "Greys"
+_GOOD = 10.0  # deviation [deg]
+
+
+def draw(quick: bool) -> Drawing:
+    """Isolines over the angle; numbers tell how large deviations are and how often a leaf has a value."""
+    cells = 60 if quick else 240
+    figure = new_figure(3.7, layout=None)
+    numbers: dict[str, float] = {}
+    for k, metric in enumerate(NAMES):
+        chart = fitted_chart(planar_problem(metric), quick)
+        points = cell_centres(cells)
+        angles = deviations(chart.problem, points, chart.jacobian(points)[:, 1])
+        axes = figure.add_axes((0.1 + 0.405 * k, 0.25, 0.37, 0.67))
+        _draw_plane(axes, chart, angles.reshape(cells, cells), cells)
+        axes.set_title(f"({'ab'[k]}) ${NAMES[metric]}$", fontsize=LABEL)
+        if k > 0:
+            axes.set_ylabel("")
+            axes.tick_params(labelleft=False)
+        numbers |= {f"{metric}_{key}": value for key, value in _numbers(chart, points, angles).items()}
+    bar = figure.colorbar(ScalarMappable(Normalize(0, 90), _SHADES), cax=figure.add_axes((0.905, 0.28, 0.014, 0.61)))
+    bar.set_ticks(np.linspace(0, 90, 7))
+    bar.ax.tick_params(labelsize=TICK)
+    bar.set_label(r"$|\angle(\mathrm{d}\xi, \nabla_A h) - 90°|$ [deg]", fontsize=LABEL)
+    figure.legend(handles=_entries(), loc="lower center", ncols=4, fontsize=TICK, frameon=False, columnspacing=1.4)
+    return Drawing({"": figure}, numbers)
+
+
+def _draw_plane(axes: Any, chart: Chart, angles: Array, cells: int) -> None:
+    axes.imshow(angles, extent=2 * (-np.pi, np.pi), origin="lower", cmap=_SHADES, vmin=0, vmax=90)
+    q, points = corners(cells)
+    h, xi = (values.reshape(cells + 1, cells + 1) for values in chart.phi(points).T)
+    axes.contour(q, q, h, levels=np.linspace(-1.75, 1.75, 8), colors=TASK, linewidths=0.8, linestyles="-")
+    xi = xi - np.median(xi)  # any constant may be added
+    axes.contour(q, q, xi, levels=np.quantile(xi, np.linspace(0.025, 0.975, 20)), colors=EXTRA, linewidths=0.9)
+    mark_singular(axes, singular_points(chart.problem))
+    joint_plane(axes)
+
+
+def _entries() -> list[Line2D]:
+    style = {"linestyle": "", "color": "white", "markeredgecolor": INK}
+    return [
+        Line2D([], [], color=EXTRA, label=r"$\xi > 0$"),
+        Line2D([], [], color=EXTRA, linestyle="--", label=r"$\xi < 0$"),
+        Line2D([], [], color=TASK, label="leaves of the task, $x$ constant"),
+        *(Line2D([], [], marker=marker, label=f"{kind} of $h$", **style) for kind, marker in MARKS.items()),
+    ]
+
+
+def _numbers(chart: Chart, points: Array, angles: Array) -> dict[str, float]:
+    counts = np.concatenate([_crossings(chart, level) for level in _LEAVES])
+    good = points[angles < _GOOD]
+    return {
+        "median_deviation_deg": float(np.median(angles)),
+        "deviation_95_percent_deg": float(np.quantile(angles, 0.95)),
+        "share_above_10_deg": float(np.mean(angles > _GOOD)),
+        "least_times_of_a_value_on_a_leaf": float(counts.min()),
+        "largest_times_of_a_value_on_a_leaf": float(counts.max()),
+        "share_of_values_twice_on_a_leaf": float(np.mean(counts == 2)),
+        "median_angle_to_grown_gradient_deg": float(np.median(_angles_to_grown(chart, good))),
+    }
+
+
+def _crossings(chart: Chart, level: float, values: int = 21) -> Array:
+    """How often a closed leaf has each of some values between the extrema of xi on it."""
+    flow, x0 = TaskFlow(chart.problem), np.array([level])
+    start = flow.pull(np.array([_INSIDE]), x0, 1e-12).points[0]
+    xi = chart.xi(circle_leaf(chart.problem, x0, start).curve)[:, 0]
+    wanted = np.linspace(xi.min(), xi.max(), values + 2)[1:-1]
+    crossings: Array = np.count_nonzero(np.diff(xi > wanted[:, None], axis=1), axis=1)
+    return crossings
+
+
+def _angles_to_grown(chart: Chart, points: Array, most: int = 5000) -> Array:
+    """Angle between the lines along the gradients of fitted and of grown coordinates [deg]."""
+    some = points[:: len(points) // most + 1]
+    fitted, grown = (c.jacobian(some)[:, 1] for c in (chart, grown_chart(chart.problem)))
+    sines = (fitted[:, 0] * grown[:, 1] - fitted[:, 1] * grown[:, 0]) / (
+        np.linalg.norm(fitted, axis=1) * np.linalg.norm(grown, axis=1)
+    )
+    return np.degrees(np.arcsin(np.clip(np.abs(sines[np.isfinite(sines)]), 0, 1)))

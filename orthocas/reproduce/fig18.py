@@ -1,0 +1,68 @@
+"""[AS2023] Fig. 18: surfaces of the task x and of the fitted coordinate of Fig. 17, A = I."""
+
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.colors import LightSource
+from matplotlib.ticker import MaxNLocator
+
+from orthocas.checks import Array
+from orthocas.reproduce.drawing import Drawing
+from orthocas.reproduce.planar_fit import fitted_chart
+from orthocas.reproduce.planar_flow import cell_centres, corners, deviations, planar_problem
+from orthocas.reproduce.style import LABEL, TICK, add_3d, joint_axis, new_figure
+
+
+def draw(quick: bool) -> Drawing:
+    """Both surfaces; numbers tell their ranges, and that right angles hold almost everywhere."""
+    chart = fitted_chart(planar_problem("euclidean"), quick)
+    cells = 40 if quick else 160
+    q, points = corners(cells)
+    h, xi = (values.reshape(cells + 1, cells + 1) for values in chart.phi(points).T)
+    figure = new_figure(3.1, layout=None)
+    panels = (("(a) task $h(q) = x$ [m]", h), (r"(b) fitted coordinate $\xi(q)$ [1]", xi))
+    for k, (title, values) in enumerate(panels):
+        axes = add_3d(figure, 0.01 + 0.495 * k, 0.02, 0.48, 0.94)
+        _draw_surface(axes, q, values)
+        axes.text2D(0.5, 0.97, title, fontsize=LABEL, ha="center", transform=axes.transAxes)
+    centres = cell_centres(cells)
+    angles = deviations(chart.problem, centres, chart.jacobian(centres)[:, 1])
+    numbers = {
+        "least_task_value": float(h.min()),
+        "largest_task_value": float(h.max()),
+        "least_xi": float(xi.min()),
+        "largest_xi": float(xi.max()),
+        "difference_across_the_edges": float(max(np.abs(np.diff(v[[0, -1]], axis=0)).max() for v in (xi, xi.T))),
+        "median_deviation_deg": float(np.median(angles)),
+    }
+    return Drawing({"": figure}, numbers)
+
+
+def _draw_surface(axes: Any, q: Array, values: Array) -> None:
+    """A shaded surface with isolines under it."""
+    low, high = values.min(), values.max()
+    shades = LightSource(315, 50).shade(values, mpl.colormaps["viridis"], blend_mode="soft", vert_exag=0.4)
+    axes.plot_surface(
+        *np.meshgrid(q, q), values, facecolors=shades, rcount=len(q), ccount=len(q), linewidth=0, antialiased=False
+    )
+    floor = low - 0.45 * (high - low)
+    axes.contour(
+        q,
+        q,
+        values,
+        levels=np.linspace(low, high, 16)[1:-1],
+        zdir="z",
+        offset=floor,
+        cmap="viridis",
+        linewidths=0.8,
+        linestyles="-",
+    )
+    axes.set_zlim(floor, high)
+    ticks = MaxNLocator(5).tick_values(low, high)
+    axes.set_zticks(ticks[(ticks > low - 1e-9) & (ticks < high + 1e-9)])
+    for joint, letter in enumerate("xy", 1):
+        joint_axis(axes, letter, joint)
+    axes.tick_params(labelsize=TICK, pad=0)
+    axes.view_init(32, -62)
+    axes.set_box_aspect((1, 1, 0.8), zoom=0.83)

@@ -1,0 +1,56 @@
+"""A section of joint space under the task (x, y) of the planar arm with three joints, A = I: what Figs. 10 and 19 share."""
+
+import numpy as np
+
+from orthocas import problems
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.domains import Box
+from orthocas.growing.level_surface import level_surface
+from orthocas.growing.triangle_mesh import TriangleMesh
+from orthocas.problem import Problem
+from orthocas.reproduce.self_motion import trace
+from orthocas.tasks import Task
+
+
+def section(low: Array, high: Array) -> Problem:
+    """Planar arm with three joints, task (x, y), A = I, on a box: no exact coordinates exist ([AS2023] Sec. 6.2)."""
+    robot = problems.get("planar_3r_xy").robot
+    return Problem(robot, Task.position(robot, "xy"), "euclidean", Box((low + high) / 2, (high - low) / 2), "section")
+
+
+def isosurface(chart: Chart, value: float, cells: int) -> TriangleMesh:
+    """The part in the domain of the leaf where a single coordinate has a value."""
+    domain, xi = chart.problem.domain, chart.coordinates
+    low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
+    return level_surface(lambda q: xi.xi(q)[:, 0], lambda q: xi.jacobian(q)[:, 0], value, low, high, cells)
+
+
+def curves_inside(problem: Problem, starts: Array, step: float) -> list[Array]:
+    """The parts in the domain of self-motion curves through points of it, (P, 3) each, as far as they hang together."""
+    curves = []
+    for curve in trace(problem.task, starts, step):
+        turns = curve[-1] - curve[0]  # of joints that go around
+        line, at = np.concatenate([curve[:-1] - turns, curve]), len(curve) - 1
+        inside = (np.abs(line - problem.domain.centre) <= problem.domain.half_width).all(axis=1)
+        before, after = np.append(inside[at::-1], False), np.append(inside[at:], False)
+        curves.append(line[at - int(np.argmin(before)) + 1 : at + int(np.argmin(after))])
+    return curves
+
+
+def unit_gradients(problem: Problem, points: Array) -> Array:
+    """Gradients of x and y scaled to unit length, (N, 2, 3)."""
+    J = problem.task.batched_jacobian(points)[0]
+    unit: Array = J / np.linalg.norm(J, axis=2, keepdims=True)
+    return unit
+
+
+def tilts(chart: Chart, points: Array) -> Array:
+    """Angles between the plane of both task gradients and the leaf of the coordinate, (N,) [deg]."""
+    J = chart.jacobian(points)
+    normals = np.cross(J[:, 0], J[:, 1])
+    cosines = np.abs(np.sum(normals * J[:, 2], axis=1)) / (
+        np.linalg.norm(normals, axis=1) * np.linalg.norm(J[:, 2], axis=1)
+    )
+    angles: Array = np.degrees(np.arccos(np.minimum(cosines, 1)))
+    return angles
