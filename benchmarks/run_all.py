@@ -14,6 +14,8 @@ SCRIPTS = (
     "compiled_loss",
     "ipopt_front",
     "starts",
+    "mesh_chart",
+    "growing_queries",
     "against_torch",
     "paper_network",
 )

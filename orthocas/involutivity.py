@@ -10,7 +10,7 @@ from orthocas.batch import Batched
 from orthocas.checks import Array, require_count, require_memory
 from orthocas.domains import sample_uniform
 from orthocas.errors import SingularTaskError
-from orthocas.problem import NEAR_SINGULAR, Problem, check, task_jacobians
+from orthocas.problem import NEAR_SINGULAR, Problem, check, relative_singular_values
 from orthocas.task_brackets import TaskBrackets
 
 _ROUNDING = 1e-7  # defects below this share of the terms they are differences of are zero
@@ -107,9 +107,7 @@ def _regular_points(problem: Problem, samples: int, seed: int) -> Array:
     """Uniform samples of the domain without those that `check` counts as near-singular."""
     check(problem, samples, seed)
     points = sample_uniform(problem.domain, samples, seed)
-    J = task_jacobians(problem, points)
-    scale = np.sqrt((J**2).sum(axis=2).mean(axis=0))
-    regular = np.linalg.svd(J / scale[:, None], compute_uv=False)[:, -1] >= NEAR_SINGULAR
+    regular = relative_singular_values(problem, points) >= NEAR_SINGULAR
     if not regular.any():
         raise SingularTaskError(f"task '{problem.task.name}' is near-singular at all {samples} samples of the domain")
     return points[regular]

@@ -107,12 +107,7 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
     """
     points = sample_uniform(problem.domain, samples, seed)
     metric_matrices(problem.metric, points)
-    J = task_jacobians(problem, points)
-    scale = np.sqrt((J**2).sum(axis=2).mean(axis=0))
-    idle = np.flatnonzero(scale == 0)
-    if idle.size:
-        raise SingularTaskError(f"task component '{problem.task.labels[idle[0]]}' does not depend on any joint")
-    smallest = np.linalg.svd(J / scale[:, None], compute_uv=False)[:, -1]
+    smallest = relative_singular_values(problem, points)
     if smallest.max() < _RANK_LOST:
         raise SingularTaskError(
             f"the Jacobian of task '{problem.task.name}' has rank below m = {problem.m} "
@@ -125,6 +120,20 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
         smallest_singular_value=float(smallest[worst]),
         most_singular_point=tuple(points[worst].tolist()),
     )
+
+
+def relative_singular_values(problem: Problem, points: Array) -> Array:
+    """Smallest singular value of J_x at points (N, n), with each row divided by its root mean square length, (N,).
+
+    Raises:
+        SingularTaskError: if a task component does not depend on any joint, or J_x is not finite at a point.
+    """
+    J = task_jacobians(problem, points)
+    scale = np.sqrt((J**2).sum(axis=2).mean(axis=0))
+    idle = np.flatnonzero(scale == 0)
+    if idle.size:
+        raise SingularTaskError(f"task component '{problem.task.labels[idle[0]]}' does not depend on any joint")
+    return np.asarray(np.linalg.svd(J / scale[:, None], compute_uv=False)[:, -1])
 
 
 def task_jacobians(problem: Problem, points: Array) -> Array:

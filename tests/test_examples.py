@@ -5,8 +5,10 @@ from pathlib import Path
 import c_timing
 import casadi as ca
 import compare_parametrisations
+import distillation
 import fits
 import front
+import growing_queries
 import iiwa_demo
 import involutivity
 import ipopt_front
@@ -15,6 +17,8 @@ import paper_network
 import pytest
 import scaling
 import starts
+
+import orthocas as oc
 
 
 def test_demo_saves_chart_and_pictures(tmp_path: Path) -> None:
@@ -76,6 +80,23 @@ def test_comparison_example_knows_every_problem() -> None:
     assert set(compare_parametrisations.BASES) == set(compare_parametrisations.NETWORKS)
     problem = compare_parametrisations.build("iiwa_pose")
     assert (problem.m, problem.r) == (6, 1)
+
+
+def test_distillation_keeps_more_with_the_degree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = distillation.main(tmp_path, quick=True)
+    assert found["euclidean polynomial:4"] < 0.2 < found["euclidean polynomial:2"] < 2
+    assert found["inertia polynomial:4"] > 2  # steep coordinates: stated in the docs
+    assert "| euclidean | polynomial:4 |" in capsys.readouterr().out
+    assert oc.evaluate(oc.load(tmp_path / "distilled_euclidean.orthocas"), 1000).task_angle.std < 0.2
+
+
+def test_growing_benchmark_compares_equal_results(capsys: pytest.CaptureFixture[str]) -> None:
+    found = growing_queries.main(quick=True)
+    assert found["euclidean ours error"] < 1e-9
+    assert found["euclidean CVODES error"] < 1e-8
+    assert found["euclidean SciPy RK45, NumPy by hand, stop 1e-06 error"] < 1e-5
+    assert found["euclidean SciPy RK45, robot functions, stop 1e-09 error"] < 1e-8
+    assert "| ours |" in capsys.readouterr().out
 
 
 def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[str]) -> None:

@@ -72,7 +72,7 @@ def test_whole_picture_is_one_region(n: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("n", ["fig17"], indirect=True)
 def test_fitted_coordinate_folds_on_closed_leaves(n: dict[str, float]) -> None:
-    """Sec. 6.1: no global coordinate. On a circle a continuous function has values between its extrema twice or more."""
+    """Sec. 6.1: no global coordinate. A continuous function on a circle has values twice or more."""
     for metric in ("euclidean", "inertia"):
         assert n[f"{metric}_least_times_of_a_value_on_a_leaf"] == 2
         assert n[f"{metric}_largest_times_of_a_value_on_a_leaf"] % 2 == 0

@@ -62,10 +62,8 @@ def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...
         J = task_jacobians(problem, q)
         step = np.linalg.pinv(hessian(q)[0].reshape(-1, problem.n, problem.n)) @ J.transpose(0, 2, 1)
         q = q - step[:, :, 0]
-    away = q - problem.domain.centre
-    q = q - 2 * np.pi * np.floor(away / (2 * np.pi) + 0.5 - _SAME) * turning_joints(
-        problem
-    )  # half a turn counts as +pi
+    turns = np.floor((q - problem.domain.centre) / (2 * np.pi) + 0.5 - _SAME)  # half a turn counts as +pi
+    q = q - 2 * np.pi * turns * turning_joints(problem)
     flat = np.abs(task_jacobians(problem, q)).max(axis=(1, 2)) < _FLAT
     found = _distinct(q[flat & contains(problem.domain, q)])
     return tuple(_classified(problem, point, hessian) for point in found)

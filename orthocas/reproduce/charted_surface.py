@@ -12,9 +12,7 @@ from orthocas.reproduce.scene import Scene
 _SAME = 9  # decimals of corners that are one [rad]
 
 
-def add_with_lines(
-    scene: Scene, vertices: Array, faces: Numbers, colour: str, families: Sequence[Isolines]
-) -> None:
+def add_with_lines(scene: Scene, vertices: Array, faces: Numbers, colour: str, families: Sequence[Isolines]) -> None:
     """Add a triangle mesh with several families of isolines; later families cross over earlier ones.
 
     Args:
@@ -76,7 +74,10 @@ def add_with_edges(scene: Scene, vertices: Array, faces: Numbers, colours: Array
     shrunk = np.clip(1 - width / 2 * around / (2 * area), 0, 1)[:, None, None]
     inner = centre[:, None] + shrunk * (corners - centre[:, None])
     here, after = np.arange(3), (np.arange(3) + 1) % 3
-    outside = [corners[:, here], corners[:, after], inner[:, after]], [corners[:, here], inner[:, after], inner[:, here]]
+    outside = (
+        [corners[:, here], corners[:, after], inner[:, after]],
+        [corners[:, here], inner[:, after], inner[:, here]],
+    )
     borders = [np.stack(three, axis=2).reshape(-1, 3, 3) for three in outside]
     triangles = np.concatenate([inner, *borders])
     looks = np.concatenate([colours, np.tile(edge, (6 * len(faces), 1))])

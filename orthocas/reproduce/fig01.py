@@ -1,7 +1,8 @@
-"""[AS2023] Fig. 1: leaves of the task x of the planar arm with three joints, and leaves of coordinates orthogonal to it.
+"""[AS2023] Fig. 1: leaves of the task x of the planar arm with three joints, and orthogonal leaves.
 
-Coordinates (xi1, xi2) of the base leaf x = 0 are those of Fig. 15. All surfaces are grids in (x, xi1, xi2), carried along
-the task gradients from the base leaf: patches of two task leaves, and one leaf of xi1 and of xi2 through its middle.
+Coordinates (xi1, xi2) of the base leaf x = 0 are those of Fig. 15. All surfaces are grids in (x, xi1, xi2),
+carried along the task gradients from the base leaf: patches of two task leaves, and leaves of xi1 and xi2 through the
+middle of these.
 """
 
 from dataclasses import dataclass
@@ -10,14 +11,12 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_rgba
 
-from orthocas.chart import Chart
 from orthocas.checks import Array
-from orthocas.growing.flow import TaskFlow
-from orthocas.growing.grow import grow
+from orthocas.growing.grown import GrownCoordinates
 from orthocas.problem import task_jacobians
 from orthocas.reproduce.charted_surface import add_with_lines
 from orthocas.reproduce.drawing import Drawing
-from orthocas.reproduce.fig15 import FIRST, SECOND, half_torus
+from orthocas.reproduce.fig15 import FIRST, SECOND, grown_disk
 from orthocas.reproduce.painting import Isolines, Numbers
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.style import INK, LABEL, add_3d, joint_cube, line_legend, new_figure
@@ -59,29 +58,29 @@ class Grid:
 
 def draw(quick: bool) -> Drawing:
     """Two task leaves, a leaf of xi1, one of xi2, and gradients; numbers tell the angles between them."""
-    chart = grow(half_torus(), 0.0, cells=30 if quick else 100)
+    coordinates, _ = grown_disk(30 if quick else 100)
     half = 8 if quick else 20  # times _BEYOND is a whole number, so that all surfaces share points where they meet
     sheet, wide = (np.linspace(-b, b, 2 * int(b * half) + 1) for b in (1.0, _BEYOND))
-    task_leaves = [grid(chart, np.array([x]), _REACH[0] * sheet, _REACH[1] * sheet) for x in _VALUES]
+    task_leaves = [grid(coordinates, np.array([x]), _REACH[0] * sheet, _REACH[1] * sheet) for x in _VALUES]
     heights, zero = wide * _VALUES[-1], np.zeros(1)
-    walls = [grid(chart, heights, zero, _REACH[1] * wide), grid(chart, heights, _REACH[0] * wide, zero)]
+    walls = [grid(coordinates, heights, zero, _REACH[1] * wide), grid(coordinates, heights, _REACH[0] * wide, zero)]
     figure = new_figure(4.4, 5.2, layout=None)
     axes = add_3d(figure, 0.06, 0.1, 0.9, 0.88)
     joint_cube(axes, _LOW, _HIGH, parts=1, margin=np.pi / 8)
     scene = _scene(task_leaves, walls)
-    _add_gradients(axes, scene, chart)
+    _add_gradients(axes, scene, coordinates)
     scene.draw(axes, _VIEW, _LOW, _HIGH, 1.12)
     names = ("$x$ = const", r"$\xi_1$ = const", r"$\xi_2$ = const")
     line_legend(figure, dict(zip(names, (_SHEET, FIRST, SECOND), strict=True)))
-    return Drawing({"": figure}, _numbers(chart, task_leaves, walls))
+    return Drawing({"": figure}, _numbers(coordinates, task_leaves, walls))
 
 
-def grid(chart: Chart, x: Array, first: Array, second: Array) -> Grid:
+def grid(coordinates: GrownCoordinates, x: Array, first: Array, second: Array) -> Grid:
     """Points with all combinations of x, xi1 and xi2 (counted from the middle), one of which has a single value."""
     x, first, second = np.meshgrid(x, first, second, indexing="ij")
     xi = np.stack([first.ravel(), second.ravel()], axis=1)
-    on_leaf = chart.coordinates.leaf.points(_MIDDLE + xi)
-    points = TaskFlow(chart.problem).move(on_leaf, x.reshape(-1, 1)).points
+    on_leaf = coordinates.leaf.points(_MIDDLE + xi)
+    points = coordinates.flow.move(on_leaf, x.reshape(-1, 1)).points
     size = max(x.shape)
     return Grid(points.reshape(size, size, 3), xi.reshape(size, size, 2))
 
@@ -101,10 +100,10 @@ def _scene(task_leaves: list[Grid], walls: list[Grid]) -> Scene:
     return scene
 
 
-def _add_gradients(axes: Any, scene: Scene, chart: Chart) -> None:
+def _add_gradients(axes: Any, scene: Scene, coordinates: GrownCoordinates) -> None:
     """Arrows a little above a task leaf, with their names."""
-    on_leaf = grid(chart, _AT[:1], _AT[1:2], _AT[2:]).points[0]
-    gradients = chart.jacobian(on_leaf)[0]
+    on_leaf = grid(coordinates, _AT[:1], _AT[1:2], _AT[2:]).points[0]
+    gradients = np.concatenate(_jacobians(coordinates, on_leaf), axis=1)[0]
     units = gradients / np.linalg.norm(gradients, axis=1, keepdims=True)
     start = on_leaf[0] + _LIFT * units[0]
     for unit, (name, colour) in zip(units, _GRADIENTS.items(), strict=True):
@@ -113,10 +112,10 @@ def _add_gradients(axes: Any, scene: Scene, chart: Chart) -> None:
     scene.add_ball(start, 0.045, INK)
 
 
-def _numbers(chart: Chart, task_leaves: list[Grid], walls: list[Grid]) -> dict[str, float]:
+def _numbers(coordinates: GrownCoordinates, task_leaves: list[Grid], walls: list[Grid]) -> dict[str, float]:
     """Angles between gradients, which are normals of leaves, and between normals of the surfaces in the picture."""
     q = np.concatenate([leaf.points.reshape(-1, 3) for leaf in task_leaves])
-    J_x, J_xi = task_jacobians(chart.problem, q), chart.coordinates.jacobian(q)
+    J_x, J_xi = _jacobians(coordinates, q)
     angles = _angles(J_x, J_xi)
     sheet = task_leaves[1].normals
     middle, wall_middle = len(sheet) // 2, len(walls[0].normals) // 2
@@ -128,6 +127,11 @@ def _numbers(chart: Chart, task_leaves: list[Grid], walls: list[Grid]) -> dict[s
         "largest_deviation_of_drawn_surfaces_deg": float(np.abs(drawn - 90).max()),
         "smallest_angle_xi1_xi2_deg": float(_angles(J_xi[:, 0], J_xi[:, 1]).min()),
     }
+
+
+def _jacobians(coordinates: GrownCoordinates, points: Array) -> tuple[Array, Array]:
+    """J_x (N, 1, 3) and J_xi (N, 2, 3)."""
+    return task_jacobians(coordinates.problem, points), coordinates.jacobian(points)
 
 
 def _angles(a: Array, b: Array) -> Array:

@@ -13,7 +13,14 @@ from matplotlib.patheffects import withStroke
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.reproduce.drawing import Drawing
-from orthocas.reproduce.planar_flow import LEVEL, cosines_by_differences, flow_lines, grown_chart, planar_problem
+from orthocas.reproduce.planar_flow import (
+    LEVEL,
+    base_leaf,
+    cosines_by_differences,
+    flow_lines,
+    grown_chart,
+    planar_problem,
+)
 from orthocas.reproduce.style import INK, LABEL, TASK, TICK, joint_axis, new_figure
 from orthocas.samples import samples_at
 
@@ -63,7 +70,7 @@ def _draw_leaves(axes: Any, chart: Chart, steps: int) -> None:
     texts = axes.clabel(lines, fmt=names, fontsize=TICK, inline_spacing=3, manual=places)
     for text in texts:
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
-    seeds = chart.coordinates.leaf.points(_VALUES[:, None])
+    seeds = base_leaf(chart).points(_VALUES[:, None])
     for goal in (1.999, -1.5):
         for curve in flow_lines(chart.problem, seeds, np.full(len(seeds), goal), steps):
             axes.plot(*curve.T, color=INK, linewidth=1.0)

@@ -3,9 +3,9 @@
 Derivation (ours). The lift of the unit field of task coordinate i is X_i = J^#A e_i. Moving by eps along X_1, then X_2,
 ends at q0 + eps (X_1 + X_2) + eps^2 (X_1' X_1 / 2 + X_2' X_2 / 2 + X_2' X_1) + O(eps^3); in the other order the last
 term is X_1' X_2. So q_a - q_b = eps^2 [X_1, X_2] + O(eps^3). Both fields project to fields of the task plane that
-commute, so the bracket lies in the kernel of J_x: q_a and q_b are on one self-motion curve. The bracket modulo the span
-is bilinear, so |[X_1, X_2]|_A = d / sqrt(det(J_x A^-1 J_x^T)) with the involutivity defect d: det is the squared area of
-the two gradients, and X_1, X_2 are dual to them.
+commute, so the bracket lies in the kernel of J_x: q_a and q_b are on one self-motion curve. The bracket modulo the
+span is bilinear, so |[X_1, X_2]|_A = d / sqrt(det(J_x A^-1 J_x^T)) with the involutivity defect d: det is the squared
+area of the two gradients, and X_1, X_2 are dual to them.
 """
 
 import casadi as ca
@@ -39,7 +39,7 @@ _VIEW = (20, 14)
 
 
 def draw(quick: bool) -> Drawing:
-    """Both ways, self-motion curves, gradients and a leaf as orthogonal as possible; numbers tell how far apart they end.
+    """Both ways, self-motion curves, gradients and a fitted leaf; numbers tell how far apart the ways end.
 
     `quick` draws a coarser leaf.
     """
@@ -54,7 +54,7 @@ def draw(quick: bool) -> Drawing:
         axes.text(*(place + offset), text, fontsize=LABEL, ha="center", va="center")
     first, second = "$x$, then $y$", "$y$, then $x$"
     gradients = {r"$\nabla x$": RED, r"$\nabla y$": GREEN}
-    line_legend(figure, {"self-motion": TASK, first: INK, second: EXTRA} | gradients | {r"$\xi$ = const": _LEAF})
+    line_legend(figure, {"self-motion curves": TASK, first: INK, second: EXTRA} | gradients | {r"$\xi$ = const": _LEAF})
     return Drawing({"": figure}, _numbers(problem, chart, ways))
 
 
@@ -131,13 +131,15 @@ def _bracket(problem: Problem, at: Array) -> tuple[float, float]:
     lifts = [TaskFlow(problem).field(q, ca.DM.eye(2)[:, k]) for k in range(2)]
     J = problem.task.jacobian_function(q)
     defect = TaskBrackets.of(problem).defect_function()(q)
-    evaluate = dense_function("bracket", [q], [ca.norm_2(lie_bracket(*lifts, q)), defect / ca.sqrt(ca.det(J @ J.T))])
+    evaluate = dense_function(
+        "bracket", [q], [ca.norm_2(lie_bracket(lifts[0], lifts[1], q)), defect / ca.sqrt(ca.det(J @ J.T))]
+    )
     bracket, formula = Batched(evaluate)(at[None])
     return float(bracket[0, 0]), float(formula[0, 0])
 
 
 def _elbow(problem: Problem) -> Problem:
-    """The same arm with the end of the second link as its task: two joints move it, and the gradients span their plane."""
+    """The same arm with the end of link 2 as its task: two joints move it, and gradients span their plane."""
 
     def end(q: ca.SX) -> ca.SX:
         return ca.vertcat(ca.cos(q[0]) + ca.cos(q[0] + q[1]), ca.sin(q[0]) + ca.sin(q[0] + q[1]))

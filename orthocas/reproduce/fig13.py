@@ -2,8 +2,8 @@
 
 xi is an angle: with a cyclic colour map the cut of S0, where xi passes from pi to -pi, does not show and is drawn as a
 line. Edges of colour are true jumps: lines that flow from the minimum of h into a saddle, where points on their sides
-part. Lower row (ours): each point is shifted by whole turns to where its flow line meets S0 around the origin. The torus
-becomes one region, all jumps lie on its boundary, and the puzzle of the paper is solved.
+part. Lower row (ours): each point is shifted by whole turns to where its flow line meets S0 around the origin. The
+torus becomes one region, all jumps lie on its boundary, and the puzzle of the paper is solved.
 """
 
 import time
@@ -24,17 +24,19 @@ from orthocas.growing.singularities import Jump, SingularPoint, jumps, singular_
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.planar_flow import (
     EXTREME,
-    MARKS,
     NAMES,
+    base_leaf,
     cell_centres,
     cosines_by_differences,
     deviations,
     flow_lines,
     grown_chart,
+    grown_coordinates,
     mark,
     mark_singular,
     planar_problem,
     plot_wrapped,
+    singular_symbols,
 )
 from orthocas.reproduce.self_motion import wrapped
 from orthocas.reproduce.style import INK, LABEL, TICK, TURN, joint_axis, joint_plane, new_figure, pi_text
@@ -80,7 +82,8 @@ def draw(quick: bool) -> Drawing:
     bar = figure.colorbar(
         ScalarMappable(Normalize(-np.pi, np.pi), _COLOURS), cax=figure.add_axes((0.92, 0.27, 0.016, 0.55))
     )
-    bar.set_ticks(ticks := np.linspace(-np.pi, np.pi, 5), labels=[pi_text(tick) for tick in ticks])
+    ticks = np.linspace(-np.pi, np.pi, 5).tolist()
+    bar.set_ticks(ticks, labels=[pi_text(tick) for tick in ticks])
     bar.ax.tick_params(labelsize=TICK)
     bar.ax.set_title(r"$\xi$ [rad]", fontsize=LABEL)
     figure.legend(handles=_entries(), loc="lower center", ncols=3, fontsize=TICK, frameon=False, columnspacing=1.4)
@@ -97,8 +100,8 @@ def _evaluated(metric: str, cells: int) -> _Field:
     points = cell_centres(cells)
     chart.xi(points[:1])  # builds functions
     start = time.perf_counter()
-    pulled = chart.coordinates.pull(points)  # once, for both xi and turns
-    xi = np.where(pulled.reached, chart.coordinates.leaf.values(pulled.points).xi[:, 0], np.nan)
+    pulled = grown_coordinates(chart).pull(points)  # once, for both xi and turns
+    xi = np.where(pulled.reached, base_leaf(chart).values(pulled.points).xi[:, 0], np.nan)
     seconds = time.perf_counter() - start
     turns = np.round(pulled.points / TURN)
     shape = (cells, cells)
@@ -107,7 +110,7 @@ def _evaluated(metric: str, cells: int) -> _Field:
 
 def _draw_torus(axes: Any, field: _Field) -> None:
     axes.imshow(field.xi, extent=2 * (-np.pi, np.pi), **_SHOWN)
-    plot_wrapped(axes, [field.chart.coordinates.leaf.curve], **_LEAF)
+    plot_wrapped(axes, [base_leaf(field.chart).curve], **_LEAF)
     plot_wrapped(axes, _cut_line(field.chart), **_CUT)
     for lines, _ in _jump_lines(field):
         plot_wrapped(axes, lines, **_JUMP)
@@ -129,7 +132,7 @@ def _put_together(field: _Field) -> Array:
 
 def _draw_region(axes: Any, field: _Field) -> None:
     axes.imshow(_put_together(field), extent=2 * (-3 * np.pi, 3 * np.pi), **_SHOWN)
-    axes.plot(*field.chart.coordinates.leaf.curve.T, **_LEAF)
+    axes.plot(*base_leaf(field.chart).curve.T, **_LEAF)
     for curve in _cut_line(field.chart):
         axes.plot(*curve.T, **_CUT)
     for lines, turns in _jump_lines(field):
@@ -145,15 +148,13 @@ def _draw_region(axes: Any, field: _Field) -> None:
 
 
 def _entries() -> list[Line2D]:
-    lines = [Line2D([], [], **style) for style in (_LEAF, _CUT, _JUMP)]
-    style = {"linestyle": "", "color": "white", "markeredgecolor": INK}
-    return lines + [Line2D([], [], marker=marker, label=f"{kind} of $h$", **style) for kind, marker in MARKS.items()]
+    return [*(Line2D([], [], **style) for style in (_LEAF, _CUT, _JUMP)), *singular_symbols()]
 
 
 def _cut_line(chart: Chart) -> list[Array]:
     """The flow line through the point of S0 where xi passes from pi to -pi, down and up."""
     goals = np.array([-EXTREME, EXTREME])
-    return flow_lines(chart.problem, np.tile(chart.coordinates.leaf.cut, (2, 1)), goals, 100)
+    return flow_lines(chart.problem, np.tile(base_leaf(chart).cut, (2, 1)), goals, 100)
 
 
 def _jump_lines(field: _Field) -> list[tuple[list[Array], Array]]:
@@ -162,7 +163,7 @@ def _jump_lines(field: _Field) -> list[tuple[list[Array], Array]]:
     for saddle in (s for s in field.singular if s.kind == "saddle"):
         falling, rising = 1e-3 * saddle.directions.T
         lines = flow_lines(field.chart.problem, saddle.point + np.stack([falling, -falling]), np.full(2, -EXTREME), 100)
-        sides = field.chart.coordinates.pull(saddle.point + np.stack([rising, -rising])).points
+        sides = grown_coordinates(field.chart).pull(saddle.point + np.stack([rising, -rising])).points
         found.append((lines, np.round(sides / TURN)))
     return found
 
@@ -198,5 +199,5 @@ def _at_saddles(chart: Chart) -> list[Jump]:
 
 def _difference_on_leaf(first: Chart, second: Chart) -> float:
     """Largest difference of the coordinates at points of S0 [rad]."""
-    on_leaf = first.coordinates.leaf.curve[::7]
+    on_leaf = base_leaf(first).curve[::7]
     return float(np.abs(wrapped(first.xi(on_leaf) - second.xi(on_leaf))).max())

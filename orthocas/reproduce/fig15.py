@@ -13,12 +13,12 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb, to_rgba
 
 from orthocas import problems
-from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.domains import Box, sample_uniform
 from orthocas.growing.disk_leaf import DiskLeaf, disk_leaf
 from orthocas.growing.flow import TaskFlow
 from orthocas.growing.grow import grow
+from orthocas.growing.grown import GrownCoordinates
 from orthocas.growing.harmonic import signed_areas
 from orthocas.growing.level_surface import level_surface
 from orthocas.problem import Problem, task_jacobians
@@ -44,19 +44,26 @@ _TINTS = np.array([to_rgb(c) for c in ("#cfe0f3", "#f6d9bd", "#d3ebd0", "#e4d3ee
 _VIEW = (24, 32)
 
 
-def half_torus() -> Problem:
-    """Planar arm with three joints, task x, A = I, on 0 <= q1 <= pi: [AS2023] Sec. 5.2."""
+def grown_disk(cells: int) -> tuple[GrownCoordinates, DiskLeaf]:
+    """Coordinates of [AS2023] Sec. 5.2, planar arm with three joints, task x, A = I, 0 <= q1 <= pi; and their base leaf.
+
+    Args:
+        cells: of marching cubes, along the longest edge of the box.
+    """
     robot = problems.get("planar_3r_x").robot
-    return Problem(robot, Task.position(robot, "x"), "euclidean", Box((_LOW + _HIGH) / 2, (_HIGH - _LOW) / 2), "half")
+    domain = Box((_LOW + _HIGH) / 2, (_HIGH - _LOW) / 2)
+    coordinates = grow(Problem(robot, Task.position(robot, "x"), "euclidean", domain), 0.0, cells=cells).coordinates
+    assert isinstance(coordinates, GrownCoordinates)
+    assert isinstance(coordinates.leaf, DiskLeaf)
+    return coordinates, coordinates.leaf
 
 
 def draw(quick: bool) -> Drawing:
     """Triangles, their image, isolines on the base leaf and on others; numbers tell how exact the coordinates are."""
-    problem = half_torus()
     start = perf_counter()
-    chart = grow(problem, 0.0, cells=24 if quick else 70)
+    coordinates, fine = grown_disk(24 if quick else 70)
     seconds = perf_counter() - start
-    fine, coarse = chart.coordinates.leaf, disk_leaf(problem, np.zeros(1), problem.domain, _COARSE)
+    coarse = disk_leaf(fine.problem, fine.level, fine.region, _COARSE)
     figure = new_figure(6.7, layout=None)
     _draw_triangles(_cube_axes(figure, 0.0, 0.545, "(a) triangles of $S_0$"), coarse)
     _draw_disk(figure, coarse)
@@ -64,7 +71,7 @@ def draw(quick: bool) -> Drawing:
     _draw_leaves(_cube_axes(figure, 0.5, 0.06, "(d) other leaves, cut away in steps"), fine, _CUTS)
     line_legend(figure, {r"$\xi_1$ = const": FIRST, r"$\xi_2$ = const": SECOND} | _NAMES)
     numbers = {"triangles": float(len(fine.faces)), "seconds_to_grow": seconds} | _mesh_numbers(fine, coarse)
-    return Drawing({"": figure}, numbers | _chart_numbers(chart))
+    return Drawing({"": figure}, numbers | _flow_numbers(coordinates))
 
 
 def moved_leaf(leaf: DiskLeaf, dx: float) -> Array:
@@ -88,7 +95,9 @@ def _draw_triangles(axes: Any, leaf: DiskLeaf) -> None:
 
 def _draw_disk(figure: Any, leaf: DiskLeaf) -> None:
     axes = figure.add_axes((0.6, 0.595, 0.36, 0.36 * 6.3 / 6.7))
-    triangles = PolyCollection(leaf.disk[leaf.mesh.faces], facecolors=_quadrants(leaf), edgecolors=INK, linewidths=0.4)
+    triangles = PolyCollection(
+        list(leaf.disk[leaf.mesh.faces]), facecolors=_quadrants(leaf), edgecolors=INK, linewidths=0.4
+    )
     axes.add_collection(triangles)
     axes.set(xlim=(-1.04, 1.04), ylim=(-1.04, 1.04), aspect="equal")
     axes.set_title("(b) the same in the unit disk", fontsize=LABEL)
@@ -131,31 +140,31 @@ def _mesh_numbers(fine: DiskLeaf, coarse: DiskLeaf) -> dict[str, float]:
     }
 
 
-def _chart_numbers(chart: Chart) -> dict[str, float]:
+def _flow_numbers(coordinates: GrownCoordinates) -> dict[str, float]:
     """How orthogonal, how constant along the flow, and how far the coordinates reach."""
-    problem = chart.problem
+    problem = coordinates.problem
     points = sample_uniform(problem.domain, _SAMPLES, 3)
-    pulled = chart.coordinates.pull(points)
+    pulled = coordinates.pull(points)
     points, on_leaf = points[pulled.reached], pulled.points[pulled.reached]
-    J_xi, J_x = chart.coordinates.jacobian(points), task_jacobians(problem, points)
+    J_xi, J_x = coordinates.jacobian(points), task_jacobians(problem, points)
     lengths = np.linalg.norm(J_xi, axis=2) * np.linalg.norm(J_x, axis=2)
     cosines = (J_xi @ J_x.transpose(0, 2, 1))[:, :, 0] / lengths
-    moved = [TaskFlow(problem).move(on_leaf, np.full((len(on_leaf), 1), dx)).points for dx in (_STEP, -_STEP)]
+    moved = [coordinates.flow.move(on_leaf, np.full((len(on_leaf), 1), dx)).points for dx in (_STEP, -_STEP)]
     return {
         "samples_with_coordinates": len(points) / _SAMPLES,
         "largest_cosine": float(np.abs(cosines).max()),
-        "largest_change_along_flow": float(np.abs([chart.xi(q) - chart.xi(on_leaf) for q in moved]).max()),
-        "covered_at_0.3": _covered(chart, _STEP),
-        "covered_at_-0.3": _covered(chart, -_STEP),
+        "largest_change_along_flow": float(np.abs([coordinates.xi(q) - coordinates.xi(on_leaf) for q in moved]).max()),
+        "covered_at_0.3": _covered(coordinates, _STEP),
+        "covered_at_-0.3": _covered(coordinates, -_STEP),
     }
 
 
-def _covered(chart: Chart, x: float) -> float:
+def _covered(coordinates: Chart, x: float) -> float:
     """Share of the area of a leaf in the domain where coordinates have values."""
-    task, low, high = chart.problem.task, _LOW, _HIGH
+    task, low, high = coordinates.problem.task, _LOW, _HIGH
     mesh = level_surface(
         lambda q: task.batched(q)[0][:, 0], lambda q: task.batched_jacobian(q)[0][:, 0], x, low, high, _COVER_CELLS
     )
     corners = mesh.vertices[mesh.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return float(areas[np.isfinite(chart.xi(corners.mean(axis=1))[:, 0])].sum() / areas.sum())
+    return float(areas[np.isfinite(coordinates.xi(corners.mean(axis=1))[:, 0])].sum() / areas.sum())

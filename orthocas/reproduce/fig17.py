@@ -1,7 +1,7 @@
 """[AS2023] Fig. 17: coordinates of the planar arm with two joints, fitted on the whole torus, for A = I and A = M.
 
-No smooth function parametrises closed leaves with one number, so there are regions of bad fit: along the lines that flow
-into singular points, and along folds, where xi has its extrema on the leaves. Equal parts of the torus lie between
+No smooth function parametrises closed leaves with one number, so there are regions of bad fit: along the lines that
+flow into singular points, and along folds, where xi has its extrema on the leaves. Equal parts of the torus lie between
 neighbouring isolines of xi, and as much of it where xi > 0 as where xi < 0.
 """
 
@@ -20,7 +20,6 @@ from orthocas.growing.singularities import singular_points
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.planar_fit import fitted_chart
 from orthocas.reproduce.planar_flow import (
-    MARKS,
     NAMES,
     cell_centres,
     corners,
@@ -28,8 +27,9 @@ from orthocas.reproduce.planar_flow import (
     grown_chart,
     mark_singular,
     planar_problem,
+    singular_symbols,
 )
-from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, TICK, joint_plane, new_figure
+from orthocas.reproduce.style import EXTRA, LABEL, TASK, TICK, joint_plane, new_figure
 
 _LEAVES = (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5)  # task values where values of xi are counted [m]
 _INSIDE = (0.3, 0.8)  # a point from where all leaves are reached [rad]
@@ -54,7 +54,7 @@ def draw(quick: bool) -> Drawing:
             axes.tick_params(labelleft=False)
         numbers |= {f"{metric}_{key}": value for key, value in _numbers(chart, points, angles).items()}
     bar = figure.colorbar(ScalarMappable(Normalize(0, 90), _SHADES), cax=figure.add_axes((0.905, 0.28, 0.014, 0.61)))
-    bar.set_ticks(np.linspace(0, 90, 7))
+    bar.set_ticks(list(range(0, 91, 15)))
     bar.ax.tick_params(labelsize=TICK)
     bar.set_label(r"$|\angle(\mathrm{d}\xi, \nabla_A h) - 90°|$ [deg]", fontsize=LABEL)
     figure.legend(handles=_entries(), loc="lower center", ncols=4, fontsize=TICK, frameon=False, columnspacing=1.4)
@@ -73,12 +73,11 @@ def _draw_plane(axes: Any, chart: Chart, angles: Array, cells: int) -> None:
 
 
 def _entries() -> list[Line2D]:
-    style = {"linestyle": "", "color": "white", "markeredgecolor": INK}
     return [
         Line2D([], [], color=EXTRA, label=r"$\xi > 0$"),
         Line2D([], [], color=EXTRA, linestyle="--", label=r"$\xi < 0$"),
         Line2D([], [], color=TASK, label="leaves of the task, $x$ constant"),
-        *(Line2D([], [], marker=marker, label=f"{kind} of $h$", **style) for kind, marker in MARKS.items()),
+        *singular_symbols(),
     ]
 
 
@@ -113,4 +112,5 @@ def _angles_to_grown(chart: Chart, points: Array, most: int = 5000) -> Array:
     sines = (fitted[:, 0] * grown[:, 1] - fitted[:, 1] * grown[:, 0]) / (
         np.linalg.norm(fitted, axis=1) * np.linalg.norm(grown, axis=1)
     )
-    return np.degrees(np.arcsin(np.clip(np.abs(sines[np.isfinite(sines)]), 0, 1)))
+    angles: Array = np.degrees(np.arcsin(np.clip(np.abs(sines[np.isfinite(sines)]), 0, 1)))
+    return angles

@@ -59,7 +59,7 @@ def _draw_surface(axes: Any, q: Array, values: Array) -> None:
         linestyles="-",
     )
     axes.set_zlim(floor, high)
-    ticks = MaxNLocator(5).tick_values(low, high)
+    ticks = MaxNLocator(4, steps=[1, 2, 5, 10]).tick_values(low, high)
     axes.set_zticks(ticks[(ticks > low - 1e-9) & (ticks < high + 1e-9)])
     for joint, letter in enumerate("xy", 1):
         joint_axis(axes, letter, joint)

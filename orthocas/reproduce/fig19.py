@@ -27,8 +27,8 @@ _SPREAD = 0.45  # between self-motion curves, along the task gradients at the ce
 _HALF, _ARROW = 0.13, 0.2  # half an edge of the rectangles, length of the gradients [rad]
 _LIFT = 0.03  # of rectangles above isosurfaces [rad]
 _SAMPLES = 2000
-_LEAF, _PLANE = "#b4b8be", "#e4572e"
-_VIEW = (20, -60)
+_LEAF, _PLANE = "#c9cdd3", "#e4572e"
+_VIEW = (25, 244)
 
 
 def draw(quick: bool) -> Drawing:
@@ -41,15 +41,15 @@ def draw(quick: bool) -> Drawing:
     levels = np.quantile(chart.xi(sample_uniform(problem.domain, _SAMPLES, 3))[:, 0], _SHARES)
     curves = curves_inside(problem, _starts(problem), 0.02)
     places = np.concatenate([_crossings(chart, curve, levels) for curve in curves])
-    figure = new_figure(4.5, 5.4, layout=None)
-    axes = add_3d(figure, 0.06, 0.11, 0.9, 0.88)
+    figure = new_figure(4.6, layout=None)
+    axes = add_3d(figure, 0.1, 0.1, 0.8, 0.89)
     joint_cube(axes, _LOW, _HIGH, parts=1, margin=np.pi / 8)
     scene = _scene(problem, curves, places)
     for level in levels:
-        leaf = isosurface(chart, float(level), 25 if quick else 60)
-        scene.add_surface(leaf.vertices, leaf.faces, _LEAF, 0.55)
-    scene.draw(axes, _VIEW, _LOW, _HIGH, 1.08)
-    names = {"self-motion": TASK, r"$\nabla h_1$": RED, r"$\nabla h_2$": GREEN, "their plane": _PLANE}
+        leaf = isosurface(chart, float(level), 25 if quick else 80)
+        scene.add_surface(leaf.vertices, leaf.faces, _LEAF, 0.6)
+    scene.draw(axes, _VIEW, _LOW, _HIGH, 1.05)
+    names = {"self-motion curves": TASK, r"$\nabla h_1$": RED, r"$\nabla h_2$": GREEN, "their plane": _PLANE}
     line_legend(figure, names | {r"$\xi$ = const": _LEAF})
     return Drawing({"": figure}, _numbers(problem, chart, places))
 
@@ -88,7 +88,7 @@ def _scene(problem: Problem, curves: list[Array], places: Array) -> Scene:
 
 
 def _rectangle(centre: Array, units: Array, cells: int = 10) -> tuple[Array, Array]:
-    """A square in the plane of two vectors, one of them along its diagonal: vertices and faces."""
+    """A square in the plane of two vectors: vertices and faces."""
     basis = np.linalg.qr(units.T)[0].T
     line = np.linspace(-_HALF, _HALF, cells + 1)
     vertices = centre + np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2) @ basis

@@ -1,8 +1,8 @@
 """[AS2023] Fig. 20: angles between dxi_j and grad_M h_i of fitted coordinates, with and without exact solutions.
 
-The planar arm with three joints and A = M: task x (exact coordinates exist) and task (x, y) (they do not). The paper does
-not say on what part of joint space it fits; here it is the box of `orthocas.problems.planar_3r_x`, where neither task is
-singular.
+The planar arm with three joints and A = M: task x (exact coordinates exist) and task (x, y) (they do not). The paper
+does not say on what part of joint space it fits; here it is the box of `orthocas.problems.planar_3r_x` for both tasks,
+where neither is singular.
 """
 
 from typing import Any

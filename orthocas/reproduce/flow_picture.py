@@ -16,16 +16,19 @@ from orthocas.reproduce.painting import Isolines
 from orthocas.reproduce.planar_flow import (
     EXTREME,
     LEVEL,
-    MARKS,
     NAMES,
+    base_leaf,
     cell_centres,
     corners,
     distance_to,
     flow_lines,
     grown_chart,
+    grown_coordinates,
     mark_singular,
     planar_problem,
     plot_wrapped,
+    singular_symbols,
+    symbol,
 )
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.self_motion import wrapped
@@ -69,7 +72,7 @@ def _draw_plane(axes: Any, chart: Chart, curves: list[Array], starts: Array, pul
     axes.contour(q, q, h, levels=_LEVELS, colors=TASK, linewidths=0.8, linestyles="-")
     plot_wrapped(axes, curves, color=EXTRA, linewidth=0.7)
     axes.plot(*starts.T, "+", color=GREY, markersize=4.5, markeredgewidth=0.9, zorder=3)
-    plot_wrapped(axes, [chart.coordinates.leaf.curve], color=INK, linewidth=2.0, zorder=4)
+    plot_wrapped(axes, [base_leaf(chart).curve], color=INK, linewidth=2.0, zorder=4)
     plot_wrapped(axes, pulls, color=_PULL, linewidth=2.0, zorder=4)
     for k, colour in ((0, INK), (-1, _END)):
         ends = wrapped(np.array([pull[k] for pull in pulls]))
@@ -88,7 +91,7 @@ def _draw_torus(
     scene.add_surface(embedded(q), torus_faces(cells, cells // 2), "#eef1f4", lines=lines)
     for curve in curves:
         scene.add_tube(_above(_thinned(curve), 0.016), 0.016, EXTRA)
-    scene.add_tube(_above(chart.coordinates.leaf.curve[::10], 0.04), 0.05, INK)
+    scene.add_tube(_above(base_leaf(chart).curve[::10], 0.04), 0.05, INK)
     for pull in pulls:
         scene.add_tube(_above(_thinned(pull), 0.04), 0.05, _PULL)
         scene.add_ball(embedded(pull[:1])[0], 0.1, INK)
@@ -116,11 +119,6 @@ def _thinned(curve: Array, step: float = 0.02) -> Array:
 
 
 def _add_legend(figure: Any) -> None:
-    def symbol(marker: str, colour: str, text: str) -> Line2D:
-        edge = INK if colour == "white" else colour
-        style = {"linestyle": "", "color": colour, "markeredgecolor": edge, "markersize": 6}
-        return Line2D([], [], marker=marker, label=text, **style)
-
     handles = [
         Line2D([], [], color=TASK, label="leaves of the task"),
         Line2D([], [], color=EXTRA, label=r"curves of $\pm\nabla_A h$"),
@@ -129,7 +127,7 @@ def _add_legend(figure: Any) -> None:
         Line2D([], [], color=_PULL, linewidth=2, label="pull onto $S_0$"),
         symbol("x", INK, "where it starts"),
         symbol("x", _END, "where it ends"),
-        *(symbol(marker, "white", f"{kind} of $h$") for kind, marker in MARKS.items()),
+        *singular_symbols(),
     ]
     figure.legend(handles=handles, loc="lower center", ncols=4, fontsize=TICK, frameon=False, columnspacing=1.4)
 
@@ -150,11 +148,11 @@ def _curve_numbers(up: list[Array], down: list[Array], singular: tuple[SingularP
 
 def _pull_numbers(chart: Chart, pulls: list[Array], samples: int) -> dict[str, float]:
     """How exact pulls are, those drawn and those of random points of the torus."""
-    moved = chart.coordinates.pull(sample_uniform(chart.problem.domain, samples, 0))
+    moved = grown_coordinates(chart).pull(sample_uniform(chart.problem.domain, samples, 0))
     drawn = np.array([pull[-1] for pull in pulls])
     return {
         "task_error_of_drawn_pulls": float(np.abs(chart.task(drawn) - LEVEL).max()),
         "task_error_of_pulls": float(np.abs(chart.task(moved.points[moved.reached]) - LEVEL).max()),
         "share_that_reaches_base_leaf": float(moved.reached.mean()),
-        "length_of_base_leaf": float(chart.coordinates.leaf.length[0]),
+        "length_of_base_leaf": float(base_leaf(chart).length[0]),
     }

@@ -7,13 +7,16 @@ saddles of height 0 at (0, pi) and (pi, pi).
 from typing import Any
 
 import numpy as np
+from matplotlib.lines import Line2D
 
 from orthocas import problems
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.domains import Torus
+from orthocas.growing.circle_leaf import CircleLeaf
 from orthocas.growing.flow import TaskFlow
 from orthocas.growing.grow import grow
+from orthocas.growing.grown import GrownCoordinates
 from orthocas.growing.singularities import SingularPoint
 from orthocas.problem import Problem
 from orthocas.reproduce.self_motion import pieces_in_cube, wrapped
@@ -36,6 +39,19 @@ def planar_problem(metric: str) -> Problem:
 def grown_chart(problem: Problem) -> Chart:
     """Coordinates grown from S0, charted by arc length from (pi/3, 0)."""
     return grow(problem, LEVEL, origin=_ORIGIN)
+
+
+def grown_coordinates(chart: Chart) -> GrownCoordinates:
+    """What `grown_chart` made."""
+    assert isinstance(chart.coordinates, GrownCoordinates)
+    return chart.coordinates
+
+
+def base_leaf(chart: Chart) -> CircleLeaf:
+    """S0 of a chart that `grown_chart` made."""
+    leaf = grown_coordinates(chart).leaf
+    assert isinstance(leaf, CircleLeaf)
+    return leaf
 
 
 def flow_lines(problem: Problem, starts: Array, goals: Array, steps: int) -> list[Array]:
@@ -100,7 +116,8 @@ def deviations(problem: Problem, points: Array, J_xi: Array) -> Array:
     """
     gradients = samples_at(problem, points).unit_task_gradients[:, 0]
     cosines = (gradients * J_xi).sum(axis=1) / np.linalg.norm(J_xi, axis=1)
-    return np.degrees(np.arcsin(np.clip(np.abs(cosines), 0, 1)))
+    angles: Array = np.degrees(np.arcsin(np.clip(np.abs(cosines), 0, 1)))
+    return angles
 
 
 def cosines_by_differences(chart: Chart, points: Array, step: float = 1e-4) -> Array:
@@ -132,6 +149,17 @@ def mark(axes: Any, kind: str, points: Array, size: float = 7.0) -> None:
     """Mark singular points (N, 2) of a kind, "maximum", "minimum" or "saddle"."""
     style = {"color": "white", "markeredgecolor": INK, "markersize": size, "markeredgewidth": 0.9}
     axes.plot(*points.T, MARKS[kind], **style, clip_on=False, zorder=6)
+
+
+def symbol(marker: str, colour: str, text: str) -> Line2D:
+    """An entry of a legend for a mark."""
+    edge = INK if colour == "white" else colour
+    return Line2D([], [], linestyle="", marker=marker, color=colour, markeredgecolor=edge, markersize=6, label=text)
+
+
+def singular_symbols() -> list[Line2D]:
+    """Entries of a legend for singular points."""
+    return [symbol(marker, "white", f"{kind} of $h$") for kind, marker in MARKS.items()]
 
 
 def mark_singular(axes: Any, singular: tuple[SingularPoint, ...], size: float = 7.0) -> None:

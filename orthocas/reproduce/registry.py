@@ -7,7 +7,23 @@ from pathlib import Path
 
 from orthocas.errors import UnknownNameError
 from orthocas.objective import Monitor, Progress, silent
-from orthocas.reproduce import fig06, fig07, fig08, fig09, fig11, fig12, fig13, fig14, fig17, fig18, fig20
+from orthocas.reproduce import (
+    fig01,
+    fig06,
+    fig07,
+    fig08,
+    fig09,
+    fig10,
+    fig11,
+    fig12,
+    fig13,
+    fig14,
+    fig15,
+    fig17,
+    fig18,
+    fig19,
+    fig20,
+)
 from orthocas.reproduce.drawing import Drawing, made_folder, save
 
 
@@ -20,16 +36,20 @@ class Recipe:
 
 
 FIGURES: dict[str, Recipe] = {
+    "fig01": Recipe("The idea of orthogonal foliations, task x in the 3-torus", fig01.draw),
     "fig06": Recipe("Leaves of the task x on the 2-torus", fig06.draw),
     "fig07": Recipe("Leaves of the task x in the 3-torus", fig07.draw),
     "fig08": Recipe("Self-motion curves of the task (x, y) in the 3-torus", fig08.draw),
     "fig09": Recipe("Orthogonal foliations for dynamic consistency", fig09.draw),
+    "fig10": Recipe("A distribution that is not involutive, task (x, y)", fig10.draw),
     "fig11": Recipe("Rows of the task Jacobian in Cartesian and polar coordinates", fig11.draw),
     "fig12": Recipe("Following the gradient flow, A = I", fig12.draw),
     "fig13": Recipe("The grown coordinate, A = I and A = M", fig13.draw),
     "fig14": Recipe("Following the gradient flow, A = M", fig14.draw),
+    "fig15": Recipe("Coordinates grown from a leaf that is a disk", fig15.draw),
     "fig17": Recipe("Isolines of fitted coordinates, A = I and A = M", fig17.draw),
     "fig18": Recipe("Surfaces of the task and of a fitted coordinate", fig18.draw),
+    "fig19": Recipe("A fitted coordinate, task (x, y), in a section of joint space", fig19.draw),
     "fig20": Recipe("Angles of fitted coordinates, involutive and not", fig20.draw),
 }
 

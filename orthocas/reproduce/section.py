@@ -1,4 +1,4 @@
-"""A section of joint space under the task (x, y) of the planar arm with three joints, A = I: what Figs. 10 and 19 share."""
+"""What Figs. 10 and 19 share: a box of joint space, task (x, y) of the planar arm with three joints, A = I."""
 
 import numpy as np
 
@@ -32,7 +32,7 @@ def curves_inside(problem: Problem, starts: Array, step: float) -> list[Array]:
     for curve in trace(problem.task, starts, step):
         turns = curve[-1] - curve[0]  # of joints that go around
         line, at = np.concatenate([curve[:-1] - turns, curve]), len(curve) - 1
-        inside = (np.abs(line - problem.domain.centre) <= problem.domain.half_width).all(axis=1)
+        inside = np.all(np.abs(line - problem.domain.centre) <= problem.domain.half_width, axis=1)
         before, after = np.append(inside[at::-1], False), np.append(inside[at:], False)
         curves.append(line[at - int(np.argmin(before)) + 1 : at + int(np.argmin(after))])
     return curves
