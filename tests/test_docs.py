@@ -25,16 +25,26 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def test_python_quickstart_runs(checkout: Path) -> None:
-    (code,) = blocks("python")
+    code = blocks("python")[0]
     done = subprocess.run([sys.executable, "-c", code], cwd=checkout, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert float(done.stdout.split()[0]) < 2.06
     assert (checkout / "arm.orthocas").exists()
 
 
+def test_python_block_of_exact_coordinates_runs(checkout: Path) -> None:
+    code = blocks("python")[1]
+    done = subprocess.run([sys.executable, "-c", code], cwd=checkout, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    verdict, numbers = done.stdout.splitlines()
+    assert "orthogonal" in verdict
+    exact, distilled = map(float, numbers.split())
+    assert exact < 1e-9 < distilled < 0.1
+
+
 def test_shell_quickstart_runs(checkout: Path) -> None:
     commands = [shlex.split(line) for line in blocks("sh")[1].splitlines()]
-    assert len(commands) == 7
+    assert len(commands) == 8
     for words in commands:
         assert words[0] == "orthocas"
         done = subprocess.run([sys.executable, "-m", *words], cwd=checkout, capture_output=True, text=True, check=False)

@@ -113,8 +113,8 @@ def test_flow_lines_are_orthogonal_to_leaves_in_the_metric(metric: str) -> None:
     assert abs(cosine) < 1e-5  # chords of length 1e-3
 
 
-def test_flow_line_into_a_saddle_stops_there() -> None:
-    """By symmetry q1 = 0, q1 + q2 = pi - t is no flow line, but the line from the saddle downwards leads back to it."""
+def test_flow_line_down_from_a_saddle_leads_back_past_it() -> None:
+    """Starting along the eigenvector of falling h; the direction is that of the golden ratio."""
     problem = planar_problem("euclidean")
     saddle, into = np.array([0.0, np.pi]), np.array([-0.85065081, 0.52573111])
     (down,) = flow_lines(problem, (saddle + 1e-6 * into)[None], np.array([-1e-3]), 5)

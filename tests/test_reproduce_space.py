@@ -60,7 +60,7 @@ def test_fig19_planes_are_nearly_tangent(drawings: dict[str, Drawing]) -> None:
     """Sec. 6.2: no exact coordinate exists, but a good one."""
     n = drawings["fig19"].numbers
     assert n["rectangles"] >= 12
-    assert 0.5 < n["mean_tilt_of_rectangles_deg"] < n["largest_tilt_of_rectangles_deg"] < 12
+    assert 0.5 < n["mean_tilt_of_rectangles_deg"] < n["largest_tilt_of_rectangles_deg"] < 15
     assert n["mean_tilt_in_section_deg"] < 6
     assert n["task_angle_mean_deg"] == pytest.approx(90, abs=2)
     assert 0.5 < n["task_angle_std_deg"] < n["expected_angle_deg"]  # that of quadratic coordinates

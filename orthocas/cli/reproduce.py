@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from orthocas.cli.output import AsJson, note, print_json, print_rows
+from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.progress import terminal_monitor
 from orthocas.reproduce.drawing import made_folder
 from orthocas.reproduce.registry import FIGURES, chosen
@@ -29,4 +29,4 @@ def reproduce(
     for name, values in numbers.items():
         typer.echo(f"{name}: {FIGURES[name].title}")
         print_rows({f"  {key}": f"{value:.6g}" for key, value in values.items()})
-    note(f"files are in {folder}")
+    print_rows({"files": str(folder)})

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.colors import to_rgba
+from matplotlib.patheffects import withStroke
 
 from orthocas.checks import Array
 from orthocas.growing.grown import GrownCoordinates
@@ -108,7 +109,10 @@ def _add_gradients(axes: Any, scene: Scene, coordinates: GrownCoordinates) -> No
     start = on_leaf[0] + _LIFT * units[0]
     for unit, (name, colour) in zip(units, _GRADIENTS.items(), strict=True):
         scene.add_arrow(start, _ARROW * unit, 0.025, colour)
-        axes.text(*(start + (_ARROW + 0.16) * unit), name, color=colour, fontsize=LABEL, ha="center", va="center")
+        text = axes.text(
+            *(start + (_ARROW + 0.16) * unit), name, color=colour, fontsize=LABEL, ha="center", va="center"
+        )
+        text.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
     scene.add_ball(start, 0.045, INK)
 
 

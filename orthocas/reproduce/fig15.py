@@ -45,7 +45,7 @@ _VIEW = (24, 32)
 
 
 def grown_disk(cells: int) -> tuple[GrownCoordinates, DiskLeaf]:
-    """Coordinates of [AS2023] Sec. 5.2, planar arm with three joints, task x, A = I, 0 <= q1 <= pi; and their base leaf.
+    """Coordinates of [AS2023] Sec. 5.2 (three joints, task x, A = I, 0 <= q1 <= pi), and their base leaf.
 
     Args:
         cells: of marching cubes, along the longest edge of the box.
@@ -159,7 +159,7 @@ def _flow_numbers(coordinates: GrownCoordinates) -> dict[str, float]:
     }
 
 
-def _covered(coordinates: Chart, x: float) -> float:
+def _covered(coordinates: GrownCoordinates, x: float) -> float:
     """Share of the area of a leaf in the domain where coordinates have values."""
     task, low, high = coordinates.problem.task, _LOW, _HIGH
     mesh = level_surface(
