@@ -8,12 +8,14 @@ the other. The last block is filled up with copies of the first sample.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from orthocas.batch import THREADS
 from orthocas.checks import Array
 from orthocas.expression_tape import Tape, replay, to_tape
 
@@ -57,10 +59,14 @@ class ColumnFunction:
         self._function = function
 
     def __call__(self, *arguments: Array) -> list[Array]:
-        """Outputs (B, entries, c) for inputs (B, entries, c), contiguous."""
-        run = self.on_one_block()
-        blocks = [run(*block) for block in zip(*arguments, strict=True)]
-        return [np.stack(outputs) for outputs in zip(*blocks, strict=True)]
+        """Outputs (B, entries, c) for inputs (B, entries, c), contiguous; threads share the blocks."""
+        parts = min(THREADS, len(arguments[0]))
+        if parts == 1:
+            return self._of_blocks(*arguments)
+        shares_of_threads = zip(*(np.array_split(argument, parts) for argument in arguments), strict=True)
+        with ThreadPoolExecutor(parts) as pool:  # CasADi lets go of Python's lock while it works
+            results = list(pool.map(lambda part: self._of_blocks(*part), shares_of_threads))
+        return [np.concatenate(outputs) for outputs in zip(*results, strict=True)]
 
     def on_one_block(self) -> Callable[..., list[Array]]:
         """A function of contiguous inputs (entries, c) with its own scratch memory; outputs (entries, c)."""
@@ -78,6 +84,12 @@ class ColumnFunction:
             return results
 
         return run
+
+    def _of_blocks(self, *arguments: Array) -> list[Array]:
+        """Outputs for some blocks, in one thread."""
+        run = self.on_one_block()
+        blocks = [run(*block) for block in zip(*arguments, strict=True)]
+        return [np.stack(outputs) for outputs in zip(*blocks, strict=True)]
 
     @cached_property
     def _on_block(self) -> ca.Function:

@@ -1,7 +1,7 @@
 """Many independent initial value problems at once, each with its own step size.
 
 SUNDIALS spends two thirds of its time outside the right-hand side when a system has three states. Here one step of
-every trajectory is one call of a mapped CasADi function, so that only arithmetic is left.
+every trajectory is an operation on columns of samples, so that only arithmetic is left.
 """
 
 from dataclasses import dataclass
@@ -15,9 +15,10 @@ from scipy.integrate import DOP853
 
 from orthocas.batch import Batched, dense_function
 from orthocas.checks import Array
+from orthocas.columns import ColumnFunction, blocked, by_sample
 
 _STAGES = 12
-_LARGE = 3000  # operations of a field from which stages call it instead of holding copies of it
+_FEW = 64  # trajectories that are not worth a block of columns
 _FIRST = 0.25  # first step
 _SMALLEST = 1e-9  # step at which a trajectory is given up: its field is singular there
 _SHRINK, _GROW, _SAFETY = 0.2, 10.0, 0.9
@@ -52,7 +53,7 @@ class BatchedFlow:
         running = np.arange(len(starts))
         while running.size:
             tried = np.minimum(step[running], 1 - s[running])
-            moved, error = self._step(y[running], tried[:, None], parameters[running])
+            moved, error = self._moved(y[running], tried[:, None], parameters[running])
             ratio = np.nan_to_num(error[:, 0] / tolerance, nan=np.inf)
             good = ratio <= 1
             y[running[good]] = moved[good]
@@ -61,12 +62,27 @@ class BatchedFlow:
             running = running[(s[running] < 1) & (step[running] > _SMALLEST)]
         return y, s >= 1
 
+    def _moved(self, *arguments: Array) -> list[Array]:
+        """A step of some trajectories: y (N, k), step sizes (N, 1), p (N, l) -> y (N, k), errors (N, 1)."""
+        N = len(arguments[0])
+        if N <= _FEW:
+            return self._few(*arguments)
+        outputs = self._many(*map(blocked, arguments))
+        return [by_sample(out[:, None], N)[:, :, 0] for out in outputs]
+
     @cached_property
-    def _step(self) -> Batched:
+    def _few(self) -> Batched:
+        return Batched(self._step)
+
+    @cached_property
+    def _many(self) -> ColumnFunction:
+        return ColumnFunction(self._step)
+
+    @cached_property
+    def _step(self) -> ca.Function:
         """One step: y, step size, p -> new y and the estimate of its error in units of the tolerance."""
         k = self.field.size1_in(0)
-        symbol: Any = ca.SX if self.field.n_instructions() < _LARGE else ca.MX
-        y, step, p = symbol.sym("y", k), symbol.sym("step"), symbol.sym("p", self.field.size1_in(1))
+        y, step, p = ca.SX.sym("y", k), ca.SX.sym("step"), ca.SX.sym("p", self.field.size1_in(1))
         slopes: list[Any] = []
         for i in range(_STAGES):
             slopes.append(self.field(y + step * _combined(DOP853.A[i, :i], slopes), p) if i else self.field(y, p))
@@ -75,7 +91,7 @@ class BatchedFlow:
         fifth = ca.sumsqr(_combined(DOP853.E5[:_STAGES], slopes) / scale)
         third = ca.sumsqr(_combined(DOP853.E3[:_STAGES], slopes) / scale)
         error = step * fifth / ca.sqrt(fifth + 0.01 * third + 1e-300)
-        return Batched(dense_function("step", [y, step, p], [moved, error]))
+        return dense_function("step", [y, step, p], [moved, error])
 
 
 def _combined(weights: Array, slopes: list[Any]) -> Any:
