@@ -1,5 +1,6 @@
 """Examples and benchmarks run in their quick modes and return sensible numbers."""
 
+import re
 from pathlib import Path
 
 import c_timing
@@ -8,6 +9,7 @@ import compare_parametrisations
 import distillation
 import fits
 import front
+import gallery
 import growing_queries
 import iiwa_demo
 import involutivity
@@ -17,8 +19,10 @@ import paper_network
 import pytest
 import scaling
 import starts
+from PIL import Image
 
 import orthocas as oc
+from orthocas.reproduce.registry import FIGURES
 
 
 def test_demo_saves_chart_and_pictures(tmp_path: Path) -> None:
@@ -88,6 +92,20 @@ def test_distillation_keeps_more_with_the_degree(tmp_path: Path, capsys: pytest.
     assert found["inertia polynomial:4"] > 2  # steep coordinates: stated in the docs
     assert "| euclidean | polynomial:4 |" in capsys.readouterr().out
     assert oc.evaluate(oc.load(tmp_path / "distilled_euclidean.orthocas"), 1000).task_angle.std < 0.2
+
+
+def test_gallery_shrinks_pictures(tmp_path: Path) -> None:
+    assert set(gallery.main(tmp_path, "fig11", quick=True)) == {"fig11"}
+    with Image.open(tmp_path / "fig11.png") as picture:
+        assert picture.mode == "P"
+        assert 600 < picture.width <= gallery.WIDTH
+
+
+def test_gallery_page_shows_every_figure() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "gallery.md").read_text()
+    shown = re.findall(r"figures/paper/(fig\d+)\.png", page)
+    assert shown == list(FIGURES)
+    assert page.count("- Agrees: ") == page.count("- Differs: ") == len(shown)
 
 
 def test_growing_benchmark_compares_equal_results(capsys: pytest.CaptureFixture[str]) -> None:

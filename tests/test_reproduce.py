@@ -186,7 +186,13 @@ def test_unwritable_folder_is_refused(tmp_path: Path) -> None:
 def test_command_prints_rows_or_json(run, two_figures: list[tuple[str, bool]], tmp_path: Path) -> None:
     code, out, err = run("all", "--out", "new")
     assert (code, err) == (0, "")
-    assert out.splitlines() == ["fig06: title of fig06", "  name  6", "fig11: title of fig11", "  name  11", "files  new"]
+    assert out.splitlines() == [
+        "fig06: title of fig06",
+        "  name  6",
+        "fig11: title of fig11",
+        "  name  11",
+        "files  new",
+    ]
     code, out, err = run("6", "--out", "new", "--quick", "--json")
     assert (code, json.loads(out), err) == (0, {"fig06": {"name": 6.0}}, "")
     assert two_figures == [("fig06", False), ("fig11", False), ("fig06", True)]

@@ -1,0 +1,45 @@
+"""The pictures of docs/gallery.md: every figure of the paper that is drawn again, in the size of a page (2 min)."""
+
+import argparse
+from pathlib import Path
+
+from PIL import Image
+
+from orthocas.reproduce import reproduce
+
+WIDTH = 1300  #: pixels, enough for a page
+COLOURS = 192
+
+
+def main(out: Path, name: str = "all", quick: bool = False) -> dict[str, dict[str, float]]:
+    """Draw figures and shrink the pictures.
+
+    Args:
+        out: folder for pictures, numbers and meshes.
+        name: a figure, or "all".
+        quick: coarser figures.
+
+    Returns:
+        The numbers of each figure.
+    """
+    numbers = reproduce(name, out, quick)
+    for figure in numbers:
+        for path in out.glob(f"{figure}*.png"):
+            shrink(path)
+    return numbers
+
+
+def shrink(path: Path) -> None:
+    """Make a picture at most WIDTH pixels wide, with a palette."""
+    with Image.open(path) as picture:
+        small = picture.convert("RGB")
+    small.thumbnail((WIDTH, 10 * WIDTH))
+    small.quantize(COLOURS, Image.Quantize.MEDIANCUT).save(path, optimize=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/gallery"))
+    parser.add_argument("--quick", action="store_true")
+    arguments = parser.parse_args()
+    main(arguments.out, quick=arguments.quick)
