@@ -76,9 +76,11 @@ def test_fitted_coordinate_folds_on_closed_leaves(n: dict[str, float]) -> None:
     for metric in ("euclidean", "inertia"):
         assert n[f"{metric}_least_times_of_a_value_on_a_leaf"] == 2
         assert n[f"{metric}_largest_times_of_a_value_on_a_leaf"] % 2 == 0
-        assert n[f"{metric}_median_deviation_deg"] < 15  # a random direction gives 45
+        assert n[f"{metric}_median_deviation_deg"] < 20  # a random direction gives 45
         assert n[f"{metric}_median_angle_to_grown_gradient_deg"] < 10  # by selection; 90 if one of them were wrong
-    assert n["inertia_share_of_values_twice_on_a_leaf"] > 0.9
+        assert n[f"{metric}_share_of_values_twice_on_a_leaf"] > 0.9
+    assert n["euclidean_free_start_median_deviation_deg"] < n["euclidean_median_deviation_deg"]
+    assert n["euclidean_free_start_share_of_values_twice"] < 0.5  # better, but folded more often
 
 
 @pytest.mark.parametrize("n", ["fig18"], indirect=True)

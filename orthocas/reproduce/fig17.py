@@ -18,7 +18,7 @@ from orthocas.growing.circle_leaf import circle_leaf
 from orthocas.growing.flow import TaskFlow
 from orthocas.growing.singularities import singular_points
 from orthocas.reproduce.drawing import Drawing
-from orthocas.reproduce.planar_fit import fitted_chart
+from orthocas.reproduce.planar_fit import fitted_from_grown, freely_fitted
 from orthocas.reproduce.planar_flow import (
     NAMES,
     cell_centres,
@@ -34,6 +34,7 @@ from orthocas.reproduce.style import EXTRA, LABEL, TASK, TICK, joint_plane, new_
 _LEAVES = (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5)  # task values where values of xi are counted [m]
 _INSIDE = (0.3, 0.8)  # a point from where all leaves are reached [rad]
 _SHADES = "Greys"
+_FITS = {"euclidean": fitted_from_grown, "inertia": freely_fitted}
 _GOOD = 10.0  # deviation [deg]
 
 
@@ -43,7 +44,7 @@ def draw(quick: bool) -> Drawing:
     figure = new_figure(3.7, layout=None)
     numbers: dict[str, float] = {}
     for k, metric in enumerate(NAMES):
-        chart = fitted_chart(planar_problem(metric), quick)
+        chart = _FITS[metric](planar_problem(metric), quick)
         points = cell_centres(cells)
         angles = deviations(chart.problem, points, chart.jacobian(points)[:, 1])
         axes = figure.add_axes((0.1 + 0.405 * k, 0.25, 0.37, 0.67))
@@ -57,6 +58,10 @@ def draw(quick: bool) -> Drawing:
     bar.set_ticks(list(range(0, 91, 15)))
     bar.ax.tick_params(labelsize=TICK)
     bar.set_label(r"$|\angle(\mathrm{d}\xi, \nabla_A h) - 90°|$ [deg]", fontsize=LABEL)
+    free = freely_fitted(planar_problem("euclidean"), quick)
+    angles = deviations(free.problem, points, free.jacobian(points)[:, 1])
+    numbers["euclidean_free_start_median_deviation_deg"] = float(np.median(angles))
+    numbers["euclidean_free_start_share_of_values_twice"] = float(np.mean(_counts(free) == 2))
     figure.legend(handles=_entries(), loc="lower center", ncols=4, fontsize=TICK, frameon=False, columnspacing=1.4)
     return Drawing({"": figure}, numbers)
 
@@ -82,7 +87,7 @@ def _entries() -> list[Line2D]:
 
 
 def _numbers(chart: Chart, points: Array, angles: Array) -> dict[str, float]:
-    counts = np.concatenate([_crossings(chart, level) for level in _LEAVES])
+    counts = _counts(chart)
     good = points[angles < _GOOD]
     return {
         "median_deviation_deg": float(np.median(angles)),
@@ -93,6 +98,11 @@ def _numbers(chart: Chart, points: Array, angles: Array) -> dict[str, float]:
         "share_of_values_twice_on_a_leaf": float(np.mean(counts == 2)),
         "median_angle_to_grown_gradient_deg": float(np.median(_angles_to_grown(chart, good))),
     }
+
+
+def _counts(chart: Chart) -> Array:
+    """How often leaves have values, for several leaves and values."""
+    return np.concatenate([_crossings(chart, level) for level in _LEAVES])
 
 
 def _crossings(chart: Chart, level: float, values: int = 21) -> Array:

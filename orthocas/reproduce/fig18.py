@@ -9,14 +9,14 @@ from matplotlib.ticker import MaxNLocator
 
 from orthocas.checks import Array
 from orthocas.reproduce.drawing import Drawing
-from orthocas.reproduce.planar_fit import fitted_chart
+from orthocas.reproduce.planar_fit import fitted_from_grown
 from orthocas.reproduce.planar_flow import cell_centres, corners, deviations, planar_problem
 from orthocas.reproduce.style import LABEL, TICK, add_3d, joint_axis, new_figure
 
 
 def draw(quick: bool) -> Drawing:
     """Both surfaces; numbers tell their ranges, and that right angles hold almost everywhere."""
-    chart = fitted_chart(planar_problem("euclidean"), quick)
+    chart = fitted_from_grown(planar_problem("euclidean"), quick)
     cells = 40 if quick else 160
     q, points = corners(cells)
     h, xi = (values.reshape(cells + 1, cells + 1) for values in chart.phi(points).T)
