@@ -23,7 +23,7 @@ def leaf(task: Task, value: float, cells: int) -> trimesh.Trimesh:
         cells: number of cells along an edge of the cube. A prime number keeps vertices of the grid off the surface.
     """
     grid = _grid_values(task, cells) - value
-    q, faces, _, _ = marching_cubes(grid, 0.0, spacing=3 * (TURN / cells,))  # type: ignore[no-untyped-call]
+    q, faces, _, _ = marching_cubes(grid, 0.0, spacing=3 * (TURN / cells,))
     inside = ~(np.isclose(q, 0, atol=1e-9) | np.isclose(q, TURN, atol=1e-6))
     q = np.where(inside, q, TURN * np.round(q / TURN)).astype(float)
     for _ in range(4):
@@ -62,7 +62,7 @@ def wall(task: Task, value: float, cells: int, edge: float, thickness: float) ->
     distance = np.abs(task.batched(q)[0][:, 0] - value) / np.maximum(slope, 1e-9) * edge / TURN
     below_cube = np.minimum(points, edge - points).min(axis=1)
     depth = np.maximum(np.minimum(thickness / 2 - distance, below_cube), -thickness)
-    vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
+    vertices, faces, _, _ = marching_cubes(
         depth.reshape(3 * (cells + 2,)), 0.0, spacing=3 * (edge / cells,), gradient_direction="ascent"
     )
     return trimesh.Trimesh(vertices + line[0], faces, process=False)
