@@ -12,7 +12,9 @@ from orthocas.comparison import Cell, CellResult, run_cells
 from orthocas.comparison_report import Comparison
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import Fit, fit_chart
+from orthocas.growing import GrownCoordinates
 from orthocas.growing.distil import Distilled, distil_chart
+from orthocas.growing.grow import GrownChart
 from orthocas.loss import DEFAULT_WEIGHTS, Weights
 from orthocas.objective import Monitor, Solver, Watch, silent
 from orthocas.parametrisations import MLP, SEW, Given, GradedParametrisation, Linear, Parametrisation, Polynomial
@@ -110,6 +112,10 @@ def distil(
     parametrisation = Polynomial(degree=6) if parametrisation is None else parametrisation
     if not isinstance(parametrisation, GradedParametrisation | MLP):
         raise InvalidValueError("parametrisation", repr(parametrisation), "Polynomial, Fourier or MLP")
+    if not isinstance(chart, Chart):
+        raise InvalidValueError("chart", repr(chart), "a grown chart")
+    if solver is not None and not (isinstance(parametrisation, MLP) and isinstance(solver, Solver)):
+        raise InvalidValueError("solver", repr(solver), "a solver such as LBFGS(), and only for a network")
     solver = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
     return distil_chart(
         chart, parametrisation, solver, samples, seed, Watch(monitor, f"distil {parametrisation.label}")
@@ -215,5 +221,8 @@ def _weights(numbers: WeightNumbers) -> Weights:
 
 
 def load(path: str | Path) -> Chart:
-    """Read a chart file; see `Chart.load`."""
-    return Chart.load(path)
+    """Read a chart file; see `Chart.load`. A grown chart comes back as a `GrownChart`."""
+    chart = Chart.load(path)
+    if isinstance(chart.coordinates, GrownCoordinates):
+        return GrownChart(chart.problem, chart.coordinates, chart.notes)
+    return chart

@@ -78,8 +78,8 @@ class Chart:
 
         Args:
             phi: wanted values, (n,) or (N, n).
-            q_start: where to start, (n,), or (N, n) with one start per row of phi; grown coordinates need no start,
-                there it tells which whole turns are wanted.
+            q_start: where to start, (n,), or (N, n) with one start per row of phi. For grown coordinates it tells which
+                whole turns are wanted, and which sheet of a linear leaf.
             tolerance: largest remaining |phi(q) - phi|.
 
         Returns:
@@ -109,7 +109,9 @@ class Chart:
             NoExpressionError: if the coordinates are grown; `orthocas.distil` fits an expression to them.
         """
         require_known("chart function", name, FUNCTIONS)
-        return self._functions[name]
+        if name == "task":
+            return self.problem.task.function
+        return self.problem.task.jacobian_function if name == "task_jacobian" else self._functions[name]
 
     def save(self, path: str | Path) -> None:
         """Write a self-contained chart file.
@@ -138,8 +140,6 @@ class Chart:
             "xi": xi,
             "phi": ca.vertcat(x, xi),
             "jacobian": ca.vertcat(J_x, J_xi),
-            "task": x,
-            "task_jacobian": J_x,
         }
         return {name: ca.Function(name, [q], [ca.densify(out)], ["q"], [name]) for name, out in outputs.items()}
 
@@ -160,7 +160,11 @@ class Chart:
     def _require_solved(self, solutions: Array, targets: Array, tolerance: float) -> None:
         finite = np.asarray(np.isfinite(solutions).all(axis=1))
         safe = np.where(finite[:, None], solutions, self.problem.domain.centre)
-        error = np.where(finite, np.abs(self.phi(safe) - targets).max(axis=1), np.inf)
+        difference = self.phi(safe) - targets
+        if isinstance(self.coordinates, InvertibleMap) and self.coordinates.turn:
+            turn = self.coordinates.turn
+            difference[:, self.m :] -= turn * np.round(difference[:, self.m :] / turn)
+        error = np.where(finite, np.abs(difference).max(axis=1), np.inf)
         bad = np.flatnonzero(~(error <= tolerance))
         if bad.size:
             rows = f"rows {bad[:5].tolist()}" if len(targets) > 1 else "phi"

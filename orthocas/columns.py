@@ -60,12 +60,15 @@ class ColumnFunction:
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Outputs (B, entries, c) for inputs (B, entries, c), contiguous; threads share the blocks."""
-        parts = min(THREADS, len(arguments[0]))
+        parts = max(1, min(THREADS, len(arguments[0])))
+        # CasADi lets go of Python's lock while it evaluates. It must not build in a thread: its own lock against
+        # Python's is a deadlock.
+        runs = [self.on_one_block() for _ in range(parts)]
+        split = zip(*(np.array_split(argument, parts) for argument in arguments), strict=True)
         if parts == 1:
-            return self._of_blocks(*arguments)
-        shares_of_threads = zip(*(np.array_split(argument, parts) for argument in arguments), strict=True)
-        with ThreadPoolExecutor(parts) as pool:  # CasADi lets go of Python's lock while it works
-            results = list(pool.map(lambda part: self._of_blocks(*part), shares_of_threads))
+            return _of_blocks(runs[0], *arguments)
+        with ThreadPoolExecutor(parts) as pool:
+            results = list(pool.map(lambda run, part: _of_blocks(run, *part), runs, split))
         return [np.concatenate(outputs) for outputs in zip(*results, strict=True)]
 
     def on_one_block(self) -> Callable[..., list[Array]]:
@@ -84,12 +87,6 @@ class ColumnFunction:
             return results
 
         return run
-
-    def _of_blocks(self, *arguments: Array) -> list[Array]:
-        """Outputs for some blocks, in one thread."""
-        run = self.on_one_block()
-        blocks = [run(*block) for block in zip(*arguments, strict=True)]
-        return [np.stack(outputs) for outputs in zip(*blocks, strict=True)]
 
     @cached_property
     def _on_block(self) -> ca.Function:
@@ -115,3 +112,9 @@ class ColumnFunction:
         outputs = self._function.call(parts)
         stacked = ca.densify(ca.vertcat(*(ca.vec(ca.densify(out)) for out in outputs)))
         return to_tape(ca.Function("flat", [column], [ca.cse(stacked)]))
+
+
+def _of_blocks(run: Callable[..., list[Array]], *arguments: Array) -> list[Array]:
+    """Outputs for some blocks, in one thread."""
+    blocks = [run(*block) for block in zip(*arguments, strict=True)]
+    return [np.stack(outputs) for outputs in zip(*blocks, strict=True)]

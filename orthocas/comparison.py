@@ -2,15 +2,17 @@
 
 import math
 import os
+import pickle
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from orthocas.batch import THREADS
 from orthocas.fitting import fit_chart
@@ -161,7 +163,25 @@ def _outcome(future: Future[CellResult], cell: Cell) -> CellResult:
 
 
 def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResult]:
-    """All cells in processes of our own. If one dies, all that were left are run again, each in a pool of its own."""
+    """All cells in processes of our own. If one dies, all that were left are run again, each in a pool of its own.
+
+    Cells go through files: a pool whose process dies while a large argument is on its way hangs in Python 3.11.2.
+    """
+    with TemporaryDirectory(prefix="orthocas-") as folder:
+        files = {}
+        for k, cell in enumerate(cells):
+            try:
+                content = pickle.dumps(cell)
+            except (pickle.PicklingError, TypeError, AttributeError) as error:
+                yield failure(cell, f"{type(error).__name__}: {error}")
+                continue
+            files[cell] = Path(folder) / f"{k}.pickle"
+            files[cell].write_bytes(content)
+        yield from _in_pools(files, jobs)
+
+
+def _in_pools(files: Mapping[Cell, Path], jobs: int | None) -> Iterator[CellResult]:
+    """Cells that lie in files, in a pool, and one by one what a dying process left."""
     left: list[Cell] = []
     context = get_context("spawn")  # new interpreters: forked ones would inherit threads that no longer run
     stop = context.Event()
@@ -171,7 +191,7 @@ def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResu
 
     with single_threaded():
         with pool_of(jobs or THREADS) as pool:
-            futures = {pool.submit(run_cell, cell): cell for cell in cells}
+            futures = {pool.submit(_run_stored, file): cell for cell, file in files.items()}
             try:
                 for future in as_completed(futures):
                     if isinstance(future.exception(), BrokenExecutor):
@@ -184,7 +204,13 @@ def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResu
                 raise
         for cell in left:
             with pool_of(1) as pool:
-                yield _outcome(pool.submit(run_cell, cell), cell)
+                yield _outcome(pool.submit(_run_stored, files[cell]), cell)
+
+
+def _run_stored(file: Path) -> CellResult:
+    """Run a cell that this program has written to a file."""
+    cell: Cell = pickle.loads(file.read_bytes())
+    return run_cell(cell)
 
 
 def _begin(stop: Event) -> None:

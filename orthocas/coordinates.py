@@ -60,6 +60,11 @@ class CoordinateMap(Protocol):
 class InvertibleMap(Protocol):
     """Coordinates that know their way back."""
 
+    @property
+    def turn(self) -> float:
+        """What may be added to a coordinate without changing the point: 2 pi on a circle, otherwise 0."""
+        ...
+
     def inverse(self, phi: Array, q_start: Array) -> Array:
         """Joint positions with given task values and coordinates (N, n), (N, n); NaN where there are none."""
         ...

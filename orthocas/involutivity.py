@@ -9,7 +9,7 @@ import numpy as np
 from orthocas.batch import Batched
 from orthocas.checks import Array, require_count, require_memory
 from orthocas.domains import sample_uniform
-from orthocas.errors import SingularTaskError
+from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.problem import NEAR_SINGULAR, Problem, check, relative_singular_values
 from orthocas.task_brackets import TaskBrackets
 
@@ -78,6 +78,8 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     """
     samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
     require_memory(f"{samples} samples of the defect", 32.0 * samples * problem.n * problem.m**2)
+    if not isinstance(problem, Problem):
+        raise InvalidValueError("problem", repr(problem), "a Problem, such as problems.get('iiwa')")
     points = _regular_points(problem, samples, seed)
     brackets = TaskBrackets.of(problem)
     across, size, basis = Batched(brackets.tensor_function())(points)

@@ -71,6 +71,9 @@ def report_rows(report: Report) -> dict[str, str]:
         at = ", ".join(f"{value:.2f}" for value in report.worst_point)
         share = report.folded_samples / report.samples
         rows["folded"] = f"{share:.3%} of the domain, where det J changes sign; conditioning worst at q = ({at})"
+    if report.singular_samples:
+        rows["left out"] = f"{report.singular_samples / report.samples:.3%} of the domain: singular, or without a value"
     if report.degenerate:
-        rows["DEGENERATE"] = "coordinates are nearly parallel or lean into the task: raise lambda2 or change the domain"
+        advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
+        rows["DEGENERATE"] = f"coordinates are nearly parallel or lean into the task: {advice}"
     return rows

@@ -11,8 +11,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from orthocas.checks import Array, frozen_array
-from orthocas.errors import GrowError
-from orthocas.growing.leaf import LeafValues, turning_joints, without_turns
+from orthocas.errors import GrowError, InvalidValueError
+from orthocas.growing.leaf import LeafValues, require_on_leaf, turning_joints, without_turns
 from orthocas.interrupts import deferred
 from orthocas.problem import Problem, task_jacobians
 
@@ -21,6 +21,7 @@ _ON_CURVE = 1e-5  # distance [rad] beyond which a point belongs to another piece
 _PIECE, _STEPS = 1.0, 100  # arc length and outputs of one call of the integrator
 _LONGEST = 200.0  # [rad]
 _SINGULAR = 0.01  # smallest singular value of J_x on the curve, relative to the largest
+_FEWEST = 20  # samples of a curve
 _CLOSINGS = 3  # corrections of the length
 _PROJECTIONS = 4  # Gauss-Newton steps from the nearest sample to the nearest point of the curve
 
@@ -37,10 +38,15 @@ class CircleLeaf:
     curve: Array  #: samples at equal arc lengths, (K + 1, n); the last is the first one, up to whole turns
     length: Array  #: L, (1,)
     kind = "circle"
+    turn = 2 * np.pi
+    periodic = True
 
     def __post_init__(self) -> None:
         for name, shape in (("level", (self.problem.m,)), ("curve", (None, self.problem.n)), ("length", (1,))):
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+        if len(self.curve) < _FEWEST or not self.length[0] > 0:
+            raise InvalidValueError("curve", f"{len(self.curve)} samples of length {self.length[0]}", "a closed curve")
+        require_on_leaf(self.problem, self.level, self.curve)
 
     @property
     def cut(self) -> Array:
@@ -64,10 +70,10 @@ class CircleLeaf:
         gradients = 2 * np.pi / L * tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
         return LeafValues(xi[:, None], gradients[:, None, :], inside)
 
-    def points(self, xi: Array) -> Array:
-        """Points of the leaf with coordinates xi (N, 1) in (-pi, pi]; NaN for others."""
+    def points(self, xi: Array, near: Array | None = None) -> Array:
+        """Points of the leaf with coordinates xi (N, 1) in [-pi, pi], whose ends are the cut; NaN for others."""
         along = xi[:, 0] * self.length[0] / (2 * np.pi)
-        return np.where(np.abs(xi) <= np.pi, self._at(along), np.nan)
+        return np.where(np.abs(xi) <= np.pi + 1e-9, self._at(along), np.nan)
 
     def to_arrays(self) -> Mapping[str, Array]:
         """All numbers, for chart files."""

@@ -6,18 +6,20 @@ from functools import cached_property
 
 import numpy as np
 
-from orthocas.checks import Array, frozen_array
-from orthocas.domains import Box
-from orthocas.errors import GrowError
+from orthocas.checks import Array, frozen_array, require_memory
+from orthocas.domains import Box, sample_uniform
+from orthocas.errors import GrowError, InvalidValueError
 from orthocas.growing.harmonic import harmonic_disk
-from orthocas.growing.leaf import LeafValues, covers, without_turns
+from orthocas.growing.leaf import LeafValues, covers, require_on_leaf, without_turns
 from orthocas.growing.level_surface import TriangleMesh, level_surface
 from orthocas.growing.triangle_locator import TriangleLocator
 from orthocas.problem import Problem
 
 CELLS = 60  #: marching cubes cells along the longest edge of the region
 _ROUNDS = 30  # Newton steps from a triangle to the leaf above it
-_ON_LEAF = 1e-12
+_ON_LEAF = 1e-12  # distance [rad] or [m]
+_FEWEST_ACROSS = 5  # cells along the shortest edge of a region
+_SCALE_SAMPLES = 1000  # that tell the size of the gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,8 @@ class DiskLeaf:
     faces: Array  #: (F, 3), whole numbers
     disk: Array  #: images of the vertices, (V, 2)
     kind = "disk"
+    turn = 0.0
+    periodic = True
 
     def __post_init__(self) -> None:
         count = len(self.vertices)
@@ -49,6 +53,11 @@ class DiskLeaf:
         }
         for name, shape in shapes.items():
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+        if not np.array_equal(self.faces, np.round(self.faces)) or len(self.mesh.faces) == 0:
+            raise InvalidValueError("faces", "empty or not whole numbers", "indices of vertices")
+        if np.linalg.norm(self.disk, axis=1).max() > 1 + 1e-9:
+            raise InvalidValueError("disk", "outside the unit disk", "images of the vertices in the unit disk")
+        require_on_leaf(self.problem, self.level, self.vertices)
 
     @property
     def region(self) -> Box:
@@ -68,12 +77,13 @@ class DiskLeaf:
         xi = np.einsum("sk,skr->sr", found.barycentric, corners)
         return LeafValues(xi, self._gradients[found.face], covers(self.region, points))
 
-    def points(self, xi: Array) -> Array:
+    def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for others.
 
         The point of the triangle is moved along the triangle's normal onto the leaf, so that `values` leads back.
         """
-        found = self._in_disk.locate(xi)
+        inside = (xi**2).sum(axis=1) <= 1
+        found = self._in_disk.locate(np.where(inside[:, None], xi, 0.0))
         corners = self.mesh.faces[found.face]
         feet = np.einsum("sk,skn->sn", found.barycentric, self.vertices[corners])
         normals = self._normals[found.face]
@@ -81,11 +91,12 @@ class DiskLeaf:
         for _ in range(_ROUNDS):
             q = feet + height * normals
             residual = self.problem.task.batched(q)[0] - self.level
-            if np.abs(residual).max(initial=0.0) < _ON_LEAF:
-                break
             slope = (self.problem.task.batched_jacobian(q)[0].reshape(-1, 3) * normals).sum(axis=1, keepdims=True)
             height = height - residual / slope
-        return np.where((found.distance < _ON_LEAF)[:, None], feet + height * normals, np.nan)
+            if np.abs(residual / slope).max(initial=0.0) < _ON_LEAF:
+                break
+        known = inside & (found.distance < _ON_LEAF)
+        return np.where(known[:, None], feet + height * normals, np.nan)
 
     def to_arrays(self) -> Mapping[str, Array]:
         """All numbers, for chart files."""
@@ -136,11 +147,21 @@ def disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -
     if (problem.n, problem.m) != (3, 1):
         raise GrowError(f"a disk chart is for n = 3 joints and m = 1 task, got n = {problem.n} and m = {problem.m}")
     low, high = region.centre - region.half_width, region.centre + region.half_width
+    shortest = cells * float(region.half_width.min() / region.half_width.max())
+    if shortest < _FEWEST_ACROSS:
+        widths = (2 * region.half_width).round(4).tolist()
+        raise GrowError(
+            f"the leaf's region has edges {widths}: {cells} cells along the longest leave {shortest:.1f} for "
+            f"the shortest, expected at least {_FEWEST_ACROSS}"
+        )
+    require_memory(f"a mesh with {cells} cells", 40.0 * cells**3)
     task = problem.task
+    points = sample_uniform(region, _SCALE_SAMPLES, 0)
+    scale = float(np.sqrt((task.batched_jacobian(points)[0] ** 2).sum(axis=(1, 2)).mean()))  # units do not matter
     mesh = level_surface(
-        lambda q: task.batched(q)[0][:, 0],
-        lambda q: task.batched_jacobian(q)[0].reshape(-1, 3),
-        float(level[0]),
+        lambda q: task.batched(q)[0][:, 0] / scale,
+        lambda q: task.batched_jacobian(q)[0].reshape(-1, 3) / scale,
+        float(level[0]) / scale,
         low,
         high,
         cells,

@@ -9,13 +9,13 @@ import numpy as np
 
 from orthocas.batch import Batched, dense_function
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_count
+from orthocas.checks import Array, require_count, require_memory
 from orthocas.coordinates import Coordinates, joint_space
 from orthocas.domains import sample_evenly, sample_uniform
 from orthocas.errors import GrowError, InvalidValueError
 from orthocas.growing.grown import GrownCoordinates
 from orthocas.numpy_nodes import NumpyGraph
-from orthocas.objective import Solver, Watch
+from orthocas.objective import Progress, Solver, Watch
 from orthocas.parametrisations import Family, Parametrisation
 from orthocas.parametrisations.product_basis import LinearFamily
 from orthocas.quality import Report, evaluate
@@ -58,10 +58,13 @@ def distil_chart(
     family = parametrisation.family(space, chart.r)
     wanted = int(np.clip(_PER_PARAMETER * family.size // chart.r, _LEAST, _MOST))
     count = wanted if samples is None else require_count("samples", samples)
+    if count * (1 + chart.n) <= family.size / chart.r:
+        raise InvalidValueError("samples", count, f"enough for the {family.size // chart.r} numbers of a coordinate")
+    require_memory(f"distilling with {count} samples", 8.0 * count * chart.n * (chart.n + 4))
     points = sample_evenly(chart.problem.domain, count, require_count("seed", seed, least=0))
     targets = _targets(chart, points)
     if isinstance(family, LinearFamily):
-        theta, offset = _least_squares(family, targets)
+        theta, offset = _least_squares(family, targets, watch)
     else:
         theta, offset = _minimised(family, targets, solver, seed, watch)
     coordinates = Coordinates(parametrisation, space, (), theta, offset, np.ones(chart.r))
@@ -76,7 +79,7 @@ def _targets(chart: Chart, points: Array) -> _Targets:
     known = np.isfinite(xi).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
     if not known.any():
         raise GrowError(f"the grown chart has no value at any of {len(points)} samples of the domain")
-    weight = float(np.linalg.norm(chart.problem.domain.half_width) / chart.n)
+    weight = float(chart.problem.domain.half_width.mean())
     return _Targets(points[known], xi[known], gradients[known] * weight, weight)
 
 
@@ -97,15 +100,17 @@ def _judged(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Di
     )
 
 
-def _least_squares(family: LinearFamily, targets: _Targets) -> tuple[Array, Array]:
+def _least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tuple[Array, Array]:
     """Coefficients and offset of the best linear combination, by normal equations over chunks of samples."""
     n, K = targets.points.shape[1], family.width
+    require_memory(f"least squares with {K} terms", 8.0 * K * (3 * K + (n + 1) * _CHUNK))
     q = ca.SX.sym("q", n)
     basis = family.basis(q)
     both = Batched(dense_function("basis", [q], [basis, ca.jacobian(basis, q)]))
     normal, right = np.zeros((K + 1, K + 1)), np.zeros((K + 1, family.outputs))
     for start in range(0, len(targets.points), _CHUNK):
         part = slice(start, start + _CHUNK)
+        watch.monitor(Progress(watch.stage, start / len(targets.points), f"{start} samples"))
         values, slopes = both(targets.points[part])
         slopes = slopes.reshape(len(values), K, n).transpose(0, 2, 1).reshape(-1, K) * targets.weight
         constant = np.r_[np.ones(len(values)), np.zeros(len(slopes))]

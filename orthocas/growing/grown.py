@@ -5,9 +5,9 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from orthocas.checks import Array
+from orthocas.checks import Array, as_point_set
 from orthocas.errors import NoExpressionError
 from orthocas.growing.flow import TOLERANCE, Arrival, Moved, TaskFlow
 from orthocas.growing.leaf import LeafChart, LeafValues, without_turns
@@ -43,13 +43,19 @@ class GrownCoordinates:
         """Number of numbers that describe the chart of the leaf."""
         return sum(array.size for array in self.leaf.to_arrays().values())
 
-    def pull(self, points: Array, tolerance: float = TOLERANCE) -> Moved:
-        """Where points (N, n) meet the base leaf, with the status of each.
+    @property
+    def turn(self) -> float:
+        """What may be added to a coordinate without changing the point: 2 pi on a circle, otherwise 0."""
+        return self.leaf.turn
+
+    def pull(self, points: ArrayLike, tolerance: float = TOLERANCE) -> Moved:
+        """Where points meet the base leaf, with the status of each.
 
         Args:
-            points: joint positions.
+            points: joint positions, (N, n) or (n,) for N = 1.
             tolerance: local error of a step of the flow.
         """
+        points = as_point_set("points", points, self.problem.n)[0]
         moved = self.flow.pull(points, self.leaf.level, tolerance)
         return Moved(moved.points, self._status(moved, self._on_leaf(moved)))
 
@@ -68,15 +74,25 @@ class GrownCoordinates:
     def inverse(self, phi: Array, q_start: Array) -> Array:
         """Joint positions with given task values and coordinates, (N, n): from the leaf back along the flow.
 
-        No search is needed; the start (N, n) only tells which whole turns are wanted. NaN where there is none.
+        The start (N, n) tells which whole turns are wanted, and, where a linear leaf has several sheets, which one. NaN
+        where there is none.
         """
         m, n = self.problem.m, self.problem.n
-        on_leaf = self.leaf.points(phi[:, m:])
+        start = self.flow.pull(q_start, self.leaf.level)
+        on_leaf = self.leaf.points(phi[:, m:], np.where(start.reached[:, None], start.points, np.nan))
         found = np.isfinite(on_leaf).all(axis=1)
         solutions = np.full((len(phi), n), np.nan)
         moved = self.flow.move(on_leaf[found], phi[found, :m] - self.leaf.level, _INVERSE_TOLERANCE)
-        solutions[found] = np.where(moved.reached[:, None], moved.points, np.nan)
-        return q_start + without_turns(self.problem, solutions - q_start)
+        solutions[found] = np.where(moved.reached[:, None], self._onto_task(moved.points, phi[found, :m]), np.nan)
+        return q_start + without_turns(self.problem, solutions - q_start) if self.leaf.periodic else solutions
+
+    def _onto_task(self, points: Array, x: Array) -> Array:
+        """Points (N, n) after a Newton step along the task gradients to the task values x (N, m).
+
+        It takes away what the integration has lost, which counts when a task value has large units.
+        """
+        dx = x - self.problem.task.batched(points)[0]
+        return self.flow.move(points, dx, _INVERSE_TOLERANCE).points
 
     @property
     def functions(self) -> dict[str, ca.Function]:

@@ -9,7 +9,10 @@ from numpy.typing import NDArray
 
 from orthocas.checks import Array
 from orthocas.domains import Box
-from orthocas.problem import Problem
+from orthocas.errors import InvalidValueError
+from orthocas.problem import Problem, task_jacobians
+
+_ON_LEAF = 1e-6  # [rad] or [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +41,23 @@ class LeafChart(Protocol):
         """Coordinates of points on the leaf, (N, n)."""
         ...
 
-    def points(self, xi: Array) -> Array:
-        """Points of the leaf with coordinates xi (N, r), (N, n); NaN where there is none."""
+    @property
+    def turn(self) -> float:
+        """What may be added to the coordinates without changing the point: 2 pi on a circle, otherwise 0."""
+        ...
+
+    @property
+    def periodic(self) -> bool:
+        """Whether whole turns of the joints lead to the same coordinates."""
+        ...
+
+    def points(self, xi: Array, near: Array | None = None) -> Array:
+        """Points of the leaf with coordinates xi (N, r), (N, n); NaN where there is none.
+
+        Args:
+            xi: coordinates.
+            near: points of the leaf, (N, n), NaN if unknown; where there are several solutions, one near them is taken.
+        """
         ...
 
     def to_arrays(self) -> Mapping[str, Array]:
@@ -60,3 +78,12 @@ def without_turns(problem: Problem, differences: Array) -> Array:
 def covers(region: Box, points: Array) -> NDArray[np.bool_]:
     """Which points lie in the region, up to rounding, (N,)."""
     return np.asarray((np.abs(points - region.centre) <= region.half_width + 1e-9).all(axis=1))
+
+
+def require_on_leaf(problem: Problem, level: Array, points: Array) -> None:
+    """Raise InvalidValueError unless points (N, n) lie on the leaf h(q) = level (m,), relative to the size of J_x."""
+    J = task_jacobians(problem, points)
+    off = np.abs(problem.task.batched(points)[0] - level).max(axis=1)
+    size = np.sqrt((J**2).sum(axis=(1, 2)).mean())
+    if not off.max() <= _ON_LEAF * size:
+        raise InvalidValueError("points of the base leaf", f"{off.max():.3g} off h(q) = {level.tolist()}", "on it")

@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from orthocas.checks import Array, frozen_array
-from orthocas.growing.leaf import LeafValues
+from orthocas.errors import InvalidValueError
+from orthocas.growing.leaf import LeafValues, require_on_leaf
 from orthocas.metrics import metric_matrices
 from orthocas.problem import Problem, task_jacobians
 from orthocas.samples import samples_at
@@ -29,30 +31,37 @@ class LinearLeaf:
     centre: Array  #: q0, (n,)
     normals: Array  #: N, (n, r), unit columns with J_x(q0) A^-1(q0) N = 0
     kind = "linear"
+    turn = 0.0
+    periodic = False
 
     def __post_init__(self) -> None:
         n, m, r = self.problem.n, self.problem.m, self.problem.r
         for name, shape in (("level", (m,)), ("centre", (n,)), ("normals", (n, r))):
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+        require_on_leaf(self.problem, self.level, self.centre[None])
+        if np.abs(np.linalg.norm(self.normals, axis=0) - 1).max() > 1e-9:
+            raise InvalidValueError("normals", self.normals.tolist(), "columns of length 1")
 
     def values(self, points: Array) -> LeafValues:
         """Coordinates of points on the leaf, (N, n)."""
         gradients = np.broadcast_to(self.normals.T, (len(points), *self.normals.T.shape))
         return LeafValues((points - self.centre) @ self.normals, gradients, np.ones(len(points), dtype=bool))
 
-    def points(self, xi: Array) -> Array:
+    def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf with coordinates xi (N, r), NaN where there is none.
 
-        Newton's method along the straight way from 0 to xi, so that the sheet of the leaf that q0 lies on is kept.
+        Newton's method along the straight way from the coordinates of `near`, or of q0, to xi: one sheet is kept.
         """
         q = np.broadcast_to(self.centre, (len(xi), len(self.centre)))
+        q = q if near is None else np.where(np.isfinite(near), near, q)
+        start = (q - self.centre) @ self.normals
         N = np.broadcast_to(self.normals.T, (len(xi), *self.normals.T.shape))
         for share in np.linspace(0.0, 1.0, _STAGES + 1)[1:]:
             for _ in range(_ITERATIONS):
-                residual = self._residual(q, share * xi)
+                residual = self._residual(q, start + share * (xi - start))
                 if np.abs(residual).max(initial=0.0) < _SOLVED:
                     break
-                J = np.concatenate([task_jacobians(self.problem, q), N], axis=1)
+                J = np.concatenate([task_jacobians(self.problem, q) / self._scale, N], axis=1)
                 q = q - (np.linalg.pinv(J) @ residual[:, :, None])[:, :, 0]
         solved = np.abs(self._residual(q, xi)).max(axis=1) < 1e3 * _SOLVED
         return np.where(solved[:, None], q, np.nan)
@@ -63,7 +72,12 @@ class LinearLeaf:
 
     def _residual(self, q: Array, xi: Array) -> Array:
         x = self.problem.task.batched(q)[0]
-        return np.concatenate([x - self.level, (q - self.centre) @ self.normals - xi], axis=1)
+        return np.concatenate([(x - self.level) / self._scale, (q - self.centre) @ self.normals - xi], axis=1)
+
+    @cached_property
+    def _scale(self) -> float:
+        """Size of J_x at q0, so that units of the task do not matter."""
+        return float(np.linalg.norm(task_jacobians(self.problem, self.centre[None])))
 
 
 def linear_leaf(problem: Problem, centre: Array) -> LinearLeaf:

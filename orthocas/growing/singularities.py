@@ -17,7 +17,7 @@ from orthocas.metrics import metric_matrices
 from orthocas.problem import Problem, task_jacobians
 
 _NEWTON_STEPS = 40
-_FLAT = 1e-10  # |J_x| of a singular point
+_FLAT = 1e-10  # |J_x| of a singular point, relative to its root mean square
 _SAME = 1e-6  # distance of two that are one
 _STARTS = 500
 
@@ -58,13 +58,14 @@ def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...
         raise GrowError(f"singular points are found for m = 1 tasks, got m = {problem.m}")
     hessian = _hessian(problem)
     q = sample_evenly(problem.domain, _STARTS, seed)
+    size = np.sqrt((task_jacobians(problem, q) ** 2).sum(axis=(1, 2)).mean())
     for _ in range(_NEWTON_STEPS):
         J = task_jacobians(problem, q)
         step = np.linalg.pinv(hessian(q)[0].reshape(-1, problem.n, problem.n)) @ J.transpose(0, 2, 1)
         q = q - step[:, :, 0]
     turns = np.floor((q - problem.domain.centre) / (2 * np.pi) + 0.5 - _SAME)  # half a turn counts as +pi
     q = q - 2 * np.pi * turns * turning_joints(problem)
-    flat = np.abs(task_jacobians(problem, q)).max(axis=(1, 2)) < _FLAT
+    flat = np.abs(task_jacobians(problem, q)).max(axis=(1, 2)) < _FLAT * size
     found = _distinct(q[flat & contains(problem.domain, q)])
     return tuple(_classified(problem, point, hessian) for point in found)
 

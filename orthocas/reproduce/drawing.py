@@ -49,9 +49,9 @@ def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
     writers[f"{name}.json"] = lambda draft: draft.write_text(text)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".reproduce-") as drafts:
         for file, write in writers.items():
-            draft = Path(drafts) / file
-            write(draft)
-            os.replace(draft, folder / file)
+            write(Path(drafts) / file)
+        for file in writers:  # all at once, so that numbers belong to the picture beside them
+            os.replace(Path(drafts) / file, folder / file)
     return [folder / file for file in writers]
 
 
