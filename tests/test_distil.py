@@ -5,7 +5,7 @@ import pytest
 
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, MemoryNeedError
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
 BOX = oc.Box([0.6, 0.8, 0.8], np.pi / 8)
@@ -53,5 +53,11 @@ def test_what_is_not_grown_is_refused() -> None:
     fitted = oc.fit(problems.get("planar_3r_x"), oc.Polynomial(2)).chart
     with pytest.raises(InvalidValueError, match="expected a grown chart"):
         oc.distil(fitted)
+    with pytest.raises(InvalidValueError, match="samples is 1, expected enough"):
+        oc.distil(grown(), oc.Polynomial(6), samples=1)
+    with pytest.raises(InvalidValueError, match="only for a network"):
+        oc.distil(grown(), oc.Polynomial(2), solver=solvers.LBFGS())
+    with pytest.raises(MemoryNeedError):
+        oc.distil(grown(), oc.Polynomial(90))
     with pytest.raises(InvalidValueError, match="Polynomial, Fourier or MLP"):
         oc.distil(grown(), oc.Linear())  # type: ignore[arg-type]

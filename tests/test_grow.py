@@ -1,5 +1,6 @@
 """Grown charts: exact coordinates with the interface of fitted ones."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import casadi as ca
@@ -11,14 +12,17 @@ from orthocas import problems
 from orthocas.errors import (
     ChartFileError,
     GrowError,
+    InvalidValueError,
     InverseError,
+    MemoryNeedError,
+    MetricError,
     NoExpressionError,
     NotADiskError,
     NotInvolutiveError,
     ShapeError,
     UnknownNameError,
 )
-from orthocas.growing import Arrival, GrownCoordinates, TaskFlow
+from orthocas.growing import Arrival, GrownCoordinates, TaskFlow, leaf_from_arrays
 from orthocas.metrics import metric_matrices
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
@@ -76,6 +80,7 @@ def test_coordinates_do_not_change_along_flow_lines(chart: oc.Chart) -> None:
 
 
 def test_gradients_are_orthogonal_to_the_task(chart: oc.Chart) -> None:
+    """True by construction; that the gradients are those of xi is what the test after this one shows."""
     points = known_points(chart)
     J, A = chart.jacobian(points), metric_matrices(chart.problem.metric, points)
     raised = np.linalg.solve(A, J[:, : chart.m].transpose(0, 2, 1))
@@ -102,16 +107,18 @@ def test_inverse_leads_back(chart: oc.Chart) -> None:
     found = chart.coordinates.inverse(wanted, points)
     error = np.abs(chart.phi(found) - wanted).max(axis=1)
     assert np.median(error) < 1e-8
-    good = error < 1e-9
-    assert good.sum() >= 10
-    np.testing.assert_allclose(
-        chart.task(chart.inverse(wanted[good], points[good])), wanted[good, : chart.m], atol=1e-9
-    )
+    good = error < 1e-9  # next to an edge of a mesh, or to a saddle, a value may be out of reach
+    assert good.sum() >= 18
+    solved = chart.inverse(wanted[good], points[good])
+    np.testing.assert_allclose(chart.phi(solved), wanted[good], atol=1e-9)
+    np.testing.assert_allclose(solved, points[good], atol=1e-4)
 
 
 def test_files_hold_everything(chart: oc.Chart, tmp_path: Path) -> None:
     chart.save(tmp_path / "grown.orthocas")
     again = oc.load(tmp_path / "grown.orthocas")
+    assert isinstance(again, oc.GrownChart)
+    assert again.notes == chart.notes
     points = known_points(chart, 20)
     np.testing.assert_array_equal(again.phi(points), chart.phi(points))
     np.testing.assert_array_equal(again.jacobian(points), chart.jacobian(points))
@@ -130,6 +137,7 @@ def test_one_point_and_many_have_the_usual_shapes(chart: oc.Chart) -> None:
 def test_there_is_no_expression_but_a_pointer(chart: oc.Chart) -> None:
     with pytest.raises(NoExpressionError, match=r"orthocas\.distil"):
         chart.function("phi")
+    assert chart.function("task").size_out(0) == (chart.m, 1)
 
 
 def test_both_metrics_agree_on_the_base_leaf() -> None:
@@ -194,11 +202,90 @@ def test_bad_arguments_name_what_came() -> None:
         oc.grow(problem, 1.0, leaf="disk")
     with pytest.raises(GrowError, match="r = 1"):
         oc.grow(planar_3r("euclidean"), 0.0, leaf="circle")
+    with pytest.raises(InvalidValueError, match="problem is 'planar_2r', expected a Problem"):
+        oc.grow("planar_2r")  # type: ignore[arg-type]
+    with pytest.raises(InvalidValueError, match="leaf is 3"):
+        oc.grow(problem, leaf=3)  # type: ignore[arg-type]
+    with pytest.raises(InvalidValueError, match="belong to a disk"):
+        oc.grow(problem, 1.0, cells=30)
+    with pytest.raises(InvalidValueError, match="expected a Box"):
+        oc.grow(planar_3r("euclidean"), 0.0, region="all")  # type: ignore[arg-type]
+    with pytest.raises(GrowError, match="not periodic"):
+        oc.grow(problem, 1.0, leaf="linear")
+    with pytest.raises(MemoryNeedError, match="cells"):
+        oc.grow(planar_3r("euclidean"), 0.0, cells=100_000)
+    with pytest.raises(GrowError, match="for the shortest, expected at least"):
+        oc.grow(planar_3r("euclidean"), 0.0, region=oc.Box([1.5, 0, 0], [0.01, 1, 1]))
     with pytest.raises(GrowError, match="singularity of the task"):
         oc.grow(problem, 0.0)  # the leaf through the saddles is no circle
     chart = oc.grow(problem, 1.0, origin=ON_LEAF)
     with pytest.raises(InverseError, match="no q"):
         chart.inverse([1.0, 4.0], [0.0, 0.0])  # beyond pi
+    assert isinstance(chart.coordinates, GrownCoordinates)
+    with pytest.raises(ShapeError, match="points"):
+        chart.coordinates.pull(np.zeros(3))
+    with pytest.raises(InverseError, match="no q"):
+        oc.grow(planar_3r("euclidean"), 0.0, cells=20).inverse([0.0, 1e300, 1e300], [1.0, 0.0, 0.0])
+
+
+def test_metrics_that_are_not_positive_are_refused() -> None:
+    def metric(q: ca.SX) -> ca.SX:
+        return ca.diag(ca.vertcat(q[0] - 0.5, 1, 1))
+
+    with pytest.raises(MetricError, match="eigenvalue"):
+        oc.grow(oc.Problem(ARM, oc.Task.position(ARM, "x"), metric, oc.Box([0.6, 0.8, 0.8], 0.4)))
+
+
+def test_the_two_ends_of_a_circle_are_one_point() -> None:
+    chart = oc.grow(planar_2r("euclidean"), 1.0, origin=ON_LEAF)
+    ends = [chart.inverse([1.2, xi], [-1.0, 0.0]) for xi in (np.pi, -np.pi)]
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e5])
+@pytest.mark.parametrize("leaf", ["disk", "linear"])
+def test_units_of_the_task_do_not_matter(leaf: str, scale: float) -> None:
+    box = oc.Box([0.6, 0.8, 0.8], 0.3)
+    charts = []
+    for factor in (1.0, scale):
+        task = oc.Task.custom(ARM, "x", lambda q, f=factor: f * (ca.cos(q[0]) + ca.cos(q[0] + q[1]) + ca.sin(q[2])))
+        charts.append(oc.grow(oc.Problem(ARM, task, "euclidean", box), leaf=leaf))
+    points = known_points(charts[0], 20)
+    np.testing.assert_allclose(charts[1].xi(points), charts[0].xi(points), atol=1e-8)
+    found = charts[1].coordinates.inverse(charts[1].phi(points), points)
+    np.testing.assert_allclose(charts[1].task(found), charts[1].task(points), rtol=1e-9, atol=1e-9 * scale)
+    np.testing.assert_allclose(found, points, atol=1e-4)
+
+
+def test_a_start_elsewhere_is_no_obstacle_for_a_linear_leaf() -> None:
+    box = oc.Box([0.6, 0.8, 0.8], 0.4)
+    chart = oc.grow(oc.Problem(ARM, oc.Task.position(ARM, "x"), "euclidean", box), leaf="linear")
+    points = known_points(chart, 10)
+    np.testing.assert_allclose(chart.inverse(chart.phi(points), points + np.array([0, 0, 1.0])), points, atol=1e-7)
+    np.testing.assert_allclose(chart.inverse(chart.phi(points), points), points, atol=1e-7)
+
+
+def test_prismatic_joints_grow(tmp_path: Path) -> None:
+    """A slide that carries a planar arm: x = q1 + cos q2 + cos(q2 + q3)."""
+    kinds = [("prismatic", 0, "1 0 0"), ("revolute", 0, "0 0 1"), ("revolute", 1, "0 0 1")]
+    joints = "".join(
+        f'<joint name="j{k}" type="{kind}"><parent link="l{k}"/><child link="l{k + 1}"/><origin xyz="{x} 0 0"/>'
+        f'<axis xyz="{axis}"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
+        for k, (kind, x, axis) in enumerate(kinds)
+    )
+    inertia = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    links = "".join(f'<link name="l{k}">{inertia}</link>' for k in range(4)) + '<link name="tip"/>'
+    fixed = '<joint name="end" type="fixed"><parent link="l3"/><child link="tip"/><origin xyz="1 0 0"/></joint>'
+    (tmp_path / "slide.urdf").write_text(f'<robot name="slide">{links}{joints}{fixed}</robot>')
+    robot = oc.Robot.from_urdf(tmp_path / "slide.urdf", tip="tip")
+    problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box([0.2, 0.6, 0.8], [0.2, 0.3, 0.3]))
+    for leaf in ("disk", "linear"):
+        grown = oc.grow(problem, leaf=leaf)
+        points = known_points(grown, 20)
+        step = 1e-6 * np.random.default_rng(1).normal(size=points.shape)
+        change = (grown.xi(points + step) - grown.xi(points - step)) / 2
+        wanted = np.einsum("srn,sn->sr", grown.jacobian(points)[:, 1:], step)
+        assert np.median(np.abs(change - wanted)) < 1e-10
 
 
 def test_damaged_files_of_grown_charts_are_refused(tmp_path: Path) -> None:
@@ -208,3 +295,29 @@ def test_damaged_files_of_grown_charts_are_refused(tmp_path: Path) -> None:
     (tmp_path / "short.orthocas").write_bytes(content[: len(content) // 2])
     with pytest.raises(ChartFileError):
         oc.load(tmp_path / "short.orthocas")
+
+
+@pytest.mark.parametrize(
+    ("leaf", "name", "change"),
+    [
+        ("circle", "curve", lambda a: a[:1]),
+        ("circle", "curve", lambda a: a + 0.1),
+        ("circle", "length", lambda a: -a),
+        ("disk", "faces", lambda a: a + 10**6),
+        ("disk", "faces", lambda a: a + 0.5),
+        ("disk", "disk", lambda a: 5 * a),
+        ("disk", "vertices", lambda a: a + 0.3),
+        ("linear", "normals", lambda a: 0 * a),
+        ("linear", "level", lambda a: a + 0.3),
+    ],
+)
+def test_edited_leaves_are_refused(leaf: str, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    if leaf == "circle":
+        chart = oc.grow(planar_2r("euclidean"), 1.0, origin=ON_LEAF)
+    else:
+        problem = oc.Problem(ARM, oc.Task.position(ARM, "x"), "euclidean", oc.Box([0.6, 0.8, 0.8], 0.3))
+        chart = oc.grow(problem, leaf=leaf)
+    arrays = dict(chart.coordinates.leaf.to_arrays())
+    arrays[name] = change(arrays[name])
+    with pytest.raises((InvalidValueError, ShapeError)):
+        leaf_from_arrays(chart.problem, leaf, arrays)

@@ -1,5 +1,6 @@
 """Singular points of a task, and how grown coordinates jump there."""
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -20,6 +21,12 @@ def test_planar_2r_has_the_four_singular_points_of_the_paper(metric: str) -> Non
     wanted = {(0.0, 0.0): ("maximum", 2.0), (0.0, 1.0): ("saddle", 0.0), (1.0, 0.0): ("minimum", -2.0)}
     wanted[1.0, 1.0] = ("saddle", 0.0)
     assert {tuple(np.abs(np.round(s.point / np.pi, 8))): (s.kind, round(s.task_value, 9)) for s in found} == wanted
+
+
+def test_units_of_the_task_do_not_matter() -> None:
+    robot = problems.get("planar_2r").robot
+    task = oc.Task.custom(robot, "x", lambda q: 1e6 * (ca.cos(q[0]) + ca.cos(q[0] + q[1])))
+    assert len(singular_points(oc.Problem(robot, task, "euclidean", oc.Torus(2)))) == 4
 
 
 def test_planar_3r_has_eight() -> None:

@@ -82,7 +82,7 @@ class DiskLeaf:
 
         The point of the triangle is moved along the triangle's normal onto the leaf, so that `values` leads back.
         """
-        inside = (xi**2).sum(axis=1) <= 1
+        inside = np.hypot(xi[:, 0], xi[:, 1]) <= 1
         found = self._in_disk.locate(np.where(inside[:, None], xi, 0.0))
         corners = self.mesh.faces[found.face]
         feet = np.einsum("sk,skn->sn", found.barycentric, self.vertices[corners])

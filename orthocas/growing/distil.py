@@ -56,6 +56,9 @@ def distil_chart(
         raise InvalidValueError("chart", f"a chart of kind {chart.coordinates.label}", "a grown chart")
     space = joint_space(chart.problem)
     family = parametrisation.family(space, chart.r)
+    if isinstance(family, LinearFamily):
+        needed = 8.0 * family.width * (3 * family.width + (chart.n + 1) * _CHUNK)
+        require_memory(f"least squares with {family.width} terms", needed)
     wanted = int(np.clip(_PER_PARAMETER * family.size // chart.r, _LEAST, _MOST))
     count = wanted if samples is None else require_count("samples", samples)
     if count * (1 + chart.n) <= family.size / chart.r:
@@ -103,7 +106,6 @@ def _judged(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Di
 def _least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tuple[Array, Array]:
     """Coefficients and offset of the best linear combination, by normal equations over chunks of samples."""
     n, K = targets.points.shape[1], family.width
-    require_memory(f"least squares with {K} terms", 8.0 * K * (3 * K + (n + 1) * _CHUNK))
     q = ca.SX.sym("q", n)
     basis = family.basis(q)
     both = Batched(dense_function("basis", [q], [basis, ca.jacobian(basis, q)]))
