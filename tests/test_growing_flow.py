@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.errors import GrowError
 from orthocas.growing import Arrival, SundialsFlow, TaskFlow
 from orthocas.growing.dormand_prince import BatchedFlow
 from orthocas.metrics import metric_matrices
@@ -59,8 +60,8 @@ def test_pull_ends_where_the_paper_s_gradient_flow_ends(metric: object) -> None:
         np.testing.assert_allclose(end, solved, atol=1e-8)
 
 
-@pytest.mark.parametrize("metric", ["euclidean", "inertia"])
-def test_all_flows_agree(metric: str) -> None:
+@pytest.mark.parametrize("metric", ["euclidean", "inertia", STIFFNESS], ids=["I", "M", "custom"])
+def test_all_flows_agree(metric: object) -> None:
     problem = planar(metric)
     points = samples(problem)
     ours, sundials = TaskFlow(problem).pull(points, np.zeros(1)), SundialsFlow(problem)
@@ -122,6 +123,11 @@ def test_singular_starts_get_a_status_and_stay_finite() -> None:
     ):
         np.testing.assert_array_equal(moved.status, wanted)
         assert np.isfinite(moved.points).all()
+
+
+def test_sundials_flow_is_for_one_task_component() -> None:
+    with pytest.raises(GrowError, match="m = 1"):
+        SundialsFlow(problems.get("planar_3r_xy"))
 
 
 def test_unreachable_levels_end_as_singular() -> None:

@@ -9,7 +9,7 @@ from orthocas.chart import Chart
 from orthocas.checks import Array, as_float_array, frozen_array, require_count, require_known, require_shape
 from orthocas.domains import Box, Torus, sample_evenly
 from orthocas.errors import GrowError, InvalidValueError, NotInvolutiveError
-from orthocas.growing.circle_leaf import circle_leaf
+from orthocas.growing.circle_leaf import CircleLeaf, circle_leaf
 from orthocas.growing.disk_leaf import CELLS, disk_leaf
 from orthocas.growing.flow import TaskFlow
 from orthocas.growing.grown import GrownCoordinates
@@ -92,6 +92,8 @@ def grow(
         "level": ", ".join(f"{value:.6g}" for value in x0),
         "share of the domain": float(reached.mean()),
     }
+    if isinstance(coordinates.leaf, CircleLeaf):
+        notes["cut"] = ", ".join(f"{value:.6g}" for value in coordinates.leaf.cut)
     return GrownChart(problem, coordinates, notes)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from orthocas.batch import Batched, dense_function
 from orthocas.checks import Array
+from orthocas.errors import GrowError
 from orthocas.growing.flow import Arrival, Moved, TaskFlow
 from orthocas.problem import Problem
 
@@ -28,10 +29,17 @@ class SundialsFlow:
     Args:
         problem: with m = 1.
         tolerance: relative and absolute tolerance of CVODES.
+
+    Raises:
+        GrowError: if m > 1.
     """
 
     problem: Problem
     tolerance: float = 1e-10
+
+    def __post_init__(self) -> None:
+        if self.problem.m != 1:
+            raise GrowError(f"this flow is for m = 1 tasks, got m = {self.problem.m}")
 
     def gradient_flow(self, points: Array, level: float, change: float = CHANGE) -> Moved:
         """Follow dq/dt = (x0 - h(q)) grad_A h(q), [AS2023] eq. (23), until q changes by less than `change` in a step.
