@@ -184,6 +184,20 @@ def test_mjcf_files_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(robot.tip_position(np.array([np.pi / 2, 0.5])), [0, 1.5, 0], atol=1e-12)
 
 
+@pytest.mark.parametrize(("angle", "hinge"), [("", 90.0), ('<compiler angle="radian"/>', np.pi / 2)])
+def test_ranges_of_mjcf_slides_are_metres(tmp_path: Path, angle: str, hinge: float) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        f"""<mujoco>{angle}<worldbody><body name="a"><joint name="j1" type="slide" axis="0 1 1" range="-0.5 2"/>
+        <geom type="sphere" size="0.1" mass="2"/>
+        <body name="b" pos="1 0 0"><joint name="j2" type="hinge" axis="0 0 1" range="-{hinge} {hinge}"/>
+        <geom type="sphere" size="0.1" mass="1"/></body></body></worldbody></mujoco>"""
+    )
+    robot = oc.Robot.from_mjcf(path, "b")
+    np.testing.assert_allclose(robot.lower, [-0.5, -np.pi / 2])
+    np.testing.assert_allclose(robot.upper, [2, np.pi / 2])
+
+
 def test_mimic_joint_is_refused_by_name() -> None:
     with pytest.raises(RobotError, match="panda_finger_joint2.*mimic"):
         oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")

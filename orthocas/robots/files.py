@@ -15,6 +15,9 @@ from orthocas.checks import Array, require_known
 from orthocas.errors import InvalidValueError, RobotError
 from orthocas.robots.pinocchio_model import frame_index
 
+_SLIDE = """<mujoco><worldbody><body name="b"><joint name="s" type="slide" range="-1 1"/>
+<geom type="sphere" size="0.1" mass="1"/></body></worldbody></mujoco>"""  # a range of 1 m
+
 
 def read_urdf(path: str | Path) -> pin.Model:
     """Read a URDF file; mimic joints stay visible so that they can be refused or locked.
@@ -31,7 +34,27 @@ def read_mjcf(path: str | Path) -> pin.Model:
     Raises:
         RobotError: if the file is missing or is not an MJCF model.
     """
-    return _read(Path(path), "mujoco", "MJCF", pin.buildModelFromMJCF)
+    model = _read(Path(path), "mujoco", "MJCF", pin.buildModelFromMJCF)
+    compiler = ElementTree.parse(path).getroot().find("compiler")
+    if compiler is None or compiler.get("angle", "degree") == "degree":
+        _in_metres(model)
+    return model
+
+
+def _in_metres(model: pin.Model) -> None:
+    """Undo what Pinocchio (4.1) does to ranges of slides in files with angles in degrees: it scales them like angles.
+
+    How much it scales is asked of it, so that a version that does it right stays untouched.
+    """
+    slides = [joint.idx_q for joint in model.joints if joint.shortname().startswith("JointModelP") and joint.nq == 1]
+    if not slides:
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        probe = Path(folder) / "probe.xml"
+        probe.write_text(_SLIDE)
+        scale = pin.buildModelFromMJCF(str(probe)).upperPositionLimit[0]
+    for limits in (model.lowerPositionLimit, model.upperPositionLimit):
+        limits[slides] /= scale
 
 
 def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
