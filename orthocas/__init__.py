@@ -11,12 +11,13 @@ from orthocas import problems, solvers
 from orthocas.api import compare, distil, fit, load
 from orthocas.chart import Chart
 from orthocas.domains import Box, Torus, contains
-from orthocas.growing.grow import GrownChart, grow
+from orthocas.grown_chart import GrownChart, grow
 from orthocas.involutivity import Involutivity, involutivity
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial
 from orthocas.problem import Problem, check
 from orthocas.quality import Report, evaluate
 from orthocas.robots import Robot
+from orthocas.singularities import jumps, singular_points
 from orthocas.task_brackets import lie_bracket
 from orthocas.tasks import Task
 
@@ -45,8 +46,10 @@ __all__ = [
     "fit",
     "grow",
     "involutivity",
+    "jumps",
     "lie_bracket",
     "load",
     "problems",
+    "singular_points",
     "solvers",
 ]

@@ -10,11 +10,11 @@ from orthocas.chart import Chart
 from orthocas.checks import as_float_array, require_count
 from orthocas.comparison import Cell, CellResult, run_cells
 from orthocas.comparison_report import Comparison
+from orthocas.distillation import Distilled, distil_chart
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import Fit, fit_chart
 from orthocas.growing import GrownCoordinates
-from orthocas.growing.distil import Distilled, distil_chart
-from orthocas.growing.grow import GrownChart
+from orthocas.grown_chart import GrownChart
 from orthocas.loss import DEFAULT_WEIGHTS, Weights
 from orthocas.objective import Monitor, Solver, Watch, silent
 from orthocas.parametrisations import MLP, SEW, Given, GradedParametrisation, Linear, Parametrisation, Polynomial

@@ -7,7 +7,7 @@ import pytest
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import GrowError
-from orthocas.growing.singularities import jumps, singular_points
+from orthocas.singularities import jumps, singular_points
 
 
 def planar_2r(metric: str) -> oc.Problem:

@@ -20,7 +20,6 @@ from matplotlib.patheffects import withStroke
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
-from orthocas.growing.singularities import Jump, SingularPoint, jumps, singular_points
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.planar_flow import (
     EXTREME,
@@ -40,6 +39,7 @@ from orthocas.reproduce.planar_flow import (
 )
 from orthocas.reproduce.self_motion import wrapped
 from orthocas.reproduce.style import INK, LABEL, TICK, TURN, joint_axis, joint_plane, new_figure, pi_text
+from orthocas.singularities import Jump, SingularPoint, jumps, singular_points
 
 _COLOURS = "twilight"  # light at +-pi
 _HALO = [withStroke(linewidth=3.2, foreground="white")]

@@ -17,10 +17,10 @@ from orthocas.checks import Array
 from orthocas.domains import Box, sample_uniform
 from orthocas.growing.disk_leaf import DiskLeaf, disk_leaf
 from orthocas.growing.flow import TaskFlow
-from orthocas.growing.grow import grow
 from orthocas.growing.grown import GrownCoordinates
 from orthocas.growing.harmonic import signed_areas
 from orthocas.growing.level_surface import level_surface
+from orthocas.grown_chart import grow
 from orthocas.problem import Problem, task_jacobians
 from orthocas.reproduce.charted_surface import add_with_edges, add_with_lines, part_below
 from orthocas.reproduce.drawing import Drawing

@@ -16,7 +16,6 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.growing.circle_leaf import circle_leaf
 from orthocas.growing.flow import TaskFlow
-from orthocas.growing.singularities import singular_points
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.planar_fit import fitted_from_grown, freely_fitted
 from orthocas.reproduce.planar_flow import (
@@ -30,6 +29,7 @@ from orthocas.reproduce.planar_flow import (
     singular_symbols,
 )
 from orthocas.reproduce.style import EXTRA, LABEL, TASK, TICK, joint_plane, new_figure
+from orthocas.singularities import singular_points
 
 _LEAVES = (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5)  # task values where values of xi are counted [m]
 _INSIDE = (0.3, 0.8)  # a point from where all leaves are reached [rad]

@@ -9,7 +9,6 @@ from matplotlib.lines import Line2D
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
-from orthocas.growing.singularities import SingularPoint, singular_points
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.fig06 import embedded, torus_faces
 from orthocas.reproduce.painting import Isolines
@@ -33,6 +32,7 @@ from orthocas.reproduce.planar_flow import (
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.self_motion import wrapped
 from orthocas.reproduce.style import EXTRA, GREY, INK, LABEL, TASK, TICK, TURN, add_3d, joint_plane, new_figure
+from orthocas.singularities import SingularPoint, singular_points
 
 _LEVELS = np.linspace(-1.8, 1.8, 10)  #: task values of the leaves drawn [m]
 _PULLED = np.array([[2.5, 0.6], [-1.2, -1.9], [-0.25, 0.45]])  #: examples of pulls [rad]

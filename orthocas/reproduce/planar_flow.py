@@ -15,13 +15,13 @@ from orthocas.checks import Array
 from orthocas.domains import Torus
 from orthocas.growing.circle_leaf import CircleLeaf
 from orthocas.growing.flow import TaskFlow
-from orthocas.growing.grow import grow
 from orthocas.growing.grown import GrownCoordinates
-from orthocas.growing.singularities import SingularPoint
+from orthocas.grown_chart import grow
 from orthocas.problem import Problem
 from orthocas.reproduce.self_motion import pieces_in_cube, wrapped
 from orthocas.reproduce.style import INK, TURN
 from orthocas.samples import samples_at
+from orthocas.singularities import SingularPoint
 
 NAMES = {"euclidean": "A = I", "inertia": "A = M"}
 LEVEL = 1.0  #: task value of the base leaf S0 [m]
