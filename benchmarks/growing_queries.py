@@ -44,7 +44,7 @@ def robot_functions(problem: oc.Problem) -> Rate:
 def paper_query(rate: Rate, start: Array, change: float, tolerance: float) -> Array:
     """Equation (23) by SciPy until q changes by less than `change` in a step.
 
-    At a tolerance above 1e-6 the steps grow to the limit of stability and the rule is met only after minutes.
+    At looser tolerances than 1e-6 the steps stay at the limit of stability, and the rule is hardly ever met.
     """
     solver = RK45(lambda t, q: rate(q), 0.0, start, np.inf, rtol=tolerance, atol=tolerance)
     while solver.status == "running":

@@ -95,9 +95,8 @@ def _jump(chart: Chart, singular: SingularPoint, level: float, radius: float) ->
         ring = singular.point + radius * np.stack([np.cos(around), np.sin(around)], axis=1) @ singular.directions.T
         xi = chart.xi(ring)
         return Jump(singular, (float(np.nanmin(xi)), float(np.nanmax(xi))), 2 * np.pi)
-    leaving = singular.directions[
-        :, -1 if level > singular.task_value else 0
-    ]  # the flow to the leaf moves away along it
+    steepest = -1 if level > singular.task_value else 0  # the flow to the leaf moves away along this direction
+    leaving = singular.directions[:, steepest]
     sides = chart.xi(singular.point + radius * np.stack([leaving, -leaving]))[:, 0]
     apart = abs(sides[1] - sides[0])
     return Jump(singular, (float(sides[0]), float(sides[1])), float(min(apart, 2 * np.pi - apart)))

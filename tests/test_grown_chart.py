@@ -140,6 +140,12 @@ def test_there_is_no_expression_but_a_pointer(chart: oc.Chart) -> None:
     assert chart.function("task").size_out(0) == (chart.m, 1)
 
 
+def test_evaluate_counts_what_lies_too_near_to_a_separatrix_as_folded() -> None:
+    report = oc.evaluate(CHARTS["circle_M"](), 20_000)
+    assert 0 < report.folded_samples < 200
+    assert oc.evaluate(CHARTS["circle_I"](), 20_000).folded_samples == 0
+
+
 def test_both_metrics_agree_on_the_base_leaf() -> None:
     charts = [oc.grow(planar_2r(metric), 1.0, origin=ON_LEAF) for metric in ("euclidean", "inertia")]
     leaves = [chart.coordinates.leaf for chart in charts]

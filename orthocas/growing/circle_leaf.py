@@ -6,7 +6,6 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
@@ -80,10 +79,6 @@ class CircleLeaf:
         return {"level": self.level, "curve": self.curve, "length": self.length}
 
     @cached_property
-    def _turning(self) -> NDArray[np.bool_]:
-        return turning_joints(self.problem)
-
-    @cached_property
     def _drift(self) -> Array:
         """Whole turns of the joints along the curve, (n,) [rad]."""
         return np.asarray(self.curve[-1] - self.curve[0])
@@ -105,8 +100,9 @@ class CircleLeaf:
 
     def _embedded(self, points: Array) -> Array:
         """Angles as points of circles, so that whole turns do not matter."""
-        turning = points[:, self._turning]
-        return np.concatenate([np.cos(turning), np.sin(turning), points[:, ~self._turning]], axis=1)
+        turning = turning_joints(self.problem)
+        angles = points[:, turning]
+        return np.concatenate([np.cos(angles), np.sin(angles), points[:, ~turning]], axis=1)
 
 
 def circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAMPLES) -> CircleLeaf:

@@ -1,7 +1,7 @@
 """Many independent initial value problems at once, each with its own step size.
 
-SUNDIALS spends two thirds of its time outside the right-hand side when a system has three states. Here one step of
-every trajectory is an operation on columns of samples, so that only arithmetic is left.
+Mapped SUNDIALS solvers are several times slower on systems of a few states (benchmarks/growing_queries.py): here one
+step of every trajectory is an operation on columns of samples, so that little but arithmetic is left.
 """
 
 from dataclasses import dataclass
