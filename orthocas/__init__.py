@@ -7,7 +7,7 @@ from pathlib import Path as _Path
 if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
-from orthocas import problems, solvers
+from orthocas import control, problems, solvers
 from orthocas.api import compare, distil, fit, load
 from orthocas.chart import Chart
 from orthocas.domains import Box, Torus, contains
@@ -41,6 +41,7 @@ __all__ = [
     "check",
     "compare",
     "contains",
+    "control",
     "distil",
     "evaluate",
     "fit",

@@ -17,7 +17,7 @@ from orthocas.coordinates import CoordinateMap, InvertibleMap
 from orthocas.errors import InverseError, ShapeError
 from orthocas.problem import Problem, task_jacobians
 
-FUNCTIONS = ("xi", "phi", "jacobian", "task", "task_jacobian")
+FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
 _SINGULAR = 1e-8  # ratio of singular values of J where the inverse map is given up
 
 
@@ -50,6 +50,11 @@ class Chart:
     def r(self) -> int:
         """Number of extra coordinates."""
         return self.problem.r
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the components of phi: those of the task, then xi1, xi2, ..."""
+        return (*self.problem.task.labels, *(f"xi{k + 1}" for k in range(self.r)))
 
     def xi(self, q: ArrayLike) -> Array:
         """Extra coordinates, (r,) or (N, r)."""
@@ -104,6 +109,8 @@ class Chart:
     def function(self, name: str) -> ca.Function:
         """The CasADi function behind a method: xi, phi, jacobian (n, n), task, task_jacobian; q is (n, 1).
 
+        second_derivative is d^2 phi(q)[v, w] = (d/ds) J(q + s v) w, (n, 1), of q, v, w: with v = dq it is dJ/dt w.
+
         Raises:
             UnknownNameError: if there is no such function.
             NoExpressionError: if the coordinates are grown; `orthocas.distil` fits an expression to them.
@@ -141,7 +148,13 @@ class Chart:
             "phi": ca.vertcat(x, xi),
             "jacobian": ca.vertcat(J_x, J_xi),
         }
-        return {name: ca.Function(name, [q], [ca.densify(out)], ["q"], [name]) for name, out in outputs.items()}
+        functions = {name: ca.Function(name, [q], [ca.densify(out)], ["q"], [name]) for name, out in outputs.items()}
+        v, w = ca.MX.sym("v", self.n), ca.MX.sym("w", self.n)
+        second = ca.jtimes(ca.jtimes(outputs["phi"], q, w), q, v)
+        functions["second_derivative"] = ca.Function(
+            "second_derivative", [q, v, w], [ca.densify(second)], ["q", "v", "w"], ["second_derivative"]
+        )
+        return functions
 
     @cached_property
     def _rootfinder(self) -> ca.Function:

@@ -109,6 +109,10 @@ class ChartFileError(ArchiveError):
     """A chart file is missing, truncated, foreign, edited or too new."""
 
 
+class UnreachableReferenceError(OrthocasError, ValueError):
+    """A reference asks for what the robot cannot do inside the domain."""
+
+
 class GrowError(OrthocasError, ValueError):
     """Coordinates cannot be grown as asked."""
 

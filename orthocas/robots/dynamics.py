@@ -76,6 +76,12 @@ def inverse_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, ddq: ca.SX, gravi
     return _joint_forces(tree, joints, bodies, states, accelerations) + ca.SX(ca.DM(tree.armatures)) * ddq
 
 
+def forward_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, gravity: Array) -> ca.SX:
+    """Ddq = M^-1 (tau - C dq - g), (n, 1), with M = L D L^T."""
+    D, LT, order = ca.ldl(mass_matrix(tree, q), False)
+    return ca.ldl_solve(tau - bias(tree, q, dq, gravity), D, LT, order)
+
+
 def bias(tree: KinematicTree, q: ca.SX, dq: ca.SX, gravity: Array) -> ca.SX:
     """C(q, dq) dq + g(q), (n, 1)."""
     return inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity)

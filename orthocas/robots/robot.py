@@ -105,6 +105,10 @@ class Robot:
         """Tau = M ddq + C dq + g, (n,)."""
         return self._call("inverse_dynamics", q, dq, ddq)
 
+    def forward_dynamics(self, q: Any, dq: Any, tau: Any) -> Any:
+        """Ddq = M^-1 (tau - C dq - g), (n,)."""
+        return self._call("forward_dynamics", q, dq, tau)
+
     def coriolis_product(self, q: Any, v: Any, w: Any) -> Any:
         """C(q, v) w, (n,), with the Christoffel C (dM/dt - 2 C is skew): bilinear and symmetric in (v, w)."""
         return self._call("coriolis_product", q, v, w)
@@ -161,6 +165,12 @@ class Robot:
                 [q, dq, ddq],
                 [dynamics.inverse_dynamics(tree, q, dq, ddq, tree.gravity)],
                 ["q", "dq", "ddq"],
+            ),
+            "forward_dynamics": dense_function(
+                "forward_dynamics",
+                [q, dq, ddq],
+                [dynamics.forward_dynamics(tree, q, dq, ddq, tree.gravity)],
+                ["q", "dq", "tau"],
             ),
             "coriolis_product": dense_function(
                 "coriolis_product", [q, dq, ddq], [dynamics.coriolis_product(tree, q, dq, ddq)], ["q", "v", "w"]

@@ -1,0 +1,22 @@
+"""Controllers as CasADi functions of state, reference and gains, and the references they follow."""
+
+from orthocas.control.controller import Controller
+from orthocas.control.kinematic import Kinematic
+from orthocas.control.operational_space import DampingCheck, Impedance, PDPlus
+from orthocas.control.projector import KinematicProjector, Projector
+from orthocas.control.reachability import joint_path
+from orthocas.control.reference import Reference
+from orthocas.control.status import ControlStatus
+
+__all__ = [
+    "ControlStatus",
+    "Controller",
+    "DampingCheck",
+    "Impedance",
+    "Kinematic",
+    "KinematicProjector",
+    "PDPlus",
+    "Projector",
+    "Reference",
+    "joint_path",
+]

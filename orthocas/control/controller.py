@@ -1,0 +1,102 @@
+"""What every controller offers: one CasADi function of state, reference and gains, with the gains it was made with."""
+
+from typing import Literal, Protocol
+
+import casadi as ca
+
+from orthocas.checks import Array
+from orthocas.control.reference import Reference
+from orthocas.control.status import guard
+from orthocas.domains import Domain
+from orthocas.problem import Problem
+
+Command = Literal["torque", "velocity"]
+STATE_AND_REFERENCE = ("q", "dq", "reference", "reference_velocity", "reference_acceleration")
+
+
+class Controller(Protocol):
+    """A control law for a robot and a task."""
+
+    @property
+    def name(self) -> str:
+        """Short name, for example 'pd_plus'."""
+        ...
+
+    @property
+    def problem(self) -> Problem:
+        """Robot (the model the law uses), task, metric and domain."""
+        ...
+
+    @property
+    def command(self) -> Command:
+        """What comes out: joint torques [N m] or velocities [rad/s]."""
+        ...
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the k controlled quantities, in the order of the reference."""
+        ...
+
+    @property
+    def gains(self) -> dict[str, Array]:
+        """Values of the gains, by the names of their inputs."""
+        ...
+
+    @property
+    def function(self) -> ca.Function:
+        """Inputs q, dq (n, 1), reference and two derivatives (k, 1), gains -> command (n, 1), status (1, 1)."""
+        ...
+
+    @property
+    def energy(self) -> ca.Function | None:
+        """Same inputs -> storage V [J] and power dissipated by damping [W]; None for velocity controllers."""
+        ...
+
+    @property
+    def measured(self) -> ca.Function:
+        """The controlled quantities, q (n, 1) -> (k, 1)."""
+        ...
+
+    def require_reachable(self, reference: Reference, q_start: Array) -> None:
+        """Raise UnreachableReferenceError, with time and place, if the reference leaves what the law can follow."""
+        ...
+
+
+def named_inputs(n: int, gains: dict[str, Array], k: int) -> dict[str, ca.MX]:
+    """Symbols of the inputs of a controller, in order."""
+    sizes = {"q": n, "dq": n, "reference": k, "reference_velocity": k, "reference_acceleration": k}
+    sizes |= {name: len(value) for name, value in gains.items()}
+    return {name: ca.MX.sym(name, size) for name, size in sizes.items()}
+
+
+def guarded_function(
+    name: str,
+    inputs: dict[str, ca.MX],
+    command: ca.MX,
+    fallback: ca.MX,
+    volume: ca.MX,
+    domain: Domain | None,
+) -> ca.Function:
+    """The function of a controller: its law behind the guard of `orthocas.control.status`."""
+    numbers = ca.vertcat(*(value for key, value in inputs.items() if key != "limit"))
+    check = guard(domain, command.shape[0], numbers.shape[0])
+    safe, status = check(command, fallback, inputs["limit"], inputs["q"], numbers, volume)
+    return control_function(name, inputs, {"command": safe, "status": status})
+
+
+def control_function(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
+    """A function with named inputs and dense outputs; scalar code where all its parts are (several times faster)."""
+    dense = [ca.densify(out) for out in outputs.values()]
+    function = ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))
+    return scalar_code(function)
+
+
+def scalar_code(function: ca.Function) -> ca.Function:
+    """The function as scalar operations with common parts shared, or itself if it holds matrices (networks)."""
+    try:
+        flat = function.expand()
+    except RuntimeError:
+        return function
+    inputs = flat.sx_in()
+    outputs = ca.cse(list(flat.call(inputs)))
+    return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())

@@ -1,0 +1,47 @@
+"""Checks of gains: numbers a control law multiplies with, given as one for all or one for each."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.checks import Array, as_float_array, frozen_array, require_shape
+from orthocas.errors import InvalidValueError
+
+
+def positive_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers > 0, (length,), from one number or (length,)."""
+    gains = _spread(name, value, length)
+    _require(name, gains, gains > 0, "positive numbers")
+    return gains
+
+
+def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers >= 0, (length,), from one number or (length,)."""
+    gains = _spread(name, value, length)
+    _require(name, gains, gains >= 0, "numbers >= 0")
+    return gains
+
+
+def command_limit(name: str, value: ArrayLike | None, length: int) -> Array:
+    """Numbers > 0, (length,), infinite where nothing was given."""
+    if value is None:
+        return np.full(length, np.inf)
+    limit = np.array(np.broadcast_to(_one_or(name, value, length), (length,)))
+    _require(name, limit, limit > 0, "positive numbers")
+    return limit
+
+
+def _spread(name: str, value: ArrayLike, length: int) -> Array:
+    return frozen_array(name, np.broadcast_to(_one_or(name, value, length), (length,)), (length,))
+
+
+def _one_or(name: str, value: ArrayLike, length: int) -> Array:
+    array = as_float_array(name, value)
+    if array.ndim:
+        require_shape(name, array.shape, (length,))
+    return array
+
+
+def _require(name: str, gains: Array, good: Array, want: str) -> None:
+    bad = np.flatnonzero(~good)
+    if bad.size:
+        raise InvalidValueError(f"{name}[{bad[0]}]", gains[bad[0]], want)

@@ -1,0 +1,40 @@
+"""Inertia in task and extra coordinates, in blocks, and how close its gradients are to being dependent."""
+
+import casadi as ca
+import numpy as np
+
+from orthocas.batch import Batched, dense_function
+from orthocas.control.linear_algebra import spd_inverse
+from orthocas.domains import sample_uniform
+from orthocas.metrics import Metric
+from orthocas.problem import Problem
+
+_SAMPLES, _SEED = 256, 0
+
+
+def block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
+    """A function J (k, n), A (n, n) -> B = A^-1 J^T (n, k), Lambda (k, k), volume (1, 1).
+
+    With the rows of J in blocks, k = sum(blocks): Lambda is block diagonal with (J_b A^-1 J_b^T)^-1, [AS2023] eqs.
+    (30), (31); one block gives the full M_phi. The volume is the product of the det(J_b A^-1 J_b^T): 0 in singularities.
+    """
+    k = sum(blocks)
+    J, A = ca.SX.sym("J", k, n), ca.SX.sym("A", n, n)
+    B = ca.SX(spd_inverse(A)[0]) @ J.T
+    parts, volume, start = [], ca.SX(1), 0
+    for size in blocks:
+        rows = list(range(start, start + size))
+        inverse, determinant = spd_inverse(J[rows, :] @ B[:, rows])
+        parts.append(inverse)
+        volume *= determinant
+        start += size
+    return ca.Function("inertia", [J, A], [ca.densify(B), ca.densify(ca.diagcat(*parts)), volume])
+
+
+def median_volume(problem: Problem, jacobian: ca.Function, metric: str | Metric, blocks: tuple[int, ...]) -> float:
+    """Median of the volume of `block_inertia` over the domain: the scale for "near singular"."""
+    metric = Metric.from_spec(problem.robot, metric) if isinstance(metric, str) else metric
+    q = ca.MX.sym("q", problem.n)
+    volume = block_inertia(problem.n, blocks)(jacobian(q), metric.function(q))[2]
+    points = sample_uniform(problem.domain, _SAMPLES, _SEED)
+    return float(np.nanmedian(Batched(dense_function("volume", [q], [volume]))(points)[0]))

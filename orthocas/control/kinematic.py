@@ -1,0 +1,85 @@
+"""Velocity control in the coordinates phi = [x; xi] ([AS2023] Sec. 9)."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import casadi as ca
+from numpy.typing import ArrayLike
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.control.controller import Command, guarded_function, named_inputs
+from orthocas.control.gains import command_limit, non_negative_gains
+from orthocas.control.inertia import block_inertia, median_volume
+from orthocas.control.reachability import joint_path
+from orthocas.control.reference import Reference
+from orthocas.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class Kinematic:
+    """Joint velocity dq = J^-1 (d_phi_d + Lambda (phi_d - phi)).
+
+    Args:
+        chart: a chart with a closed expression (not a grown one).
+        feedback: diagonal of Lambda, >= 0, (n,) or one number [1/s]; the paper uses 0.
+        limit: largest speed of each joint, (n,) or one number [rad/s] or [m/s]; default none.
+
+    Raises:
+        ShapeError, InvalidValueError: for settings that do not fit.
+        NoExpressionError: if the chart is grown.
+
+    Source:
+        [AS2023] Sec. 9; the feedback is ours.
+    """
+
+    chart: Chart
+    feedback: Array
+    limit: Array
+
+    name: ClassVar[str] = "kinematic"
+    command: ClassVar[Command] = "velocity"
+    energy: ClassVar[None] = None
+
+    def __init__(self, chart: Chart, feedback: ArrayLike = 0.0, limit: ArrayLike | None = None) -> None:
+        chart.function("xi")  # refuses grown charts
+        object.__setattr__(self, "chart", chart)
+        object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))
+        object.__setattr__(self, "limit", command_limit("limit", limit, chart.n))
+
+    @property
+    def problem(self) -> Problem:
+        """Robot, task, metric and domain of the chart."""
+        return self.chart.problem
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Task labels, then xi1, xi2, ..."""
+        return self.chart.labels
+
+    @property
+    def gains(self) -> dict[str, Array]:
+        """Feedback and limit."""
+        return {"feedback": self.feedback, "limit": self.limit}
+
+    @property
+    def measured(self) -> ca.Function:
+        """Phi(q)."""
+        return self.chart.function("phi")
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """Inputs q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
+        n, problem = self.chart.n, self.problem
+        inputs = named_inputs(n, self.gains, n)
+        q = inputs["q"]
+        B, Lambda, volume = block_inertia(n, (n,))(self.chart.function("jacobian")(q), problem.metric.function(q))
+        rate = inputs["reference_velocity"] + inputs["feedback"] * (inputs["reference"] - self.measured(q))
+        scale = median_volume(problem, self.chart.function("jacobian"), problem.metric, (n,))
+        velocity = B @ (Lambda @ rate)  # J^-1 = A^-1 J^T (J A^-1 J^T)^-1
+        return guarded_function(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain)
+
+    def require_reachable(self, reference: Reference, q_start: Array) -> None:
+        """Raise UnreachableReferenceError if the reference leaves the chart's domain, seen from q_start."""
+        joint_path(self.chart, reference, q_start)

@@ -1,0 +1,44 @@
+"""Inverse and square root of small symmetric positive definite matrices, as smooth CasADi expressions without branches.
+
+They end up in generated C, so there are no eigenvectors (which jump) and no loops that stop when they like.
+"""
+
+import casadi as ca
+
+_ROUNDS = 8  # rounding accuracy up to a condition number of 1e6 (tests/test_control_linear_algebra.py)
+
+
+def spd_inverse(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Inverse and determinant of a symmetric positive definite matrix (k, k), by L D L^T without pivoting.
+
+    NaN or infinite where the matrix is singular.
+    """
+    k = matrix.shape[0]
+    D, LT, order = ca.ldl(matrix, False)
+    inverse = ca.ldl_solve(ca.SX.eye(k), D, LT, order)
+    determinant = ca.SX(1)
+    for i in range(k):
+        determinant *= D[i]
+    return (inverse + inverse.T) / 2, determinant
+
+
+def square_root(matrix: ca.SX) -> ca.SX:
+    """The symmetric positive definite S with S S = A, (k, k).
+
+    Newton's iteration in the product form of Denman and Beavers, scaled by determinants, with a fixed number of rounds:
+    a rational function of the entries with square roots of determinants.
+
+    Source:
+        [H2008] eq. (6.29) with the scaling of Sec. 6.5.
+    """
+    k = matrix.shape[0]
+    if k == 1:
+        return ca.sqrt(matrix)
+    identity = ca.SX.eye(k)
+    root, product = matrix, matrix
+    for _ in range(_ROUNDS):
+        inverse, determinant = spd_inverse(product)
+        mu_squared = determinant ** (-1 / k)
+        root = ca.sqrt(mu_squared) * (root + root @ inverse / mu_squared) / 2
+        product = (identity + (mu_squared * product + inverse / mu_squared) / 2) / 2
+    return (root + root.T) / 2

@@ -1,0 +1,219 @@
+"""Impedance control and PD+ in the coordinates phi = [x; xi] ([AS2023] Sec. 7), coupled or decoupled."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.batch import Batched
+from orthocas.chart import Chart
+from orthocas.checks import Array, require_known
+from orthocas.control.controller import Command, control_function, guarded_function, named_inputs
+from orthocas.control.damping import DAMPING_DESIGNS, DampingDesign, damping_matrix
+from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
+from orthocas.control.inertia import block_inertia, median_volume
+from orthocas.control.reachability import joint_path
+from orthocas.control.reference import Reference
+from orthocas.domains import sample_uniform
+from orthocas.problem import Problem
+
+Coupling = Literal["coupled", "decoupled"]
+COUPLINGS: tuple[Coupling, ...] = ("coupled", "decoupled")
+
+
+@dataclass(frozen=True)
+class DampingCheck:
+    """Whether the damping matrix D is positive semi-definite over a domain."""
+
+    samples: int
+    smallest_eigenvalue: float  #: of D, divided by its largest eigenvalue at the same point
+    indefinite_share: float  #: share of samples with a negative eigenvalue
+    worst_point: tuple[float, ...]  #: [rad] or [m]
+
+
+@dataclass(frozen=True, eq=False)
+class _OperationalSpace:
+    """What impedance and PD+ share: settings, inertia and damping in the coordinates of a chart.
+
+    Args:
+        chart: a chart with a closed expression (not a grown one).
+        stiffness: diagonal of K, > 0, (n,) or one number for all; [N/m] for positions, [J] for coordinates.
+        damping_ratio: diagonal of Z, >= 0, (n,) or one number.
+        coupling: `coupled` takes the full M_phi = (J M^-1 J^T)^-1; `decoupled` sums one controller for the task and one
+            for the extra coordinates, each with its own inertia, and relies on condition (5).
+        damping: `square_root` is the paper's design (29); `double_diagonal` is always positive semi-definite.
+        limit: largest torque of each joint, (n,) or one number [N m] or [N]; default none.
+
+    Raises:
+        ShapeError, InvalidValueError, UnknownNameError: for settings that do not fit.
+        NoExpressionError: if the chart is grown; `orthocas.distil` makes one that fits.
+    """
+
+    chart: Chart
+    stiffness: Array
+    damping_ratio: Array
+    coupling: Coupling
+    damping: DampingDesign
+    limit: Array
+
+    feed_forward: ClassVar[bool]
+    name: ClassVar[str]
+    command: ClassVar[Command] = "torque"
+
+    def __init__(
+        self,
+        chart: Chart,
+        stiffness: ArrayLike,
+        damping_ratio: ArrayLike = 0.7,
+        coupling: Coupling = "coupled",
+        damping: DampingDesign = "square_root",
+        limit: ArrayLike | None = None,
+    ) -> None:
+        require_known("coupling", coupling, COUPLINGS)
+        require_known("damping", damping, DAMPING_DESIGNS)
+        chart.function("xi")  # refuses grown charts
+        n = chart.n
+        for name, value in {
+            "chart": chart,
+            "stiffness": positive_gains("stiffness", stiffness, n),
+            "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, n),
+            "coupling": coupling,
+            "damping": damping,
+            "limit": command_limit("limit", limit, n),
+        }.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def problem(self) -> Problem:
+        """Robot, task, metric and domain of the chart."""
+        return self.chart.problem
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Task labels, then xi1, xi2, ..."""
+        return self.chart.labels
+
+    @property
+    def gains(self) -> dict[str, Array]:
+        """Stiffness, damping ratio and limit."""
+        return {"stiffness": self.stiffness, "damping_ratio": self.damping_ratio, "limit": self.limit}
+
+    @property
+    def measured(self) -> ca.Function:
+        """Phi(q)."""
+        return self.chart.function("phi")
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """Inputs q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
+        inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
+        q = inputs["q"]
+        J, gravity = self.chart.function("jacobian")(q), self.problem.robot.gravity(q)
+        force, volume = self._force(inputs, J)
+        torque, relative = J.T @ force + gravity, volume / self._median_volume
+        return guarded_function(self.name, inputs, torque, gravity, relative, self.problem.domain)
+
+    @cached_property
+    def energy(self) -> ca.Function:
+        """V = 1/2 de^T M_phi de + 1/2 e^T K e [J] and P = de^T D de [W], e = phi - phi_d.
+
+        Impedance control takes the velocity J dq in place of de, so that V is kinetic energy and springs.
+        """
+        inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
+        q, K = inputs["q"], ca.diag(inputs["stiffness"])
+        J = self.chart.function("jacobian")(q)
+        _, Lambda, _, D = self._inertia(J, self.problem.robot.mass_matrix(q), inputs)
+        e, de = self._errors(inputs, J)
+        storage = (ca.bilin(Lambda, de, de) + ca.bilin(K, e, e)) / 2
+        return control_function("energy", inputs, {"storage": storage, "dissipated_power": ca.bilin(D, de, de)})
+
+    @cached_property
+    def damping_matrix(self) -> ca.Function:
+        """Q, stiffness, damping_ratio -> D(q), (n, n)."""
+        inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
+        chosen = {name: inputs[name] for name in ("q", "stiffness", "damping_ratio")}
+        q = chosen["q"]
+        D = self._inertia(self.chart.function("jacobian")(q), self.problem.robot.mass_matrix(q), inputs)[-1]
+        return control_function("damping_matrix", chosen, {"D": D})
+
+    def check_damping(self, samples: int = 1000, seed: int = 0) -> DampingCheck:
+        """Smallest eigenvalue of D over uniform samples of the domain: (29) can make it negative."""
+        points = sample_uniform(self.problem.domain, samples, seed)
+        rows = [np.tile(gain, (samples, 1)) for gain in (self.stiffness, self.damping_ratio)]
+        D = Batched(self.damping_matrix)(points, *rows)[0].reshape(samples, self.chart.n, self.chart.n)
+        values = np.linalg.eigvalsh(D)
+        ratio = values[:, 0] / np.abs(values).max(axis=1).clip(np.finfo(float).tiny)
+        worst = int(np.argmin(ratio))
+        return DampingCheck(samples, float(ratio[worst]), float((ratio < -1e-12).mean()), tuple(points[worst].tolist()))
+
+    def require_reachable(self, reference: Reference, q_start: Array) -> None:
+        """Raise UnreachableReferenceError if the reference leaves the chart's domain, seen from q_start."""
+        joint_path(self.chart, reference, q_start)
+
+    @property
+    def _blocks(self) -> tuple[int, ...]:
+        return (self.chart.n,) if self.coupling == "coupled" else (self.chart.m, self.chart.r)
+
+    def _inertia(self, J: ca.MX, M: ca.MX, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ...]:
+        """B = M^-1 J^T, the inertia Lambda in blocks, its volume, and D with the same blocks."""
+        B, Lambda, volume = block_inertia(self.chart.n, self._blocks)(J, M)
+        D = _block_damping(self.damping, self._blocks)(Lambda, inputs["stiffness"], inputs["damping_ratio"])
+        return B, Lambda, volume, D
+
+    def _errors(self, inputs: dict[str, ca.MX], J: ca.MX) -> tuple[ca.MX, ca.MX]:
+        e = self.measured(inputs["q"]) - inputs["reference"]
+        velocity = J @ inputs["dq"]
+        return e, velocity - inputs["reference_velocity"] if self.feed_forward else velocity
+
+    def _force(self, inputs: dict[str, ca.MX], J: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """Force in the coordinates, (n, 1), and the volume of the gradients."""
+        q, dq, robot = inputs["q"], inputs["dq"], self.problem.robot
+        B, Lambda, volume, D = self._inertia(J, robot.mass_matrix(q), inputs)
+        e, de = self._errors(inputs, J)
+        force = -inputs["stiffness"] * e - D @ de
+        if self.feed_forward:
+            w = B @ (Lambda @ inputs["reference_velocity"])  # J^-1 d_phi_d; under (5) also when decoupled, by (8)
+            curvature = self.chart.function("second_derivative")(q, dq, w)
+            acceleration = inputs["reference_acceleration"] + B.T @ robot.coriolis_product(q, dq, w) - curvature
+            force += Lambda @ acceleration
+        return force, volume
+
+    @cached_property
+    def _median_volume(self) -> float:
+        return median_volume(self.problem, self.chart.function("jacobian"), "inertia", self._blocks)
+
+
+class Impedance(_OperationalSpace):
+    """Impedance control tau = J^T (-K (phi - phi_d) - D J dq) + g, passive for constant phi_d.
+
+    Source:
+        [AS2023] eqs. (28), (29), (33).
+    """
+
+    feed_forward = False
+    name = "impedance"
+
+
+class PDPlus(_OperationalSpace):
+    """Trajectory tracking tau = J^T (f_imp + f_FF) + g, operational space PD+.
+
+    f_FF = M_phi (dd_phi_d + (J M^-1 C - dJ/dt) J^-1 d_phi_d) + D d_phi_d.
+
+    Source:
+        [AS2023] eq. (35).
+    """
+
+    feed_forward = True
+    name = "pd_plus"
+
+
+def _block_damping(design: DampingDesign, blocks: tuple[int, ...]) -> ca.Function:
+    """Lambda (block diagonal), stiffness, damping_ratio -> D with the same blocks."""
+    n = sum(blocks)
+    Lambda, K, Z = ca.SX.sym("Lambda", n, n), ca.SX.sym("K", n), ca.SX.sym("Z", n)
+    places = np.split(np.arange(n), np.cumsum(blocks)[:-1])
+    parts = [damping_matrix(design, Lambda[p.tolist(), p.tolist()], K[p.tolist()], Z[p.tolist()]) for p in places]
+    return ca.Function("damping", [Lambda, K, Z], [ca.densify(ca.diagcat(*parts))])

@@ -1,0 +1,42 @@
+"""Whether a reference can be followed inside the domain of a chart, found before anything moves."""
+
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.control.reference import Reference
+from orthocas.domains import contains
+from orthocas.errors import InverseError, UnreachableReferenceError
+
+
+def joint_path(chart: Chart, reference: Reference, q_start: Array) -> Array:
+    """Joint positions that have the reference's values, followed from q_start, (N, n) on `reference.grid()`.
+
+    Raises:
+        UnreachableReferenceError: with the first time at which there is no such q near the one before, or it lies
+            outside the domain.
+    """
+    times = reference.grid()
+    values = reference.sample(times)[0]
+    path, q = np.empty((len(times), chart.n)), q_start
+    for k, value in enumerate(values):
+        where = f"at t = {times[k]:.3g} s, at {_list(reference.labels, value)}"
+        try:
+            q = chart.inverse(value, q)
+        except InverseError as error:
+            raise UnreachableReferenceError(f"the reference cannot be reached {where}: {error}") from None
+        if not contains(chart.problem.domain, q):
+            raise UnreachableReferenceError(f"the reference leaves the domain {where}: {_outside(chart, q)}")
+        path[k] = q
+    return path
+
+
+def _outside(chart: Chart, q: Array) -> str:
+    domain = chart.problem.domain
+    i = int(np.argmax(np.abs(q - domain.centre) / domain.half_width))
+    low, high = domain.centre[i] - domain.half_width[i], domain.centre[i] + domain.half_width[i]
+    return f"joint '{chart.problem.robot.joint_names[i]}' at {q[i]:.4g}, expected within [{low:.4g}, {high:.4g}]"
+
+
+def _list(labels: tuple[str, ...], value: Array) -> str:
+    return ", ".join(f"{label} = {number:.3g}" for label, number in zip(labels, value, strict=True))

@@ -1,0 +1,156 @@
+"""References: smooth motions phi_d(t) of named quantities, as steps through a low pass or trajectories through points."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import PPoly, make_interp_spline
+
+from orthocas.batch import Batched, dense_function
+from orthocas.checks import Array, as_float_array, frozen_array, require_known, require_shape
+from orthocas.control.low_pass import low_pass_response
+from orthocas.errors import InvalidValueError
+
+NATURAL_FREQUENCY = 2 * np.pi  #: omega0 [rad/s] of [AS2023] Sec. 8
+DAMPING_RATIO = 0.7  #: zeta of [AS2023] Sec. 8
+_GRID = 0.05  # [s]
+_DEGREE = 5  # of splines through points
+Change = tuple[float, Mapping[str, float]]  #: a time [s] and the new targets by label
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Phi_d(t) and two derivatives, smooth on each of S segments. Use `steps` or `through` to build one."""
+
+    labels: tuple[str, ...]  #: names of the k quantities
+    times: Array  #: (S + 1,) starts of the segments, and the end [s]
+    targets: Array  #: (S, k) what each segment heads for
+    start: Array  #: (k,) value at the start
+    parameters: Array  #: (S, p) inputs of the profile
+    profile: ca.Function  #: time since the start of the segment, parameters -> value, velocity, acceleration (k, 1)
+
+    @classmethod
+    def steps(
+        cls,
+        labels: Sequence[str],
+        start: ArrayLike,
+        changes: Sequence[Change],
+        duration: float,
+        natural_frequency: float = NATURAL_FREQUENCY,
+        damping_ratio: float = DAMPING_RATIO,
+    ) -> Self:
+        """Steps of the target, through the low pass dd_phi_d = omega0^2 (target - phi_d) - 2 zeta omega0 d_phi_d.
+
+        Args:
+            labels: names of the quantities, as the controller has them.
+            start: value at t = 0, where the reference rests, (k,).
+            changes: (time, {label: new target}), in the order of time, 0 <= time < duration.
+            duration: [s].
+            natural_frequency: omega0 > 0 [rad/s].
+            damping_ratio: zeta >= 0.
+
+        Raises:
+            InvalidValueError, UnknownNameError, ShapeError: for what does not fit.
+
+        Source:
+            [AS2023] Sec. 8.
+        """
+        names, value = tuple(labels), frozen_array("start", start, (len(labels),))
+        _require_number("natural_frequency", natural_frequency, above=0.0)
+        _require_number("duration", duration, above=0.0)
+        _require_number("damping_ratio", damping_ratio, above=-np.finfo(float).tiny)
+        times, targets = _stairs(names, value, changes, duration)
+        profile = low_pass_response(len(names), natural_frequency, damping_ratio)
+        run = Batched(profile)
+        parameters = [np.concatenate([targets[0], value, np.zeros_like(value)])]
+        for target, lasted in zip(targets[1:], np.diff(times)[:-1], strict=True):
+            position, velocity, _ = (out[0] for out in run(np.array([[lasted]]), parameters[-1][None]))
+            parameters.append(np.concatenate([target, position, velocity]))
+        return cls(names, times, targets, value, np.array(parameters), profile)
+
+    @classmethod
+    def through(cls, labels: Sequence[str], times: ArrayLike, points: ArrayLike) -> Self:
+        """A spline of degree 5 through points, at rest at both ends; velocity and acceleration are continuous.
+
+        Args:
+            labels: names of the quantities.
+            times: (N,) increasing, from 0 [s], N >= 2.
+            points: (N, k).
+
+        Raises:
+            InvalidValueError, ShapeError: for what does not fit.
+        """
+        names = tuple(labels)
+        t = frozen_array("times", times, (None,))
+        values = frozen_array("points", points, (len(t), len(names)))
+        if len(t) < 2 or t[0] != 0 or np.diff(t).min() <= 0:
+            raise InvalidValueError("times", t.tolist(), "at least two increasing times that begin with 0")
+        rest = [(order, np.zeros(len(names))) for order in (1, 2)]
+        pieces = PPoly.from_spline(make_interp_spline(t, values, _DEGREE, bc_type=(rest, rest)))
+        inner = (pieces.x[:-1] >= 0) & (pieces.x[:-1] < t[-1]) & (np.diff(pieces.x) > 0)
+        coefficients = pieces.c[:, inner].transpose(1, 2, 0).reshape(inner.sum(), -1)
+        return cls(names, t, values[1:], values[0], coefficients, _polynomial(len(names)))
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+        return float(self.times[-1])
+
+    def segment(self, times: Array) -> Array:
+        """Index of the segment that holds each time; a border belongs to the later one."""
+        return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.parameters) - 1)
+
+    def sample(self, times: ArrayLike) -> tuple[Array, Array, Array]:
+        """Value, velocity and acceleration at times (N,), three arrays (N, k)."""
+        t = frozen_array("times", times, (None,))
+        k = self.segment(t)
+        value, velocity, acceleration = self._batched((t - self.times[k])[:, None], self.parameters[k])
+        return value, velocity, acceleration
+
+    def grid(self, spacing: float = _GRID) -> Array:
+        """Times from start to end, at most that far apart [s]."""
+        return np.linspace(0.0, self.duration, max(2, int(np.ceil(self.duration / spacing)) + 1))
+
+    @cached_property
+    def _batched(self) -> Batched:
+        return Batched(self.profile)
+
+
+def _stairs(labels: tuple[str, ...], start: Array, changes: Sequence[Change], duration: float) -> tuple[Array, Array]:
+    """Segment borders (S + 1,) and targets (S, k)."""
+    times, targets = [0.0], [start]
+    for time, moves in changes:
+        at = float(as_float_array("time of a step", time))
+        if not times[-1] <= at < duration:
+            raise InvalidValueError("time of a step", at, f"from {times[-1]:g} to below the duration {duration:g} s")
+        target = targets[-1].copy()
+        for label, value in moves.items():
+            require_known("quantity", label, labels)
+            target[labels.index(label)] = _require_number(f"target of {label}", value)
+        if at == times[-1]:
+            targets[-1] = target
+        else:
+            times.append(at)
+            targets.append(target)
+    return np.array([*times, float(duration)]), np.array(targets)
+
+
+def _polynomial(k: int) -> ca.Function:
+    """Time, coefficients of k polynomials with the highest power first -> value and two derivatives."""
+    t, coefficients = ca.SX.sym("t"), ca.SX.sym("coefficients", k * (_DEGREE + 1))
+    table = ca.reshape(coefficients, _DEGREE + 1, k).T
+    value = ca.SX(table @ ca.vertcat(*(t ** (_DEGREE - i) for i in range(_DEGREE + 1))))
+    velocity = ca.jacobian(value, t)
+    return dense_function("spline", [t, coefficients], [value, velocity, ca.jacobian(velocity, t)])
+
+
+def _require_number(name: str, value: float, above: float = -np.inf) -> float:
+    array = as_float_array(name, value)
+    require_shape(name, array.shape, ())
+    if not (np.isfinite(array) and array > above):
+        raise InvalidValueError(name, value, "a finite number" if above == -np.inf else f"a finite number > {above:.0f}")
+    return float(array)
