@@ -7,7 +7,7 @@ from pathlib import Path as _Path
 if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
-from orthocas import control, problems, solvers
+from orthocas import control, problems, simulation, solvers
 from orthocas.api import compare, distil, fit, load
 from orthocas.chart import Chart
 from orthocas.domains import Box, Torus, contains
@@ -17,6 +17,7 @@ from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomi
 from orthocas.problem import Problem, check
 from orthocas.quality import Report, evaluate
 from orthocas.robots import Robot
+from orthocas.simulation import simulate
 from orthocas.singularities import jumps, singular_points
 from orthocas.task_brackets import lie_bracket
 from orthocas.tasks import Task
@@ -51,6 +52,8 @@ __all__ = [
     "lie_bracket",
     "load",
     "problems",
+    "simulate",
+    "simulation",
     "singular_points",
     "solvers",
 ]

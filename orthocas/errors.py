@@ -89,6 +89,10 @@ class SolveError(OrthocasError, RuntimeError):
     """A minimiser stopped without a usable result."""
 
 
+class SimulationError(OrthocasError, RuntimeError):
+    """An integrator gave up in the middle of a closed loop."""
+
+
 class InfeasibleError(SolveError):
     """Constraints of a fit cannot be met."""
 
@@ -103,6 +107,10 @@ class ArchiveError(OrthocasError, ValueError):
 
 class CheckpointError(ArchiveError):
     """A checkpoint is damaged, foreign, or belongs to another fit."""
+
+
+class TrajectoryFileError(ArchiveError):
+    """A trajectory file is missing, damaged, foreign or too new."""
 
 
 class ChartFileError(ArchiveError):

@@ -3,6 +3,7 @@
 from orthocas.control.controller import Controller
 from orthocas.control.kinematic import Kinematic
 from orthocas.control.operational_space import DampingCheck, Impedance, PDPlus
+from orthocas.control.posture import posture_reference
 from orthocas.control.projector import KinematicProjector, Projector
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
@@ -19,4 +20,5 @@ __all__ = [
     "Projector",
     "Reference",
     "joint_path",
+    "posture_reference",
 ]

@@ -1,7 +1,7 @@
 """Checks of gains: numbers a control law multiplies with, given as one for all or one for each."""
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.checks import Array, as_float_array, frozen_array, require_shape
 from orthocas.errors import InvalidValueError
@@ -41,7 +41,7 @@ def _one_or(name: str, value: ArrayLike, length: int) -> Array:
     return array
 
 
-def _require(name: str, gains: Array, good: Array, want: str) -> None:
+def _require(name: str, gains: Array, good: NDArray[np.bool_], want: str) -> None:
     bad = np.flatnonzero(~good)
     if bad.size:
         raise InvalidValueError(f"{name}[{bad[0]}]", gains[bad[0]], want)

@@ -16,7 +16,7 @@ def block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
     """A function J (k, n), A (n, n) -> B = A^-1 J^T (n, k), Lambda (k, k), volume (1, 1).
 
     With the rows of J in blocks, k = sum(blocks): Lambda is block diagonal with (J_b A^-1 J_b^T)^-1, [AS2023] eqs.
-    (30), (31); one block gives the full M_phi. The volume is the product of the det(J_b A^-1 J_b^T): 0 in singularities.
+    (30), (31); one block gives the full M_phi. The volume is the product of det(J_b A^-1 J_b^T): 0 in singularities.
     """
     k = sum(blocks)
     J, A = ca.SX.sym("J", k, n), ca.SX.sym("A", n, n)

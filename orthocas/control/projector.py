@@ -113,7 +113,7 @@ class Projector:
         return named_inputs(self.problem.n, self.gains, len(self.labels))
 
     def _errors_and_damping(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
-        """e = [x - x_d; q - q_d], D_x with the inertia M_x, and D_q with M."""
+        """E = [x - x_d; q - q_d], D_x with the inertia M_x, and D_q with M."""
         problem, m = self.problem, self.problem.m
         q, K, Z = inputs["q"], inputs["stiffness"], inputs["damping_ratio"]
         M = problem.robot.mass_matrix(q)
@@ -213,6 +213,6 @@ def _require_posture_within_limits(problem: Problem, reference: Reference) -> No
     if outside.size:
         k, i = outside[0]
         raise UnreachableReferenceError(
-            f"the reference wants joint '{problem.robot.joint_names[i]}' at {postures[k, i]:.4g} at t = {times[k]:.3g} s, "
-            f"expected within [{problem.robot.lower[i]:.4g}, {problem.robot.upper[i]:.4g}]"
+            f"the reference wants joint '{problem.robot.joint_names[i]}' at {postures[k, i]:.4g} "
+            f"at t = {times[k]:.3g} s, expected within [{problem.robot.lower[i]:.4g}, {problem.robot.upper[i]:.4g}]"
         )

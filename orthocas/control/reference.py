@@ -1,14 +1,15 @@
-"""References: smooth motions phi_d(t) of named quantities, as steps through a low pass or trajectories through points."""
+"""References: smooth motions phi_d(t) of named quantities, steps through a low pass or splines through points."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import factorial
 from typing import Self
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PPoly, make_interp_spline
+from scipy.interpolate import make_interp_spline
 
 from orthocas.batch import Batched, dense_function
 from orthocas.checks import Array, as_float_array, frozen_array, require_known, require_shape
@@ -90,9 +91,9 @@ class Reference:
         if len(t) < 2 or t[0] != 0 or np.diff(t).min() <= 0:
             raise InvalidValueError("times", t.tolist(), "at least two increasing times that begin with 0")
         rest = [(order, np.zeros(len(names))) for order in (1, 2)]
-        pieces = PPoly.from_spline(make_interp_spline(t, values, _DEGREE, bc_type=(rest, rest)))
-        inner = (pieces.x[:-1] >= 0) & (pieces.x[:-1] < t[-1]) & (np.diff(pieces.x) > 0)
-        coefficients = pieces.c[:, inner].transpose(1, 2, 0).reshape(inner.sum(), -1)
+        spline = make_interp_spline(t, values, _DEGREE, bc_type=(rest, rest))
+        taylor = [spline(t[:-1], order) / factorial(order) for order in reversed(range(_DEGREE + 1))]
+        coefficients = np.stack(taylor, axis=2).reshape(len(t) - 1, -1)
         return cls(names, t, values[1:], values[0], coefficients, _polynomial(len(names)))
 
     @property
@@ -152,5 +153,7 @@ def _require_number(name: str, value: float, above: float = -np.inf) -> float:
     array = as_float_array(name, value)
     require_shape(name, array.shape, ())
     if not (np.isfinite(array) and array > above):
-        raise InvalidValueError(name, value, "a finite number" if above == -np.inf else f"a finite number > {above:.0f}")
+        raise InvalidValueError(
+            name, value, "a finite number" if above == -np.inf else f"a finite number > {above:.0f}"
+        )
     return float(array)

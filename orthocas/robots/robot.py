@@ -1,16 +1,19 @@
 """The robot as users meet it: names, limits, and kinematics and dynamics for SX, MX and NumPy."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
 import casadi as ca
+import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from orthocas.batch import Batched, dense_function
-from orthocas.checks import Array, as_point_set, require_known
-from orthocas.errors import ShapeError
+from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_known
+from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
 from orthocas.robots.pinocchio_model import frame_index, tree_from_model
 from orthocas.robots.tree import KinematicTree
@@ -68,6 +71,18 @@ class Robot:
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
         """A planar arm with uniform links, lengths [m] and masses [kg]; x horizontal, gravity along -y."""
         return cls(tree_from_model(planar.planar_model(lengths, masses), planar.TIP))
+
+    def with_scaled_masses(self, factor: ArrayLike) -> Self:
+        """The same robot with other masses: mass and inertia of each body times a factor, (n,) or one number > 0.
+
+        Raises:
+            ShapeError, InvalidValueError: for factors that do not fit.
+        """
+        factors = frozen_array("factor", np.broadcast_to(as_float_array("factor", factor), (self.n,)), (self.n,))
+        if factors.min() <= 0:
+            raise InvalidValueError("factor", factors.min(), "numbers > 0")
+        masses, inertias = self.tree.masses * factors, self.tree.inertias * factors[:, None, None]
+        return type(self)(replace(self.tree, masses=masses, inertias=inertias))
 
     @property
     def n(self) -> int:

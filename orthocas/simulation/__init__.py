@@ -1,0 +1,20 @@
+"""Controllers run in closed loop on real dynamics, and what the runs tell."""
+
+from orthocas.simulation.breakdown import Breakdown, task_acceleration_breakdown
+from orthocas.simulation.coupling import Coupling, coupling_index
+from orthocas.simulation.disturbances import Friction, Noise, Push
+from orthocas.simulation.run import simulate
+from orthocas.simulation.trajectory import Outcome, Trajectory
+
+__all__ = [
+    "Breakdown",
+    "Coupling",
+    "Friction",
+    "Noise",
+    "Outcome",
+    "Push",
+    "Trajectory",
+    "coupling_index",
+    "simulate",
+    "task_acceleration_breakdown",
+]

@@ -1,0 +1,55 @@
+"""Where unwanted task acceleration comes from ([AS2023] Fig. 25b)."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from orthocas.batch import Batched, dense_function
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.errors import InvalidValueError
+from orthocas.simulation.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Breakdown:
+    """Parts of the task acceleration dd_x along a run, each (N, m). They add up to dd_x."""
+
+    labels: tuple[str, ...]  #: of x
+    own: Array  #: J_x M^-1 J_x^T f_x: what the force in the task does
+    error: Array  #: J_x M^-1 J_xi^T f_xi, [AS2023] eq. (38): 0 where (5) holds with A = M
+    curvature: Array  #: dJ_x/dt dq
+    coriolis: Array  #: -J_x M^-1 C dq
+
+    @property
+    def total(self) -> Array:
+        """Dd_x, (N, m)."""
+        return self.own + self.error + self.curvature + self.coriolis
+
+
+def task_acceleration_breakdown(chart: Chart, trajectory: Trajectory) -> Breakdown:
+    """Split dd_x as the first rows of [AS2023] eq. (34), with f_phi = J^-T (tau - g) for any torque controller.
+
+    Args:
+        chart: coordinates to split by, on the controller's model of the robot; no pushes, no friction.
+        trajectory: of a torque controller.
+
+    Raises:
+        InvalidValueError: if the trajectory is one of a velocity controller.
+    """
+    if trajectory.kind != "torque":
+        raise InvalidValueError("trajectory", f"one of '{trajectory.controller}'", "one of a torque controller")
+    parts = Batched(_parts(chart))(trajectory.q, trajectory.dq, trajectory.command)
+    return Breakdown(chart.problem.task.labels, *parts)
+
+
+def _parts(chart: Chart) -> ca.Function:
+    n, m, robot = chart.n, chart.m, chart.problem.robot
+    q, dq, tau = (ca.MX.sym(name, n) for name in ("q", "dq", "tau"))
+    J = chart.function("jacobian")(q)
+    f = ca.solve(J.T, tau - robot.gravity(q))
+    mobility = ca.solve(robot.mass_matrix(q), J[:m, :].T).T  # J_x M^-1
+    own, error = mobility @ J[:m, :].T @ f[:m], mobility @ J[m:, :].T @ f[m:]
+    curvature = chart.function("second_derivative")(q, dq, dq)[:m]
+    coriolis = -mobility @ robot.coriolis_product(q, dq, dq)
+    return dense_function("breakdown", [q, dq, tau], [own, error, curvature, coriolis], ["q", "dq", "tau"])

@@ -1,0 +1,87 @@
+"""The right-hand side of a closed loop: controller, plant and disturbances as one CasADi function."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+
+from orthocas.control.controller import Controller, scalar_code
+from orthocas.control.reference import Reference
+from orthocas.errors import SimulationError
+from orthocas.interrupts import deferred
+from orthocas.robots import Robot
+from orthocas.simulation.disturbances import Friction
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """A controller on a plant. The state is [q; dq] for torque controllers and q for velocity controllers."""
+
+    controller: Controller
+    plant: Robot  #: the robot as it is, which the controller's model may not match
+    friction: Friction
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.plant.n
+
+    @property
+    def torque(self) -> bool:
+        """Whether the command is a torque."""
+        return self.controller.command == "torque"
+
+    @cached_property
+    def plant_rate(self) -> ca.Function:
+        """State, command (n, 1), load (3 + n, 1) -> rate of the state."""
+        n = self.n
+        q, dq, command, load = (
+            ca.SX.sym(name, size) for name, size in (("q", n), ("dq", n), ("u", n), ("load", 3 + n))
+        )
+        if not self.torque:
+            return ca.Function("plant", [q, command, load], [command])
+        external = self.plant.tip_jacobian(q)[:3, :].T @ load[:3] + load[3:]
+        ddq = self.plant.forward_dynamics(q, dq, command + external - self.friction.torque(dq))
+        return ca.Function("plant", [ca.vertcat(q, dq), command, load], [ca.vertcat(dq, ddq)])
+
+    def commanded(self, state: ca.MX, reference: Sequence[ca.MX]) -> tuple[ca.MX, ca.MX]:
+        """Command and status for a (measured) state and the reference with two derivatives."""
+        dq = state[self.n :] if self.torque else ca.MX(self.n, 1)
+        gains = [ca.DM(gain) for gain in self.controller.gains.values()]
+        command, status = self.controller.function.call([state[: self.n], dq, *reference, *gains])
+        return command, status
+
+    def rate(self, reference: Reference) -> ca.Function:
+        """State, time since the start of a segment, its parameters, load -> rate of the state."""
+        state = ca.MX.sym("state", self.plant_rate.size1_in(0))
+        t, parameters = ca.MX.sym("t"), ca.MX.sym("parameters", reference.profile.size1_in(1))
+        load = ca.MX.sym("load", 3 + self.n)
+        command, _ = self.commanded(state, reference.profile.call([t, parameters]))
+        return scalar_code(ca.Function("rate", [state, t, parameters, load], [self.plant_rate(state, command, load)]))
+
+
+def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:
+    """Call a function that integrates; Ctrl-C waits until it returns.
+
+    Raises:
+        SimulationError: if CVODES gives up.
+    """
+    with deferred():
+        try:
+            return function(*arguments, **named)
+        except RuntimeError as error:
+            raise SimulationError(f"CVODES gave up: {str(error)[:200]}") from None
+
+
+def cvodes_options(tolerance: float) -> dict[str, Any]:
+    """Adams with functional iteration: needs no Jacobian of the closed loop, which is smooth and not stiff."""
+    return {
+        "linear_multistep_method": "adams",
+        "nonlinear_solver_iteration": "functional",
+        "abstol": tolerance,
+        "reltol": tolerance,
+        "max_num_steps": 20_000,
+        "disable_internal_warnings": True,
+    }

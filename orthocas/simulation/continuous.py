@@ -1,0 +1,60 @@
+"""Closed loops in continuous time, by CVODES, segment by segment, so that it never steps over a jump."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.checks import Array
+from orthocas.control.reference import Reference
+from orthocas.simulation.closed_loop import ClosedLoop, cvodes_options, run_compiled
+from orthocas.simulation.disturbances import Push, loads_at
+
+_OUTPUTS = 25  # instants of one integrator call: one object serves all, and Ctrl-C waits no longer than that
+
+
+def integrate(
+    loop: ClosedLoop, reference: Reference, pushes: tuple[Push, ...], start: Array, step: float, tolerance: float
+) -> Iterator[tuple[Array, Array]]:
+    """Times (25,) and states (25, s) in turn, from after the start to the end of the reference.
+
+    Raises:
+        SimulationError: when CVODES gives up.
+    """
+    run = _integrator(loop, reference, tolerance)
+    state = start
+    for begin, end in _pieces(reference, pushes, step * _OUTPUTS):
+        segment = int(reference.segment(np.array([begin]))[0])
+        load = loads_at(pushes, np.array([begin]), loop.n)[0]
+        since = begin - reference.times[segment]
+        p = np.concatenate([[end - begin, since], reference.parameters[segment], load])
+        states = np.asarray(run_compiled(run, x0=ca.DM(state), p=ca.DM(p))["xf"]).T
+        state = states[-1]
+        yield begin + (end - begin) * np.arange(1, _OUTPUTS + 1) / _OUTPUTS, states
+
+
+def _pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> Iterator[tuple[float, float]]:
+    """Intervals no longer than that, without a step of the reference or a change of load inside."""
+    edges = np.array([*reference.times, *(t for push in pushes for t in (push.start, push.end))])
+    borders = np.unique(edges[edges <= reference.duration])
+    for begin, end in pairwise(borders):
+        count = max(1, int(np.ceil((end - begin) / longest - 1e-9)))
+        cuts = np.linspace(begin, end, count + 1)
+        yield from pairwise(cuts)
+
+
+def _integrator(loop: ClosedLoop, reference: Reference, tolerance: float) -> ca.Function:
+    """x0, p = [length; time since the start of the segment; its parameters; load] -> states at 25 even instants."""
+    rate = loop.rate(reference)
+    state_size, _, p_size, load_size = (rate.size1_in(i) for i in range(4))
+    kind: Any = ca.SX if rate.is_a("SXFunction") else ca.MX
+    x, s = kind.sym("x", state_size), kind.sym("s")
+    p = kind.sym("p", 2 + p_size + load_size)
+    length, since, parameters, load = p[0], p[1], p[2 : 2 + p_size], p[2 + p_size :]
+    ode = length * rate(x, since + s * length, parameters, load)
+    grid = np.arange(1, _OUTPUTS + 1) / _OUTPUTS
+    return ca.integrator(
+        "closed_loop", "cvodes", {"x": x, "t": s, "p": p, "ode": ode}, 0.0, grid, cvodes_options(tolerance)
+    )

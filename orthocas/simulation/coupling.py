@@ -1,0 +1,55 @@
+"""How much a commanded coordinate disturbs the others."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.control.reference import Reference
+from orthocas.errors import InvalidValueError
+from orthocas.simulation.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Coupling:
+    """Coupling indices: rows are disturbed coordinates, columns the commanded ones."""
+
+    labels: tuple[str, ...]  #: of phi = [x; xi]
+    index: Array  #: (n, n) [unit of the row / unit of the column]; NaN where a coordinate was never commanded alone
+
+    def of(self, disturbed: str, commanded: str) -> float:
+        """The index of one pair, by labels: how much the first suffers from steps of the second."""
+        return float(self.index[self.labels.index(disturbed), self.labels.index(commanded)])
+
+
+def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -> Coupling:
+    """Largest excursion of each coordinate from its reference while only another is commanded, over the commanded step.
+
+    Steps that change several targets at once are left out; of several steps in one coordinate the worst counts.
+
+    Args:
+        chart: the coordinates that are judged, also for controllers that do not use them.
+        reference: steps in phi = [x; xi], `Reference.steps` with `chart.labels`.
+        trajectory: the run.
+
+    Raises:
+        InvalidValueError: if the reference has other labels.
+
+    Source:
+        ours
+    """
+    if reference.labels != chart.labels:
+        raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
+    away = np.abs(chart.phi(trajectory.q) - reference.sample(np.minimum(trajectory.times, reference.duration))[0])
+    steps = np.diff(np.vstack([reference.start, reference.targets]), axis=0)
+    index = np.full((chart.n, chart.n), np.nan)
+    for segment, step in enumerate(steps):
+        moved = np.flatnonzero(step)
+        begin, end = reference.times[segment : segment + 2]
+        inside = (trajectory.times >= begin) & (trajectory.times <= end)
+        if len(moved) == 1 and inside.any():
+            worst = away[inside].max(axis=0) / abs(step[moved[0]])
+            worst[moved] = np.nan
+            index[:, moved[0]] = np.fmax(index[:, moved[0]], worst)
+    return Coupling(chart.labels, index)

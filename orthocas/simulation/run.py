@@ -1,0 +1,162 @@
+"""`simulate`: a controller, a reference and a robot, run in closed loop."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.batch import Batched
+from orthocas.checks import Array, frozen_array
+from orthocas.control.controller import Controller
+from orthocas.control.reference import Reference
+from orthocas.errors import InvalidValueError, SimulationError
+from orthocas.objective import Monitor, Progress, silent
+from orthocas.robots import Robot
+from orthocas.simulation.closed_loop import ClosedLoop
+from orthocas.simulation.continuous import integrate
+from orthocas.simulation.disturbances import Friction, Noise, Push
+from orthocas.simulation.sampled import run_ticks
+from orthocas.simulation.trajectory import Outcome, Trajectory
+
+TOLERANCE = 1e-8  #: relative and absolute, of CVODES
+
+
+def simulate(
+    controller: Controller,
+    reference: Reference,
+    q_start: ArrayLike,
+    dq_start: ArrayLike | None = None,
+    step: float = 0.01,
+    control_rate: float | None = None,
+    plant: Robot | None = None,
+    pushes: Sequence[Push] = (),
+    friction: Friction | None = None,
+    noise: Noise | None = None,
+    must_be_reachable: bool = True,
+    tolerance: float = TOLERANCE,
+    monitor: Monitor = silent,
+) -> Trajectory:
+    """Run a closed loop by SUNDIALS (CVODES) for as long as the reference lasts.
+
+    Torque controllers move M ddq + C dq + g = tau + loads - friction ([AS2023] eq. (26)); velocity controllers move
+    dq = command, as a robot that follows its commands perfectly.
+
+    Args:
+        controller: see `orthocas.control`.
+        reference: with the labels of the controller.
+        q_start: joint positions at t = 0, (n,) [rad] or [m].
+        dq_start: joint velocities at t = 0, (n,); default at rest. Torque controllers only.
+        step: longest time between two instants of the result [s].
+        control_rate: ticks per second of a sampled controller, whose command is held between them; instants of the
+            result are then those ticks. Default: a controller in continuous time.
+        plant: the robot as it is, for example `robot.with_scaled_masses(1.1)`; default the controller's model.
+        pushes: external loads.
+        friction: in the joints.
+        noise: on what a sampled controller measures.
+        must_be_reachable: whether to refuse a reference that leaves the domain, before the run.
+        tolerance: relative and absolute tolerance of CVODES.
+        monitor: called with progress.
+
+    Returns:
+        The trajectory. Its outcome tells whether it ended early, by Ctrl-C or because the integrator gave up.
+
+    Raises:
+        UnreachableReferenceError: if the reference leaves the domain.
+        ShapeError, InvalidValueError: for what does not fit.
+    """
+    loop = ClosedLoop(controller, plant or controller.problem.robot, friction or Friction())
+    start = _start_state(loop, q_start, dq_start)
+    _require_fitting(loop, reference, tuple(pushes), friction, noise, control_rate)
+    for name, value in (("step", step), ("tolerance", tolerance), ("control_rate", control_rate or 1.0)):
+        if not 0 < value < np.inf:
+            raise InvalidValueError(name, value, "a finite number > 0")
+    if must_be_reachable:
+        controller.require_reachable(reference, start[: loop.n])
+    loads, pieces = tuple(pushes), []
+    outcome = Outcome.COMPLETE
+    running = (
+        integrate(loop, reference, loads, start, step, tolerance)
+        if control_rate is None
+        else run_ticks(loop, reference, loads, start, control_rate, noise or Noise(), tolerance)
+    )
+    try:
+        for piece in running:
+            pieces.append(piece)
+            monitor(_progress(controller.name, piece[0][-1], reference.duration))
+    except KeyboardInterrupt:
+        outcome = Outcome.INTERRUPTED
+    except SimulationError:
+        outcome = Outcome.DIVERGED
+    return _trajectory(loop, reference, start, pieces, outcome)
+
+
+def _progress(name: str, time: float, duration: float) -> Progress:
+    return Progress(f"simulate {name}", time / duration, f"{time:.1f} s")
+
+
+def _start_state(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | None) -> Array:
+    q = frozen_array("q_start", q_start, (loop.n,))
+    if not loop.torque:
+        if dq_start is not None:
+            raise InvalidValueError("dq_start", dq_start, "nothing: velocity controllers have no velocity as a state")
+        return q
+    return np.concatenate([q, np.zeros(loop.n) if dq_start is None else frozen_array("dq_start", dq_start, (loop.n,))])
+
+
+def _require_fitting(
+    loop: ClosedLoop,
+    reference: Reference,
+    pushes: Sequence[Push],
+    friction: Friction | None,
+    noise: Noise | None,
+    control_rate: float | None,
+) -> None:
+    """Refuse what would be ignored, or fail later with a worse message."""
+    controller = loop.controller
+    if reference.labels != controller.labels:
+        raise InvalidValueError(
+            "labels of the reference", reference.labels, f"those of the controller {controller.labels}"
+        )
+    if loop.n != controller.problem.n:
+        raise InvalidValueError("joints of the plant", loop.n, f"{controller.problem.n}, as the controller's robot")
+    if not loop.torque and (pushes or friction is not None):
+        raise InvalidValueError("pushes or friction", "given", "none: a velocity controller sees no forces")
+    if noise is not None and control_rate is None:
+        raise InvalidValueError("noise", noise, "none without a control_rate: white noise needs ticks")
+
+
+def _trajectory(
+    loop: ClosedLoop, reference: Reference, start: Array, pieces: Sequence[tuple[Array, ...]], outcome: Outcome
+) -> Trajectory:
+    """Put the pieces in a row, and add what follows from states and reference."""
+    controller, n = loop.controller, loop.n
+    times = np.concatenate([[0.0], *(piece[0] for piece in pieces)])
+    states = np.vstack([start, *(piece[1] for piece in pieces)])
+    q = states[:, :n]
+    wanted = reference.sample(np.minimum(times, reference.duration))
+    dq = states[:, n:] if loop.torque else np.zeros_like(q)
+    arguments = [q, dq, *wanted, *(np.tile(gain, (len(times), 1)) for gain in controller.gains.values())]
+    command, status = Batched(controller.function)(*arguments)
+    if pieces and len(pieces[0]) > 2:  # commands were held from noisy measurements: take those that were sent
+        command = np.vstack([*(piece[2] for piece in pieces), pieces[-1][2][-1:]])
+        status = np.concatenate([*(piece[3] for piece in pieces), pieces[-1][3][-1:]])[:, None]
+    unknown = [np.full((len(times), 1), np.nan)] * 2
+    storage, power = unknown if controller.energy is None else Batched(controller.energy)(*arguments)
+    return Trajectory(
+        controller=controller.name,
+        kind=controller.command,
+        outcome=outcome,
+        labels=controller.labels,
+        joint_names=loop.plant.joint_names,
+        times=times,
+        q=q,
+        dq=dq if loop.torque else command,
+        command=command,
+        status=status[:, 0].astype(int),
+        value=Batched(controller.measured)(q)[0],
+        reference=wanted[0],
+        reference_velocity=wanted[1],
+        reference_acceleration=wanted[2],
+        storage=storage[:, 0],
+        dissipated_power=power[:, 0],
+    )

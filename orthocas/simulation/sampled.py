@@ -1,0 +1,69 @@
+"""Closed loops with a sampled controller: the command is held between ticks, the plant moves on under CVODES."""
+
+from collections.abc import Iterator
+
+import casadi as ca
+import numpy as np
+
+from orthocas.checks import Array
+from orthocas.control.reference import Reference
+from orthocas.simulation.closed_loop import ClosedLoop, cvodes_options, run_compiled
+from orthocas.simulation.disturbances import Noise, Push, loads_at
+
+_TICKS = 50  # of one call
+
+
+def run_ticks(
+    loop: ClosedLoop,
+    reference: Reference,
+    pushes: tuple[Push, ...],
+    start: Array,
+    rate: float,
+    noise: Noise,
+    tolerance: float,
+) -> Iterator[tuple[Array, Array, Array, Array]]:
+    """Times (50,), states (50, s) at their end, commands (50, n) and status (50,) of ticks, in turn.
+
+    Raises:
+        SimulationError: when CVODES gives up.
+    """
+    ticks = int(np.ceil(reference.duration * rate - 1e-9))
+    times = np.arange(ticks) / rate
+    columns = (
+        np.hstack(reference.sample(times)),
+        noise.sample(ticks, loop.n)[:, : loop.plant_rate.size1_in(0)],
+        loads_at(pushes, times, loop.n),
+    )
+    run = _tick(loop, 1 / rate, len(reference.labels), tolerance).mapaccum(_TICKS)
+    state = start
+    for first in range(0, ticks, _TICKS):
+        count = min(_TICKS, ticks - first)
+        inputs = [_filled(column[first : first + count]).T for column in columns]
+        outputs = run_compiled(run, ca.DM(state), *map(ca.DM, inputs))
+        states, commands, status = (np.asarray(out).T[:count] for out in outputs)
+        state = states[-1]
+        yield times[first : first + count] + 1 / rate, states, commands, status[:, 0]
+
+
+def _filled(rows: Array) -> Array:
+    """Repeat the last row until there are as many as one call takes."""
+    return np.vstack([rows, np.repeat(rows[-1:], _TICKS - len(rows), axis=0)])
+
+
+def _tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Function:
+    """State, reference with derivatives (3 k, 1), noise, load -> state after the tick, command, status."""
+    size = loop.plant_rate.size1_in(0)
+    x, u, w = ca.SX.sym("x", size), ca.SX.sym("u", loop.n), ca.SX.sym("load", 3 + loop.n)
+    plant = ca.integrator(
+        "plant",
+        "cvodes",
+        {"x": x, "p": ca.vertcat(u, w), "ode": loop.plant_rate(x, u, w)},
+        0.0,
+        length,
+        cvodes_options(tolerance),
+    )
+    state, reference = ca.MX.sym("state", size), ca.MX.sym("reference", 3 * k)
+    noise, load = ca.MX.sym("noise", size), ca.MX.sym("load", 3 + loop.n)
+    command, status = loop.commanded(state + noise, (reference[:k], reference[k : 2 * k], reference[2 * k :]))
+    end = plant(x0=state, p=ca.vertcat(command, load))["xf"]
+    return ca.Function("tick", [state, reference, noise, load], [end, command, status])

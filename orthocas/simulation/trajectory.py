@@ -1,0 +1,136 @@
+"""What a simulation returns: arrays over time, with names and units, in and out of NPZ files."""
+
+import json
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass, fields
+from enum import Enum
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from scipy.integrate import cumulative_simpson
+
+from orthocas.archive import require_writable
+from orthocas.checks import Array
+from orthocas.errors import TrajectoryFileError
+
+_VERSION = 1
+_ARRAYS = {  #: array fields and their units
+    "times": "s",
+    "q": "rad or m",
+    "dq": "rad/s or m/s",
+    "command": "N m or N (torque), rad/s or m/s (velocity)",
+    "status": "orthocas.control.ControlStatus",
+    "value": "as labels: m or rad of the task, coordinates as charted",
+    "reference": "as value",
+    "reference_velocity": "value / s",
+    "reference_acceleration": "value / s^2",
+    "storage": "J",
+    "dissipated_power": "W",
+}
+
+
+class Outcome(Enum):
+    """How a run ended."""
+
+    COMPLETE = "complete"
+    INTERRUPTED = "interrupted"  #: by Ctrl-C; the arrays end there
+    DIVERGED = "diverged"  #: the integrator gave up; the arrays end there
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A closed loop over time: N instants, n joints, k controlled quantities."""
+
+    controller: str
+    kind: str  #: of the command, 'torque' or 'velocity'
+    outcome: Outcome
+    labels: tuple[str, ...]  #: names of the k quantities
+    joint_names: tuple[str, ...]
+    times: Array  #: (N,) [s]
+    q: Array  #: (N, n)
+    dq: Array  #: (N, n)
+    command: Array  #: (N, n) torques, or velocities
+    status: Array  #: (N,) of the controller, `orthocas.control.ControlStatus`
+    value: Array  #: (N, k) the controlled quantities
+    reference: Array  #: (N, k) what they should be
+    reference_velocity: Array  #: (N, k)
+    reference_acceleration: Array  #: (N, k)
+    storage: Array  #: (N,) V [J]; NaN for velocity controllers
+    dissipated_power: Array  #: (N,) taken by the controller's damping [W]; NaN for velocity controllers
+
+    @property
+    def energy_balance(self) -> Array:
+        """V(t) - V(0) + the energy dissipated until t, (N,) [J].
+
+        0 for impedance and PD+ (coupled) with the right model, no friction and no pushes, while the reference rests.
+        """
+        lost = cumulative_simpson(self.dissipated_power, x=self.times, initial=0.0)
+        return np.asarray(self.storage - self.storage[0] + lost)
+
+    @property
+    def storage_rise(self) -> float:
+        """How far V ever climbs above an earlier value [J]: 0 for a passive controller at a resting reference."""
+        return float((self.storage - np.minimum.accumulate(self.storage)).max())
+
+    @property
+    def tracking_error(self) -> Array:
+        """Largest |value - reference| of each quantity, (k,)."""
+        return np.asarray(np.abs(self.value - self.reference).max(axis=0))
+
+    def save(self, path: str | Path) -> None:
+        """Write an NPZ file with every array, names and units; it appears whole or not at all.
+
+        Raises:
+            TrajectoryFileError: if the folder is missing or cannot be written.
+        """
+        target = Path(path)
+        require_writable(target, TrajectoryFileError)
+        header = {
+            "version": _VERSION,
+            "controller": self.controller,
+            "kind": self.kind,
+            "outcome": self.outcome.value,
+            "labels": self.labels,
+            "joint_names": self.joint_names,
+            "units": _ARRAYS,
+        }
+        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=".orthocas-", delete=False) as draft:
+            try:
+                np.savez_compressed(draft, header=json.dumps(header), **{name: getattr(self, name) for name in _ARRAYS})
+                draft.flush()
+                os.replace(draft.name, target)
+            except BaseException:
+                os.unlink(draft.name)
+                raise
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a file of `save`; never runs code.
+
+        Raises:
+            TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                header: dict[str, Any] = json.loads(str(file["header"]))
+                arrays: dict[str, Any] = {name: file[name] for name in _ARRAYS}
+        except FileNotFoundError:
+            raise TrajectoryFileError(f"trajectory file {path} does not exist") from None
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, TypeError):
+            raise TrajectoryFileError(f"{path} is truncated, damaged or not a trajectory file") from None
+        if header.get("version") != _VERSION:
+            raise TrajectoryFileError(f"{path} has version {header.get('version')}, this orthocas reads {_VERSION}")
+        return cls(
+            header["controller"],
+            header["kind"],
+            Outcome(header["outcome"]),
+            tuple(header["labels"]),
+            tuple(header["joint_names"]),
+            **arrays,
+        )
+
+
+assert set(_ARRAYS) < {field.name for field in fields(Trajectory)}
