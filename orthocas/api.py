@@ -21,7 +21,7 @@ from orthocas.parametrisations import MLP, SEW, Given, GradedParametrisation, Li
 from orthocas.problem import Problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt
 
-WeightNumbers = tuple[float, float] | tuple[float, float, float]
+WeightNumbers = tuple[float, float] | tuple[float, float, float] | tuple[float, float, float, float]
 
 
 def fit(
@@ -46,8 +46,9 @@ def fit(
         parametrisation: default Polynomial(degree=4).
         solver: default GaussNewton for families linear in their parameters, LBFGS otherwise.
         weights: (lambda1, lambda2) is the loss of the paper: task term against mutual term; their ratio picks a point
-            on the front. (lambda1, lambda2, lambda3) adds the regularity term (ours), which keeps the gradients of
-            the coordinates from collapsing anywhere.
+            on the front. A third number lambda3 adds the regularity term (ours), which keeps the gradients of the
+            coordinates from collapsing anywhere; a fourth, lambda4, the length term (ours), which keeps their lengths
+            even.
         samples: number of samples; default grows with the number of parameters.
         seed: seed of samples and of random starts.
         monitor: called with progress.
@@ -212,8 +213,8 @@ def _require_grid(parametrisations: Sequence[Parametrisation | SEW], solvers: Se
 
 def _weights(numbers: WeightNumbers) -> Weights:
     values = as_float_array("weights", numbers)
-    if values.shape not in ((2,), (3,)):
-        raise ShapeError("weights", values.shape, (3,))
+    if values.shape not in ((2,), (3,), (4,)):
+        raise ShapeError("weights", values.shape, (4,))
     weights = Weights(*values.tolist())
     if weights.task == 0:
         raise InvalidValueError("lambda1", weights.task, "a positive number")

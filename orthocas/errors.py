@@ -117,6 +117,10 @@ class ChartFileError(ArchiveError):
     """A chart file is missing, truncated, foreign, edited or too new."""
 
 
+class StepsFileError(OrthocasError, ValueError):
+    """A steps file is missing, is no JSON, or asks for what makes no sense."""
+
+
 class UnreachableReferenceError(OrthocasError, ValueError):
     """A reference asks for what the robot cannot do inside the domain."""
 

@@ -122,7 +122,7 @@ class StageRunner:
         # pairs with an idle joint are exactly orthogonal, so the others may use their share
         bounded = BoundedMutual(objective, self.max_mutual * (all_pairs / fitted) ** 0.5)
         if fresh and self.starter is not None:
-            weighted = Weights(self.weights.task, DEFAULT_WEIGHTS[1], self.weights.regularity)
+            weighted = Weights(self.weights.task, DEFAULT_WEIGHTS[1], self.weights.regularity, self.weights.length)
             theta = self.starter.minimise(objective.reweighted(weighted), theta).theta
         return bounded, bounded.in_gauge(theta)
 

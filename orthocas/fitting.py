@@ -134,6 +134,7 @@ def _notes(stages: list[Stage], solver: Solver, weights: Weights, seed: int) -> 
         "lambda1": weights.task,
         "lambda2": weights.mutual,
         "lambda3": weights.regularity,
+        "lambda4": weights.length,
         "seed": seed,
         "samples": stages[-1].samples if stages else 0,
         "status": stages[-1].result.status.value if stages else Status.CONVERGED.value,

@@ -16,18 +16,19 @@ REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term
 
 @dataclass(frozen=True)
 class Weights:
-    """lambda1 (task term) and lambda2 (mutual term) of (24), and lambda3 of the regularity term (ours)."""
+    """lambda1 (task term) and lambda2 (mutual term) of (24); lambda3 (regularity) and lambda4 (lengths) are ours."""
 
     task: float
     mutual: float
     regularity: float = 0.0
+    length: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, value in (("lambda1", self.task), ("lambda2", self.mutual), ("lambda3", self.regularity)):
+        for k, name in enumerate(("task", "mutual", "regularity", "length")):
+            value = getattr(self, name)
             if not 0 <= value < float("inf"):
-                raise InvalidValueError(name, value, "a finite number >= 0")
-        for name in ("task", "mutual", "regularity"):
-            object.__setattr__(self, name, float(getattr(self, name)))
+                raise InvalidValueError(f"lambda{k + 1}", value, "a finite number >= 0")
+            object.__setattr__(self, name, float(value))
         if self.task == 0 and self.mutual == 0:
             raise InvalidValueError("lambda1 and lambda2", self.task, "at least one positive number")
 
@@ -98,6 +99,17 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
     return ca.det((J @ null_basis) / ca.repmat(lengths, 1, J.shape[0]))
 
 
+def log_lengths(coordinate_jacobian: ca.SX) -> ca.SX:
+    """Logarithms of the lengths of the coordinate gradients, (r, 1).
+
+    Angles leave free how fast a coordinate grows along itself: xi^7 is as orthogonal as xi, and flat at 0.
+
+    Source:
+        ours, docs/derivations.md#lengths.
+    """
+    return ca.log(ca.sum2(coordinate_jacobian**2)) / 2
+
+
 @dataclass(frozen=True)
 class LossShape:
     """Sizes and weights that fix the residuals of one sample."""
@@ -123,10 +135,11 @@ class LossShape:
         """Residuals rho of one sample with L(q, theta) = |rho|^2 / 2.
 
         First the task cosines, coordinate by coordinate, times sqrt(lambda1 / (m r)); then the mutual cosines times
-        sqrt(lambda2 / C(r, 2)); last sqrt(lambda3) max(v0 - det D, 0), if lambda3 > 0.
+        sqrt(lambda2 / C(r, 2)); then sqrt(lambda4 / r) log |v_xi,j| of each coordinate, if lambda4 > 0; last
+        sqrt(lambda3) max(v0 - det D, 0), if lambda3 > 0.
 
         Source:
-            [AS2023] eq. (24), written as least squares; the last residual is ours.
+            [AS2023] eq. (24), written as least squares; the last two residuals are ours.
         """
         inverse = None if self.identity_metric else data[1]
         count = len(pairs(self.r))
@@ -134,6 +147,8 @@ class LossShape:
         rows = [(self.weights.task / (self.m * self.r)) ** 0.5 * task]
         if count:
             rows.append((self.weights.mutual / count) ** 0.5 * mutual_cosines(coordinate_jacobian, inverse))
+        if self.weights.length:
+            rows.append((self.weights.length / self.r) ** 0.5 * log_lengths(coordinate_jacobian))
         if self.regular:
             volume = gradient_volume(coordinate_jacobian, data[-1], inverse)
             rows.append(self.weights.regularity**0.5 * ca.fmax(REGULAR_VOLUME - volume, 0))
@@ -141,10 +156,12 @@ class LossShape:
         return rho
 
     def rows_of(self, j: int) -> list[int]:
-        """Residuals of (24) that depend on coordinate j: its task cosines, and the pairs it is part of."""
+        """Residuals that depend on coordinate j: its task cosines, the pairs it is part of, and its length."""
+        cosines = self.m * self.r + len(pairs(self.r))
         return [
             *range(j * self.m, (j + 1) * self.m),
             *(self.m * self.r + p for p, pair in enumerate(pairs(self.r)) if j in pair),
+            *([cosines + j] if self.weights.length else []),
         ]
 
 

@@ -41,3 +41,9 @@ def iiwa_fit(iiwa: oc.Problem) -> Fit:
 @pytest.fixture(scope="session")
 def planar_fit(planar_x: oc.Problem) -> Fit:
     return oc.fit(planar_x, oc.Polynomial(degree=4))
+
+
+@pytest.fixture(scope="session")
+def planar_chart(planar_x: oc.Problem) -> oc.Chart:
+    """Task x, A = M, orthogonal to 0.2 degrees, with gradients of even lengths: for controllers."""
+    return oc.fit(planar_x, oc.Polynomial(degree=8), weights=(1000, 30, 150, 0.1)).chart

@@ -7,6 +7,7 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas import solvers
+from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError, MemoryNeedError, ShapeError
 from orthocas.fitting import Fit
 from orthocas.objective import UNWATCHED, Objective, Progress, SolveResult, Status, Watch
@@ -56,6 +57,20 @@ def test_exact_coordinates_of_an_involutive_task_are_found(planar_x: oc.Problem)
     coarse, fine = (oc.evaluate(oc.fit(planar_x, oc.Polynomial(d)).chart, 5000) for d in (4, 8))
     assert fine.task_angle.std <= 0.1 < coarse.task_angle.std
     assert fine.conditioning.p01 > 0.9
+
+
+def test_length_term_keeps_gradients_even(planar_x: oc.Problem) -> None:
+    """Held out: angles leave lengths free by a factor of thousands, and a controller's gains with them."""
+    points = sample_uniform(planar_x.domain, 4000, 5)
+
+    def spread(weights: tuple[float, ...]) -> float:
+        chart = oc.fit(planar_x, oc.Polynomial(6), weights=weights).chart  # type: ignore[arg-type]
+        assert oc.evaluate(chart, 4000, seed=5).task_angle.std < 1.0
+        lengths = np.linalg.norm(chart.jacobian(points)[:, 1:], axis=2)
+        return float((np.quantile(lengths, 0.99, axis=0) / np.quantile(lengths, 0.01, axis=0)).max())
+
+    assert spread((1000, 30, 150)) > 500
+    assert spread((1000, 30, 150, 1)) < 20
 
 
 def test_linear_coordinates_are_exact_at_their_base_only(planar_x: oc.Problem) -> None:
@@ -189,7 +204,7 @@ def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
         oc.fit(planar_x, "polynomial:3")  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match="solver is 'lbfgs'"):
         oc.fit(planar_x, solver="lbfgs")  # type: ignore[arg-type]
-    for weights in ((1.0,), (1.0, 2.0, 3.0, 4.0)):
+    for weights in ((1.0,), (1.0, 2.0, 3.0, 4.0, 5.0)):
         with pytest.raises(ShapeError, match="weights"):
             oc.fit(planar_x, weights=weights)  # type: ignore[arg-type]
     for base in ((0.0,) * 5, (0.0,) * 2):

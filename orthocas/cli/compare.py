@@ -49,7 +49,7 @@ def compare(
         int, typer.Option("--held-out", parser=whole_number, help="Held-out samples that judge every fit.")
     ] = 100_000,
     weights: Annotated[
-        str, typer.Option("--weights", help='"lambda1,lambda2" or "lambda1,lambda2,lambda3".')
+        str, typer.Option("--weights", help='"lambda1,lambda2", and lambda3 and lambda4 if wanted.')
     ] = WEIGHTS_TEXT,
     jobs: Annotated[
         int | None, typer.Option("--jobs", parser=whole_number, help="Processes, one thread each; default all cores.")

@@ -51,7 +51,7 @@ def fit(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", parser=whole_number, help="Seed of samples and random starts.")] = 0,
     weights: Annotated[
-        str, typer.Option("--weights", help='"lambda1,lambda2" or "lambda1,lambda2,lambda3".')
+        str, typer.Option("--weights", help='"lambda1,lambda2", and lambda3 and lambda4 if wanted.')
     ] = WEIGHTS_TEXT,
     max_mutual_deg: Annotated[
         float | None,
@@ -88,14 +88,16 @@ def fit(
         raise typer.Exit(130)
 
 
-def parse_weights(text: str) -> tuple[float, float] | tuple[float, float, float]:
-    """Read "1000,30" or "1000,30,150"."""
-    values = parse_numbers("--weights", text).tolist()
-    if len(values) == 2:
-        return values[0], values[1]
-    if len(values) == 3:
-        return values[0], values[1], values[2]
-    raise InvalidValueError("--weights", repr(text), "two or three numbers")
+def parse_weights(text: str) -> api.WeightNumbers:
+    """Read "1000,30", "1000,30,150" or "1000,30,150,0.01"."""
+    match parse_numbers("--weights", text).tolist():
+        case [task, mutual]:
+            return task, mutual
+        case [task, mutual, regularity]:
+            return task, mutual, regularity
+        case [task, mutual, regularity, length]:
+            return task, mutual, regularity, length
+    raise InvalidValueError("--weights", repr(text), "two to four numbers")
 
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:

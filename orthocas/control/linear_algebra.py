@@ -5,7 +5,7 @@ They end up in generated C, so there are no eigenvectors (which jump) and no loo
 
 import casadi as ca
 
-_ROUNDS = 8  # rounding accuracy up to a condition number of 1e6 (tests/test_control_linear_algebra.py)
+_ROUNDS = 8  # rounding accuracy up to a condition number of 1e6 (tests/test_control_algebra.py)
 
 
 def spd_inverse(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -29,7 +29,7 @@ def square_root(matrix: ca.SX) -> ca.SX:
     a rational function of the entries with square roots of determinants.
 
     Source:
-        [H2008] eq. (6.29) with the scaling of Sec. 6.5.
+        [H2008] Sec. 6.3, product form of the Denman-Beavers iteration with determinantal scaling.
     """
     k = matrix.shape[0]
     if k == 1:

@@ -1,0 +1,104 @@
+"""Building a controller from command-line words, and refusing words that another controller takes."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from orthocas.batch import Batched, dense_function
+from orthocas.chart import Chart
+from orthocas.checks import Array, require_known
+from orthocas.cli.problem_argument import parse_numbers
+from orthocas.control import Impedance, Kinematic, KinematicProjector, PDPlus, Projector
+from orthocas.control.controller import Controller
+from orthocas.control.inertia import block_inertia
+from orthocas.domains import sample_uniform
+from orthocas.errors import InvalidValueError
+
+_SPRINGS, _BY_TORQUE = ("stiffness", "damping_ratio"), ("mass_factor", "friction")
+_OPTIONS = {  #: which options each controller takes, by the names of fields
+    "impedance": (*_SPRINGS, "coupling", *_BY_TORQUE),
+    "pd_plus": (*_SPRINGS, "coupling", *_BY_TORQUE),
+    "kinematic": ("feedback",),
+    "projector": (*_SPRINGS, "posture_stiffness", *_BY_TORQUE),
+    "kinematic_projector": ("feedback",),
+}
+CONTROLLERS = tuple(_OPTIONS)
+SPRING_FREQUENCY = 4 * np.pi  #: of springs that were not given [rad/s], twice that of the reference's low pass
+_SAMPLES, _SEED = 256, 0
+
+
+@dataclass(frozen=True)
+class ControllerOptions:
+    """The words of a command line that only some controllers take."""
+
+    stiffness: str | None = None
+    damping_ratio: str | None = None
+    coupling: str | None = None
+    posture_stiffness: str | None = None
+    feedback: str | None = None
+    mass_factor: float | None = None
+    friction: str | None = None
+
+
+def require_options(name: str, options: ControllerOptions) -> None:
+    """Check the name of a controller, and that it takes all options that were given.
+
+    Raises:
+        UnknownNameError: if there is no such controller.
+        InvalidValueError: for an option that it would ignore.
+    """
+    require_known("controller", name, CONTROLLERS)
+    for field, value in vars(options).items():
+        if value is not None and field not in _OPTIONS[name]:
+            takers = ", ".join(other for other, fields in _OPTIONS.items() if field in fields)
+            raise InvalidValueError(
+                f"--{field.replace('_', '-')}", value, f"no such option with {name}: it belongs to {takers}"
+            )
+
+
+def build_controller(name: str, chart: Chart, options: ControllerOptions, limit: str | None) -> Controller:
+    """The controller that a command line describes, see `require_options`.
+
+    Raises:
+        OrthocasError: if anything does not fit together.
+    """
+    bounds = None if limit is None else _one_or_all("--limit", limit)
+    if name == "kinematic":
+        return Kinematic(chart, _one_or_all("--feedback", options.feedback or "0"), bounds)
+    if name == "kinematic_projector":
+        m, n = chart.m, chart.n
+        feedback = _one_or_all("--feedback", options.feedback or "0")
+        if feedback.ndim and len(feedback) != m + n:
+            raise InvalidValueError("--feedback", options.feedback, f"one number, or {m + n}: for task, then joints")
+        spread = np.broadcast_to(feedback, m + n)
+        return KinematicProjector(chart.problem, spread[:m], spread[m:], bounds)
+    damping = _one_or_all("--damping-ratio", options.damping_ratio or "0.7")
+    springs = _default_stiffness(chart)
+    given = None if options.stiffness is None else _one_or_all("--stiffness", options.stiffness)
+    if name == "projector":
+        posture = options.posture_stiffness
+        joints = springs[chart.n :] if posture is None else _one_or_all("--posture-stiffness", posture)
+        return Projector(chart.problem, springs[: chart.m] if given is None else given, joints, damping, bounds)
+    law = Impedance if name == "impedance" else PDPlus
+    coupling = "coupled" if options.coupling is None else options.coupling
+    return law(chart, springs[: chart.n] if given is None else given, damping, coupling, limit=bounds)
+
+
+def _default_stiffness(chart: Chart) -> Array:
+    """Springs of 2 Hz with the inertia of each of [x; xi; q], its median over the domain, (2 n,).
+
+    Scales of coordinates differ by orders of magnitude: one stiffness for all would leave some limp.
+    """
+    q = ca.MX.sym("q", chart.n)
+    M = chart.problem.robot.mass_matrix(q)
+    inertia = block_inertia(chart.n, (chart.m, chart.r))(chart.function("jacobian")(q), M)[1]
+    both = dense_function("inertias", [q], [ca.vertcat(ca.diag(inertia), ca.diag(M))])
+    samples = Batched(both)(sample_uniform(chart.problem.domain, _SAMPLES, _SEED))[0]
+    return np.asarray(SPRING_FREQUENCY**2 * np.nanmedian(samples, axis=0))
+
+
+def _one_or_all(option: str, text: str) -> Array:
+    """Read "100" as a number, "100,50" as an array."""
+    numbers = parse_numbers(option, text)
+    return numbers.reshape(()) if len(numbers) == 1 else numbers

@@ -1,0 +1,129 @@
+"""What `orthocas simulate` says about a run: plain data for JSON, and rows for people."""
+
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.control import ControlStatus, Reference
+from orthocas.control.controller import Controller
+from orthocas.simulation import Trajectory, coupling_index
+
+_REASONS = {
+    ControlStatus.OUTSIDE_DOMAIN: "the arm left the domain",
+    ControlStatus.SINGULAR: "the coordinates became singular",
+    ControlStatus.NOT_FINITE: "a number that the controller got was not finite",
+}
+
+
+def run_report(
+    chart: Chart, controller: Controller, reference: Reference, has_steps: bool, seen: Trajectory, seconds: float
+) -> dict[str, Any]:
+    """Numbers of a run, SI units, ready for JSON.
+
+    Args:
+        chart: the coordinates that judge it.
+        controller: what ran.
+        reference: in the chart's coordinates.
+        has_steps: whether it is one of steps, which coupling indices need.
+        seen: the run in the chart's coordinates.
+        seconds: computing time.
+    """
+    bad = np.flatnonzero(seen.status)
+    first = int(bad[0]) if bad.size else None
+    largest = np.abs(seen.command).max(axis=0)
+    return {
+        "controller": controller.name,
+        "gains": {name: [_finite(value) for value in gain] for name, gain in controller.gains.items()},
+        "outcome": seen.outcome.value,
+        "duration": float(seen.times[-1]),
+        "tracking_error": dict(zip(seen.labels, map(_finite, seen.tracking_error), strict=True)),
+        "coupling_index": _coupling(chart, reference, seen) if has_steps else None,
+        "fallback": {
+            "share": float((seen.status != ControlStatus.OK).mean()),
+            "since": None if first is None else float(seen.times[first]),
+            "reason": None if first is None else _REASONS[ControlStatus(int(seen.status[first]))],
+        },
+        "command": seen.kind,
+        "largest_command": dict(zip(seen.joint_names, map(_finite, largest), strict=True)),
+        "energy": _energy(seen) if seen.kind == "torque" else None,
+        "seconds": seconds,
+    }
+
+
+def run_rows(report: dict[str, Any], m: int, units: dict[str, str]) -> dict[str, str]:
+    """The report as rows; m labels are those of the task."""
+    errors = [f"{label} {value:.3g} {units.get(label, '')}".strip() for label, value in report["tracking_error"].items()]
+    joint, command = max(report["largest_command"].items(), key=lambda pair: pair[1])
+    by_torque = report["command"] == "torque"
+    lengths = units.get(joint) == "m"
+    unit = ("N" if lengths else "N m") if by_torque else ("m/s" if lengths else "rad/s")
+    rows = {
+        "run": f"{report['controller']}, {report['duration']:.4g} s: {report['outcome']}",
+        "largest error": ", ".join(errors),
+    }
+    if report["coupling_index"]:
+        rows["coupling"] = _worst_couplings(report["coupling_index"], list(report["tracking_error"])[:m])
+    rows["command"] = f"at most {command:.4g} {unit}, {joint}"
+    if by_torque:
+        energy = report["energy"]
+        rows["energy"] = (
+            f"V at most {energy['storage_largest']:.3g} J, at the end {energy['storage_end']:.3g} J; "
+            f"{energy['dissipated']:.3g} J dissipated"
+        )
+    rows["computed in"] = f"{report['seconds']:.2f} s"
+    return rows
+
+
+def fallback_text(report: dict[str, Any]) -> str | None:
+    """Since when and why the controller gave its fallback; None if it never did."""
+    fallback = report["fallback"]
+    if fallback["since"] is None:
+        return None
+    what = "the torque of gravity" if report["command"] == "torque" else "no velocity"
+    return (
+        f"from t = {fallback['since']:.4g} s on the controller gave only {what}, {fallback['share']:.1%} of the run: "
+        f"{fallback['reason']}"
+    )
+
+
+def _coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str, dict[str, float]]:
+    """Commanded -> disturbed -> index, for what was commanded alone."""
+    found = coupling_index(chart, reference, seen)
+    return {
+        commanded: {
+            disturbed: float(found.index[i, j]) for i, disturbed in enumerate(found.labels) if isfinite(found.index[i, j])
+        }
+        for j, commanded in enumerate(found.labels)
+        if np.isfinite(found.index[:, j]).any()
+    }
+
+
+def _worst_couplings(index: dict[str, dict[str, float]], task: list[str]) -> str:
+    """The worst index of the task by an extra coordinate, and the other way round."""
+    pairs = [(value, to, by) for by, column in index.items() for to, value in column.items()]
+    texts = []
+    for name, of_task in (("task <- extra", True), ("extra <- task", False)):
+        chosen = [pair for pair in pairs if (pair[1] in task) == of_task and (pair[2] in task) != of_task]
+        if chosen:
+            value, to, by = max(chosen)
+            texts.append(f"{name} {value:.3g} ({to} <- {by})")
+    return ", ".join(texts) or "see report.json"
+
+
+def _energy(seen: Trajectory) -> dict[str, float | None]:
+    """Storage and what the controller's damping took, [J]."""
+    taken = seen.energy_balance[-1] - seen.storage[-1] + seen.storage[0]
+    return {
+        "storage_start": _finite(seen.storage[0]),
+        "storage_end": _finite(seen.storage[-1]),
+        "storage_largest": _finite(seen.storage.max()),
+        "storage_rise": _finite(seen.storage_rise),
+        "dissipated": _finite(taken),
+    }
+
+
+def _finite(value: float) -> float | None:
+    """JSON knows no infinity."""
+    return float(value) if isfinite(value) else None

@@ -1,0 +1,92 @@
+"""Smooth matrix functions of control laws, and damping designs, against NumPy, SciPy and closed forms."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.linalg import eigh, sqrtm
+
+from orthocas.checks import Array
+from orthocas.control.damping import damping_matrix
+from orthocas.control.linear_algebra import spd_inverse, square_root
+
+RNG = np.random.default_rng(11)
+
+
+def spd(size: int, condition: float) -> Array:
+    """A random matrix with eigenvalues from 1 to the condition number."""
+    Q = np.linalg.qr(RNG.normal(size=(size, size)))[0]
+    values = np.exp(np.linspace(0, np.log(condition), size))
+    return np.asarray(Q @ np.diag(values) @ Q.T)
+
+
+def function_of(expression: object, symbol: ca.SX) -> ca.Function:
+    return ca.Function("f", [symbol], [expression])
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 7])
+@pytest.mark.parametrize("condition", [1.0, 1e3, 1e6])
+def test_square_root_squares_to_the_matrix(size: int, condition: float) -> None:
+    A = ca.SX.sym("A", size, size)
+    root = function_of(square_root(A), A)
+    for _ in range(20):
+        given = spd(size, condition)
+        found = root(given).full()
+        np.testing.assert_allclose(found @ found, given, atol=1e-15 * condition**1.5 + 1e-14)
+        np.testing.assert_allclose(found, sqrtm(given).real, atol=1e-11 * np.sqrt(condition))
+        assert np.linalg.eigvalsh(found)[0] > 0
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_square_root_does_not_depend_on_units(scale: float) -> None:
+    A = ca.SX.sym("A", 3, 3)
+    given = spd(3, 100.0)
+    found = function_of(square_root(A), A)(given * scale).full()
+    np.testing.assert_allclose(found, sqrtm(given).real * np.sqrt(scale), rtol=1e-12)
+
+
+def test_square_root_is_differentiable_where_eigenvalues_meet() -> None:
+    """At a multiple of the identity: d sqrt(A) = dA / (2 sqrt(a)); eigenvectors would jump there."""
+    A = ca.SX.sym("A", 3, 3)
+    direction = np.diag([1.0, 2.0, 3.0]) + 0.5
+    slope = ca.Function("g", [A], [ca.reshape(ca.jtimes(square_root(A), A, ca.DM(direction)), 3, 3)])
+    np.testing.assert_allclose(slope(4 * np.eye(3)).full(), direction / 4, atol=1e-12)
+
+
+def test_inverse_and_determinant_agree_with_numpy() -> None:
+    A = ca.SX.sym("A", 5, 5)
+    inverse, determinant = ca.Function("f", [A], list(spd_inverse(A)))(given := spd(5, 1e4))
+    np.testing.assert_allclose(inverse.full() @ given, np.eye(5), atol=1e-10)
+    assert float(determinant) == pytest.approx(np.linalg.det(given), rel=1e-10)
+
+
+def damping(design: str, inertia: Array, K: Array, Z: Array) -> Array:
+    M = ca.SX.sym("M", *inertia.shape)
+    return np.asarray(ca.Function("D", [M], [damping_matrix(design, M, ca.SX(K), ca.SX(Z))])(inertia).full())  # type: ignore[arg-type]
+
+
+def test_square_root_design_is_equation_29() -> None:
+    M, K, Z = spd(4, 50.0), np.array([1.0, 20.0, 5.0, 300.0]), np.array([0.5, 0.7, 1.0, 0.2])
+    half = sqrtm(M).real @ np.diag(Z) @ np.diag(np.sqrt(K))
+    np.testing.assert_allclose(damping("square_root", M, K, Z), half + half.T, rtol=1e-10)
+
+
+@pytest.mark.parametrize("design", ["square_root", "double_diagonal"])
+def test_diagonal_case_is_two_zeta_root_of_m_k(design: str) -> None:
+    m, K, Z = np.array([2.0, 0.1, 30.0]), np.array([1.0, 20.0, 5.0]), np.array([0.5, 0.7, 1.0])
+    np.testing.assert_allclose(damping(design, np.diag(m), K, Z), np.diag(2 * Z * np.sqrt(m * K)), atol=1e-12)
+
+
+def test_double_diagonal_gives_every_mode_the_damping_ratio() -> None:
+    """In the generalised eigenvectors of (K, M): W^T M W = I, W^T K W = diag(omega^2), W^T D W = diag(2 zeta omega)."""
+    M, K = spd(5, 1e3), np.array([1.0, 20.0, 5.0, 300.0, 0.3])
+    values, W = eigh(np.diag(K), M)
+    D = damping("double_diagonal", M, K, np.full(5, 0.6))
+    np.testing.assert_allclose(W.T @ D @ W, np.diag(2 * 0.6 * np.sqrt(values)), atol=1e-9 * np.sqrt(values[-1]))
+
+
+def test_equation_29_can_be_indefinite_where_double_diagonal_is_not() -> None:
+    """M with a large off-diagonal part and stiffnesses far apart: B Z S + S Z B of positive factors, yet negative."""
+    M, K, Z = np.array([[1.0, 0.99], [0.99, 1.0]]), np.array([1.0, 1e4]), np.full(2, 0.7)
+    assert np.linalg.eigvalsh(damping("square_root", M, K, Z))[0] < -0.1
+    for ratios in (Z, np.array([0.1, 2.0]), np.array([0.0, 1.0])):
+        assert np.linalg.eigvalsh(damping("double_diagonal", M, K, ratios))[0] > -1e-12
