@@ -65,9 +65,13 @@ def simulate(
         ShapeError, InvalidValueError: for what does not fit.
     """
     loop = ClosedLoop(controller, plant or controller.problem.robot, friction or Friction())
-    start = _start_state(loop, q_start, dq_start)
     _require_fitting(loop, reference, tuple(pushes), friction, noise, control_rate)
-    for name, value in (("step", step), ("tolerance", tolerance), ("control_rate", control_rate or 1.0)):
+    start = _start_state(loop, q_start, dq_start)
+    for name, value in (
+        ("step", step),
+        ("tolerance", tolerance),
+        ("control_rate", 1.0 if control_rate is None else control_rate),
+    ):
         if not 0 < value < np.inf:
             raise InvalidValueError(name, value, "a finite number > 0")
     if must_be_reachable:

@@ -4,17 +4,20 @@ import json
 import os
 import tempfile
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.integrate import cumulative_simpson
 
 from orthocas.archive import require_writable
 from orthocas.checks import Array
 from orthocas.errors import TrajectoryFileError
+from orthocas.simulation.figure import trajectory_figure
 
 _VERSION = 1
 _ARRAYS = {  #: array fields and their units
@@ -80,6 +83,14 @@ class Trajectory:
         """Largest |value - reference| of each quantity, (k,)."""
         return np.asarray(np.abs(self.value - self.reference).max(axis=0))
 
+    def plot(self, units: Mapping[str, str] | None = None) -> Figure:
+        """A picture of everything over time, see `orthocas.simulation.figure`.
+
+        Args:
+            units: of the quantities and joints, by name, `units_of(problem)`; default none are shown.
+        """
+        return trajectory_figure(self, units)
+
     def save(self, path: str | Path) -> None:
         """Write an NPZ file with every array, names and units; it appears whole or not at all.
 
@@ -97,14 +108,11 @@ class Trajectory:
             "joint_names": self.joint_names,
             "units": _ARRAYS,
         }
-        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=".orthocas-", delete=False) as draft:
-            try:
-                np.savez_compressed(draft, header=json.dumps(header), **{name: getattr(self, name) for name in _ARRAYS})
-                draft.flush()
-                os.replace(draft.name, target)
-            except BaseException:
-                os.unlink(draft.name)
-                raise
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".orthocas-") as folder:
+            draft = Path(folder) / "draft.npz"
+            np.savez_compressed(draft, header=json.dumps(header), **arrays)
+            os.replace(draft, target)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -114,7 +122,7 @@ class Trajectory:
             TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # np.load leaks bad ones
                 header: dict[str, Any] = json.loads(str(file["header"]))
                 arrays: dict[str, Any] = {name: file[name] for name in _ARRAYS}
         except FileNotFoundError:
