@@ -16,6 +16,7 @@ SCRIPTS = (
     "starts",
     "mesh_chart",
     "growing_queries",
+    "closed_loop",
     "against_torch",
     "paper_network",
 )

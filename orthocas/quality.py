@@ -60,6 +60,7 @@ class Report:
     conditioning: Conditioning
     worst_point: tuple[float, ...]  #: the sampled joint position with the smallest conditioning
     singular_samples: int  #: samples left out because a gradient vanishes there, or a grown coordinate has no value
+    length_ratio: float  #: longest over shortest gradient of a coordinate, 99 % over 1 % quantile, the worst one's
     folded_samples: int  #: samples where det J has not the sign it has at most samples: the chart has folded over
 
     @property
@@ -86,6 +87,7 @@ class Report:
             "worst_point": list(self.worst_point),
             "singular_samples": self.singular_samples,
             "folded_samples": self.folded_samples,
+            "length_ratio": self.length_ratio,
             "degenerate": self.degenerate,
         }
 
@@ -106,12 +108,13 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
     require_memory(f"evaluating {samples} samples", 8.0 * samples * chart.n * (chart.n + 4))
     points = sample_uniform(chart.problem.domain, samples, seed)
     parts = [_judge(chart, points[start : start + _CHUNK]) for start in range(0, samples, _CHUNK)]
-    task, mutual, smallest, signs, kept = (np.concatenate([part[i] for part in parts]) for i in range(5))
+    task, mutual, smallest, signs, lengths, kept = (np.concatenate([part[i] for part in parts]) for i in range(6))
     if len(kept) == 0:
         raise SingularTaskError(
             f"a gradient vanishes, or a coordinate has no value, at all {samples} samples: nothing to evaluate"
         )
     worst = int(np.argmin(smallest))
+    short, long = np.quantile(lengths, [0.01, 0.99], axis=0)
     return Report(
         n=chart.n,
         m=chart.m,
@@ -124,12 +127,17 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
         conditioning=Conditioning(float(smallest[worst]), float(np.quantile(smallest, 0.01)), float(smallest.mean())),
         worst_point=tuple(kept[worst].tolist()),
         singular_samples=samples - len(kept),
+        length_ratio=float((long / short).max()),
         folded_samples=int(min((signs > 0).sum(), (signs <= 0).sum())),
     )
 
 
-def _judge(chart: Chart, points: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Task cosines (N, m, r), mutual cosines (N, pairs), smallest singular values (N,), signs of det J, points kept."""
+def _judge(chart: Chart, points: Array) -> tuple[Array, ...]:
+    """What is to be known at each point that is kept.
+
+    Task cosines (N, m, r), mutual cosines (N, pairs), smallest singular values (N,), signs of det J (N,), lengths of
+    the coordinate gradients (N, r), and the points (N, n).
+    """
     samples = samples_at(chart.problem, points)
     J = chart.coordinates.jacobian(samples.points)
     lengths = np.linalg.norm(J, axis=2)
@@ -141,7 +149,7 @@ def _judge(chart: Chart, points: Array) -> tuple[Array, Array, Array, Array, Arr
     products = np.einsum("spn,spn->sp", raised[:, first], J[:, second])
     mutual = products / (np.linalg.norm(raised, axis=2)[:, first] * lengths[:, second])
     signs = np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1)))
-    return task, mutual, _smallest_singular_values(samples, J, raised), signs, samples.points
+    return task, mutual, _smallest_singular_values(samples, J, raised), signs, lengths, samples.points
 
 
 def _smallest_singular_values(samples: Samples, J: Array, raised: Array) -> Array:

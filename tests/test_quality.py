@@ -128,3 +128,11 @@ def test_samples_must_be_positive(planar_fit: Fit) -> None:
         oc.evaluate(planar_fit.chart, samples=0)
     with pytest.raises(MemoryNeedError, match="GiB"):
         oc.evaluate(planar_fit.chart, samples=10**14)
+
+
+def test_length_ratio_is_that_of_the_quantiles(planar_x: oc.Problem) -> None:
+    """Xi = q1 + 2 q1^2 on |q1 - 0.6| <= pi/8: its gradient 1 + 4 q1 is uniform between its ends."""
+    quadratic = oc.Given.from_function("quadratic", 3, lambda q: ca.vertcat(q[0] + 2 * q[0] ** 2, q[1] - q[2]))
+    report = oc.evaluate(oc.fit(planar_x, quadratic).chart, 20_000)
+    ends = 1 + 4 * (0.6 + np.pi / 8 * np.array([-0.98, 0.98]))
+    assert report.length_ratio == pytest.approx(ends[1] / ends[0], rel=0.01)

@@ -25,6 +25,8 @@ def number(text: str) -> float:
         raise typer.BadParameter(f"{text!r} came, expected a number") from None
 
 
+_UNEVEN = 30.0  # gains in a coordinate mean something else where its gradient is that much longer
+
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 
@@ -63,6 +65,7 @@ def report_rows(report: Report) -> dict[str, str]:
         "task angle": f"mean {task.mean:.2f}, std {task.std:.2f}, largest deviation {task.max:.1f} deg",
         "mutual angle": f"mean {mutual.mean:.2f}, std {mutual.std:.2f}, largest deviation {mutual.max:.1f} deg",
         "conditioning": quality,
+        "lengths": f"of gradients differ by a factor of {report.length_ratio:.3g} (99 % to 1 % quantile)",
         "samples": f"{report.samples} held out, seed {report.seed}",
     }
     if report.r == 1:
@@ -73,6 +76,8 @@ def report_rows(report: Report) -> dict[str, str]:
         rows["folded"] = f"{share:.3%} of the domain, where det J changes sign; conditioning worst at q = ({at})"
     if report.singular_samples:
         rows["left out"] = f"{report.singular_samples / report.samples:.3%} of the domain: singular, or without a value"
+    if report.length_ratio > _UNEVEN:
+        rows["lengths"] += "; for controllers fit with --weights 1000,30,150,1"
     if report.degenerate:
         advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
         rows["DEGENERATE"] = f"coordinates are nearly parallel or lean into the task: {advice}"

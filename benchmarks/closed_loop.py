@@ -1,0 +1,99 @@
+"""Seconds for 10 s of closed loop: SUNDIALS against SciPy on the same functions, continuous and at 1 kHz (2 min).
+
+The peer is solve_ivp (LSODA, the multi-step method of SciPy, same tolerance) on the controller and the robot as CasADi
+functions, restarted at every step of the reference. Both start with functions built; the check of the reference and the
+energy books are part of ours. Errors are distances from a run at tolerance 1e-12.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from statistics import median
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import orthocas as oc
+from orthocas import problems
+from orthocas.checks import Array
+from orthocas.control import PDPlus, Reference
+
+TOLERANCE = 1e-8
+DURATION = 10.0  # [s]
+STIFFNESS = 100.0
+WEIGHTS = (1000.0, 30.0, 150.0, 0.1)
+
+
+def chart_of(name: str, degree: int) -> oc.Chart:
+    """The named problem with A = M."""
+    known = problems.get(name)
+    problem = oc.Problem(known.robot, known.task, "inertia", known.domain, name)
+    return oc.fit(problem, oc.Polynomial(degree), weights=WEIGHTS).chart
+
+
+def interleaved(chart: oc.Chart) -> Reference:
+    """Steps in x and xi1, there and back."""
+    start = chart.phi(chart.problem.domain.centre)
+    changes = [(1.0, {"x": start[0] + 0.015}), (3.0, {"xi1": 0.02}), (5.0, {"x": start[0]}), (7.0, {"xi1": 0.0})]
+    return Reference.steps(chart.labels, start, changes, DURATION)
+
+
+def by_scipy(law: PDPlus, reference: Reference) -> Array:
+    """Joint positions at the end."""
+    robot, n = law.problem.robot, law.problem.n
+    gains, forward = list(law.gains.values()), robot.function("forward_dynamics")
+
+    def rate(t: float, state: Array, segment: int) -> Array:
+        wanted = reference.profile(t - reference.times[segment], reference.parameters[segment])
+        tau = law.function(state[:n], state[n:], *wanted, *gains)[0]
+        return np.concatenate([state[n:], np.asarray(forward(state[:n], state[n:], tau)).ravel()])
+
+    state = np.concatenate([law.problem.domain.centre, np.zeros(n)])
+    for segment, span in enumerate(zip(reference.times[:-1], reference.times[1:], strict=True)):
+        run = solve_ivp(rate, span, state, "LSODA", rtol=TOLERANCE, atol=TOLERANCE, args=(segment,))
+        state = run.y[:, -1]
+    return np.asarray(state[:n])
+
+
+def timed(work: Callable[[], Array], rounds: int) -> tuple[float, Array]:
+    """Median seconds, and what came out."""
+    seconds = []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        result = work()
+        seconds.append(time.perf_counter() - start)
+    return median(seconds), result
+
+
+def main(quick: bool = False) -> dict[str, float]:
+    """Print a table; seconds of 10 s by arm and kind of run."""
+    found = {}
+    rounds = 1 if quick else 5
+    print("| arm | run | seconds for 10 s | ratio to continuous | error of q at the end |")
+    print("| --- | --- | --- | --- | --- |")
+    for name, degree in (("planar_3r_x", 4 if quick else 8), *(() if quick else (("iiwa", 3),))):
+        chart = chart_of(name, degree)
+        law, reference, q0 = (
+            PDPlus(chart, STIFFNESS, coupling="decoupled"),
+            interleaved(chart),
+            chart.problem.domain.centre,
+        )
+        law.function, law.energy  # noqa: B018 (built before the clock starts)
+        exact = oc.simulate(law, reference, q0, tolerance=1e-12).q[-1]
+        kinds: dict[str, Callable[[], Array]] = {
+            "continuous": lambda: oc.simulate(law, reference, q0).q[-1],
+            "sampled at 1 kHz": lambda: oc.simulate(law, reference, q0, control_rate=1000.0).q[-1],
+            "SciPy LSODA": lambda: by_scipy(law, reference),
+        }
+        for kind, work in kinds.items():
+            seconds, end = timed(work, 1 if kind == "SciPy LSODA" else rounds)
+            found[f"{name} {kind}"] = seconds
+            ratio, error = seconds / found[f"{name} continuous"], np.abs(end - exact).max()
+            print(f"| {name}, n = {chart.n} | {kind} | {seconds:.2f} | {ratio:.1f} | {error:.1e} |", flush=True)
+    return found
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    main(parser.parse_args().quick)

@@ -1,0 +1,92 @@
+"""Every controller on the same steps: how much a commanded coordinate disturbs the others (20 s).
+
+The arms are planar_3r_x (exact coordinates exist) and planar_3r_xy (they do not), the steps interleaved as in Sec. 8 of
+the paper. Projectors get the posture that means the same motion. The coupling index is the largest excursion of a
+coordinate from its reference while only another is commanded, over the commanded step.
+"""
+
+import argparse
+from collections.abc import Iterator
+
+import numpy as np
+
+import orthocas as oc
+from orthocas import problems
+from orthocas.control import (
+    Controller,
+    Impedance,
+    Kinematic,
+    KinematicProjector,
+    PDPlus,
+    Projector,
+    Reference,
+    posture_reference,
+)
+from orthocas.simulation import coupling_index
+
+STIFFNESS = 200.0  # of x [N/m], of xi [N m], and of postures [N m/rad]
+STEP = {"x": 0.1, "y": 0.1, "xi1": 0.05, "xi2": 0.03}  # [m], [rad]: what the box of the problems has room for
+PAUSE = 2.0  # [s] between steps
+WEIGHTS = (1000.0, 30.0, 150.0, 0.1)  # the last keeps gradients even (docs/derivations.md#lengths)
+
+
+def main(quick: bool = False) -> dict[str, float]:
+    """Print a table for each arm.
+
+    Returns:
+        Worst coupling of the task by the extra coordinates, by arm and controller.
+    """
+    found = {}
+    for name in ("planar_3r_x",) if quick else ("planar_3r_x", "planar_3r_xy"):
+        problem = problems.get(name)
+        chart = oc.fit(problem, oc.Polynomial(6 if quick else 8), weights=WEIGHTS).chart
+        labels = chart.problem.task.labels
+        print(f"\n{name}: task {', '.join(labels)}; fitted {oc.evaluate(chart, 20_000).task_angle.std:.2f} deg off\n")
+        print("| controller | task <- xi | xi <- task | x <-> y | xi <-> xi |\n| --- | --- | --- | --- | --- |")
+        for title, judged, law, reference in laws(chart):
+            run = oc.simulate(law, reference, problem.domain.centre, must_be_reachable=False)
+            if (run.status != 0).any():
+                title += f" (left the domain after {run.times[np.flatnonzero(run.status)[0]]:.1f} s)"
+            cells = worst_by_kind(coupling_index(judged, steps(judged), run).index, chart.m)
+            print(f"| {title} | {' | '.join('-' if np.isnan(cell) else f'{cell:.2%}' for cell in cells)} |", flush=True)
+            found[f"{name} {title}"] = cells[0]
+    return found
+
+
+def laws(chart: oc.Chart) -> Iterator[tuple[str, oc.Chart, Controller, Reference]]:
+    """Title, chart to judge by, controller and its reference."""
+    problem, q0 = chart.problem, chart.problem.domain.centre
+    linear = oc.fit(problem, oc.Linear()).chart
+    for coupling in ("coupled", "decoupled"):
+        yield f"PD+ {coupling}, fitted", chart, PDPlus(chart, STIFFNESS, coupling=coupling), steps(chart)
+        yield f"PD+ {coupling}, linear", linear, PDPlus(linear, STIFFNESS, coupling=coupling), steps(linear)
+        yield f"impedance {coupling}, fitted", chart, Impedance(chart, STIFFNESS, coupling=coupling), steps(chart)
+    yield "kinematic, fitted", chart, Kinematic(chart), steps(chart)
+    posture = posture_reference(chart, steps(chart), q0)
+    for metric, letter in (("euclidean", "I"), ("inertia", "M")):
+        other = oc.Problem(problem.robot, problem.task, metric, problem.domain)
+        yield f"projector, A = {letter}", chart, Projector(other, STIFFNESS, STIFFNESS), posture
+        yield f"kinematic projector, A = {letter}", chart, KinematicProjector(other), posture
+
+
+def steps(chart: oc.Chart) -> Reference:
+    """One coordinate after the other, there and back, interleaved."""
+    start = chart.phi(chart.problem.domain.centre)
+    changes, time = [], 0.5
+    for back in (False, True):
+        for k, label in enumerate(chart.labels):
+            changes.append((time, {label: start[k] + (0.0 if back else STEP[label])}))
+            time += PAUSE
+    return Reference.steps(chart.labels, start, changes, time)
+
+
+def worst_by_kind(index: np.ndarray, m: int) -> list[float]:
+    """Largest entries of the blocks task <- xi, xi <- task, task <-> task and xi <-> xi; NaN for empty ones."""
+    blocks = (index[:m, m:], index[m:, :m], index[:m, :m], index[m:, m:])
+    return [float(np.nanmax(block)) if np.isfinite(block).any() else np.nan for block in blocks]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    main(parser.parse_args().quick)
