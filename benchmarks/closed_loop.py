@@ -65,8 +65,17 @@ def timed(work: Callable[[], Array], rounds: int) -> tuple[float, Array]:
     return median(seconds), result
 
 
+def runs(law: PDPlus, reference: Reference, q0: Array) -> dict[str, Callable[[], Array]]:
+    """Each returns the joint positions at the end."""
+    return {
+        "continuous": lambda: oc.simulate(law, reference, q0).q[-1],
+        "sampled at 1 kHz": lambda: oc.simulate(law, reference, q0, control_rate=1000.0).q[-1],
+        "SciPy LSODA": lambda: by_scipy(law, reference),
+    }
+
+
 def main(quick: bool = False) -> dict[str, float]:
-    """Print a table; seconds of 10 s by arm and kind of run."""
+    """Print a table; seconds of 10 s, and errors [rad], by arm and kind of run."""
     found = {}
     rounds = 1 if quick else 5
     print("| arm | run | seconds for 10 s | ratio to continuous | error of q at the end |")
@@ -80,15 +89,11 @@ def main(quick: bool = False) -> dict[str, float]:
         )
         law.function, law.energy  # noqa: B018 (built before the clock starts)
         exact = oc.simulate(law, reference, q0, tolerance=1e-12).q[-1]
-        kinds: dict[str, Callable[[], Array]] = {
-            "continuous": lambda: oc.simulate(law, reference, q0).q[-1],
-            "sampled at 1 kHz": lambda: oc.simulate(law, reference, q0, control_rate=1000.0).q[-1],
-            "SciPy LSODA": lambda: by_scipy(law, reference),
-        }
-        for kind, work in kinds.items():
+        for kind, work in runs(law, reference, q0).items():
             seconds, end = timed(work, 1 if kind == "SciPy LSODA" else rounds)
             found[f"{name} {kind}"] = seconds
             ratio, error = seconds / found[f"{name} continuous"], np.abs(end - exact).max()
+            found[f"{name} {kind} error"] = float(error)
             print(f"| {name}, n = {chart.n} | {kind} | {seconds:.2f} | {ratio:.1f} | {error:.1e} |", flush=True)
     return found
 

@@ -45,10 +45,11 @@ def main(quick: bool = False) -> dict[str, float]:
         print("| controller | task <- xi | xi <- task | x <-> y | xi <-> xi |\n| --- | --- | --- | --- | --- |")
         for title, judged, law, reference in laws(chart):
             run = oc.simulate(law, reference, problem.domain.centre, must_be_reachable=False)
-            if (run.status != 0).any():
-                title += f" (left the domain after {run.times[np.flatnonzero(run.status)[0]]:.1f} s)"
+            bad = np.flatnonzero(run.status)
+            remark = f" (left the domain after {run.times[bad[0]]:.1f} s)" if bad.size else ""
             cells = worst_by_kind(coupling_index(judged, steps(judged), run).index, chart.m)
-            print(f"| {title} | {' | '.join('-' if np.isnan(cell) else f'{cell:.2%}' for cell in cells)} |", flush=True)
+            row = " | ".join("-" if np.isnan(cell) else f"{cell:.2%}" for cell in cells)
+            print(f"| {title}{remark} | {row} |", flush=True)
             found[f"{name} {title}"] = cells[0]
     return found
 

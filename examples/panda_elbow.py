@@ -1,4 +1,4 @@
-"""A Panda from its URDF: PD+ at 1 kHz with gravity and torque limits; the elbow moves on command, the hand stays (20 s).
+"""A Panda from its URDF: PD+ at 1 kHz with gravity and torque limits; the elbow moves, the hand stays (20 s).
 
 Fits coordinates for the position of the hand with A = M, then commands steps in every xi while x is to rest, and a step
 in x at the end. The decoupled law relies on orthogonal coordinates, the coupled one does not. The URDF is the one of

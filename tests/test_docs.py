@@ -52,6 +52,16 @@ def test_shell_quickstart_runs(checkout: Path) -> None:
         assert done.stderr == ""
 
 
+def test_python_block_of_the_page_on_control_runs(tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "control.md").read_text(), flags=re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    first, coupling = done.stdout.splitlines()
+    assert first.endswith("] 0")  # no status but OK
+    assert float(coupling) < 0.005
+    assert (tmp_path / "run.npz").exists()
+
+
 def test_make_targets_of_the_readme_exist() -> None:
     makefile = (ROOT / "Makefile").read_text()
     for line in blocks("sh")[0].splitlines():

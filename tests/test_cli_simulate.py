@@ -1,0 +1,299 @@
+"""`orthocas simulate`: files, numbers, refusals, interrupts; nothing written on bad input."""
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import orthocas as oc
+from orthocas.cli import main
+from orthocas.cli import simulate as command
+from orthocas.cli.controller_argument import ControllerOptions, build_controller
+from orthocas.domains import sample_uniform
+from orthocas.fitting import Fit
+from orthocas.objective import Monitor, Progress
+from orthocas.simulation import Trajectory
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+SHORT = {"duration": 1, "steps": [{"time": 0.1, "move": {"x": 0.1}}, {"time": 0.6, "to": {"xi1": 0.05}}]}
+FILES = {"trajectory.npz", "coordinates.png", "report.json"}
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def chart(planar_fit: Fit) -> oc.Chart:
+    return planar_fit.chart
+
+
+@pytest.fixture
+def run(chart: oc.Chart, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Simulate in a folder with a.orthocas and short.json; exit code, standard output, standard error."""
+    monkeypatch.chdir(tmp_path)
+    chart.save("a.orthocas")
+    Path("short.json").write_text(json.dumps(SHORT))
+
+    def call(
+        controller: str, *words: str, steps: str = "short.json", chart: str = "a.orthocas"
+    ) -> tuple[int, str, str]:
+        line = [chart, "--controller", controller, "--steps", steps, "--out", "out", *words]
+        monkeypatch.setattr(sys, "argv", ["orthocas", "simulate", *line])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        out, err = capsys.readouterr()
+        return int(stop.value.code or 0), out, err
+
+    return call
+
+
+def written() -> set[str]:
+    return {path.name for path in Path("out").iterdir()}
+
+
+def report_of(run: Run, *words: str, **more: str) -> dict[str, Any]:
+    code, out, err = run(*words, "--animation", "none", "--json", **more)
+    assert (code, err) == (0, "")
+    report: dict[str, Any] = json.loads(out)
+    return report
+
+
+def test_example_of_the_docs_end_to_end(run: Run, chart: oc.Chart) -> None:
+    code, out, err = run("pd_plus", "--json", steps=str(EXAMPLES / "steps_planar_3r_x.json"))
+    assert (code, err) == (0, "")
+    report = json.loads(out)
+    assert json.loads(Path("out/report.json").read_text()) == report
+    assert written() == FILES | {"animation.gif"}
+    assert (report["controller"], report["outcome"], report["duration"]) == ("pd_plus", "complete", 10)
+    assert set(report["tracking_error"]) == {"x", "xi1", "xi2"}
+    assert max(report["tracking_error"].values()) < 1e-6  # CVODES at 1e-8; the full M_phi tracks exactly
+    assert set(report["coupling_index"]) == {"x", "xi1"}  # only these are commanded
+    assert report["coupling_index"]["xi1"]["x"] < 1e-6
+    assert report["fallback"] == {"share": 0, "since": None, "reason": None}
+    assert report["share_inside_domain"] == 1
+    assert report["energy"]["storage_largest"] < 1e-9
+    trajectory = Trajectory.load("out/trajectory.npz")
+    assert trajectory.times[-1] == 10
+    np.testing.assert_allclose(trajectory.q[0], chart.problem.domain.centre)
+    largest = np.abs(trajectory.command).max(axis=0)
+    assert report["largest_command"] == dict(zip(["q1", "q2", "q3"], largest.tolist(), strict=True))
+    with Image.open("out/coordinates.png") as picture:
+        assert min(picture.size) > 500
+    with Image.open("out/animation.gif") as film:
+        assert film.n_frames > 150  # type: ignore[attr-defined]
+    assert Path("out/animation.gif").stat().st_size < 3e6
+
+
+def test_rows_name_units_and_the_folder(run: Run) -> None:
+    code, out, err = run("impedance", "--animation", "none")
+    assert (code, err) == (0, "")
+    rows = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert rows["run"] == "impedance, 1 s: complete"
+    assert " m, xi1 " in rows["largest"]
+    assert "task <- extra" in rows["coupling"]
+    assert rows["command"].endswith("N m, q1")
+    assert "J dissipated" in rows["energy"]
+    assert rows["files"] == "out"
+
+
+@pytest.mark.parametrize("name", ["kinematic", "projector", "kinematic_projector"])
+def test_other_controllers_follow_the_same_file_and_are_judged_in_the_chart(run: Run, name: str) -> None:
+    report = report_of(run, name)
+    assert set(report["tracking_error"]) == {"x", "xi1", "xi2"}
+    assert report["tracking_error"]["x"] < (0.05 if name == "projector" else 1e-3)
+    assert (report["energy"] is None) == (name != "projector")
+    trajectory = Trajectory.load("out/trajectory.npz")
+    assert trajectory.labels == (("x", "xi1", "xi2") if name == "kinematic" else ("x", "q1", "q2", "q3"))
+    assert trajectory.kind == ("torque" if name == "projector" else "velocity")
+
+
+def test_springs_that_are_not_given_swing_at_two_hertz_with_the_median_inertia(chart: oc.Chart) -> None:
+    points = sample_uniform(chart.problem.domain, 256, 0)
+    J, M = chart.jacobian(points), np.array([chart.problem.robot.mass_matrix(q) for q in points])
+    task = 1 / np.einsum("ki,kij,kj->k", J[:, 0], np.linalg.inv(M), J[:, 0])
+    wanted = (2 * np.pi * 2) ** 2 * np.median(task)
+    coordinates = build_controller("pd_plus", chart, ControllerOptions(), None).gains["stiffness"]
+    assert coordinates[0] == pytest.approx(wanted, rel=1e-9)
+    projector = build_controller("projector", chart, ControllerOptions(), None).gains["stiffness"]
+    assert projector[0] == pytest.approx(wanted, rel=1e-9)
+    joints = np.median(M[:, range(3), range(3)], axis=0)
+    np.testing.assert_allclose(projector[1:], (4 * np.pi) ** 2 * joints, rtol=1e-9)
+
+
+def test_gains_and_limits_are_those_given(run: Run, chart: oc.Chart) -> None:
+    words = ("--stiffness", "100,2000,3000", "--damping-ratio", "0.9", "--limit", "400", "--coupling", "decoupled")
+    report = report_of(run, "impedance", *words)
+    assert report["gains"] == {"stiffness": [100, 2000, 3000], "damping_ratio": [0.9] * 3, "limit": [400] * 3}
+    assert report["coupling"] == "decoupled"
+    options = ControllerOptions(stiffness="300", posture_stiffness="30,20,10")
+    projector = build_controller("projector", chart, options, "50,60,70").gains
+    assert projector["stiffness"].tolist() == [300, 30, 20, 10]
+    assert projector["limit"].tolist() == [50, 60, 70]
+    each, all_of_them = ControllerOptions(feedback="1,2,3,4"), ControllerOptions(feedback="5")
+    assert build_controller("kinematic_projector", chart, each, None).gains["feedback"].tolist() == [1, 2, 3, 4]
+    assert build_controller("kinematic", chart, all_of_them, None).gains["feedback"].tolist() == [5, 5, 5]
+
+
+def test_a_wrong_model_friction_and_noise_cost_accuracy(run: Run) -> None:
+    exact = report_of(run, "pd_plus")["tracking_error"]["x"]
+    for words in (("--mass-factor", "1.1"), ("--friction", "0.5,0.2")):
+        assert report_of(run, "pd_plus", *words)["tracking_error"]["x"] > 1e3 * exact
+    sampled = ("--rate", "100", "--noise", "1e-4,1e-3")
+    first, other = (report_of(run, "pd_plus", *sampled, *seed)["tracking_error"]["x"] for seed in ((), ("--seed", "1")))
+    assert first != other
+    assert first > 1e3 * exact
+
+
+def test_points_and_pushes(run: Run) -> None:
+    points = {"points": [{"time": 1, "move": {"x": 0.1}}, {"time": 2, "move": {"xi1": 0.05}}]}
+    Path("points.json").write_text(json.dumps(points))
+    report = report_of(run, "pd_plus", steps="points.json")
+    assert (report["duration"], report["coupling_index"]) == (2, None)
+    assert report["tracking_error"]["x"] < 1e-6
+    pushed = {**points, "pushes": [{"start": 0.5, "duration": 0.1, "force": [20, 0, 0]}]}
+    Path("points.json").write_text(json.dumps(pushed))
+    assert report_of(run, "pd_plus", steps="points.json")["tracking_error"]["x"] > 1e-2
+    code, _, err = run("kinematic", steps="points.json")
+    assert code == 2
+    assert "a velocity controller sees no forces" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("pid",), "unknown controller 'pid', known: impedance, pd_plus, kinematic, projector, kinematic_projector"),
+        (("kinematic", "--stiffness", "1"), "--stiffness is 1, expected no such option with kinematic: it belongs to"),
+        (("pd_plus", "--feedback", "1"), "it belongs to kinematic, kinematic_projector"),
+        (("pd_plus", "--posture-stiffness", "1"), "it belongs to projector"),
+        (("projector", "--coupling", "coupled"), "it belongs to impedance, pd_plus"),
+        (("kinematic", "--mass-factor", "1.1"), "--mass-factor is 1.1, expected no such option with kinematic"),
+        (("kinematic", "--friction", "1,1"), "it belongs to impedance, pd_plus, projector"),
+        (("pd_plus", "--coupling", "both"), "unknown coupling 'both', known: coupled, decoupled"),
+        (("pd_plus", "--stiffness", "1,2"), "stiffness has shape (2,), expected (3,)"),
+        (("pd_plus", "--stiffness", "-1"), "stiffness[0] is -1.0, expected positive numbers"),
+        (("pd_plus", "--stiffness", "soft"), "--stiffness is ['soft'], expected an array of numbers"),
+        (("pd_plus", "--limit", "0"), "limit[0] is 0.0, expected positive numbers"),
+        (("kinematic_projector", "--feedback", "1,2"), "--feedback is 1,2, expected one number, or 4"),
+        (("pd_plus", "--rate", "0"), "control_rate is 0.0, expected a finite number > 0"),
+        (("pd_plus", "--noise", "1,1"), "--noise is 1,1, expected none without --rate"),
+        (("pd_plus", "--noise", "1", "--rate", "100"), "--noise is '1', expected two numbers"),
+        (("kinematic", "--noise", "1,1", "--rate", "100"), "kinematic measures no velocity"),
+        (("pd_plus", "--seed", "1"), "--seed is 1, expected none without --noise"),
+        (("pd_plus", "--friction", "-1,0"), "viscous[0] is -1.0"),
+        (("pd_plus", "--mass-factor", "0"), "factor is 0.0, expected numbers > 0"),
+        (("pd_plus", "--animation", "webp"), "unknown animation format 'webp', known: gif, mp4"),
+        (("pd_plus", "--out", "no/out"), "folder no does not exist"),
+        (("pd_plus", "--out", "short.json"), "--out is short.json, expected a folder"),
+        (("pd_plus", "--steps", "none.json"), "steps file none.json: cannot be read"),
+        (("pd_plus", "--steps", "a.orthocas"), "steps file a.orthocas: "),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_written(run: Run, words: tuple[str, ...], message: str) -> None:
+    before = set(Path().iterdir())
+    code, out, err = run(*words)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1
+    assert set(Path().iterdir()) == before
+
+
+def test_mp4_without_ffmpeg_is_refused_before_the_run(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    code, out, err = run("pd_plus", "--animation", "mp4")
+    assert (code, out) == (2, "")
+    assert "animation is mp4, expected gif, since MP4 needs ffmpeg and there is none on the PATH" in err
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("name", ["pd_plus", "kinematic_projector"])
+def test_a_reference_that_leaves_the_domain_is_reported_before_the_run(run: Run, name: str) -> None:
+    Path("far.json").write_text(json.dumps({"duration": 2, "steps": [{"time": 1, "move": {"x": 0.6}}]}))
+    code, out, err = run(name, steps="far.json")
+    assert (code, out) == (2, "")
+    assert "the reference leaves the domain at t = 1." in err
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("name", ["pd_plus", "kinematic_projector"])
+def test_grown_charts_are_refused(run: Run, name: str, planar_x: oc.Problem) -> None:
+    oc.grow(planar_x, leaf="linear").save("grown.orthocas")
+    code, out, err = run(name, chart="grown.orthocas")
+    assert (code, out) == (2, "")
+    assert "orthocas.distil" in err
+    assert err.count("\n") == 1
+
+
+def interrupting(stage: str) -> Callable[[], Any]:
+    """A stand-in for the terminal's monitor that sends Ctrl-C in the middle of a stage."""
+
+    @contextmanager
+    def monitor() -> Iterator[Monitor]:
+        def show(progress: Progress) -> None:
+            if progress.stage.startswith(stage) and progress.fraction > 0.5:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        yield show
+
+    return monitor
+
+
+def test_ctrl_c_in_the_run_keeps_what_was_simulated(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("out").mkdir()
+    Path("out/animation.gif").write_text("of an earlier run")
+    monkeypatch.setattr(command, "terminal_monitor", interrupting("simulate"))
+    code, out, err = run("pd_plus", "--json")
+    assert code == 130
+    assert "interrupted: what was simulated is written, without an animation" in err
+    assert written() == FILES
+    report = json.loads(out)
+    assert report["outcome"] == "interrupted"
+    assert 0.5 <= report["duration"] < 0.8
+    assert report["coupling_index"] is None
+    assert Trajectory.load("out/trajectory.npz").times[-1] == report["duration"]
+
+
+def test_ctrl_c_in_the_animation_leaves_no_half_of_it(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "terminal_monitor", interrupting("draw"))
+    code, out, err = run("pd_plus")
+    assert code == 130
+    assert "1 s: complete" in out
+    assert "without an animation" in err
+    assert written() == FILES
+
+
+def test_a_run_that_diverges_is_written_and_said(run: Run) -> None:
+    code, out, err = run("impedance", "--stiffness", "1e14", "--animation", "none")
+    assert code == 1
+    assert "diverged" in out
+    assert "the integrator gave up at t = 0.1 s, what came before is written" in err
+    assert written() == FILES
+
+
+def test_a_fallback_is_said_with_time_and_reason(run: Run) -> None:
+    code, out, err = run("pd_plus", "--limit", "40", "--animation", "none")
+    assert code == 0
+    assert "coupling" not in out  # coordinates mean nothing outside the domain
+    report = json.loads(Path("out/report.json").read_text())
+    fallback, trajectory = report["fallback"], Trajectory.load("out/trajectory.npz")
+    first = int(np.argmax(trajectory.status != 0))
+    assert fallback["since"] == trajectory.times[first] > 0
+    assert fallback["share"] == np.mean(trajectory.status != 0)
+    assert f"at t = {fallback['since']:.4g} s the arm left the domain: the controller gave the torque of gravity" in err
+    assert (report["energy"], report["coupling_index"]) == (None, None)
+
+
+def test_a_metric_other_than_inertia_is_noted(run: Run, planar_x: oc.Problem) -> None:
+    problem = oc.Problem(planar_x.robot, planar_x.task, "euclidean", planar_x.domain)
+    oc.fit(problem, oc.Linear()).chart.save("plain.orthocas")
+    Path("still.json").write_text('{"duration": 0.1, "steps": []}')
+    code, _, err = run("impedance", "--animation", "none", chart="plain.orthocas", steps="still.json")
+    assert code == 0
+    assert err.startswith("note: the metric of this chart is euclidean")
+    assert "A = M" in err
+    assert run("kinematic", "--animation", "none", chart="plain.orthocas", steps="still.json")[2] == ""

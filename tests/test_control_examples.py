@@ -1,0 +1,33 @@
+"""Examples and the benchmark of closed loops, in quick mode."""
+
+from pathlib import Path
+
+import closed_loop
+import controllers
+import panda_elbow
+
+
+def test_panda_moves_its_elbow_and_not_its_hand(tmp_path: Path) -> None:
+    found = panda_elbow.main(tmp_path, quick=True)
+    assert found["coupled_elbow_m"] > 0.04
+    assert found["decoupled_elbow_m"] > 0.04
+    assert found["coupled_hand_m"] < 1e-4  # half a tick late, and noise
+    assert found["decoupled_hand_m"] < 5e-3
+    assert found["coupled_share_of_limit"] < 1
+    assert found["coupled_ticks_not_ok"] == found["decoupled_ticks_not_ok"] == 0
+    assert (tmp_path / "panda_elbow.png").stat().st_size > 20_000
+
+
+def test_table_of_controllers_shows_what_fitted_coordinates_are_good_for() -> None:
+    found = controllers.main(quick=True)
+    fitted = found["planar_3r_x PD+ decoupled, fitted"]
+    assert found["planar_3r_x PD+ coupled, linear"] < 1e-4  # the full inertia tracks in any coordinates
+    assert fitted < 0.3 * found["planar_3r_x PD+ decoupled, linear"]
+    assert fitted < found["planar_3r_x projector, A = M"] < found["planar_3r_x projector, A = I"]
+
+
+def test_closed_loop_benchmark_agrees_with_its_peer() -> None:
+    found = closed_loop.main(quick=True)
+    assert found["planar_3r_x continuous error"] < 1e-6
+    assert found["planar_3r_x SciPy LSODA error"] < 1e-6
+    assert 1e-6 < found["planar_3r_x sampled at 1 kHz error"] < 1e-3  # half a tick late
