@@ -1,12 +1,16 @@
 """Smooth matrix functions of control laws, and damping designs, against NumPy, SciPy and closed forms."""
 
+import shutil
+import subprocess
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
 from scipy.linalg import eigh, sqrtm
 
 from orthocas.checks import Array
-from orthocas.control.damping import damping_matrix
+from orthocas.control.damping import DAMPING_DESIGNS, damping_matrix
 from orthocas.control.linear_algebra import spd_inverse, square_root
 
 RNG = np.random.default_rng(11)
@@ -90,3 +94,25 @@ def test_equation_29_can_be_indefinite_where_double_diagonal_is_not() -> None:
     assert np.linalg.eigvalsh(damping("square_root", M, K, Z))[0] < -0.1
     for ratios in (Z, np.array([0.1, 2.0]), np.array([0.0, 1.0])):
         assert np.linalg.eigvalsh(damping("double_diagonal", M, K, ratios))[0] > -1e-12
+
+
+def test_damping_generates_to_c_that_agrees(tmp_path: Path) -> None:
+    """Compiled with warnings as errors, on 100 inertias; both designs share the square root."""
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    M, K, Z = ca.SX.sym("M", 4, 4), ca.SX.sym("K", 4), ca.SX.sym("Z", 4)
+    designs = [ca.densify(damping_matrix(design, M, K, Z)) for design in DAMPING_DESIGNS]
+    function = ca.Function("damping", [M, K, Z], designs)
+    generator = ca.CodeGenerator("damping.c")
+    generator.add(function)
+    generator.generate(f"{tmp_path}/")
+    library = tmp_path / "damping.so"
+    warnings = ["-Wall", "-Wextra", "-Werror", "-Wno-unused-parameter", "-Wno-unknown-pragmas"]
+    command = [compiler, "-std=c99", "-O1", *warnings, "-fPIC", "-shared", "-o", str(library)]
+    subprocess.run([*command, str(tmp_path / "damping.c"), "-lm"], check=True)
+    compiled = ca.external("damping", str(library))
+    for _ in range(100):
+        given = (spd(4, 10.0 ** RNG.uniform(0, 5)), RNG.uniform(1, 1000, 4), RNG.uniform(0, 1, 4))
+        for want, found in zip(function(*given), compiled(*given), strict=True):
+            np.testing.assert_allclose(found.full(), want.full(), rtol=1e-12, atol=1e-10)
