@@ -15,6 +15,7 @@ from orthocas.chart_file import read_chart, write_chart
 from orthocas.checks import Array, as_point_set, require_known
 from orthocas.coordinates import CoordinateMap, InvertibleMap
 from orthocas.errors import InverseError, ShapeError
+from orthocas.interrupts import deferred
 from orthocas.problem import Problem, task_jacobians
 
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
@@ -165,10 +166,11 @@ class Chart:
         return ca.rootfinder("inverse", "newton", equations, options)
 
     def _solve(self, q_start: Array, phi: Array) -> Array:
-        try:
-            return np.asarray(self._rootfinder(ca.DM(q_start), ca.DM(phi)).nonzeros())
-        except RuntimeError:  # a singular linear system on the way
-            return np.full(self.n, np.nan)
+        with deferred():  # Ctrl-C inside comes out as a RuntimeError, or not at all
+            try:
+                return np.asarray(self._rootfinder(ca.DM(q_start), ca.DM(phi)).nonzeros())
+            except RuntimeError:  # a singular linear system on the way
+                return np.full(self.n, np.nan)
 
     def _require_solved(self, solutions: Array, targets: Array, tolerance: float) -> None:
         finite = np.asarray(np.isfinite(solutions).all(axis=1))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 import orthocas as oc
@@ -51,6 +52,12 @@ def run(chart: oc.Chart, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
         return int(stop.value.code or 0), out, err
 
     return call
+
+
+@pytest.fixture
+def blank(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Empty pictures, for tests of numbers: drawing takes longer than the runs."""
+    monkeypatch.setattr(Trajectory, "plot", lambda self, units: Figure())
 
 
 def written() -> set[str]:
@@ -102,6 +109,7 @@ def test_rows_name_units_and_the_folder(run: Run) -> None:
     assert rows["files"] == "out"
 
 
+@pytest.mark.usefixtures("blank")
 @pytest.mark.parametrize("name", ["kinematic", "projector", "kinematic_projector"])
 def test_other_controllers_follow_the_same_file_and_are_judged_in_the_chart(run: Run, name: str) -> None:
     report = report_of(run, name)
@@ -126,6 +134,7 @@ def test_springs_that_are_not_given_swing_at_two_hertz_with_the_median_inertia(c
     np.testing.assert_allclose(projector[1:], (4 * np.pi) ** 2 * joints, rtol=1e-9)
 
 
+@pytest.mark.usefixtures("blank")
 def test_gains_and_limits_are_those_given(run: Run, chart: oc.Chart) -> None:
     words = ("--stiffness", "100,2000,3000", "--damping-ratio", "0.9", "--limit", "400", "--coupling", "decoupled")
     report = report_of(run, "impedance", *words)
@@ -140,6 +149,7 @@ def test_gains_and_limits_are_those_given(run: Run, chart: oc.Chart) -> None:
     assert build_controller("kinematic", chart, all_of_them, None).gains["feedback"].tolist() == [5, 5, 5]
 
 
+@pytest.mark.usefixtures("blank")
 def test_a_wrong_model_friction_and_noise_cost_accuracy(run: Run) -> None:
     exact = report_of(run, "pd_plus")["tracking_error"]["x"]
     for words in (("--mass-factor", "1.1"), ("--friction", "0.5,0.2")):
@@ -150,6 +160,7 @@ def test_a_wrong_model_friction_and_noise_cost_accuracy(run: Run) -> None:
     assert first > 1e3 * exact
 
 
+@pytest.mark.usefixtures("blank")
 def test_points_and_pushes(run: Run) -> None:
     points = {"points": [{"time": 1, "move": {"x": 0.1}}, {"time": 2, "move": {"xi1": 0.05}}]}
     Path("points.json").write_text(json.dumps(points))
@@ -243,6 +254,7 @@ def interrupting(stage: str) -> Callable[[], Any]:
     return monitor
 
 
+@pytest.mark.usefixtures("blank")
 def test_ctrl_c_in_the_run_keeps_what_was_simulated(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("out").mkdir()
     Path("out/animation.gif").write_text("of an earlier run")
@@ -258,6 +270,7 @@ def test_ctrl_c_in_the_run_keeps_what_was_simulated(run: Run, monkeypatch: pytes
     assert Trajectory.load("out/trajectory.npz").times[-1] == report["duration"]
 
 
+@pytest.mark.usefixtures("blank")
 def test_ctrl_c_in_the_animation_leaves_no_half_of_it(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "terminal_monitor", interrupting("draw"))
     code, out, err = run("pd_plus")
@@ -267,6 +280,24 @@ def test_ctrl_c_in_the_animation_leaves_no_half_of_it(run: Run, monkeypatch: pyt
     assert written() == FILES
 
 
+@pytest.mark.usefixtures("blank")
+def test_ctrl_c_while_files_are_written_loses_nothing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    save, signals = Trajectory.save, [signal.SIGINT]
+
+    def interrupted(self: Trajectory, path: Path) -> None:
+        save(self, path)
+        if signals:
+            os.kill(os.getpid(), signals.pop())
+
+    monkeypatch.setattr(Trajectory, "save", interrupted)
+    code, out, err = run("pd_plus")
+    assert code == 130
+    assert "1 s: complete" in out
+    assert "without an animation" in err
+    assert written() == FILES
+
+
+@pytest.mark.usefixtures("blank")
 def test_a_run_that_diverges_is_written_and_said(run: Run) -> None:
     code, out, err = run("impedance", "--stiffness", "1e14", "--animation", "none")
     assert code == 1
@@ -275,6 +306,7 @@ def test_a_run_that_diverges_is_written_and_said(run: Run) -> None:
     assert written() == FILES
 
 
+@pytest.mark.usefixtures("blank")
 def test_a_fallback_is_said_with_time_and_reason(run: Run) -> None:
     code, out, err = run("pd_plus", "--limit", "40", "--animation", "none")
     assert code == 0
@@ -288,6 +320,7 @@ def test_a_fallback_is_said_with_time_and_reason(run: Run) -> None:
     assert (report["energy"], report["coupling_index"]) == (None, None)
 
 
+@pytest.mark.usefixtures("blank")
 def test_a_metric_other_than_inertia_is_noted(run: Run, planar_x: oc.Problem) -> None:
     problem = oc.Problem(planar_x.robot, planar_x.task, "euclidean", planar_x.domain)
     oc.fit(problem, oc.Linear()).chart.save("plain.orthocas")

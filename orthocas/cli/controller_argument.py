@@ -1,6 +1,7 @@
 """Building a controller from command-line words, and refusing words that another controller takes."""
 
 from dataclasses import dataclass
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -9,9 +10,9 @@ from orthocas.batch import Batched, dense_function
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_known
 from orthocas.cli.problem_argument import parse_numbers
-from orthocas.control import Impedance, Kinematic, KinematicProjector, PDPlus, Projector
-from orthocas.control.controller import Controller
+from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector
 from orthocas.control.inertia import block_inertia
+from orthocas.control.operational_space import Coupling
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError
 
@@ -81,7 +82,7 @@ def build_controller(name: str, chart: Chart, options: ControllerOptions, limit:
         joints = springs[chart.n :] if posture is None else _one_or_all("--posture-stiffness", posture)
         return Projector(chart.problem, springs[: chart.m] if given is None else given, joints, damping, bounds)
     law = Impedance if name == "impedance" else PDPlus
-    coupling = "coupled" if options.coupling is None else options.coupling
+    coupling = cast(Coupling, "coupled" if options.coupling is None else options.coupling)  # the law checks it
     return law(chart, springs[: chart.n] if given is None else given, damping, coupling, limit=bounds)
 
 

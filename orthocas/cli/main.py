@@ -10,6 +10,7 @@ from orthocas.cli.evaluate import evaluate
 from orthocas.cli.fit import fit
 from orthocas.cli.info import info
 from orthocas.cli.reproduce import reproduce
+from orthocas.cli.simulate import simulate
 from orthocas.errors import OrthocasError
 
 INTERRUPTED = 130  #: exit code after Ctrl-C, as shells have it
@@ -27,6 +28,7 @@ app.command()(evaluate)
 app.command()(info)
 app.command()(compare)
 app.command()(reproduce)
+app.command()(simulate)
 
 
 def _complain(text: str) -> None:

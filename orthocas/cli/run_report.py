@@ -6,9 +6,12 @@ from typing import Any
 import numpy as np
 
 from orthocas.chart import Chart
-from orthocas.control import ControlStatus, Reference
-from orthocas.control.controller import Controller
-from orthocas.simulation import Trajectory, coupling_index
+from orthocas.control import Controller, ControlStatus, Reference
+from orthocas.domains import contains
+from orthocas.problem import Problem
+from orthocas.simulation import Outcome, Trajectory, coupling_index
+from orthocas.simulation.figure import units_of
+from orthocas.simulation.steps_file import Plan
 
 _REASONS = {
     ControlStatus.OUTSIDE_DOMAIN: "the arm left the domain",
@@ -17,44 +20,48 @@ _REASONS = {
 }
 
 
-def run_report(
-    chart: Chart, controller: Controller, reference: Reference, has_steps: bool, seen: Trajectory, seconds: float
-) -> dict[str, Any]:
+def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajectory, seconds: float) -> dict[str, Any]:
     """Numbers of a run, SI units, ready for JSON.
 
     Args:
-        chart: the coordinates that judge it.
         controller: what ran.
-        reference: in the chart's coordinates.
-        has_steps: whether it is one of steps, which coupling indices need.
+        chart: the coordinates that judge it.
+        plan: what it followed.
         seen: the run in the chart's coordinates.
         seconds: computing time.
     """
-    bad = np.flatnonzero(seen.status)
+    bad = np.flatnonzero(seen.status != ControlStatus.OK)
     first = int(bad[0]) if bad.size else None
+    inside = np.asarray(contains(chart.problem.domain, seen.q))
+    judged = plan.has_steps and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
     largest = np.abs(seen.command).max(axis=0)
     return {
         "controller": controller.name,
+        "coupling": getattr(controller, "coupling", None),
         "gains": {name: [_finite(value) for value in gain] for name, gain in controller.gains.items()},
         "outcome": seen.outcome.value,
         "duration": float(seen.times[-1]),
         "tracking_error": dict(zip(seen.labels, map(_finite, seen.tracking_error), strict=True)),
-        "coupling_index": _coupling(chart, reference, seen) if has_steps else None,
+        "coupling_index": _coupling(chart, plan.reference, seen) if judged else None,
         "fallback": {
-            "share": float((seen.status != ControlStatus.OK).mean()),
+            "share": len(bad) / len(seen.times),
             "since": None if first is None else float(seen.times[first]),
             "reason": None if first is None else _REASONS[ControlStatus(int(seen.status[first]))],
         },
+        "share_inside_domain": float(inside.mean()),
         "command": seen.kind,
         "largest_command": dict(zip(seen.joint_names, map(_finite, largest), strict=True)),
-        "energy": _energy(seen) if seen.kind == "torque" else None,
+        "energy": _energy(seen) if seen.kind == "torque" and not bad.size else None,
         "seconds": seconds,
     }
 
 
-def run_rows(report: dict[str, Any], m: int, units: dict[str, str]) -> dict[str, str]:
-    """The report as rows; m labels are those of the task."""
-    errors = [f"{label} {value:.3g} {units.get(label, '')}".strip() for label, value in report["tracking_error"].items()]
+def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
+    """The report as rows."""
+    units = units_of(problem)
+    errors = [
+        f"{label} {_text(value)} {units.get(label, '')}".strip() for label, value in report["tracking_error"].items()
+    ]
     joint, command = max(report["largest_command"].items(), key=lambda pair: pair[1])
     by_torque = report["command"] == "torque"
     lengths = units.get(joint) == "m"
@@ -64,13 +71,12 @@ def run_rows(report: dict[str, Any], m: int, units: dict[str, str]) -> dict[str,
         "largest error": ", ".join(errors),
     }
     if report["coupling_index"]:
-        rows["coupling"] = _worst_couplings(report["coupling_index"], list(report["tracking_error"])[:m])
+        rows["coupling index"] = _worst_couplings(report["coupling_index"], problem.task.labels)
     rows["command"] = f"at most {command:.4g} {unit}, {joint}"
-    if by_torque:
-        energy = report["energy"]
+    if energy := report["energy"]:
         rows["energy"] = (
-            f"V at most {energy['storage_largest']:.3g} J, at the end {energy['storage_end']:.3g} J; "
-            f"{energy['dissipated']:.3g} J dissipated"
+            f"V at most {_text(energy['storage_largest'])} J, at the end {_text(energy['storage_end'])} J; "
+            f"{_text(energy['dissipated'])} J dissipated"
         )
     rows["computed in"] = f"{report['seconds']:.2f} s"
     return rows
@@ -83,8 +89,8 @@ def fallback_text(report: dict[str, Any]) -> str | None:
         return None
     what = "the torque of gravity" if report["command"] == "torque" else "no velocity"
     return (
-        f"from t = {fallback['since']:.4g} s on the controller gave only {what}, {fallback['share']:.1%} of the run: "
-        f"{fallback['reason']}"
+        f"at t = {fallback['since']:.4g} s {fallback['reason']}: the controller gave {what} only, "
+        f"for {fallback['share']:.1%} of the run"
     )
 
 
@@ -93,14 +99,16 @@ def _coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str,
     found = coupling_index(chart, reference, seen)
     return {
         commanded: {
-            disturbed: float(found.index[i, j]) for i, disturbed in enumerate(found.labels) if isfinite(found.index[i, j])
+            disturbed: float(found.index[i, j])
+            for i, disturbed in enumerate(found.labels)
+            if isfinite(found.index[i, j])
         }
         for j, commanded in enumerate(found.labels)
         if np.isfinite(found.index[:, j]).any()
     }
 
 
-def _worst_couplings(index: dict[str, dict[str, float]], task: list[str]) -> str:
+def _worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, ...]) -> str:
     """The worst index of the task by an extra coordinate, and the other way round."""
     pairs = [(value, to, by) for by, column in index.items() for to, value in column.items()]
     texts = []
@@ -122,6 +130,10 @@ def _energy(seen: Trajectory) -> dict[str, float | None]:
         "storage_rise": _finite(seen.storage_rise),
         "dissipated": _finite(taken),
     }
+
+
+def _text(value: float | None) -> str:
+    return "not finite" if value is None else f"{value:.3g}"
 
 
 def _finite(value: float) -> float | None:

@@ -1,10 +1,11 @@
 """`orthocas simulate`: a controller in the coordinates of a chart, run in closed loop."""
 
-import json as json_format
 import os
 import tempfile
 import time
 from dataclasses import replace
+from functools import partial
+from json import dumps
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,14 +17,16 @@ from orthocas.cli.controller_argument import CONTROLLERS, ControllerOptions, bui
 from orthocas.cli.output import AsJson, note, number, print_json, print_rows, whole_number
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.cli.run_report import fallback_text, run_report, run_rows
-from orthocas.control import Reference, posture_reference
+from orthocas.control import Controller, Reference, posture_reference
 from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.interrupts import deferred
+from orthocas.objective import Monitor
 from orthocas.progress import terminal_monitor
 from orthocas.simulation import Friction, Noise, Outcome, Trajectory
 from orthocas.simulation.animation import FORMATS, require_format, save_animation
 from orthocas.simulation.figure import units_of
 from orthocas.simulation.run import simulate as run_closed_loop
-from orthocas.simulation.steps_file import read_steps
+from orthocas.simulation.steps_file import Plan, read_steps
 
 _DIVERGED = 1  # exit code of a run whose integrator gave up: good input, a run that failed
 
@@ -71,26 +74,129 @@ def simulate(
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
-    options = ControllerOptions(
-        stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction
-    )
+    options = ControllerOptions(stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction)
     require_options(controller, options)
     if animation != "none":
         require_format(animation)
     _require_folder(out)
-    loaded = Chart.load(chart)
-    plan = read_steps(steps, loaded)
-    law = build_controller(controller, loaded, options, limit)
-    robot = law.problem.robot
-    conditions: dict[str, Any] = {
+    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+        loaded = Chart.load(chart)
+        loaded.function("xi")  # refuses grown charts
+        plan = read_steps(steps, loaded)
+        law = build_controller(controller, loaded, options, limit)
+    conditions = {
         "control_rate": rate,
-        "plant": None if mass_factor is None else robot.with_scaled_masses(mass_factor),
-        "pushes": plan.pushes,
+        "plant": None if mass_factor is None else loaded.problem.robot.with_scaled_masses(mass_factor),
         "friction": None if friction is None else Friction(*_pair("--friction", friction)),
-        "noise": _noise(noise, seed),
+        "noise": _noise(law, noise, seed, rate),
     }
-    began = time.perf_counter()
+    begin = time.perf_counter()
     with terminal_monitor() as monitor:
-        follows = plan.reference if law.labels == loaded.labels else posture_reference(loaded, plan.reference, plan.q_start)
-        run = run_closed_loop(law, follows, plan.q_start, **conditions, monitor=monitor)
-    ...
+        run = _run(law, loaded, plan, conditions, monitor)
+        finish = partial(_finish, law, loaded, plan, run, time.perf_counter() - begin, out)
+        interrupted = run.outcome is Outcome.INTERRUPTED
+        try:
+            seen, report = finish()
+            if animation != "none" and not interrupted:
+                save_animation(out / f"animation.{animation}", seen, loaded.problem, monitor)
+        except KeyboardInterrupt:  # the run is whole, and kept
+            seen, report = finish()
+            interrupted = True
+    if json:
+        print_json(report)
+    else:
+        print_rows(run_rows(report, loaded.problem) | {"files": str(out)})
+    _notes(law, report, interrupted)
+    if interrupted:
+        raise typer.Exit(130)
+    if run.outcome is Outcome.DIVERGED:
+        raise typer.Exit(_DIVERGED)
+
+
+def _require_folder(out: Path) -> None:
+    """Check, before anything is written, that there is a folder for files, or can be one."""
+    if out.exists() and not out.is_dir():
+        raise InvalidValueError("--out", str(out), "a folder")
+    require_writable(out / "report.json" if out.is_dir() else out, ArchiveError)
+
+
+def _pair(option: str, text: str) -> tuple[float, float]:
+    """Read "0.1,0.2"."""
+    values = parse_numbers(option, text).tolist()
+    if len(values) != 2:
+        raise InvalidValueError(option, repr(text), "two numbers")
+    return values[0], values[1]
+
+
+def _noise(law: Controller, text: str | None, seed: int | None, rate: float | None) -> Noise | None:
+    """Noise of the sensors, and nothing that would be ignored."""
+    if text is None:
+        if seed is not None:
+            raise InvalidValueError("--seed", seed, "none without --noise: nothing else is random")
+        return None
+    if rate is None:
+        raise InvalidValueError("--noise", text, "none without --rate: white noise needs ticks")
+    position, velocity = _pair("--noise", text)
+    if law.command == "velocity" and velocity != 0:
+        raise InvalidValueError("--noise", text, f"a velocity deviation of 0: {law.name} measures no velocity")
+    return Noise(position, velocity, 0 if seed is None else seed)
+
+
+def _run(law: Controller, chart: Chart, plan: Plan, conditions: dict[str, Any], monitor: Monitor) -> Trajectory:
+    """The closed loop; projectors get the joint positions that belong to the reference."""
+    reference = plan.reference
+    if law.labels != chart.labels:
+        reference = posture_reference(chart, reference, plan.q_start)
+    return run_closed_loop(law, reference, plan.q_start, pushes=plan.pushes, monitor=monitor, **conditions)
+
+
+def _in_chart(chart: Chart, reference: Reference, run: Trajectory) -> Trajectory:
+    """The run with the chart's coordinates as its quantities, also if the controller does not know them."""
+    value, velocity, acceleration = reference.sample(run.times.clip(0, reference.duration))
+    return replace(
+        run,
+        labels=chart.labels,
+        value=chart.phi(run.q),
+        reference=value,
+        reference_velocity=velocity,
+        reference_acceleration=acceleration,
+    )
+
+
+def _finish(
+    law: Controller, chart: Chart, plan: Plan, run: Trajectory, seconds: float, out: Path
+) -> tuple[Trajectory, dict[str, Any]]:
+    """Judge the run and write it with picture and report; the animation of an earlier run goes away.
+
+    Returns:
+        The run in the chart's coordinates, and the report.
+    """
+    seen = _in_chart(chart, plan.reference, run)
+    report = run_report(law, chart, plan, seen, seconds)
+    out.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out, prefix=".orthocas-") as folder:
+        drafts = Path(folder)
+        run.save(drafts / "trajectory.npz")
+        seen.plot(units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
+        (drafts / "report.json").write_text(dumps(report, indent=1, allow_nan=False) + "\n")
+        for draft in sorted(drafts.iterdir()):
+            os.replace(draft, out / draft.name)
+    for kind in FORMATS:
+        (out / f"animation.{kind}").unlink(missing_ok=True)
+    return seen, report
+
+
+def _notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
+    """What to know about the run, on standard error."""
+    metric = law.problem.metric.name
+    if law.name in ("impedance", "pd_plus") and metric != "inertia":
+        note(
+            f"the metric of this chart is {metric}: task and extra coordinates are decoupled only with A = M (inertia)"
+        )
+    fallback = fallback_text(report)
+    if fallback is not None:
+        note(fallback)
+    if report["outcome"] == Outcome.DIVERGED.value:
+        note(f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, what came before is written")
+    if interrupted:
+        note("interrupted: what was simulated is written, without an animation")

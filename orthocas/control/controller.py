@@ -8,6 +8,7 @@ from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.control.status import guard
 from orthocas.domains import Domain
+from orthocas.interrupts import deferred
 from orthocas.problem import Problem
 
 Command = Literal["torque", "velocity"]
@@ -93,10 +94,11 @@ def control_function(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.
 
 def scalar_code(function: ca.Function) -> ca.Function:
     """The function as scalar operations with common parts shared, or itself if it holds matrices (networks)."""
-    try:
-        flat = function.expand()
-    except RuntimeError:
-        return function
-    inputs = flat.sx_in()
-    outputs = ca.cse(list(flat.call(inputs)))
-    return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())
+    with deferred():  # expand makes a RuntimeError of Ctrl-C
+        try:
+            flat = function.expand()
+        except RuntimeError:
+            return function
+        inputs = flat.sx_in()
+        outputs = ca.cse(list(flat.call(inputs)))
+        return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())

@@ -120,14 +120,17 @@ class _OperationalSpace:
     def energy(self) -> ca.Function:
         """V = 1/2 de^T M_phi de + 1/2 e^T K e [J] and P = de^T D de [W], e = phi - phi_d.
 
-        Impedance control takes the velocity J dq in place of de, so that V is kinetic energy and springs.
+        Impedance control takes the velocity J dq in place of de, so that V is kinetic energy and springs. M_phi is the
+        full inertia, also for decoupled controllers: the robot's energy has no blocks.
         """
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         q, K = inputs["q"], ca.diag(inputs["stiffness"])
         J = self.chart.function("jacobian")(q)
-        _, Lambda, _, D = self._inertia(J, self.problem.robot.mass_matrix(q), inputs)
+        M = self.problem.robot.mass_matrix(q)
+        D = self._inertia(J, M, inputs)[-1]
+        M_phi = block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
         e, de = self._errors(inputs, J)
-        storage = (ca.bilin(Lambda, de, de) + ca.bilin(K, e, e)) / 2
+        storage = (ca.bilin(M_phi, de, de) + ca.bilin(K, e, e)) / 2
         return control_function("energy", inputs, {"storage": storage, "dissipated_power": ca.bilin(D, de, de)})
 
     @cached_property

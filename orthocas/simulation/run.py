@@ -91,7 +91,10 @@ def simulate(
         outcome = Outcome.INTERRUPTED
     except SimulationError:
         outcome = Outcome.DIVERGED
-    return _trajectory(loop, reference, start, pieces, outcome)
+    try:
+        return _trajectory(loop, reference, start, pieces, outcome)
+    except KeyboardInterrupt:  # late, but nothing need be lost
+        return _trajectory(loop, reference, start, pieces, Outcome.INTERRUPTED)
 
 
 def _progress(name: str, time: float, duration: float) -> Progress:

@@ -1,0 +1,134 @@
+"""A picture of a run: controlled quantities with their references, joints, commands and storage over time."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from orthocas.checks import Array
+from orthocas.control.status import ControlStatus
+from orthocas.problem import Problem
+
+if TYPE_CHECKING:
+    from orthocas.simulation.trajectory import Trajectory
+
+ACTUAL, FALLBACK = "#3d85c6", "#d62728"
+_WANTED, _STORAGE = "#222222", "#1b9e77"
+_SMALL = 8.0  # font size [pt]
+_NARROWEST = 1e-2  # height of a panel, as a share of the widest range of all: what rests looks at rest
+_TASK_UNITS = {  #: by the kind of task
+    "position": {"x": "m", "y": "m", "z": "m"},
+    "polar": {"radius": "m", "angle": "rad"},
+    "orientation": {"rx": "rad", "ry": "rad", "rz": "rad"},
+    "pose": {"x": "m", "y": "m", "z": "m", "rx": "rad", "ry": "rad", "rz": "rad"},
+}
+
+
+def units_of(problem: Problem) -> dict[str, str]:
+    """Units of task components and joints, by label; coordinates and custom tasks have none that is known."""
+    joints = {"revolute": "rad", "prismatic": "m"}
+    tree = problem.robot.tree
+    units = {name: joints[kind] for name, kind in zip(tree.joint_names, tree.joint_kinds, strict=True)}
+    return units | _TASK_UNITS.get(problem.task.name.partition(":")[0], {})
+
+
+def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None = None) -> Figure:
+    """Left a panel for each controlled quantity, right joints, commands and storage; red where the law gave way.
+
+    Args:
+        trajectory: the run.
+        units: of the quantities, by label, see `units_of`; others are shown without.
+    """
+    k = len(trajectory.labels)
+    figure = Figure(figsize=(10.5, max(5.4, 1.05 * k + 0.9)), layout="constrained")
+    halves: Any = figure.subfigures(1, 2)
+    left, right = halves
+    units = units or {}
+    quantities = left.subplots(k, 1, sharex=True, squeeze=False)[:, 0]
+    draw_quantities(quantities, trajectory, units)
+    for axes, label, worst in zip(quantities, trajectory.labels, trajectory.tracking_error, strict=True):
+        axes.set_title(f"largest error {worst:.2g} {units.get(label, '')}", loc="right", fontsize=7.5, pad=2)
+    quantities[0].legend(fontsize=_SMALL, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
+    others = right.subplots(2 + (trajectory.kind == "torque"), 1, sharex=True)
+    _draw_others(others, trajectory, units)
+    for axes in (*quantities, *others):
+        shade_fallback(axes, trajectory)
+    for axes in (quantities[-1], others[-1]):
+        axes.set_xlabel("time [s]", fontsize=9)
+    for column in (left, right):
+        column.align_ylabels()
+    figure.suptitle(_title(trajectory), fontsize=10.5)
+    return figure
+
+
+def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str, str], drawn: bool = True) -> None:
+    """Reference and, if drawn, actual value of each quantity, one axes each."""
+    good = (trajectory.status == ControlStatus.OK) & np.isfinite(trajectory.value).all(axis=1)
+    seen = np.vstack([trajectory.value[good], trajectory.reference])  # charts mean nothing outside their domain
+    lows, highs = seen.min(axis=0), seen.max(axis=0)
+    spans = np.maximum(highs - lows, max(_NARROWEST * (highs - lows).max(), 1e-9))
+    middles = (lows + highs) / 2
+    for i, (axes, label) in enumerate(zip(panels, trajectory.labels, strict=True)):
+        if drawn:
+            axes.plot(trajectory.times, trajectory.value[:, i], color=ACTUAL, linewidth=2.2, label="actual")
+        axes.plot(trajectory.times, trajectory.reference[:, i], "--", color=_WANTED, linewidth=1, label="reference")
+        axes.set_ylim(middles[i] - 0.58 * spans[i], middles[i] + 0.58 * spans[i])
+        unit = f" [{units[label]}]" if label in units else ""
+        axes.set_ylabel(f"{_in_mathematics(label)}{unit}", fontsize=9)
+        _style(axes, trajectory)
+
+
+def shade_fallback(axes: Axes, trajectory: "Trajectory") -> None:
+    """Red where the controller gave its fallback."""
+    edges = np.flatnonzero(np.diff(trajectory.status)) + 1
+    for start, end in zip([0, *edges], [*edges, len(trajectory.times) - 1], strict=True):
+        status = ControlStatus(int(trajectory.status[start]))
+        if status is not ControlStatus.OK:
+            axes.axvspan(trajectory.times[start], trajectory.times[end], color=FALLBACK, alpha=0.15, linewidth=0)
+
+
+def _draw_others(panels: Array, trajectory: "Trajectory", units: Mapping[str, str]) -> None:
+    """Joints, commands, and the storage of torque controllers."""
+    torque = trajectory.kind == "torque"
+    unit = " or ".join(sorted({units.get(name, "rad or m") for name in trajectory.joint_names}, reverse=True))
+    force = " or ".join({"rad": "N m", "m": "N"}[part] for part in unit.split(" or "))
+    speed = " or ".join(f"{part}/s" for part in unit.split(" or "))
+    panels[0].plot(trajectory.times, trajectory.q, linewidth=1.3, label=trajectory.joint_names)
+    panels[0].set_ylabel(f"joints q [{unit}]", fontsize=9)
+    names = len(trajectory.joint_names)
+    panels[0].legend(fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=min(names, 4), frameon=False)
+    panels[1].plot(trajectory.times, trajectory.command, linewidth=1.3)
+    panels[1].set_ylabel(f"torque [{force}]" if torque else f"velocity [{speed}]", fontsize=9)
+    if torque:
+        storage = np.where(trajectory.status == ControlStatus.OK, trajectory.storage, np.nan)
+        panels[2].plot(trajectory.times, storage, color=_STORAGE, linewidth=1.3)
+        panels[2].set_ylabel("storage V [J]", fontsize=9)
+    for axes in panels:
+        _style(axes, trajectory)
+
+
+def _style(axes: Axes, trajectory: "Trajectory") -> None:
+    axes.set_xlim(trajectory.times[0], max(trajectory.times[-1], 1e-9))
+    axes.ticklabel_format(useOffset=False)
+    axes.tick_params(labelsize=_SMALL)
+    axes.grid(alpha=0.3)
+
+
+def _title(trajectory: "Trajectory") -> str:
+    text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
+    if trajectory.outcome.value != "complete":
+        text += f": {trajectory.outcome.value}, the run ends early"
+    reasons = {ControlStatus(int(status)) for status in np.unique(trajectory.status)} - {ControlStatus.OK}
+    if reasons:
+        text += "\nred: the law gave way to its fallback, " + ", ".join(
+            reason.name.lower().replace("_", " ") for reason in sorted(reasons)
+        )
+    return text
+
+
+def _in_mathematics(label: str) -> str:
+    """xi1 as a symbol; other labels as they are."""
+    number = label.removeprefix("xi")
+    return rf"$\xi_{{{number}}}$" if label.startswith("xi") and number.isdigit() else label
