@@ -20,7 +20,8 @@ def blocks(language: str) -> list[str]:
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """A folder with the files the README names."""
-    shutil.copytree(ROOT / "problems", tmp_path / "problems")
+    for folder in ("problems", "examples"):
+        shutil.copytree(ROOT / folder, tmp_path / folder)
     return tmp_path
 
 
@@ -44,7 +45,7 @@ def test_python_block_of_exact_coordinates_runs(checkout: Path) -> None:
 
 def test_shell_quickstart_runs(checkout: Path) -> None:
     commands = [shlex.split(line) for line in blocks("sh")[1].splitlines()]
-    assert len(commands) == 8
+    assert len(commands) == 9
     for words in commands:
         assert words[0] == "orthocas"
         done = subprocess.run([sys.executable, "-m", *words], cwd=checkout, capture_output=True, text=True, check=False)
