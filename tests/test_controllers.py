@@ -12,7 +12,17 @@ from scipy.linalg import block_diag, sqrtm
 import orthocas as oc
 from orthocas.batch import Batched
 from orthocas.checks import Array
-from orthocas.control import ControlStatus, Impedance, Kinematic, KinematicProjector, PDPlus, Projector, Reference
+from orthocas.control import (
+    ControlStatus,
+    Impedance,
+    Kinematic,
+    KinematicProjector,
+    PDPlus,
+    Projector,
+    Reference,
+    matched_posture_stiffness,
+    matched_stiffness,
+)
 from orthocas.control.controller import Controller
 from orthocas.domains import sample_uniform
 from orthocas.errors import (
@@ -333,3 +343,16 @@ def test_posture_beyond_joint_limits_is_reported() -> None:
     reference = Reference.steps(law.labels, start, [(1.0, {name: 3.0})], 3.0)
     with pytest.raises(UnreachableReferenceError, match=rf"joint '{name}' at 2\.\d+ at t = 1\.\d+ s, expected within"):
         law.require_reachable(reference, problem.domain.centre)
+
+
+def test_matched_stiffness_gives_springs_of_one_frequency(planar_chart: oc.Chart) -> None:
+    """K over the median inertia of each block is omega^2."""
+    points = sample_uniform(planar_chart.problem.domain, 256, 0)
+    J, M = planar_chart.jacobian(points), planar_chart.problem.robot.mass_matrix(points)
+    G = J @ np.linalg.solve(M, J.transpose(0, 2, 1))
+    inertia = np.concatenate([1 / G[:, :1, 0], np.diagonal(np.linalg.inv(G[:, 1:, 1:]), axis1=1, axis2=2)], axis=1)
+    np.testing.assert_allclose(matched_stiffness(planar_chart, 3.0), 9 * np.median(inertia, axis=0), rtol=1e-8)
+    joints = matched_posture_stiffness(planar_chart.problem, 3.0)
+    np.testing.assert_allclose(joints, 9 * np.median(np.diagonal(M, axis1=1, axis2=2), axis=0), rtol=1e-8)
+    with pytest.raises(InvalidValueError, match="frequency"):
+        matched_stiffness(planar_chart, 0.0)

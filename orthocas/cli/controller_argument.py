@@ -3,17 +3,22 @@
 from dataclasses import dataclass
 from typing import cast
 
-import casadi as ca
 import numpy as np
 
-from orthocas.batch import Batched, dense_function
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_known
 from orthocas.cli.problem_argument import parse_numbers
-from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector
-from orthocas.control.inertia import block_inertia
+from orthocas.control import (
+    Controller,
+    Impedance,
+    Kinematic,
+    KinematicProjector,
+    PDPlus,
+    Projector,
+    matched_posture_stiffness,
+    matched_stiffness,
+)
 from orthocas.control.operational_space import Coupling
-from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError
 
 _SPRINGS, _BY_TORQUE = ("stiffness", "damping_ratio"), ("mass_factor", "friction")
@@ -25,8 +30,6 @@ _OPTIONS = {  #: which options each controller takes, by the names of fields
     "kinematic_projector": ("feedback",),
 }
 CONTROLLERS = tuple(_OPTIONS)
-SPRING_FREQUENCY = 4 * np.pi  #: of springs that were not given [rad/s], twice that of the reference's low pass
-_SAMPLES, _SEED = 256, 0
 
 
 @dataclass(frozen=True)
@@ -75,28 +78,17 @@ def build_controller(name: str, chart: Chart, options: ControllerOptions, limit:
         spread = np.broadcast_to(feedback, m + n)
         return KinematicProjector(chart.problem, spread[:m], spread[m:], bounds)
     damping = _one_or_all("--damping-ratio", options.damping_ratio or "0.7")
-    springs = _default_stiffness(chart)
     given = None if options.stiffness is None else _one_or_all("--stiffness", options.stiffness)
     if name == "projector":
         posture = options.posture_stiffness
-        joints = springs[chart.n :] if posture is None else _one_or_all("--posture-stiffness", posture)
-        return Projector(chart.problem, springs[: chart.m] if given is None else given, joints, damping, bounds)
+        joints = (
+            matched_posture_stiffness(chart.problem) if posture is None else _one_or_all("--posture-stiffness", posture)
+        )
+        stiffness = matched_stiffness(chart)[: chart.m] if given is None else given
+        return Projector(chart.problem, stiffness, joints, damping, bounds)
     law = Impedance if name == "impedance" else PDPlus
     coupling = cast(Coupling, "coupled" if options.coupling is None else options.coupling)  # the law checks it
-    return law(chart, springs[: chart.n] if given is None else given, damping, coupling, limit=bounds)
-
-
-def _default_stiffness(chart: Chart) -> Array:
-    """Springs of 2 Hz with the inertia of each of [x; xi; q], its median over the domain, (2 n,).
-
-    Scales of coordinates differ by orders of magnitude: one stiffness for all would leave some limp.
-    """
-    q = ca.MX.sym("q", chart.n)
-    M = chart.problem.robot.mass_matrix(q)
-    inertia = block_inertia(chart.n, (chart.m, chart.r))(chart.function("jacobian")(q), M)[1]
-    both = dense_function("inertias", [q], [ca.vertcat(ca.diag(inertia), ca.diag(M))])
-    samples = Batched(both)(sample_uniform(chart.problem.domain, _SAMPLES, _SEED))[0]
-    return np.asarray(SPRING_FREQUENCY**2 * np.nanmedian(samples, axis=0))
+    return law(chart, matched_stiffness(chart) if given is None else given, damping, coupling, limit=bounds)
 
 
 def _one_or_all(option: str, text: str) -> Array:

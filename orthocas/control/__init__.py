@@ -2,6 +2,7 @@
 
 from orthocas.control.controller import Controller
 from orthocas.control.kinematic import Kinematic
+from orthocas.control.matched_stiffness import matched_posture_stiffness, matched_stiffness
 from orthocas.control.operational_space import DampingCheck, Impedance, PDPlus
 from orthocas.control.posture import posture_reference
 from orthocas.control.projector import KinematicProjector, Projector
@@ -20,5 +21,7 @@ __all__ = [
     "Projector",
     "Reference",
     "joint_path",
+    "matched_posture_stiffness",
+    "matched_stiffness",
     "posture_reference",
 ]

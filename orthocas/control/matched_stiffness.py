@@ -1,0 +1,45 @@
+"""Stiffness by frequency: scales and inertias of coordinates differ by orders of magnitude, so one number suits few."""
+
+import casadi as ca
+import numpy as np
+
+from orthocas.batch import Batched, dense_function
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.control.gains import positive_gains
+from orthocas.control.inertia import block_inertia
+from orthocas.domains import sample_uniform
+from orthocas.problem import Problem
+
+SPRING_FREQUENCY = 4 * np.pi  #: [rad/s], 2 Hz: twice that of the paper's low pass
+_SAMPLES, _SEED = 256, 0
+
+
+def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY) -> Array:
+    """K_i = omega^2 times the inertia of each of [x; xi], its median over the domain, (n,).
+
+    The inertias are the diagonals of M_x and M_xi.
+
+    Args:
+        chart: a chart with a closed expression.
+        frequency: omega > 0 of the springs [rad/s].
+
+    Source:
+        ours
+    """
+    q = ca.MX.sym("q", chart.n)
+    J, M = chart.function("jacobian")(q), chart.problem.robot.mass_matrix(q)
+    inertia = ca.diag(block_inertia(chart.n, (chart.m, chart.r))(J, M)[1])
+    return _springs(chart.problem, q, inertia, frequency)
+
+
+def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUENCY) -> Array:
+    """The same for the springs in the joints, with the diagonal of M, (n,)."""
+    q = ca.MX.sym("q", problem.n)
+    return _springs(problem, q, ca.diag(problem.robot.mass_matrix(q)), frequency)
+
+
+def _springs(problem: Problem, q: ca.MX, inertia: ca.MX, frequency: float) -> Array:
+    omega = positive_gains("frequency", frequency, 1)
+    samples = Batched(dense_function("inertia", [q], [inertia]))(sample_uniform(problem.domain, _SAMPLES, _SEED))[0]
+    return np.asarray(omega**2 * np.nanmedian(samples, axis=0))

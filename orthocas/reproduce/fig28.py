@@ -1,0 +1,95 @@
+"""[AS2023] Fig. 28: a journey of the 7-DoF arm in task and extra coordinates, which ends where it began.
+
+Velocity control dq = J^-1 d_phi_d without feedback (Sec. 9), A = I, polynomials in place of the network. The paper
+shows measurements on a robot; here dq is integrated, and the steps are ours.
+"""
+
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+
+from orthocas import api, problems
+from orthocas.chart import Chart
+from orthocas.control import Kinematic, Reference
+from orthocas.parametrisations import Polynomial
+from orthocas.quality import evaluate
+from orthocas.reproduce.drawing import Drawing
+from orthocas.reproduce.style import LABEL, TICK, new_figure
+from orthocas.simulation import Trajectory, coupling_index, simulate
+
+JOURNEY = (  # which coordinate steps, and where to: from its value at the start, [m] or [1]
+    *(("xi1", -0.5), ("x", 0.12), ("xi3", -0.6), ("y", -0.3), ("xi4", 0.6), ("z", -0.15), ("xi2", 0.4)),
+    *(("y", 0.25), ("xi1", 0.2), ("x", -0.2), ("xi3", 0.3), ("xi4", -0.45), ("z", 0.15), ("xi2", -0.25)),
+    *(("y", -0.25), ("xi3", -0.5), ("x", 0.06), ("xi1", -0.45), ("z", -0.25), ("xi2", 0.6)),
+    *(("y", 0.0), ("xi4", 0.0), ("xi3", 0.0), ("x", 0.0), ("xi1", 0.0), ("z", 0.0), ("xi2", 0.0)),
+)
+_FIRST, _PAUSE, _REST = 1.0, 2.0, 6.0  # time of the first step, between two steps, and after the last one [s]
+_TOLERANCE = 1e-10  # of CVODES: without feedback its errors stay in the joints
+_COLOURS = ("#1f5fa8", "#d95f02", "#1b9e77", "#e7298a", "#7570b3", "#a6761d", "#222222")
+
+
+def draw(quick: bool) -> Drawing:
+    """Task, coordinates and joints over time; numbers tell how exactly the arm returns."""
+    chart = api.fit(problems.get("iiwa"), Polynomial(4)).chart
+    reference = journey(chart)
+    run = simulate(Kinematic(chart), reference, chart.problem.domain.centre, tolerance=_TOLERANCE)
+    figure = new_figure(6.2)
+    panes = figure.subplots(3, 1, sharex=True)
+    names = [rf"$\xi_{k + 1}$" for k in range(chart.r)]
+    _draw_values(
+        panes[0], run, slice(chart.m), list(chart.problem.task.labels), "(a) task $x$ [m]; broad: wanted, thin: reached"
+    )
+    _draw_values(panes[1], run, slice(chart.m, None), names, r"(b) coordinates $\xi$ [1]")
+    _draw_joints(panes[2], run)
+    panes[2].set_xlabel("time [s]", fontsize=LABEL)
+    quality = evaluate(chart, 5_000 if quick else 30_000)
+    away = np.abs(run.q - run.q[0])
+    numbers = {
+        "steps": float(len(JOURNEY)),
+        "seconds": reference.duration,
+        "joint_error_at_the_end_rad": float(away[-1].max()),
+        "largest_joint_excursion_rad": float(away.max()),
+        "least_joint_excursion_rad": float(away.max(axis=0).min()),
+        "largest_joint_speed_rad_s": float(np.abs(run.dq).max()),
+        "largest_coupling_index": float(np.nanmax(coupling_index(chart, reference, run).index)),
+        "instants_without_command": float(np.count_nonzero(run.status)),
+        "task_angle_std_deg": quality.task_angle.std,
+        "mutual_angle_std_deg": quality.mutual_angle.std,
+    }
+    return Drawing({"": figure}, numbers)
+
+
+def journey(chart: Chart) -> Reference:
+    """The steps of `JOURNEY` from the centre of the domain, through the low pass."""
+    start = chart.phi(chart.problem.domain.centre)
+    times = _FIRST + _PAUSE * np.arange(len(JOURNEY))
+    home = dict(zip(chart.labels, start, strict=True))
+    changes = [(time, {label: home[label] + step}) for time, (label, step) in zip(times, JOURNEY, strict=True)]
+    return Reference.steps(chart.labels, start, changes, times[-1] + _REST)
+
+
+def _draw_values(axes: Any, run: Trajectory, which: slice, names: list[str], title: str) -> None:
+    """Wanted values broad and light, reached ones thin and dark on top."""
+    for wanted, reached, name, colour in zip(
+        run.reference[:, which].T, run.value[:, which].T, names, cycle(_COLOURS), strict=False
+    ):
+        axes.plot(run.times, wanted, color=colour, linewidth=3.2, alpha=0.3)
+        axes.plot(run.times, reached, color=colour, linewidth=0.9, label=name)
+    _finish(axes, title)
+
+
+def _draw_joints(axes: Any, run: Trajectory) -> None:
+    """Joint angles, with dotted lines where they started."""
+    for k, (q, colour) in enumerate(zip(run.q.T, _COLOURS, strict=True), 1):
+        axes.plot(run.times, q, color=colour, linewidth=0.9, label=f"$q_{k}$")
+        axes.axhline(q[0], color=colour, linewidth=0.9, linestyle=":")
+    _finish(axes, "(c) joints $q$ [rad]; dotted: where they started")
+
+
+def _finish(axes: Any, title: str) -> None:
+    axes.set_title(title, fontsize=LABEL, loc="left")
+    axes.legend(fontsize=TICK, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, handlelength=1.2)
+    axes.margins(x=0)
+    axes.tick_params(labelsize=TICK)
+    axes.grid(alpha=0.3)
