@@ -151,7 +151,7 @@ class Chart:
         }
         functions = {name: ca.Function(name, [q], [ca.densify(out)], ["q"], [name]) for name, out in outputs.items()}
         v, w = ca.MX.sym("v", self.n), ca.MX.sym("w", self.n)
-        second = ca.jtimes(ca.jtimes(outputs["phi"], q, w), q, v)
+        second = ca.vertcat(task.second_derivative_function(q, v, w), coordinates["second_derivative"](q, v, w))
         functions["second_derivative"] = ca.Function(
             "second_derivative", [q, v, w], [ca.densify(second)], ["q", "v", "w"], ["second_derivative"]
         )

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -13,7 +13,9 @@ from orthocas.checks import Array, frozen_array
 from orthocas.numpy_nodes import NumpyGraph
 from orthocas.parametrisations import Family, JointSpace, Parametrisation
 from orthocas.parametrisations.family import Expression
+from orthocas.point_functions import point_functions
 from orthocas.problem import Problem
+from orthocas.scalar_code import scalar_code
 
 _COLUMNS = 256  # samples side by side in matrix-shaped graphs
 
@@ -44,7 +46,10 @@ class CoordinateMap(Protocol):
 
     @property
     def functions(self) -> dict[str, ca.Function]:
-        """CasADi functions of one joint position (n, 1): its coordinates (r, 1) and their jacobian (r, n)."""
+        """CasADi functions of one joint position (n, 1), as graphs of shared parts.
+
+        Coordinates xi (r, 1), their jacobian (r, n), and second_derivative of q, v, w (r, 1): (d/ds) J_xi(q + s v) w.
+        """
         ...
 
     def xi(self, points: Array) -> Array:
@@ -143,14 +148,29 @@ class Coordinates:
 
     @cached_property
     def functions(self) -> dict[str, ca.Function]:
-        """CasADi functions of one joint position (n, 1): its coordinates (r, 1) and their jacobian (r, n)."""
-        q: Any = (ca.MX if self.family.as_matrices else ca.SX).sym("q", self.space.n)
-        xi = self.expression(q)
-        return {"xi": dense_function("xi", [q], [xi]), "jacobian": dense_function("J_xi", [q], [ca.jacobian(xi, q)])}
+        """Functions of one joint position: xi (r, 1), jacobian (r, n), and second_derivative of q, v, w (r, 1)."""
+        n, idle, active = self.space.n, list(self.idle), self.active
+        q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
+        unit = np.eye(n)
+        xi, J, second = [], [], []
+        if len(self.offset):
+            parts, scale = point_functions(self.family, self.theta, len(active)), ca.DM(self.scale)
+            xi.append((parts["xi"](q[active]) - ca.DM(self.offset)) * scale)
+            J.append(ca.diag(scale) @ parts["jacobian"](q[active]) @ ca.DM(unit[active]))
+            second.append(parts["second_derivative"](q[active], v[active], w[active]) * scale)
+        if idle:
+            xi.append(q[idle] - ca.DM(self.space.centre[idle]))
+            J.append(ca.MX(ca.DM(unit[idle])))
+            second.append(ca.MX(len(idle), 1))
+        return {
+            "xi": dense_function("xi", [q], [ca.vertcat(*xi)]),
+            "jacobian": dense_function("J_xi", [q], [ca.vertcat(*J)]),
+            "second_derivative": dense_function("d2xi", [q, v, w], [ca.vertcat(*second)], ["q", "v", "w"]),
+        }
 
     @cached_property
     def _batched(self) -> dict[str, Batched]:
-        return {name: Batched(function) for name, function in self.functions.items()}
+        return {name: Batched(scalar_code(self.functions[name])) for name in ("xi", "jacobian")}
 
     @cached_property
     def _column_graphs(self) -> dict[str, NumpyGraph]:

@@ -118,6 +118,13 @@ class Task:
         return dense_function("task_jacobian", [q], [ca.jacobian(self.function(q), q)])
 
     @cached_property
+    def second_derivative_function(self) -> ca.Function:
+        """Q, v, w (n, 1) -> d^2 h(q)[v, w] = (d/ds) J_x(q + s v) w, (m, 1)."""
+        q, v, w = (ca.SX.sym(name, self.robot.n) for name in ("q", "v", "w"))
+        second = ca.jtimes(ca.jtimes(self.function(q), q, w), q, v)
+        return dense_function("task_second_derivative", [q, v, w], [second], ["q", "v", "w"])
+
+    @cached_property
     def batched(self) -> Batched:
         """H at many points."""
         return Batched(self.function)

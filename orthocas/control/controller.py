@@ -8,8 +8,8 @@ from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.control.status import guard
 from orthocas.domains import Domain
-from orthocas.interrupts import deferred
 from orthocas.problem import Problem
+from orthocas.scalar_code import scalar_code
 
 Command = Literal["torque", "velocity"]
 STATE_AND_REFERENCE = ("q", "dq", "reference", "reference_velocity", "reference_acceleration")
@@ -90,15 +90,3 @@ def control_function(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.
     dense = [ca.densify(out) for out in outputs.values()]
     function = ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))
     return scalar_code(function)
-
-
-def scalar_code(function: ca.Function) -> ca.Function:
-    """The function as scalar operations with common parts shared, or itself if it holds matrices (networks)."""
-    with deferred():  # expand makes a RuntimeError of Ctrl-C
-        try:
-            flat = function.expand()
-        except RuntimeError:
-            return function
-        inputs = flat.sx_in()
-        outputs = ca.cse(list(flat.call(inputs)))
-        return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())

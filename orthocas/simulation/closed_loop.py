@@ -7,11 +7,12 @@ from typing import Any
 
 import casadi as ca
 
-from orthocas.control.controller import Controller, scalar_code
+from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.errors import SimulationError
 from orthocas.interrupts import deferred
 from orthocas.robots import Robot
+from orthocas.scalar_code import scalar_code
 from orthocas.simulation.disturbances import Friction
 
 
