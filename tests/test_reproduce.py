@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import test_reproduce_control
+import test_reproduce_motion
 import test_reproduce_plane
 import test_reproduce_space
 import trimesh
@@ -77,7 +79,8 @@ CHECKS: dict[str, Callable[[Numbers], None]] = {"fig06": fig06, "fig07": fig07, 
 
 
 def test_every_figure_has_a_check() -> None:
-    assert {*CHECKS, *test_reproduce_plane.NAMES, *test_reproduce_space.NAMES} == set(FIGURES)
+    elsewhere = (test_reproduce_control, test_reproduce_motion, test_reproduce_plane, test_reproduce_space)
+    assert {*CHECKS, *(name for module in elsewhere for name in module.NAMES)} == set(FIGURES)
 
 
 @pytest.mark.parametrize("name", CHECKS)

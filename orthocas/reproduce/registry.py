@@ -9,6 +9,7 @@ from orthocas.errors import UnknownNameError
 from orthocas.objective import Monitor, Progress, silent
 from orthocas.reproduce import (
     fig01,
+    fig02,
     fig06,
     fig07,
     fig08,
@@ -23,6 +24,14 @@ from orthocas.reproduce import (
     fig18,
     fig19,
     fig20,
+    fig21,
+    fig22,
+    fig23,
+    fig24,
+    fig25,
+    fig26,
+    fig28,
+    fig30,
 )
 from orthocas.reproduce.drawing import Drawing, made_folder, save
 
@@ -37,6 +46,7 @@ class Recipe:
 
 FIGURES: dict[str, Recipe] = {
     "fig01": Recipe("The idea of orthogonal foliations, task x in the 3-torus", fig01.draw),
+    "fig02": Recipe("A geodetic spring, and a spring that a projector hides", fig02.draw),
     "fig06": Recipe("Leaves of the task x on the 2-torus", fig06.draw),
     "fig07": Recipe("Leaves of the task x in the 3-torus", fig07.draw),
     "fig08": Recipe("Self-motion curves of the task (x, y) in the 3-torus", fig08.draw),
@@ -51,6 +61,14 @@ FIGURES: dict[str, Recipe] = {
     "fig18": Recipe("Surfaces of the task and of a fitted coordinate", fig18.draw),
     "fig19": Recipe("A fitted coordinate, task (x, y), in a section of joint space", fig19.draw),
     "fig20": Recipe("Angles of fitted coordinates, involutive and not", fig20.draw),
+    "fig21": Recipe("The closed loop of the simulations", fig21.draw),
+    "fig22": Recipe("Interleaved steps with linear coordinates", fig22.draw),
+    "fig23": Recipe("Interleaved steps with fitted coordinates", fig23.draw),
+    "fig24": Recipe("Steps in all coordinates, linear and fitted, task x", fig24.draw),
+    "fig25": Recipe("Feedback only, and the parts of unwanted task acceleration", fig25.draw),
+    "fig26": Recipe("Steps in x and xi, linear and fitted, task (x, y)", fig26.draw),
+    "fig28": Recipe("A journey of the 7-DoF arm that ends where it began", fig28.draw),
+    "fig30": Recipe("Steps in all coordinates, fitted, task (x, y)", fig30.draw),
 }
 
 

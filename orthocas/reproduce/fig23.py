@@ -1,0 +1,10 @@
+"""[AS2023] Fig. 23: the interleaved steps of Fig. 22 with fitted coordinates."""
+
+from orthocas.reproduce.drawing import Drawing
+from orthocas.reproduce.fig22 import interleaved
+from orthocas.reproduce.planar_loop import GENTLE, Arm
+
+
+def draw(quick: bool) -> Drawing:
+    """As Fig. 22; numbers tell that nothing couples."""
+    return interleaved(Arm().fitted("x", GENTLE, quick), quick)
