@@ -10,6 +10,7 @@ if not (_Path(__file__).parent / "problems").is_dir():
 from orthocas import control, problems, simulation, solvers
 from orthocas.api import compare, distil, fit, load
 from orthocas.chart import Chart
+from orthocas.codegen import generate_c
 from orthocas.domains import Box, Torus, contains
 from orthocas.grown_chart import GrownChart, grow
 from orthocas.involutivity import Involutivity, involutivity
@@ -21,8 +22,9 @@ from orthocas.simulation import simulate
 from orthocas.singularities import jumps, singular_points
 from orthocas.task_brackets import lie_bracket
 from orthocas.tasks import Task
+from orthocas.version import VERSION as _VERSION
 
-__version__ = "0.1.0"
+__version__ = _VERSION
 __all__ = [
     "MLP",
     "SEW",
@@ -46,6 +48,7 @@ __all__ = [
     "distil",
     "evaluate",
     "fit",
+    "generate_c",
     "grow",
     "involutivity",
     "jumps",

@@ -93,6 +93,14 @@ class SimulationError(OrthocasError, RuntimeError):
     """An integrator gave up in the middle of a closed loop."""
 
 
+class CompileError(OrthocasError, RuntimeError):
+    """Generated C cannot be compiled here."""
+
+
+class ProofError(OrthocasError, RuntimeError):
+    """Compiled C does not do what the Python it came from does."""
+
+
 class InfeasibleError(SolveError):
     """Constraints of a fit cannot be met."""
 

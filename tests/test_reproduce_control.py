@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from orthocas.chart import Chart
+from orthocas.domains import Box
 from orthocas.reproduce import FIGURES, Drawing
 from orthocas.reproduce.closed_loop_picture import draw_coordinates, draw_plane, moved
 from orthocas.reproduce.fig24 import largest_curvature
@@ -219,8 +221,9 @@ def test_panels_show_desired_and_actual_from_the_start(linear_run: Run) -> None:
 def test_fallback_is_marked_grey() -> None:
     """A box that ends before the motion does."""
     arm = Arm()
-    small = Place(STRONG.q2, STRONG.q3, (-0.3, -0.3, -0.1), (0.3, 0.3, 0.3))
-    run = follow(arm.fitted("x", small, True), arm.base(small), ALL_OF_X)
+    small = Box(arm.base(STRONG), 0.2)
+    chart = Chart(arm.problem("x", small), arm.linear("x", STRONG).coordinates)
+    run = follow(chart, arm.base(STRONG), ALL_OF_X[:1])
     axes = Figure().subplots()
     draw_coordinates(axes, run)
     assert run.share_not_ok > 0

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import typer
 
+from orthocas.cli.codegen import codegen
 from orthocas.cli.compare import compare
 from orthocas.cli.evaluate import evaluate
 from orthocas.cli.fit import fit
@@ -29,6 +30,7 @@ app.command()(info)
 app.command()(compare)
 app.command()(reproduce)
 app.command()(simulate)
+app.command()(codegen)
 
 
 def _complain(text: str) -> None:

@@ -49,6 +49,11 @@ class Controller(Protocol):
         ...
 
     @property
+    def graph(self) -> ca.Function:
+        """The same function as a graph of shared parts, which C is generated from."""
+        ...
+
+    @property
     def energy(self) -> ca.Function | None:
         """Same inputs -> storage V [J] and power dissipated by damping [W]; None for velocity controllers."""
         ...
@@ -70,7 +75,7 @@ def named_inputs(n: int, gains: dict[str, Array], k: int) -> dict[str, ca.MX]:
     return {name: ca.MX.sym(name, size) for name, size in sizes.items()}
 
 
-def guarded_function(
+def guarded_graph(
     name: str,
     inputs: dict[str, ca.MX],
     command: ca.MX,
@@ -78,15 +83,18 @@ def guarded_function(
     volume: ca.MX,
     domain: Domain | None,
 ) -> ca.Function:
-    """The function of a controller: its law behind the guard of `orthocas.control.status`."""
+    """The graph of a controller: its law behind the guard of `orthocas.control.status`."""
     numbers = ca.vertcat(*(value for key, value in inputs.items() if key != "limit"))
     check = guard(domain, command.shape[0], numbers.shape[0])
     safe, status = check(command, fallback, inputs["limit"], inputs["q"], numbers, volume)
-    return control_function(name, inputs, {"command": safe, "status": status})
+    return _named(name, inputs, {"command": safe, "status": status})
 
 
 def control_function(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
-    """A function with named inputs and dense outputs; scalar code where all its parts are (several times faster)."""
+    """A function with named inputs and dense outputs, as scalar code."""
+    return scalar_code(_named(name, inputs, outputs))
+
+
+def _named(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
     dense = [ca.densify(out) for out in outputs.values()]
-    function = ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))
-    return scalar_code(function)
+    return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))

@@ -9,12 +9,13 @@ from numpy.typing import ArrayLike
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
-from orthocas.control.controller import Command, guarded_function, named_inputs
+from orthocas.control.controller import Command, guarded_graph, named_inputs
 from orthocas.control.gains import command_limit, non_negative_gains
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
 from orthocas.problem import Problem
+from orthocas.scalar_code import scalar_code
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,11 @@ class Kinematic:
     @cached_property
     def function(self) -> ca.Function:
         """Inputs q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
+        return scalar_code(self.graph)
+
+    @cached_property
+    def graph(self) -> ca.Function:
+        """The same function as a graph of shared parts, which C is generated from."""
         n, problem = self.chart.n, self.problem
         inputs = named_inputs(n, self.gains, n)
         q = inputs["q"]
@@ -78,7 +84,7 @@ class Kinematic:
         rate = inputs["reference_velocity"] + inputs["feedback"] * (inputs["reference"] - self.measured(q))
         scale = median_volume(problem, self.chart.function("jacobian"), problem.metric, (n,))
         velocity = B @ (Lambda @ rate)  # J^-1 = A^-1 J^T (J A^-1 J^T)^-1
-        return guarded_function(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain)
+        return guarded_graph(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if the reference leaves the chart's domain, seen from q_start."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from orthocas.batch import Batched
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_known
-from orthocas.control.controller import Command, control_function, guarded_function, named_inputs
+from orthocas.control.controller import Command, control_function, guarded_graph, named_inputs
 from orthocas.control.damping import DAMPING_DESIGNS, DampingDesign, damping_matrix
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
 from orthocas.control.inertia import block_inertia, median_volume
@@ -19,6 +19,7 @@ from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
 from orthocas.domains import sample_uniform
 from orthocas.problem import Problem
+from orthocas.scalar_code import scalar_code
 
 Coupling = Literal["coupled", "decoupled"]
 COUPLINGS: tuple[Coupling, ...] = ("coupled", "decoupled")
@@ -109,12 +110,17 @@ class _OperationalSpace:
     @cached_property
     def function(self) -> ca.Function:
         """Inputs q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
+        return scalar_code(self.graph)
+
+    @cached_property
+    def graph(self) -> ca.Function:
+        """The same function as a graph of shared parts, which C is generated from."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         q = inputs["q"]
         J, gravity = self.chart.function("jacobian")(q), self.problem.robot.gravity(q)
         force, volume = self._force(inputs, J)
         torque, relative = J.T @ force + gravity, volume / self._median_volume
-        return guarded_function(self.name, inputs, torque, gravity, relative, self.problem.domain)
+        return guarded_graph(self.name, inputs, torque, gravity, relative, self.problem.domain)
 
     @cached_property
     def energy(self) -> ca.Function:

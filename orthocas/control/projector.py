@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.checks import Array
-from orthocas.control.controller import Command, control_function, guarded_function, named_inputs
+from orthocas.control.controller import Command, control_function, guarded_graph, named_inputs
 from orthocas.control.damping import damping_matrix
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reference import Reference
 from orthocas.errors import UnreachableReferenceError
 from orthocas.problem import Problem
+from orthocas.scalar_code import scalar_code
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +80,11 @@ class Projector:
     @cached_property
     def function(self) -> ca.Function:
         """Inputs q, dq (n, 1), reference and its derivatives (m + n, 1), gains -> command (n, 1), status (1, 1)."""
+        return scalar_code(self.graph)
+
+    @cached_property
+    def graph(self) -> ca.Function:
+        """The same function as a graph of shared parts, which C is generated from."""
         problem, m = self.problem, self.problem.m
         inputs = self._inputs()
         q, K = inputs["q"], inputs["stiffness"]
@@ -89,7 +95,7 @@ class Projector:
         B, Lambda, volume = block_inertia(problem.n, (m,))(J, problem.metric.function(q))
         torque = J.T @ f_x + posture - J.T @ (Lambda @ (B.T @ posture)) + gravity
         scale = median_volume(problem, problem.task.jacobian_function, problem.metric, (m,))
-        return guarded_function(self.name, inputs, torque, gravity, volume / scale, None)
+        return guarded_graph(self.name, inputs, torque, gravity, volume / scale, None)
 
     @cached_property
     def energy(self) -> ca.Function:
@@ -177,6 +183,11 @@ class KinematicProjector:
     @cached_property
     def function(self) -> ca.Function:
         """Inputs q, dq (n, 1), reference and its derivatives (m + n, 1), gains -> command (n, 1), status (1, 1)."""
+        return scalar_code(self.graph)
+
+    @cached_property
+    def graph(self) -> ca.Function:
+        """The same function as a graph of shared parts, which C is generated from."""
         problem, m = self.problem, self.problem.m
         inputs = named_inputs(problem.n, self.gains, len(self.labels))
         q = inputs["q"]
@@ -185,7 +196,7 @@ class KinematicProjector:
         rate = inputs["reference_velocity"] + inputs["feedback"] * (inputs["reference"] - self.measured(q))
         velocity = rate[m:] + B @ (Lambda @ (rate[:m] - J @ rate[m:]))
         scale = median_volume(problem, problem.task.jacobian_function, problem.metric, (m,))
-        return guarded_function(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale, None)
+        return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale, None)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if a posture of the reference leaves the joint limits."""

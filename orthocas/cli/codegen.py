@@ -1,0 +1,81 @@
+"""`orthocas codegen`: a chart and a controller as a C library."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from orthocas.chart import Chart
+from orthocas.cli.controller_argument import CONTROLLERS, ControllerOptions, build_controller, require_options
+from orthocas.cli.output import AsJson, print_json, print_rows
+from orthocas.codegen import GeneratedC, Proof, check_c, generate_c
+from orthocas.errors import InvalidValueError
+from orthocas.interrupts import deferred
+
+_NONE = "none"
+
+
+def codegen(
+    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    controller: Annotated[str, typer.Option("--controller", help=f"{', '.join(CONTROLLERS)} or {_NONE}.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the library's source.")],
+    name: Annotated[str | None, typer.Option("--name", help="Prefix of all C names; default from the chart.")] = None,
+    stiffness: Annotated[
+        str | None, typer.Option("--stiffness", help='Default gain, "100" or one for each; else 2 Hz.')
+    ] = None,
+    damping_ratio: Annotated[str | None, typer.Option("--damping-ratio", help="Default gain; else 0.7.")] = None,
+    coupling: Annotated[
+        str | None, typer.Option("--coupling", help="coupled or decoupled, default coupled; impedance and pd_plus.")
+    ] = None,
+    posture_stiffness: Annotated[
+        str | None, typer.Option("--posture-stiffness", help="Default gain of projector; else 2 Hz.")
+    ] = None,
+    feedback: Annotated[
+        str | None, typer.Option("--feedback", help="Default gain of kinematic and kinematic_projector; else 0.")
+    ] = None,
+    limit: Annotated[str | None, typer.Option("--limit", help="Default limit of the command; else none.")] = None,
+    check: Annotated[bool, typer.Option("--check", help="Compile, and compare with Python on 1000 states.")] = False,
+    json: AsJson = False,
+) -> None:
+    """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
+    options = ControllerOptions(stiffness, damping_ratio, coupling, posture_stiffness, feedback)
+    if controller != _NONE:
+        require_options(controller, options)
+    elif options != ControllerOptions() or limit is not None:
+        raise InvalidValueError("--controller", _NONE, "a controller, for options that belong to one")
+    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+        loaded = Chart.load(chart)
+        loaded.function("xi")  # refuses grown charts
+        law = None if controller == _NONE else build_controller(controller, loaded, options, limit)
+        generated = generate_c(loaded, out, law, name)
+    proof = check_c(generated, loaded, law) if check else None
+    report = _report(generated, proof)
+    if json:
+        print_json(report)
+    else:
+        print_rows(_rows(report))
+
+
+def _report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:
+    source = generated.folder / f"{generated.name}.c"
+    return {
+        "name": generated.name,
+        "source": str(source),
+        "lines": len(source.read_text().splitlines()),
+        "stack_bytes": generated.stack_bytes,
+        "checked_states": None if proof is None else proof.states,
+        "relative_differences": None if proof is None else proof.differences,
+    }
+
+
+def _rows(report: dict[str, Any]) -> dict[str, str]:
+    rows = {
+        "library": f"{report['name']}: {report['lines']} lines of C99, {report['source']}",
+        "stack": f"{report['stack_bytes']} bytes of work arrays",
+    }
+    if differences := report["relative_differences"]:
+        worst = max(differences, key=differences.get)
+        rows["checked"] = (
+            f"{report['checked_states']} states, largest relative difference {differences[worst]:.1e} ({worst})"
+        )
+    return rows

@@ -1,0 +1,108 @@
+"""What stands in the generated files: names, sizes, tables and comments."""
+
+from importlib.resources import files
+from string import Template
+
+import casadi as ca
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.codegen.kernels import Kernels
+from orthocas.control import Controller
+from orthocas.domains import Torus
+from orthocas.version import VERSION
+
+_LAWS = {
+    "impedance": "Impedance control: tau = J^T (-K (phi - phi_d) - D J dq) + g(q).",
+    "pd_plus": "Operational space PD+: tau = J^T (f_imp + f_FF) + g(q).",
+    "projector": "Task impedance and a posture spring behind the projector of the task, plus g(q).",
+    "kinematic": "Velocity control dq = J^-1 (d phi_d + Lambda (phi_d - phi)); the input dq is not used.",
+    "kinematic_projector": "Velocity control by pseudo-inverse and projector; the input dq is not used.",
+}
+
+
+def template_values(chart: Chart, controller: Controller | None, name: str, kernels: Kernels) -> dict[str, str]:
+    """Every word that the templates ask for."""
+    problem, n = chart.problem, chart.n
+    domain = problem.domain
+    everywhere = isinstance(domain, Torus)
+    slack = np.inf if everywhere else domain.half_width * (1 + 1e-12)
+    lower, upper = domain.centre - slack, domain.centre + slack
+    values = {
+        "name": name,
+        "NAME": name.upper(),
+        "title": _title(chart, controller),
+        "version": VERSION,
+        "casadi_version": ca.CasadiMeta.version(),
+        "n": str(n),
+        "m": str(chart.m),
+        "r": str(chart.r),
+        "nn": str(n * n),
+        "joint_list": ", ".join(problem.robot.joint_names),
+        "control_text": "" if controller is None else _control_text(controller, name),
+        "joint_lines": "\n".join(f" *   {i} {joint}" for i, joint in enumerate(problem.robot.joint_names)),
+        "task_labels": ", ".join(problem.task.labels),
+        "extra_labels": ", ".join(chart.labels[chart.m :]),
+        "domain_lines": _domain_lines(problem.robot.joint_names, lower, upper),
+        "domain_lower": _numbers(lower),
+        "domain_upper": _numbers(upper),
+        "stack_bytes": str(kernels.stack_bytes),
+        "kernels": kernels.code,
+    }
+    for kernel, sizes in kernels.work.items():
+        for word, size in zip(("arg", "res", "iw", "w"), sizes, strict=True):
+            values[f"{kernel}_{word}"] = str(max(1, size))
+    if controller is not None:
+        values |= _control_values(controller)
+    for part, template in (("control_declarations", "control.h"), ("control_definitions", "control.c")):
+        values[part] = "" if controller is None else _template(template).substitute(values)
+    return values
+
+
+def _title(chart: Chart, controller: Controller | None) -> str:
+    what = "chart" if controller is None else f"{controller.name} controller"
+    metric = chart.problem.metric.name
+    return f"{what} of {chart.problem.name}: {chart.coordinates.label}, task {chart.problem.task.name}, metric {metric}"
+
+
+def _control_values(controller: Controller) -> dict[str, str]:
+    gains = controller.gains
+    torque = controller.command == "torque"
+    return {
+        "k": str(len(controller.labels)),
+        "reference_labels": ", ".join(controller.labels),
+        "gain_text": "Gains, one number for each quantity; limit: the largest command of each joint.",
+        "gain_fields": "\n".join(f"  double {gain}[{len(value)}];" for gain, value in gains.items()),
+        "gain_values": ",\n".join(f"  {{{_numbers(value)}}}" for value in gains.values()),
+        "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
+        "law": _LAWS[controller.name],
+        "fallback": "the torque of gravity, or zero where q is not finite" if torque else "zero",
+        "command": controller.command,
+    }
+
+
+def _control_text(controller: Controller, name: str) -> str:
+    gains = "\n".join(f"| `{gain}` | {_numbers(value)} |" for gain, value in controller.gains.items())
+    return (
+        f"`{name}_control` gives the joint {controller.command}; its reference is {', '.join(controller.labels)}, with "
+        f"two derivatives. Gains it was made with (`{name}_default_gains`):\n\n"
+        f"| gain | values |\n| --- | --- |\n{gains}"
+    )
+
+
+def _domain_lines(names: tuple[str, ...], lower: Array, upper: Array) -> str:
+    if np.isinf(lower).all():
+        return " *   all joint positions"
+    rows = zip(names, lower, upper, strict=True)
+    return "\n".join(f" *   {name}: {low:.6g} to {high:.6g}" for name, low, high in rows)
+
+
+def _numbers(values: Array) -> str:
+    """C literals that read back as the same numbers."""
+    words = {np.inf: "INFINITY", -np.inf: "-INFINITY"}
+    return ", ".join(words.get(float(value), repr(float(value))) for value in values)
+
+
+def _template(name: str) -> Template:
+    return Template((files("orthocas.codegen") / "templates" / f"{name}.in").read_text())

@@ -1,0 +1,91 @@
+"""Generated C, compiled and called from Python: for tests and proofs."""
+
+import ctypes
+import shutil
+import subprocess
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from orthocas.checks import Array
+from orthocas.codegen.generate import GeneratedC
+from orthocas.control import Controller
+from orthocas.errors import CompileError
+
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+
+
+def compiler() -> str:
+    """A C compiler on the path.
+
+    Raises:
+        CompileError: if there is none.
+    """
+    found = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if found is None:
+        raise CompileError("no C compiler found, expected cc, gcc or clang on the PATH")
+    return found
+
+
+def compile_shared(generated: GeneratedC, folder: Path, flags: tuple[str, ...] = ("-O2",)) -> Path:
+    """Compile to a shared library in a folder, warnings as errors.
+
+    Raises:
+        CompileError: with the first lines of what the compiler says.
+    """
+    library = folder / f"lib{generated.name}.so"
+    source = generated.folder / f"{generated.name}.c"
+    command = [compiler(), *STRICT, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise CompileError(f"{' '.join(command)} failed: {done.stderr[:500]}")
+    return library
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledLibrary:
+    """The functions of a compiled library; arrays are NumPy, matrices (n, n)."""
+
+    path: Path
+    name: str
+    n: int
+
+    def chart(self, q: Array) -> tuple[Array, Array, int]:
+        """Phi (n,), J (n, n), status."""
+        phi, J = np.empty(self.n), np.empty((self.n, self.n))
+        return phi, J, self._call("chart", [q], [phi, J])
+
+    def inverse(self, phi: Array, q_start: Array) -> tuple[Array, int]:
+        """Q (n,), status."""
+        q = np.empty(self.n)
+        return q, self._call("inverse", [phi, q_start], [q])
+
+    def dynamics(self, q: Array, dq: Array) -> tuple[Array, Array, Array, int]:
+        """M (n, n), bias (n,), gravity (n,), status."""
+        M, bias, gravity = np.empty((self.n, self.n)), np.empty(self.n), np.empty(self.n)
+        return M, bias, gravity, self._call("dynamics", [q, dq], [M, bias, gravity])
+
+    def control(self, q: Array, dq: Array, reference: Array, gains: Array) -> tuple[Array, int]:
+        """Command (n,), status; reference (3 k,) and gains are the numbers of the C structs in a row."""
+        command = np.empty(self.n)
+        return command, self._call("control", [q, dq, reference, gains], [command])
+
+    def default_gains(self, count: int) -> Array:
+        """The gains it was generated with, (count,)."""
+        return np.array((ctypes.c_double * count).in_dll(self._c, f"{self.name}_default_gains"))
+
+    @cached_property
+    def _c(self) -> ctypes.CDLL:
+        return ctypes.CDLL(str(self.path))
+
+    def _call(self, function: str, inputs: list[Array], outputs: list[Array]) -> int:
+        run = getattr(self._c, f"{self.name}_{function}")
+        arrays = [np.ascontiguousarray(array, dtype=float) for array in inputs] + outputs
+        return int(run(*(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
+
+
+def gain_numbers(controller: Controller) -> Array:
+    """The gains of a controller as the C struct has them."""
+    return np.concatenate(list(controller.gains.values()))
