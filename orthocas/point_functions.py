@@ -20,8 +20,10 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
         return _from_basis(family, theta)
     kind: Any = ca.MX if family.as_matrices else ca.SX
     q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
-    xi = family.expression(q, kind(ca.DM(theta)))
-    return _functions(xi, ca.jacobian(xi, q), second_derivative(xi, q, v, w), q, v, w)
+    parameters = kind(ca.DM(theta))
+    xi = family.expression(q, parameters)
+    jacobian = ca.horzcat(*family.jacobian(q, parameters)).T
+    return _functions(xi, jacobian, second_derivative(xi, q, v, w), q, v, w)
 
 
 def second_derivative(values: Any, q: Any, v: Any, w: Any) -> Any:

@@ -140,7 +140,8 @@ def test_object_holds_no_state_and_calls_only_mathematics(pd_plus: Generated, tm
     rows = [line.split()[-2:] for line in symbols.splitlines()]
     assert {kind for kind, _ in rows} <= {"T", "t", "R", "r", "U"}
     public = {name for kind, name in rows if kind in "TR"}
-    assert public == {f"arm_{name}" for name in ("chart", "inverse", "dynamics", "control", "default_gains")}
+    functions, tables = ("chart", "inverse", "dynamics", "control"), ("default_gains", "domain_lower", "domain_upper")
+    assert public == {f"arm_{name}" for name in (*functions, *tables)}
     known = {"sin", "cos", "sincos", "sqrt", "pow", "cbrt", "fmax", "fmin", "memset", "memcpy"}
     assert {name for kind, name in rows if kind == "U"} <= known | {"_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
 

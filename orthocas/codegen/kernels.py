@@ -2,10 +2,11 @@
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 
-_OPTIONS = {"with_header": False, "with_export": False, "casadi_int": "int"}
+_OPTIONS: dict[str, Any] = {"with_header": False, "with_export": False, "casadi_int": "int"}
 _FUNCTION = re.compile(r"^(?:static |inline |const )*\w+\s?\*?\s+\**(\w+)\((.*)", re.DOTALL)
 _DATA = re.compile(r"^static const \w+ (\w+)\[")
 

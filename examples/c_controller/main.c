@@ -1,0 +1,131 @@
+/*
+ * A 1 kHz loop around a generated controller, with a histogram of how long its ticks take and how late they start.
+ *
+ * Generate the library with the name `arm` (docs/c_controller.md). The robot is a stand-in: forward dynamics with the
+ * library's own mass matrix and bias, one semi-implicit Euler step a tick. Replace `read_robot` and `write_robot`.
+ */
+#define _POSIX_C_SOURCE 199309L
+
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#include "arm.h"
+
+#define N ARM_JOINTS
+#define PERIOD 0.001 /* [s] */
+#define BINS 24      /* of the histogram, each twice as wide as the one before */
+
+typedef struct {
+  double q[N];
+  double dq[N];
+} robot_state;
+
+static robot_state robot; /* the stand-in */
+
+static void read_robot(double q[N], double dq[N]) {
+  memcpy(q, robot.q, sizeof robot.q);
+  memcpy(dq, robot.dq, sizeof robot.dq);
+}
+
+/* Solve M x = b for symmetric positive definite M by Gauss' method; both are overwritten, b by x. */
+static void solve(double M[N * N], double b[N]) {
+  int i, j, k;
+  for (k = 0; k < N; ++k)
+    for (i = k + 1; i < N; ++i) {
+      double factor = M[i * N + k] / M[k * N + k];
+      for (j = k; j < N; ++j) M[i * N + j] -= factor * M[k * N + j];
+      b[i] -= factor * b[k];
+    }
+  for (i = N - 1; i >= 0; --i) {
+    for (j = i + 1; j < N; ++j) b[i] -= M[i * N + j] * b[j];
+    b[i] /= M[i * N + i];
+  }
+}
+
+static void write_robot(const double torque[N]) {
+  double M[N * N], bias[N], gravity[N], ddq[N];
+  int i;
+  arm_dynamics(robot.q, robot.dq, M, bias, gravity);
+  for (i = 0; i < N; ++i) ddq[i] = torque[i] - bias[i];
+  solve(M, ddq);
+  for (i = 0; i < N; ++i) {
+    robot.dq[i] += PERIOD * ddq[i];
+    robot.q[i] += PERIOD * robot.dq[i];
+  }
+}
+
+static double now(void) { /* [s] */
+  struct timespec t;
+  clock_gettime(CLOCK_MONOTONIC, &t);
+  return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+static void sleep_until(double time) {
+  double left = time - now();
+  struct timespec t;
+  if (left <= 0.0) return;
+  t.tv_sec = (time_t)left;
+  t.tv_nsec = (long)(1e9 * (left - floor(left)));
+  nanosleep(&t, NULL);
+}
+
+static int bin_of(double microseconds) {
+  int bin = 0;
+  while (bin < BINS - 1 && microseconds >= 0.25) {
+    microseconds *= 0.5;
+    ++bin;
+  }
+  return bin;
+}
+
+static void print_histogram(const char *title, const long counts[BINS]) {
+  int bin;
+  printf("%s\n", title);
+  for (bin = 0; bin < BINS; ++bin)
+    if (counts[bin]) printf("  below %10.2f us  %8ld\n", 0.25 * pow(2.0, bin), counts[bin]);
+}
+
+int main(int argc, char **argv) {
+  const long ticks = argc > 1 ? atol(argv[1]) : 5000;
+  const int paced = !(argc > 2 && strcmp(argv[2], "--free") == 0); /* --free: as fast as it goes */
+  long computing[BINS] = {0}, late[BINS] = {0}, statuses[4] = {0}, tick;
+  double q[N], dq[N], torque[N], phi[N], start_phi[N], jacobian[N * N], error = 0.0, begin;
+  arm_reference reference;
+  int i;
+
+  if (ticks < 1) {
+    fprintf(stderr, "usage: %s [TICKS >= 1] [--free]\n", argv[0]);
+    return 2;
+  }
+  for (i = 0; i < N; ++i) robot.q[i] = 0.5 * (arm_domain_lower[i] + arm_domain_upper[i]);
+  arm_chart(robot.q, start_phi, jacobian);
+  memset(&reference, 0, sizeof reference);
+  begin = now();
+  for (tick = 0; tick < ticks; ++tick) {
+    double time = PERIOD * (double)tick, started, done;
+    if (paced) sleep_until(begin + time);
+    started = now();
+    read_robot(q, dq);
+    /* Wave along the first extra coordinate; the task stays where it is. */
+    for (i = 0; i < N; ++i) reference.value[i] = start_phi[i];
+    reference.value[ARM_TASK] += 0.02 * (1.0 - cos(2.0 * time));
+    reference.velocity[ARM_TASK] = 0.04 * sin(2.0 * time);
+    reference.acceleration[ARM_TASK] = 0.08 * cos(2.0 * time);
+    statuses[arm_control(q, dq, &reference, &arm_default_gains, torque)]++;
+    done = now();
+    write_robot(torque);
+    computing[bin_of(1e6 * (done - started))]++;
+    if (paced) late[bin_of(1e6 * (started - begin - time))]++;
+    arm_chart(q, phi, jacobian);
+    for (i = 0; i < ARM_TASK; ++i) error = fmax(error, fabs(phi[i] - reference.value[i]));
+  }
+  print_histogram("computing time of a tick", computing);
+  if (paced) print_histogram("lateness of a tick", late);
+  printf("statuses: %ld ok, %ld outside, %ld singular, %ld not finite\n", statuses[0], statuses[1], statuses[2],
+         statuses[3]);
+  printf("largest deviation of the task: %.2e\n", error);
+  return statuses[0] == ticks ? 0 : 1;
+}
