@@ -1,4 +1,4 @@
-"""Control ticks in generated C: median and worst of 100,000 calls, compile time, size; peers in the same process (2 min).
+"""Control ticks in generated C: median and worst of 100,000 calls, compile time, size; peers in one process (2 min).
 
 Compiled with gcc -O2, as a user would. The peer is the projector controller, generated the same way.
 """
@@ -109,7 +109,9 @@ def states(chart: oc.Chart, law: Controller) -> np.ndarray:
     rng, n, k = np.random.default_rng(0), chart.n, len(law.labels)
     q = chart.problem.domain.centre + 0.4 * chart.problem.domain.half_width * rng.uniform(-1, 1, (64, n))
     value = np.array([law.measured(point).full().ravel() for point in q])
-    return np.hstack([q, rng.normal(size=(64, n)), value + 0.01 * rng.normal(size=(64, k)), rng.normal(size=(64, 2 * k))])
+    return np.hstack(
+        [q, rng.normal(size=(64, n)), value + 0.01 * rng.normal(size=(64, k)), rng.normal(size=(64, 2 * k))]
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Every controller on the same steps: how much a commanded coordinate disturbs the others (20 s).
+"""Every controller on the same steps: how much a commanded coordinate disturbs the others (30 s).
 
 The arms are planar_3r_x (exact coordinates exist) and planar_3r_xy (they do not), the steps interleaved as in Sec. 8 of
 the paper. Projectors get the posture that means the same motion. The coupling index is the largest excursion of a
@@ -26,7 +26,7 @@ from orthocas.simulation import coupling_index
 
 STIFFNESS = 200.0  # of x [N/m], of xi [N m], and of postures [N m/rad]
 STEP = {"x": 0.1, "y": 0.1, "xi1": 0.05, "xi2": 0.03}  # [m], [rad]: what the box of the problems has room for
-PAUSE = 2.0  # [s] between steps
+PAUSE = 4.0  # [s] between steps: also slow springs have come to rest
 WEIGHTS = (1000.0, 30.0, 150.0, 0.1)  # the last keeps gradients even (docs/derivations.md#lengths)
 
 

@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike
 
 from orthocas.chart_file import read_chart, write_chart
 from orthocas.checks import Array, as_point_set, require_known
-from orthocas.coordinates import CoordinateMap, InvertibleMap
+from orthocas.coordinates import CoordinateMap, Coordinates, InvertibleMap
 from orthocas.errors import InverseError, ShapeError
 from orthocas.interrupts import deferred
 from orthocas.problem import Problem, task_jacobians
+from orthocas.scalar_code import scalar_code
 
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
 _SINGULAR = 1e-8  # ratio of singular values of J where the inverse map is given up
@@ -56,6 +57,11 @@ class Chart:
     def labels(self) -> tuple[str, ...]:
         """Names of the components of phi: those of the task, then xi1, xi2, ..."""
         return (*self.problem.task.labels, *(f"xi{k + 1}" for k in range(self.r)))
+
+    def runnable(self, graph: ca.Function) -> ca.Function:
+        """A graph of this chart's functions in the form that runs fast: scalar code, or as it is with networks."""
+        matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.family.as_matrices
+        return graph if matrices else scalar_code(graph)
 
     def xi(self, q: ArrayLike) -> Array:
         """Extra coordinates, (r,) or (N, r)."""

@@ -200,6 +200,37 @@ def test_projector_equals_equations_2_and_3(model: pin.Model, metric: str) -> No
     np.testing.assert_allclose(found, J.T @ f_x + P.T @ posture + s.g, rtol=1e-8)
 
 
+def test_energy_of_the_projector_counts_all_springs_and_what_the_dampers_take(planar_xy: oc.Problem) -> None:
+    """dV/dt = -P + power that the projector leaks: with the posture spring at rest only the damping acts."""
+    law = Projector(planar_xy, 60.0, 20.0, 0.5)
+    q, dq = planar_xy.domain.centre + 0.05, np.array([0.3, -0.2, 0.5])
+    here = law.measured(q).full().ravel()
+    x_d, q_d = here[:2] + [0.1, -0.05], q.copy()
+    inputs = (np.concatenate([x_d, q_d]), np.zeros(5), np.zeros(5), *law.gains.values())
+    storage, power = (float(out) for out in law.energy(q, dq, *inputs))
+    M = planar_xy.robot.mass_matrix(q)
+    assert storage == pytest.approx(dq @ M @ dq / 2 + 60 * np.sum((here[:2] - x_d) ** 2) / 2, rel=1e-12)
+    ddq = planar_xy.robot.forward_dynamics(q, dq, law.function(q, dq, *inputs)[0].full().ravel())
+    h = 1e-6
+    after, before = (float(law.energy(q + s * h * dq + h**2 / 2 * ddq, dq + s * h * ddq, *inputs)[0]) for s in (1, -1))
+    J = planar_xy.task.jacobian_function(q).full()
+    sharp = np.linalg.solve(M, J.T) @ np.linalg.inv(J @ np.linalg.solve(M, J.T))
+    assert (after - before) / (2 * h) == pytest.approx(-power, rel=1e-5)
+    assert power > 0
+    assert np.abs(sharp @ J @ dq).max() > 0.01  # the projector matters here
+
+
+def test_feedback_of_the_kinematic_projector_pulls_towards_the_reference() -> None:
+    problem = oc.problems.get("iiwa")
+    q = problem.domain.centre + 0.1
+    reference = np.concatenate([problem.task.function(q).full().ravel() + [0.01, 0.0, -0.02], q + 0.1])
+    found, _ = torque(KinematicProjector(problem, 2.0, 3.0), q, np.zeros(7), reference, *np.zeros((2, 10)))
+    J = problem.task.jacobian_function(q).full()
+    sharp = np.linalg.pinv(J)
+    want = sharp @ (2.0 * np.array([0.01, 0.0, -0.02])) + (np.eye(7) - sharp @ J) @ (3.0 * np.full(7, 0.1))
+    np.testing.assert_allclose(found, want, rtol=1e-9)
+
+
 def test_pseudo_inverse_control_moves_the_tool_and_nothing_else() -> None:
     problem = oc.problems.get("iiwa")
     q = problem.domain.centre + 0.1
@@ -287,6 +318,21 @@ class TestGuard:
             assert set(np.unique(status)) <= {s.value for s in ControlStatus}
             assert len(np.unique(status)) >= 2
 
+    @pytest.mark.parametrize("bad", [np.nan, -5.0, 0.0])
+    def test_limit_that_is_none_stops_the_robot(self, laws: list[Controller], bad: float) -> None:
+        for law in laws:
+            n, k = law.problem.n, len(law.labels)
+            command, status = torque(
+                law,
+                law.problem.domain.centre,
+                *np.zeros((1, n)),
+                np.full(k, 5.0),
+                *np.zeros((2, k)),
+                limit=np.full(n, bad),
+            )
+            assert status == ControlStatus.NOT_FINITE
+            np.testing.assert_array_equal(command, 0.0)
+
     def test_limit_cuts_the_command(self, planar_chart: oc.Chart) -> None:
         q, far = planar_chart.problem.domain.centre, np.full(3, 10.0)
         free = torque(Impedance(planar_chart, 50.0), q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))[0]
@@ -331,6 +377,7 @@ def test_networks_can_be_controlled_too(planar_xy: oc.Problem) -> None:
     q, dq, acceleration = planar_xy.domain.centre, np.full(3, 0.3), np.full(3, -0.2)
     found, status = torque(law, q, dq, chart.phi(q), chart.jacobian(q) @ dq, acceleration)
     ddq = planar_xy.robot.forward_dynamics(q, dq, found)
+    assert not law.function.is_a("SXFunction")  # a thousand neurons written out would take minutes to build
     assert status == ControlStatus.OK
     np.testing.assert_allclose(chart.jacobian(q) @ ddq + jacobian_rate(chart, q, dq) @ dq, acceleration, atol=1e-6)
 

@@ -119,6 +119,29 @@ def test_reference_that_leaves_the_domain_is_reported_with_time_and_joint(planar
         joint_path(planar_chart, far, q0)
 
 
+def test_reference_with_other_labels_is_refused(planar_chart: oc.Chart) -> None:
+    q0 = planar_chart.problem.domain.centre
+    swapped = Reference.steps(("x", "xi2", "xi1"), planar_chart.phi(q0), [], 1.0)
+    with pytest.raises(InvalidValueError, match="labels of the reference"):
+        joint_path(planar_chart, swapped, q0)
+
+
+def test_fast_swings_are_seen(planar_chart: oc.Chart) -> None:
+    """A low pass of 20 Hz overshoots between the points of a coarse grid."""
+    q0 = planar_chart.problem.domain.centre
+    phi = planar_chart.phi(q0)
+    fast = Reference.steps(planar_chart.labels, phi, [(0.01, {"xi1": 0.09})], 1.0, 125.66, 0.05)
+    peak = np.abs(fast.sample(np.linspace(0, 1, 5001))[0][:, 1]).max()
+    assert np.abs(fast.sample(fast.grid())[0][:, 1]).max() > 0.97 * peak
+
+
+@pytest.mark.parametrize("time", [-0.1, 4.1])
+def test_times_outside_the_reference_are_refused(time: float) -> None:
+    reference = Reference.through(("x",), [0.0, 4.0], [[0.0], [1.0]])
+    with pytest.raises(InvalidValueError, match="from 0 to 4 s"):
+        reference.sample([time])
+
+
 def test_posture_reference_means_the_same_motion(planar_chart: oc.Chart) -> None:
     q0 = planar_chart.problem.domain.centre
     phi0 = planar_chart.phi(q0)

@@ -128,6 +128,8 @@ def test_coupling_index_reads_the_worst_excursion(planar_chart: oc.Chart, q0: Ar
     assert coupling.of("x", "xi1") == pytest.approx(0.2, rel=1e-6)
     assert coupling.of("xi2", "xi1") < 1e-6
     assert np.isnan(coupling.index[:, [0, 2]]).all()  # two targets at once are left out
+    again = Reference.steps(planar_chart.labels, phi, [(0.0, {"xi1": 0.05}), (1.0, {"xi1": 0.0})], 2.0)
+    assert coupling_index(planar_chart, again, replace(strayed, q=strayed.q)).of("x", "xi1") >= 0.2  # the worst counts
 
 
 def test_breakdown_adds_up_to_the_task_acceleration(planar_chart: oc.Chart, steps: Reference, q0: Array) -> None:
@@ -220,6 +222,34 @@ def test_push_displaces_as_far_as_the_stiffness_lets_it(planar_chart: oc.Chart, 
     assert np.abs(run.q[before] - q0).max() < 1e-9
 
 
+def test_short_push_keeps_its_impulse_between_ticks(planar_chart: oc.Chart, q0: Array) -> None:
+    """Sampled control: loads are averaged over ticks, so 0.8 ms move the arm as in continuous time."""
+    law, still = Impedance(planar_chart, K), resting(planar_chart, q0, 0.5)
+    pushes = [Push(0.1001, 0.0008, (10.0, 0.0, 0.0)), Push(0.1003, 0.0004, (0.0, 5.0, 0.0))]
+    exact, sampled = (simulate(law, still, q0, control_rate=rate, pushes=pushes) for rate in (None, 1000.0))
+    peaks = [np.abs(run.q - q0).max() for run in (exact, sampled)]
+    assert peaks[1] == pytest.approx(peaks[0], rel=0.05)
+    alone = simulate(law, still, q0, pushes=pushes[:1])
+    assert np.abs(alone.q - exact.q[: len(alone.q)]).max() > 0.05 * peaks[0]  # overlapping pushes add up
+
+
+def test_push_ends(planar_chart: oc.Chart, q0: Array) -> None:
+    run = simulate(
+        Impedance(planar_chart, 400.0), resting(planar_chart, q0, 20.0), q0, pushes=[Push(0.1, 0.2, (20.0, 0.0, 0.0))]
+    )
+    assert np.abs(run.q - q0).max() > 5e-3
+    assert np.abs(run.q[-1] - q0).max() < 1e-4
+
+
+def test_events_that_differ_by_rounding_are_one(planar_chart: oc.Chart, q0: Array) -> None:
+    """0.1 + 0.2 is not 0.3 in binary numbers."""
+    phi = planar_chart.phi(q0)
+    reference = Reference.steps(planar_chart.labels, phi, [(0.3, {"xi1": 0.02})], 1.0)
+    run = simulate(Impedance(planar_chart, K), reference, q0, pushes=[Push(0.1, 0.2, (5.0, 0.0, 0.0))])
+    assert (np.diff(run.times) > 0).all()
+    assert np.isfinite(run.energy_balance).all()
+
+
 def test_friction_takes_its_energy(planar_chart: oc.Chart, q0: Array) -> None:
     """V falls by what damping and friction take, the integral of dq . tau_f."""
     friction = Friction(viscous=0.3, coulomb=[0.2, 0.1, 0.0])
@@ -235,6 +265,26 @@ def test_friction_takes_its_energy(planar_chart: oc.Chart, q0: Array) -> None:
     taken = np.trapezoid((run.dq * torque).sum(axis=1), run.times)
     assert run.energy_balance[-1] == pytest.approx(-taken, rel=1e-4)
     assert taken > 0.01
+
+
+def test_noise_is_on_what_it_says(planar_chart: oc.Chart, q0: Array) -> None:
+    """With position noise only, held commands scatter as the stiffness says; the record shows what was sent."""
+    law, still = Impedance(planar_chart, 400.0), resting(planar_chart, q0, 0.2)
+    for noise, gain in ((Noise(1e-4, 0.0, 3), "q"), (Noise(0.0, 1e-4, 3), "dq")):
+        run = simulate(law, still, q0, control_rate=1000.0, noise=noise)
+        errors = noise.sample(200, 3)
+        k = 57
+        measured = {"q": run.q[k] + errors[k, :3], "dq": run.dq[k] + errors[k, 3:]}
+        assert np.abs(errors[:, :3]).max() > 0 if gain == "q" else np.abs(errors[:, 3:]).max() > 0
+        sent = torque_at(law, still, float(run.times[k]), measured["q"], measured["dq"])
+        np.testing.assert_allclose(run.command[k], sent, rtol=1e-9)
+
+
+def test_run_ends_with_its_reference(planar_chart: oc.Chart, q0: Array) -> None:
+    run = simulate(Impedance(planar_chart, K), resting(planar_chart, q0, 1.0), q0, control_rate=3.3)
+    assert run.times[-1] <= 1.0
+    with pytest.raises(InvalidValueError, match="at least one tick"):
+        simulate(Impedance(planar_chart, K), resting(planar_chart, q0, 0.1), q0, control_rate=5.0)
 
 
 def test_wrong_masses_are_felt(planar_chart: oc.Chart, steps: Reference, q0: Array) -> None:
@@ -319,6 +369,15 @@ def test_trajectory_file_keeps_everything(planar_chart: oc.Chart, steps: Referen
         (tmp_path / "bad.npz").write_bytes(bad)
         with pytest.raises(TrajectoryFileError, match="not a trajectory file"):
             Trajectory.load(tmp_path / "bad.npz")
+    rng = np.random.default_rng(6)
+    for _ in range(60):  # flipped bytes: an error of ours, or the same run
+        spoiled = bytearray(whole)
+        spoiled[rng.integers(len(whole))] ^= int(rng.integers(1, 256))
+        (tmp_path / "bad.npz").write_bytes(bytes(spoiled))
+        try:
+            np.testing.assert_array_equal(Trajectory.load(tmp_path / "bad.npz").q, run.q)
+        except TrajectoryFileError:
+            pass
     np.savez(tmp_path / "foreign.npz", header="{}", q=run.q)
     with pytest.raises(TrajectoryFileError, match="not a trajectory file"):
         Trajectory.load(tmp_path / "foreign.npz")
@@ -340,6 +399,9 @@ def test_trajectory_file_keeps_everything(planar_chart: oc.Chart, steps: Referen
         ({"plant": oc.Robot.planar([1, 1], [1, 1])}, InvalidValueError, "joints of the plant is 2"),
         ({"pushes": [Push(0.0, 1.0, torque=[1.0])]}, ShapeError, "torque of a push"),
         ({"friction": Friction(viscous=-1.0)}, InvalidValueError, "viscous"),
+        ({"step": "a"}, InvalidValueError, "step is 'a'"),
+        ({"pushes": [Push(0.5, 0.1)]}, InvalidValueError, "start of a push is 0.5, expected before the end"),
+        ({"q_start": [2.0, 2.0, 2.0]}, UnreachableReferenceError, "the start lies outside the domain: joint 'q"),
     ],
 )
 def test_bad_arguments_are_refused(
@@ -354,6 +416,9 @@ def test_what_would_be_ignored_is_refused(planar_chart: oc.Chart, q0: Array) -> 
     still = resting(planar_chart, q0, 0.5)
     with pytest.raises(InvalidValueError, match="a velocity controller sees no forces"):
         simulate(Kinematic(planar_chart), still, q0, pushes=[Push(0.0, 0.1)])
+    heavy = planar_chart.problem.robot.with_scaled_masses(2.0)
+    with pytest.raises(InvalidValueError, match="a velocity controller sees no forces"):
+        simulate(Kinematic(planar_chart), still, q0, plant=heavy)
     with pytest.raises(InvalidValueError, match="no velocity as a state"):
         simulate(Kinematic(planar_chart), still, q0, np.zeros(3))
     with pytest.raises(InvalidValueError, match=r"labels of the reference is \('x', 'xi1', 'xi2'\)"):

@@ -27,6 +27,10 @@ def codegen(
     coupling: Annotated[
         str | None, typer.Option("--coupling", help="coupled or decoupled, default coupled; impedance and pd_plus.")
     ] = None,
+    damping: Annotated[
+        str | None,
+        typer.Option("--damping", help="square_root (default) or double_diagonal; impedance and pd_plus."),
+    ] = None,
     posture_stiffness: Annotated[
         str | None, typer.Option("--posture-stiffness", help="Default gain of projector; else 2 Hz.")
     ] = None,
@@ -38,7 +42,7 @@ def codegen(
     json: AsJson = False,
 ) -> None:
     """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
-    options = ControllerOptions(stiffness, damping_ratio, coupling, posture_stiffness, feedback)
+    options = ControllerOptions(stiffness, damping_ratio, coupling, posture_stiffness, feedback, damping=damping)
     if controller != _NONE:
         require_options(controller, options)
     elif options != ControllerOptions() or limit is not None:

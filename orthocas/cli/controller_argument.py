@@ -18,13 +18,14 @@ from orthocas.control import (
     matched_posture_stiffness,
     matched_stiffness,
 )
+from orthocas.control.damping import DampingDesign
 from orthocas.control.operational_space import Coupling
 from orthocas.errors import InvalidValueError
 
 _SPRINGS, _BY_TORQUE = ("stiffness", "damping_ratio"), ("mass_factor", "friction")
 _OPTIONS = {  #: which options each controller takes, by the names of fields
-    "impedance": (*_SPRINGS, "coupling", *_BY_TORQUE),
-    "pd_plus": (*_SPRINGS, "coupling", *_BY_TORQUE),
+    "impedance": (*_SPRINGS, "coupling", "damping", *_BY_TORQUE),
+    "pd_plus": (*_SPRINGS, "coupling", "damping", *_BY_TORQUE),
     "kinematic": ("feedback",),
     "projector": (*_SPRINGS, "posture_stiffness", *_BY_TORQUE),
     "kinematic_projector": ("feedback",),
@@ -43,6 +44,7 @@ class ControllerOptions:
     feedback: str | None = None
     mass_factor: float | None = None
     friction: str | None = None
+    damping: str | None = None
 
 
 def require_options(name: str, options: ControllerOptions) -> None:
@@ -77,7 +79,7 @@ def build_controller(name: str, chart: Chart, options: ControllerOptions, limit:
             raise InvalidValueError("--feedback", options.feedback, f"one number, or {m + n}: for task, then joints")
         spread = np.broadcast_to(feedback, m + n)
         return KinematicProjector(chart.problem, spread[:m], spread[m:], bounds)
-    damping = _one_or_all("--damping-ratio", options.damping_ratio or "0.7")
+    ratio = _one_or_all("--damping-ratio", options.damping_ratio or "0.7")
     given = None if options.stiffness is None else _one_or_all("--stiffness", options.stiffness)
     if name == "projector":
         posture = options.posture_stiffness
@@ -85,10 +87,11 @@ def build_controller(name: str, chart: Chart, options: ControllerOptions, limit:
             matched_posture_stiffness(chart.problem) if posture is None else _one_or_all("--posture-stiffness", posture)
         )
         stiffness = matched_stiffness(chart)[: chart.m] if given is None else given
-        return Projector(chart.problem, stiffness, joints, damping, bounds)
+        return Projector(chart.problem, stiffness, joints, ratio, bounds)
     law = Impedance if name == "impedance" else PDPlus
     coupling = cast(Coupling, "coupled" if options.coupling is None else options.coupling)  # the law checks it
-    return law(chart, matched_stiffness(chart) if given is None else given, damping, coupling, limit=bounds)
+    design = cast(DampingDesign, "square_root" if options.damping is None else options.damping)
+    return law(chart, matched_stiffness(chart) if given is None else given, ratio, coupling, design, bounds)
 
 
 def _one_or_all(option: str, text: str) -> Array:

@@ -33,7 +33,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
     bad = np.flatnonzero(seen.status != ControlStatus.OK)
     first = int(bad[0]) if bad.size else None
     inside = np.asarray(contains(chart.problem.domain, seen.q))
-    judged = plan.has_steps and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
+    judged = plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
     largest = np.abs(seen.command).max(axis=0)
     return {
         "controller": controller.name,

@@ -17,7 +17,7 @@ from orthocas.cli.controller_argument import CONTROLLERS, ControllerOptions, bui
 from orthocas.cli.output import AsJson, note, number, print_json, print_rows, whole_number
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.cli.run_report import fallback_text, run_report, run_rows
-from orthocas.control import Controller, Reference, posture_reference
+from orthocas.control import Controller, Impedance, PDPlus, Reference, posture_reference
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.interrupts import deferred
 from orthocas.objective import Monitor
@@ -44,6 +44,10 @@ def simulate(
     ] = None,
     coupling: Annotated[
         str | None, typer.Option("--coupling", help="coupled or decoupled, default coupled; impedance and pd_plus.")
+    ] = None,
+    damping: Annotated[
+        str | None,
+        typer.Option("--damping", help="square_root (default) or double_diagonal; impedance and pd_plus."),
     ] = None,
     posture_stiffness: Annotated[
         str | None, typer.Option("--posture-stiffness", help="Of the joint springs of projector; default 2 Hz.")
@@ -74,7 +78,9 @@ def simulate(
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
-    options = ControllerOptions(stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction)
+    options = ControllerOptions(
+        stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction, damping
+    )
     require_options(controller, options)
     if animation != "none":
         require_format(animation)
@@ -192,6 +198,11 @@ def _notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
     if law.name in ("impedance", "pd_plus") and metric != "inertia":
         note(
             f"the metric of this chart is {metric}: task and extra coordinates are decoupled only with A = M (inertia)"
+        )
+    if isinstance(law, Impedance | PDPlus) and (found := law.check_damping()).indefinite_share:
+        note(
+            f"the damping matrix (29) is not positive at {found.indefinite_share:.1%} of the domain with these gains: "
+            "--damping double_diagonal always is"
         )
     fallback = fallback_text(report)
     if fallback is not None:

@@ -9,10 +9,8 @@ from orthocas.control.reference import Reference
 from orthocas.control.status import guard
 from orthocas.domains import Domain
 from orthocas.problem import Problem
-from orthocas.scalar_code import scalar_code
 
 Command = Literal["torque", "velocity"]
-STATE_AND_REFERENCE = ("q", "dq", "reference", "reference_velocity", "reference_acceleration")
 
 
 class Controller(Protocol):
@@ -87,14 +85,10 @@ def guarded_graph(
     numbers = ca.vertcat(*(value for key, value in inputs.items() if key != "limit"))
     check = guard(domain, command.shape[0], numbers.shape[0])
     safe, status = check(command, fallback, inputs["limit"], inputs["q"], numbers, volume)
-    return _named(name, inputs, {"command": safe, "status": status})
+    return named_function(name, inputs, {"command": safe, "status": status})
 
 
-def control_function(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
-    """A function with named inputs and dense outputs, as scalar code."""
-    return scalar_code(_named(name, inputs, outputs))
-
-
-def _named(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
+def named_function(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
+    """A function with named inputs and dense outputs."""
     dense = [ca.densify(out) for out in outputs.values()]
     return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))

@@ -23,10 +23,10 @@ def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
 
 def command_limit(name: str, value: ArrayLike | None, length: int) -> Array:
     """Numbers > 0, (length,), infinite where nothing was given."""
-    if value is None:
-        return np.full(length, np.inf)
+    value = np.inf if value is None else value
     limit = np.array(np.broadcast_to(_one_or(name, value, length), (length,)))
     _require(name, limit, limit > 0, "positive numbers")
+    limit.setflags(write=False)
     return limit
 
 

@@ -15,7 +15,6 @@ from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
 from orthocas.problem import Problem
-from orthocas.scalar_code import scalar_code
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +71,7 @@ class Kinematic:
     @cached_property
     def function(self) -> ca.Function:
         """Inputs q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
-        return scalar_code(self.graph)
+        return self.chart.runnable(self.graph)
 
     @cached_property
     def graph(self) -> ca.Function:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from orthocas.batch import Batched
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_known
-from orthocas.control.controller import Command, control_function, guarded_graph, named_inputs
+from orthocas.control.controller import Command, guarded_graph, named_function, named_inputs
 from orthocas.control.damping import DAMPING_DESIGNS, DampingDesign, damping_matrix
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
 from orthocas.control.inertia import block_inertia, median_volume
@@ -19,7 +19,6 @@ from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
 from orthocas.domains import sample_uniform
 from orthocas.problem import Problem
-from orthocas.scalar_code import scalar_code
 
 Coupling = Literal["coupled", "decoupled"]
 COUPLINGS: tuple[Coupling, ...] = ("coupled", "decoupled")
@@ -110,7 +109,7 @@ class _OperationalSpace:
     @cached_property
     def function(self) -> ca.Function:
         """Inputs q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
-        return scalar_code(self.graph)
+        return self.chart.runnable(self.graph)
 
     @cached_property
     def graph(self) -> ca.Function:
@@ -134,10 +133,12 @@ class _OperationalSpace:
         J = self.chart.function("jacobian")(q)
         M = self.problem.robot.mass_matrix(q)
         D = self._inertia(J, M, inputs)[-1]
-        M_phi = block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
         e, de = self._errors(inputs, J)
-        storage = (ca.bilin(M_phi, de, de) + ca.bilin(K, e, e)) / 2
-        return control_function("energy", inputs, {"storage": storage, "dissipated_power": ca.bilin(D, de, de)})
+        M_phi = block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
+        kinetic = ca.bilin(M_phi, de, de) if self.feed_forward else ca.bilin(M, inputs["dq"], inputs["dq"])
+        storage = (kinetic + ca.bilin(K, e, e)) / 2
+        outputs = {"storage": storage, "dissipated_power": ca.bilin(D, de, de)}
+        return self.chart.runnable(named_function("energy", inputs, outputs))
 
     @cached_property
     def damping_matrix(self) -> ca.Function:
@@ -146,7 +147,7 @@ class _OperationalSpace:
         chosen = {name: inputs[name] for name in ("q", "stiffness", "damping_ratio")}
         q = chosen["q"]
         D = self._inertia(self.chart.function("jacobian")(q), self.problem.robot.mass_matrix(q), inputs)[-1]
-        return control_function("damping_matrix", chosen, {"D": D})
+        return self.chart.runnable(named_function("damping_matrix", chosen, {"D": D}))
 
     def check_damping(self, samples: int = 1000, seed: int = 0) -> DampingCheck:
         """Smallest eigenvalue of D over uniform samples of the domain: (29) can make it negative."""

@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array
-from orthocas.control.controller import Command, control_function, guarded_graph, named_inputs
+from orthocas.checks import Array, frozen_array
+from orthocas.control.controller import Command, guarded_graph, named_function, named_inputs
 from orthocas.control.damping import damping_matrix
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
 from orthocas.control.inertia import block_inertia, median_volume
@@ -58,7 +58,7 @@ class Projector:
         task = positive_gains("stiffness", stiffness, m)
         posture = positive_gains("posture_stiffness", posture_stiffness, n)
         object.__setattr__(self, "problem", problem)
-        object.__setattr__(self, "stiffness", np.concatenate([task, posture]))
+        object.__setattr__(self, "stiffness", frozen_array("stiffness", np.concatenate([task, posture]), (m + n,)))
         object.__setattr__(self, "damping_ratio", non_negative_gains("damping_ratio", damping_ratio, m + n))
         object.__setattr__(self, "limit", command_limit("limit", limit, n))
 
@@ -109,7 +109,7 @@ class Projector:
         through = dq - B @ (Lambda @ (J @ dq))  # P dq
         storage = (ca.bilin(problem.robot.mass_matrix(q), dq, dq) + ca.dot(e, inputs["stiffness"] * e)) / 2
         power = ca.bilin(D_x, J @ dq, J @ dq) + ca.bilin(D_q, through, dq)
-        return control_function("energy", inputs, {"storage": storage, "dissipated_power": power})
+        return scalar_code(named_function("energy", inputs, {"storage": storage, "dissipated_power": power}))
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if a posture of the reference leaves the joint limits."""

@@ -6,7 +6,7 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.domains import contains
-from orthocas.errors import InverseError, UnreachableReferenceError
+from orthocas.errors import InvalidValueError, InverseError, UnreachableReferenceError
 
 
 def joint_path(chart: Chart, reference: Reference, q_start: Array) -> Array:
@@ -16,6 +16,10 @@ def joint_path(chart: Chart, reference: Reference, q_start: Array) -> Array:
         UnreachableReferenceError: with the first time at which there is no such q near the one before, or it lies
             outside the domain.
     """
+    if reference.labels != chart.labels:
+        raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
+    if not contains(chart.problem.domain, q_start):
+        raise UnreachableReferenceError(f"the start lies outside the domain: {_outside(chart, q_start)}")
     times = reference.grid()
     values = reference.sample(times)[0]
     path, q = np.empty((len(times), chart.n)), q_start

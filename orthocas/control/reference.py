@@ -19,6 +19,7 @@ from orthocas.errors import InvalidValueError
 NATURAL_FREQUENCY = 2 * np.pi  #: omega0 [rad/s] of [AS2023] Sec. 8
 DAMPING_RATIO = 0.7  #: zeta of [AS2023] Sec. 8
 _GRID = 0.05  # [s]
+_SWING = 0.3  # [rad] of the low pass's swing between two times of the grid: 0.048 s for the paper's
 _DEGREE = 5  # of splines through points
 Change = tuple[float, Mapping[str, float]]  #: a time [s] and the new targets by label
 
@@ -33,6 +34,7 @@ class Reference:
     start: Array  #: (k,) value at the start
     parameters: Array  #: (S, p) inputs of the profile
     profile: ca.Function  #: time since the start of the segment, parameters -> value, velocity, acceleration (k, 1)
+    spacing: float = _GRID  #: [s] that shows every swing
 
     @classmethod
     def steps(
@@ -71,7 +73,7 @@ class Reference:
         for target, lasted in zip(targets[1:], np.diff(times)[:-1], strict=True):
             position, velocity, _ = (out[0] for out in run(np.array([[lasted]]), parameters[-1][None]))
             parameters.append(np.concatenate([target, position, velocity]))
-        return cls(names, times, targets, value, np.array(parameters), profile)
+        return cls(names, times, targets, value, np.array(parameters), profile, min(_GRID, _SWING / natural_frequency))
 
     @classmethod
     def through(cls, labels: Sequence[str], times: ArrayLike, points: ArrayLike) -> Self:
@@ -94,7 +96,8 @@ class Reference:
         spline = make_interp_spline(t, values, _DEGREE, bc_type=(rest, rest))
         taylor = [spline(t[:-1], order) / factorial(order) for order in reversed(range(_DEGREE + 1))]
         coefficients = np.stack(taylor, axis=2).reshape(len(t) - 1, -1)
-        return cls(names, t, values[1:], values[0], coefficients, _polynomial(len(names)))
+        spacing = min(_GRID, float(np.diff(t).min()) / 4)
+        return cls(names, t, values[1:], values[0], coefficients, _polynomial(len(names)), spacing)
 
     @property
     def duration(self) -> float:
@@ -106,15 +109,22 @@ class Reference:
         return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.parameters) - 1)
 
     def sample(self, times: ArrayLike) -> tuple[Array, Array, Array]:
-        """Value, velocity and acceleration at times (N,), three arrays (N, k)."""
+        """Value, velocity and acceleration at times (N,), three arrays (N, k).
+
+        Raises:
+            InvalidValueError: for a time before the start or after the end.
+        """
         t = frozen_array("times", times, (None,))
+        if len(t) and not (t.min() >= 0 and t.max() <= self.duration * (1 + 1e-9)):
+            bad = t.min() if t.min() < 0 else t.max()
+            raise InvalidValueError("time of a reference", bad, f"from 0 to {self.duration:g} s")
         k = self.segment(t)
         value, velocity, acceleration = self._batched((t - self.times[k])[:, None], self.parameters[k])
         return value, velocity, acceleration
 
-    def grid(self, spacing: float = _GRID) -> Array:
-        """Times from start to end, at most that far apart [s]."""
-        return np.linspace(0.0, self.duration, max(2, int(np.ceil(self.duration / spacing)) + 1))
+    def grid(self) -> Array:
+        """Times from start to end, at most `spacing` apart [s]."""
+        return np.linspace(0.0, self.duration, max(2, int(np.ceil(self.duration / self.spacing)) + 1))
 
     @cached_property
     def _batched(self) -> Batched:

@@ -40,12 +40,14 @@ def guard(domain: Domain | None, n: int, numbers: int) -> ca.Function:
     regular = ca.logic_and(volume > _SMALLEST_VOLUME**2, _all_finite(command))
     status = ca.if_else(regular, float(ControlStatus.OK), float(ControlStatus.SINGULAR))
     status = ca.if_else(_is_inside(domain, q), status, float(ControlStatus.OUTSIDE_DOMAIN))
-    status = ca.if_else(_all_finite(inputs), status, float(ControlStatus.NOT_FINITE))
+    meant = ca.logic_and(_all_finite(inputs), ca.logic_all(limit > 0))
+    status = ca.if_else(meant, status, float(ControlStatus.NOT_FINITE))
     rows = []
     for i in range(n):
         safe = ca.if_else(_is_finite(fallback[i]), fallback[i], 0)
         chosen = ca.if_else(status == float(ControlStatus.OK), command[i], safe)
-        rows.append(ca.fmin(ca.fmax(chosen, -limit[i]), limit[i]))
+        bound = ca.if_else(limit[i] > 0, limit[i], 0)  # also where it is NaN
+        rows.append(ca.fmin(ca.fmax(chosen, -bound), bound))
     return ca.Function("guard", [command, fallback, limit, q, inputs, volume], [ca.vertcat(*rows), status])
 
 

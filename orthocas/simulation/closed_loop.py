@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
@@ -34,6 +35,11 @@ class ClosedLoop:
         """Whether the command is a torque."""
         return self.controller.command == "torque"
 
+    @property
+    def stiff(self) -> bool:
+        """Whether friction asks for an implicit method."""
+        return bool(np.any(np.asarray(self.friction.coulomb)))
+
     @cached_property
     def plant_rate(self) -> ca.Function:
         """State, command (n, 1), load (3 + n, 1) -> rate of the state."""
@@ -60,7 +66,8 @@ class ClosedLoop:
         t, parameters = ca.MX.sym("t"), ca.MX.sym("parameters", reference.profile.size1_in(1))
         load = ca.MX.sym("load", 3 + self.n)
         command, _ = self.commanded(state, reference.profile.call([t, parameters]))
-        return scalar_code(ca.Function("rate", [state, t, parameters, load], [self.plant_rate(state, command, load)]))
+        rate = ca.Function("rate", [state, t, parameters, load], [self.plant_rate(state, command, load)])
+        return scalar_code(rate) if self.controller.function.is_a("SXFunction") else rate
 
 
 def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:
@@ -76,13 +83,14 @@ def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:
             raise SimulationError(f"CVODES gave up: {str(error)[:200]}") from None
 
 
-def cvodes_options(tolerance: float) -> dict[str, Any]:
-    """Adams with functional iteration: needs no Jacobian of the closed loop, which is smooth and not stiff."""
+def cvodes_options(tolerance: float, stiff: bool) -> dict[str, Any]:
+    """Adams with functional iteration, which needs no Jacobian; BDF with Newton's where Coulomb friction is stiff."""
     return {
-        "linear_multistep_method": "adams",
-        "nonlinear_solver_iteration": "functional",
+        "linear_multistep_method": "bdf" if stiff else "adams",
+        "nonlinear_solver_iteration": "newton" if stiff else "functional",
         "abstol": tolerance,
         "reltol": tolerance,
         "max_num_steps": 20_000,
         "disable_internal_warnings": True,
+        "show_eval_warnings": False,
     }

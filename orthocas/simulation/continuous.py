@@ -15,6 +15,9 @@ from orthocas.simulation.disturbances import Push, loads_at
 _OUTPUTS = 25  # instants of one integrator call: one object serves all, and Ctrl-C waits no longer than that
 
 
+_SAME = 1e-9  # [s]: events closer than that differ by rounding
+
+
 def integrate(
     loop: ClosedLoop, reference: Reference, pushes: tuple[Push, ...], start: Array, step: float, tolerance: float
 ) -> Iterator[tuple[Array, Array]]:
@@ -26,8 +29,8 @@ def integrate(
     run = _integrator(loop, reference, tolerance)
     state = start
     for begin, end in _pieces(reference, pushes, step * _OUTPUTS):
-        segment = int(reference.segment(np.array([begin]))[0])
-        load = loads_at(pushes, np.array([begin]), loop.n)[0]
+        middle = np.array([(begin + end) / 2])
+        segment, load = int(reference.segment(middle)[0]), loads_at(pushes, middle, loop.n)[0]
         since = begin - reference.times[segment]
         p = np.concatenate([[end - begin, since], reference.parameters[segment], load])
         states = np.asarray(run_compiled(run, x0=ca.DM(state), p=ca.DM(p))["xf"]).T
@@ -39,6 +42,7 @@ def _pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> I
     """Intervals no longer than that, without a step of the reference or a change of load inside."""
     edges = np.array([*reference.times, *(t for push in pushes for t in (push.start, push.end))])
     borders = np.unique(edges[edges <= reference.duration])
+    borders = borders[np.diff(borders, prepend=-1.0) > _SAME]
     for begin, end in pairwise(borders):
         count = max(1, int(np.ceil((end - begin) / longest - 1e-9)))
         cuts = np.linspace(begin, end, count + 1)
@@ -56,5 +60,5 @@ def _integrator(loop: ClosedLoop, reference: Reference, tolerance: float) -> ca.
     ode = length * rate(x, since + s * length, parameters, load)
     grid = np.arange(1, _OUTPUTS + 1) / _OUTPUTS
     return ca.integrator(
-        "closed_loop", "cvodes", {"x": x, "t": s, "p": p, "ode": ode}, 0.0, grid, cvodes_options(tolerance)
+        "closed_loop", "cvodes", {"x": x, "t": s, "p": p, "ode": ode}, 0.0, grid, cvodes_options(tolerance, loop.stiff)
     )

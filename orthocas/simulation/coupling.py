@@ -10,6 +10,8 @@ from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError
 from orthocas.simulation.trajectory import Trajectory
 
+_NO_STEP = 1e-9  # differences of targets that come from rounding
+
 
 @dataclass(frozen=True, eq=False)
 class Coupling:
@@ -26,7 +28,8 @@ class Coupling:
 def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -> Coupling:
     """Largest excursion of each coordinate from its reference while only another is commanded, over the commanded step.
 
-    Steps that change several targets at once are left out; of several steps in one coordinate the worst counts.
+    Steps that change several targets at once are left out; of several steps in one coordinate the worst counts. What a
+    step before has left counts too: let the arm come to rest in between.
 
     Args:
         chart: the coordinates that are judged, also for controllers that do not use them.
@@ -45,7 +48,7 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
     steps = np.diff(np.vstack([reference.start, reference.targets]), axis=0)
     index = np.full((chart.n, chart.n), np.nan)
     for segment, step in enumerate(steps):
-        moved = np.flatnonzero(step)
+        moved = np.flatnonzero(np.abs(step) > _NO_STEP)
         begin, end = reference.times[segment : segment + 2]
         inside = (trajectory.times >= begin) & (trajectory.times <= end)
         if len(moved) == 1 and inside.any():

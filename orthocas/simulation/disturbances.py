@@ -32,9 +32,11 @@ class Push:
     def __init__(
         self, start: float, duration: float, force: ArrayLike = (0.0, 0.0, 0.0), torque: ArrayLike | None = None
     ) -> None:
-        for name, value, good in (("start", start, start >= 0), ("duration", duration, duration > 0)):
-            if not (good and np.isfinite(value)):
-                raise InvalidValueError(f"{name} of a push", value, "a finite number > 0, or a start of 0")
+        for name, value, want in (("start", start, ">= 0"), ("duration", duration, "> 0")):
+            number = as_float_array(f"{name} of a push", value)
+            require_shape(f"{name} of a push", number.shape, ())
+            if not (np.isfinite(number) and (number > 0 or (number == 0 and name == "start"))):
+                raise InvalidValueError(f"{name} of a push", value, f"a finite number {want}")
         object.__setattr__(self, "start", float(start))
         object.__setattr__(self, "duration", float(duration))
         object.__setattr__(self, "force", frozen_array("force", force, (3,)))
@@ -57,6 +59,15 @@ def loads_at(pushes: tuple[Push, ...], times: Array, n: int) -> Array:
     loads = np.zeros((len(times), 3 + n))
     for push in pushes:
         loads[(times >= push.start) & (times < push.end)] += push.load(n)
+    return loads
+
+
+def mean_loads(pushes: tuple[Push, ...], starts: Array, length: float, n: int) -> Array:
+    """Time means of the loads over intervals of one length, (N, 3 + n): a short push keeps its impulse."""
+    loads = np.zeros((len(starts), 3 + n))
+    for push in pushes:
+        overlap = np.minimum(starts + length, push.end) - np.maximum(starts, push.start)
+        loads += np.maximum(overlap, 0.0)[:, None] / length * push.load(n)
     return loads
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.batch import Batched
-from orthocas.checks import Array, frozen_array
+from orthocas.checks import Array, as_float_array, frozen_array
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, SimulationError
@@ -65,15 +65,15 @@ def simulate(
         ShapeError, InvalidValueError: for what does not fit.
     """
     loop = ClosedLoop(controller, plant or controller.problem.robot, friction or Friction())
-    _require_fitting(loop, reference, tuple(pushes), friction, noise, control_rate)
-    start = _start_state(loop, q_start, dq_start)
     for name, value in (
         ("step", step),
         ("tolerance", tolerance),
         ("control_rate", 1.0 if control_rate is None else control_rate),
     ):
-        if not 0 < value < np.inf:
+        if not 0 < as_float_array(name, value) < np.inf:
             raise InvalidValueError(name, value, "a finite number > 0")
+    _require_fitting(loop, reference, tuple(pushes), friction, noise, control_rate)
+    start = _start_state(loop, q_start, dq_start)
     if must_be_reachable:
         controller.require_reachable(reference, start[: loop.n])
     loads, pieces = tuple(pushes), []
@@ -126,8 +126,13 @@ def _require_fitting(
         )
     if loop.n != controller.problem.n:
         raise InvalidValueError("joints of the plant", loop.n, f"{controller.problem.n}, as the controller's robot")
-    if not loop.torque and (pushes or friction is not None):
-        raise InvalidValueError("pushes or friction", "given", "none: a velocity controller sees no forces")
+    if not loop.torque and (pushes or friction is not None or loop.plant is not controller.problem.robot):
+        raise InvalidValueError("pushes, friction or plant", "given", "none: a velocity controller sees no forces")
+    late = [push.start for push in pushes if push.start >= reference.duration]
+    if late:
+        raise InvalidValueError("start of a push", late[0], f"before the end at {reference.duration:g} s")
+    if control_rate is not None and as_float_array("control_rate", control_rate) * reference.duration < 1:
+        raise InvalidValueError("control_rate", control_rate, f"at least one tick in {reference.duration:g} s")
     if noise is not None and control_rate is None:
         raise InvalidValueError("noise", noise, "none without a control_rate: white noise needs ticks")
 

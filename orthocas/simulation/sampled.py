@@ -8,7 +8,7 @@ import numpy as np
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.simulation.closed_loop import ClosedLoop, cvodes_options, run_compiled
-from orthocas.simulation.disturbances import Noise, Push, loads_at
+from orthocas.simulation.disturbances import Noise, Push, mean_loads
 
 _TICKS = 50  # of one call
 
@@ -27,12 +27,12 @@ def run_ticks(
     Raises:
         SimulationError: when CVODES gives up.
     """
-    ticks = int(np.ceil(reference.duration * rate - 1e-9))
+    ticks = int(np.floor(reference.duration * rate + 1e-9))  # whole ticks: the reference ends with its last segment
     times = np.arange(ticks) / rate
     columns = (
         np.hstack(reference.sample(times)),
         noise.sample(ticks, loop.n)[:, : loop.plant_rate.size1_in(0)],
-        loads_at(pushes, times, loop.n),
+        mean_loads(pushes, times, 1 / rate, loop.n),
     )
     run = _tick(loop, 1 / rate, len(reference.labels), tolerance).mapaccum(_TICKS)
     state = start
@@ -60,7 +60,7 @@ def _tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Funct
         {"x": x, "p": ca.vertcat(u, w), "ode": loop.plant_rate(x, u, w)},
         0.0,
         length,
-        cvodes_options(tolerance),
+        cvodes_options(tolerance, loop.stiff),
     )
     state, reference = ca.MX.sym("state", size), ca.MX.sym("reference", 3 * k)
     noise, load = ca.MX.sym("noise", size), ca.MX.sym("load", 3 + loop.n)

@@ -4,6 +4,7 @@ import json
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
@@ -20,6 +21,8 @@ from orthocas.errors import TrajectoryFileError
 from orthocas.simulation.figure import trajectory_figure
 
 _VERSION = 1
+_WRONG_CONTENT = (ValueError, KeyError, TypeError, AttributeError)
+_DAMAGE = (*_WRONG_CONTENT, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 _ARRAYS = {  #: array fields and their units
     "times": "s",
     "q": "rad or m",
@@ -68,7 +71,8 @@ class Trajectory:
     def energy_balance(self) -> Array:
         """V(t) - V(0) + the energy dissipated until t, (N,) [J].
 
-        0 for impedance and PD+ (coupled) with the right model, no friction and no pushes, while the reference rests.
+        0 for impedance and PD+ (coupled) in continuous time with the right model, without friction, pushes, noise, and
+        commands that were cut or replaced by the fallback, while the reference rests.
         """
         lost = cumulative_simpson(self.dissipated_power, x=self.times, initial=0.0)
         return np.asarray(self.storage - self.storage[0] + lost)
@@ -121,24 +125,29 @@ class Trajectory:
         Raises:
             TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
         """
+        damaged = TrajectoryFileError(f"{path} is truncated, damaged or not a trajectory file")
         try:
             with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # np.load leaks bad ones
                 header: dict[str, Any] = json.loads(str(file["header"]))
                 arrays: dict[str, Any] = {name: file[name] for name in _ARRAYS}
+            version = header["version"]
         except FileNotFoundError:
             raise TrajectoryFileError(f"trajectory file {path} does not exist") from None
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, TypeError):
-            raise TrajectoryFileError(f"{path} is truncated, damaged or not a trajectory file") from None
-        if header.get("version") != _VERSION:
-            raise TrajectoryFileError(f"{path} has version {header.get('version')}, this orthocas reads {_VERSION}")
-        return cls(
-            header["controller"],
-            header["kind"],
-            Outcome(header["outcome"]),
-            tuple(header["labels"]),
-            tuple(header["joint_names"]),
-            **arrays,
-        )
+        except _DAMAGE:
+            raise damaged from None
+        if version != _VERSION:
+            raise TrajectoryFileError(f"{path} has version {version}, this orthocas reads {_VERSION}")
+        try:
+            names = [tuple(header[key]) for key in ("labels", "joint_names")]
+            run = cls(header["controller"], header["kind"], Outcome(header["outcome"]), *names, **arrays)
+        except _DAMAGE:
+            raise damaged from None
+        if run.q.shape != (len(run.times), len(run.joint_names)) or run.value.shape != (
+            len(run.times),
+            len(run.labels),
+        ):
+            raise damaged
+        return run
 
 
 assert set(_ARRAYS) < {field.name for field in fields(Trajectory)}
