@@ -17,6 +17,7 @@ SCRIPTS = (
     "mesh_chart",
     "growing_queries",
     "closed_loop",
+    "control_tick",
     "against_torch",
     "paper_network",
 )

@@ -205,7 +205,7 @@ def test_energy_of_the_projector_counts_all_springs_and_what_the_dampers_take(pl
     law = Projector(planar_xy, 60.0, 20.0, 0.5)
     q, dq = planar_xy.domain.centre + 0.05, np.array([0.3, -0.2, 0.5])
     here = law.measured(q).full().ravel()
-    x_d, q_d = here[:2] + [0.1, -0.05], q.copy()
+    x_d, q_d = here[:2] + np.array([0.1, -0.05]), q.copy()
     inputs = (np.concatenate([x_d, q_d]), np.zeros(5), np.zeros(5), *law.gains.values())
     storage, power = (float(out) for out in law.energy(q, dq, *inputs))
     M = planar_xy.robot.mass_matrix(q)
@@ -223,11 +223,12 @@ def test_energy_of_the_projector_counts_all_springs_and_what_the_dampers_take(pl
 def test_feedback_of_the_kinematic_projector_pulls_towards_the_reference() -> None:
     problem = oc.problems.get("iiwa")
     q = problem.domain.centre + 0.1
-    reference = np.concatenate([problem.task.function(q).full().ravel() + [0.01, 0.0, -0.02], q + 0.1])
+    ahead = np.array([0.01, 0.0, -0.02])
+    reference = np.concatenate([problem.task.function(q).full().ravel() + ahead, q + 0.1])
     found, _ = torque(KinematicProjector(problem, 2.0, 3.0), q, np.zeros(7), reference, *np.zeros((2, 10)))
     J = problem.task.jacobian_function(q).full()
     sharp = np.linalg.pinv(J)
-    want = sharp @ (2.0 * np.array([0.01, 0.0, -0.02])) + (np.eye(7) - sharp @ J) @ (3.0 * np.full(7, 0.1))
+    want = sharp @ (2.0 * ahead) + (np.eye(7) - sharp @ J) @ (3.0 * np.full(7, 0.1))
     np.testing.assert_allclose(found, want, rtol=1e-9)
 
 

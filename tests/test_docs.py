@@ -45,7 +45,7 @@ def test_python_block_of_exact_coordinates_runs(checkout: Path) -> None:
 
 def test_shell_quickstart_runs(checkout: Path) -> None:
     commands = [shlex.split(line) for line in blocks("sh")[1].splitlines()]
-    assert len(commands) == 9
+    assert len(commands) == 10
     for words in commands:
         assert words[0] == "orthocas"
         done = subprocess.run([sys.executable, "-m", *words], cwd=checkout, capture_output=True, text=True, check=False)
@@ -61,6 +61,22 @@ def test_python_block_of_the_page_on_control_runs(tmp_path: Path) -> None:
     assert first.endswith("] 0")  # no status but OK
     assert float(coupling) < 0.005
     assert (tmp_path / "run.npz").exists()
+
+
+def test_ten_minutes_to_a_controller_in_c_run(checkout: Path) -> None:
+    """Every command of docs/c_controller.md, in order."""
+    if shutil.which("cmake") is None or shutil.which("cc") is None:
+        pytest.skip("no C compiler, or no cmake")
+    page = (ROOT / "docs" / "c_controller.md").read_text()
+    lines = [line for block in re.findall(r"```sh\n(.*?)```", page, flags=re.DOTALL) for line in block.splitlines()]
+    assert len(lines) == 7
+    for line in lines:
+        words = shlex.split(line)
+        command = [sys.executable, "-m", *words] if words[0] == "orthocas" else words
+        done = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{line}: {done.stderr}"
+    assert "statuses: 2000 ok, 0 outside" in done.stdout
+    assert float(done.stdout.split()[-1]) < 1e-4  # the task stays while the arm moves
 
 
 def test_make_targets_of_the_readme_exist() -> None:

@@ -138,8 +138,9 @@ class Trajectory:
         if version != _VERSION:
             raise TrajectoryFileError(f"{path} has version {version}, this orthocas reads {_VERSION}")
         try:
-            names = [tuple(header[key]) for key in ("labels", "joint_names")]
-            run = cls(header["controller"], header["kind"], Outcome(header["outcome"]), *names, **arrays)
+            labels, joint_names = tuple(header["labels"]), tuple(header["joint_names"])
+            outcome = Outcome(header["outcome"])
+            run = cls(header["controller"], header["kind"], outcome, labels, joint_names, **arrays)
         except _DAMAGE:
             raise damaged from None
         if run.q.shape != (len(run.times), len(run.joint_names)) or run.value.shape != (
