@@ -6,7 +6,19 @@ from typing import Annotated, Any
 import typer
 
 from orthocas.chart import Chart
-from orthocas.cli.controller_argument import CONTROLLERS, ControllerOptions, build_controller, require_options
+from orthocas.cli.controller_argument import (
+    CONTROLLERS,
+    ControllerOptions,
+    CouplingName,
+    DampingName,
+    DampingRatio,
+    Feedback,
+    Limit,
+    PostureStiffness,
+    Stiffness,
+    build_controller,
+    require_options,
+)
 from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.codegen import GeneratedC, Proof, check_c, generate_c
 from orthocas.errors import InvalidValueError
@@ -20,24 +32,13 @@ def codegen(
     controller: Annotated[str, typer.Option("--controller", help=f"{', '.join(CONTROLLERS)} or {_NONE}.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the library's source.")],
     name: Annotated[str | None, typer.Option("--name", help="Prefix of all C names; default from the chart.")] = None,
-    stiffness: Annotated[
-        str | None, typer.Option("--stiffness", help='Default gain, "100" or one for each; else 2 Hz.')
-    ] = None,
-    damping_ratio: Annotated[str | None, typer.Option("--damping-ratio", help="Default gain; else 0.7.")] = None,
-    coupling: Annotated[
-        str | None, typer.Option("--coupling", help="coupled or decoupled, default coupled; impedance and pd_plus.")
-    ] = None,
-    damping: Annotated[
-        str | None,
-        typer.Option("--damping", help="square_root (default) or double_diagonal; impedance and pd_plus."),
-    ] = None,
-    posture_stiffness: Annotated[
-        str | None, typer.Option("--posture-stiffness", help="Default gain of projector; else 2 Hz.")
-    ] = None,
-    feedback: Annotated[
-        str | None, typer.Option("--feedback", help="Default gain of kinematic and kinematic_projector; else 0.")
-    ] = None,
-    limit: Annotated[str | None, typer.Option("--limit", help="Default limit of the command; else none.")] = None,
+    stiffness: Stiffness = None,
+    damping_ratio: DampingRatio = None,
+    coupling: CouplingName = None,
+    damping: DampingName = None,
+    posture_stiffness: PostureStiffness = None,
+    feedback: Feedback = None,
+    limit: Limit = None,
     check: Annotated[bool, typer.Option("--check", help="Compile, and compare with Python on 1000 states.")] = False,
     json: AsJson = False,
 ) -> None:

@@ -1,9 +1,10 @@
 """Building a controller from command-line words, and refusing words that another controller takes."""
 
 from dataclasses import dataclass
-from typing import cast
+from typing import Annotated, cast
 
 import numpy as np
+import typer
 
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_known
@@ -31,6 +32,27 @@ _OPTIONS = {  #: which options each controller takes, by the names of fields
     "kinematic_projector": ("feedback",),
 }
 CONTROLLERS = tuple(_OPTIONS)
+
+
+Stiffness = Annotated[
+    str | None, typer.Option("--stiffness", help='"100" or one for each; default 2 Hz with the median inertia.')
+]
+DampingRatio = Annotated[str | None, typer.Option("--damping-ratio", help="One number, or one for each; default 0.7.")]
+CouplingName = Annotated[
+    str | None, typer.Option("--coupling", help="coupled or decoupled, default coupled; impedance and pd_plus.")
+]
+DampingName = Annotated[
+    str | None, typer.Option("--damping", help="square_root (default) or double_diagonal; impedance and pd_plus.")
+]
+PostureStiffness = Annotated[
+    str | None, typer.Option("--posture-stiffness", help="Of the joint springs of projector; default 2 Hz.")
+]
+Feedback = Annotated[
+    str | None, typer.Option("--feedback", help="[1/s], of kinematic and kinematic_projector; default 0.")
+]
+Limit = Annotated[
+    str | None, typer.Option("--limit", help="Largest torque or speed of all joints, or of each; default none.")
+]
 
 
 @dataclass(frozen=True)

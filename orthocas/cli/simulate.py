@@ -13,7 +13,19 @@ import typer
 
 from orthocas.archive import require_writable
 from orthocas.chart import Chart
-from orthocas.cli.controller_argument import CONTROLLERS, ControllerOptions, build_controller, require_options
+from orthocas.cli.controller_argument import (
+    CONTROLLERS,
+    ControllerOptions,
+    CouplingName,
+    DampingName,
+    DampingRatio,
+    Feedback,
+    Limit,
+    PostureStiffness,
+    Stiffness,
+    build_controller,
+    require_options,
+)
 from orthocas.cli.output import AsJson, note, number, print_json, print_rows, whole_number
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.cli.run_report import fallback_text, run_report, run_rows
@@ -36,28 +48,13 @@ def simulate(
     controller: Annotated[str, typer.Option("--controller", help=f"{', '.join(CONTROLLERS)}.")],
     steps: Annotated[Path, typer.Option("--steps", help="What the robot is to do: a JSON file, see docs/simulate.md.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the run, its pictures and its report.")],
-    stiffness: Annotated[
-        str | None, typer.Option("--stiffness", help='"100" or one for each; default 2 Hz with the median inertia.')
-    ] = None,
-    damping_ratio: Annotated[
-        str | None, typer.Option("--damping-ratio", help="One number, or one for each; default 0.7.")
-    ] = None,
-    coupling: Annotated[
-        str | None, typer.Option("--coupling", help="coupled or decoupled, default coupled; impedance and pd_plus.")
-    ] = None,
-    damping: Annotated[
-        str | None,
-        typer.Option("--damping", help="square_root (default) or double_diagonal; impedance and pd_plus."),
-    ] = None,
-    posture_stiffness: Annotated[
-        str | None, typer.Option("--posture-stiffness", help="Of the joint springs of projector; default 2 Hz.")
-    ] = None,
-    feedback: Annotated[
-        str | None, typer.Option("--feedback", help="[1/s], of kinematic and kinematic_projector; default 0.")
-    ] = None,
-    limit: Annotated[
-        str | None, typer.Option("--limit", help="Largest torque or speed of all joints, or of each; default none.")
-    ] = None,
+    stiffness: Stiffness = None,
+    damping_ratio: DampingRatio = None,
+    coupling: CouplingName = None,
+    damping: DampingName = None,
+    posture_stiffness: PostureStiffness = None,
+    feedback: Feedback = None,
+    limit: Limit = None,
     rate: Annotated[
         float | None, typer.Option("--rate", parser=number, help="Control rate [Hz]; default continuous control.")
     ] = None,
