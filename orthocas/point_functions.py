@@ -20,7 +20,7 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
         return _from_basis(family, theta)
     kind: Any = ca.MX if family.as_matrices else ca.SX
     q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
-    parameters = kind(ca.DM(theta))
+    parameters: Any = ca.DM(theta)  # numbers, so that slices and transposes of weights are not done at every call
     xi = family.expression(q, parameters)
     jacobian = ca.horzcat(*family.jacobian(q, parameters)).T
     return _functions(xi, jacobian, second_derivative(xi, q, v, w), q, v, w)

@@ -146,32 +146,51 @@ def test_object_holds_no_state_and_calls_only_mathematics(pd_plus: Generated, tm
     assert {name for kind, name in rows if kind == "U"} <= known | {"_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
 
 
-def test_random_ticks_under_sanitizers_never_trap(pd_plus: Generated, tmp_path: Path) -> None:
-    """100,000 ticks with the address and undefined-behaviour sanitizers."""
-    generated, law = pd_plus
+def random_ticks(generated: GeneratedC, law: Controller, ticks: int, folder: Path, *flags: str) -> Path:
+    """The program of `_FUZZ`, compiled."""
     text = _FUZZ
-    for word, value in (("NAME", "arm"), ("TICKS", "100000L"), ("LIMIT", "90.0"), ("KK", "3")):
+    words = {"NAME": "arm", "TICKS": f"{ticks}L", "LIMIT": "90.0", "KK": str(len(law.labels)), "N": str(law.problem.n)}
+    for word, value in words.items():
         text = re.sub(rf"\b{word}(?=\b|_)", value, text)
-    (tmp_path / "fuzz.c").write_text(re.sub(r"\bN\b", str(law.problem.n), text))
-    binary = tmp_path / "fuzz"
-    flags = ["-std=c99", "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    sources = [str(tmp_path / "fuzz.c"), str(generated.folder / "arm.c")]
-    built = subprocess.run(
-        [compiler(), *flags, f"-I{generated.folder}", "-o", str(binary), *sources, "-lm"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    (folder / "fuzz.c").write_text(text)
+    sources = [str(folder / "fuzz.c"), str(generated.folder / "arm.c")]
+    command = [
+        compiler(),
+        "-std=c99",
+        "-O1",
+        "-g",
+        *flags,
+        f"-I{generated.folder}",
+        "-o",
+        str(folder / "fuzz"),
+        *sources,
+    ]
+    built = subprocess.run([*command, "-lm"], capture_output=True, text=True, check=False)
     if built.returncode != 0 and "cannot find" in built.stderr:
         pytest.skip("no sanitizer libraries")
     assert built.returncode == 0, built.stderr
-    done = subprocess.run([str(binary)], capture_output=True, text=True, check=False)
+    return folder / "fuzz"
+
+
+def test_a_million_random_ticks_under_sanitizers_never_trap(pd_plus: Generated, tmp_path: Path) -> None:
+    """Address and undefined-behaviour sanitizers; the program itself checks statuses, finiteness and the limit."""
+    program = random_ticks(*pd_plus, 1_000_000, tmp_path, "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     counts = [int(word) for word in done.stdout.split()]
-    assert sum(counts) == 100_000
-    assert counts[0] > 10_000  # within the domain
-    assert counts[1] > 10_000  # outside
-    assert counts[3] > 10_000  # not finite
+    assert sum(counts) == 1_000_000
+    assert counts[0] > 100_000  # within the domain
+    assert counts[1] > 100_000  # outside
+    assert counts[3] > 50_000  # not finite
+
+
+def test_valgrind_finds_nothing(pd_plus: Generated, tmp_path: Path) -> None:
+    if shutil.which("valgrind") is None:
+        pytest.skip("no valgrind")
+    program = random_ticks(*pd_plus, 20_000, tmp_path)
+    command = ["valgrind", "--error-exitcode=9", "--leak-check=full", str(program)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
 
 
 def test_two_threads_get_what_one_gets(pd_plus: Generated, tmp_path: Path) -> None:

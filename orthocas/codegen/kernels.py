@@ -34,7 +34,7 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     generator = ca.CodeGenerator("kernels.c", _OPTIONS)
     for function in functions:
         generator.add(function)
-    items = _definitions(generator.dump())
+    items = _definitions(generator.dump().replace(_ACROSS, _ALONG))
     names = [function.name() for function in functions]
     code = "\n\n".join(_without_warnings(items[name]) for name in _needed(items, names))
     code = re.sub(r"CASADI_CAST\((\w+), ([^()]+)\)", r"(\1)(\2)", code)
@@ -42,6 +42,15 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)
     work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), f.sz_w()) for f in functions}
     return Kernels(code, work)
+
+
+# CasADi's product of dense matrices walks across the columns of x; along them, compilers can vectorise it.
+_ACROSS = """      for (j=0; j<nrow_x; ++j) {
+        for (k=0; k<ncol_x; ++k) {
+"""
+_ALONG = """      for (k=0; k<ncol_x; ++k) {
+        for (j=0; j<nrow_x; ++j) {
+"""
 
 
 def _definitions(text: str) -> dict[str, str]:
