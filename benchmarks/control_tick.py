@@ -46,7 +46,6 @@ int main(int argc, char **argv) { /* states, ticks, n, k, gains, then library an
       if (t >= 0) seconds[t] = (b.tv_sec - a.tv_sec) * 1e6 + (b.tv_nsec - a.tv_nsec) * 1e-3;
     }
     qsort(seconds, ticks, sizeof(double), order);
-    printf("%s", "");
     for (j = 0; j < 3; ++j) printf("%.3f ", seconds[j == 0 ? ticks / 2 : j == 1 ? ticks * 99 / 100 : ticks - 1]);
     printf("\n");
   }

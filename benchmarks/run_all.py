@@ -16,6 +16,7 @@ SCRIPTS = (
     "starts",
     "mesh_chart",
     "growing_queries",
+    "lengths",
     "closed_loop",
     "control_tick",
     "against_torch",

@@ -6,6 +6,7 @@ from pathlib import Path
 import closed_loop
 import control_tick
 import controllers
+import lengths
 import panda_elbow
 import pytest
 
@@ -43,3 +44,8 @@ def test_ticks_of_generated_c_are_measured() -> None:
     assert {"PD+ decoupled, polynomial:2", "projector, A = M"} <= set(found)
     for row in found.values():
         assert 0 < row["median"] <= row["p99"] <= row["worst"]
+
+
+def test_length_term_evens_gradients() -> None:
+    found = lengths.main(quick=True)
+    assert found["planar_3r_x 4 1"].length_ratio < 0.3 * found["planar_3r_x 4 0"].length_ratio

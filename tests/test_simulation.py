@@ -129,8 +129,6 @@ def test_coupling_index_reads_the_worst_excursion(planar_chart: oc.Chart, q0: Ar
     assert coupling.of("x", "xi1") == pytest.approx(0.2, rel=1e-6)
     assert coupling.of("xi2", "xi1") < 1e-6
     assert np.isnan(coupling.index[:, [0, 2]]).all()  # two targets at once are left out
-    again = Reference.steps(planar_chart.labels, phi, [(0.0, {"xi1": 0.05}), (1.0, {"xi1": 0.0})], 2.0)
-    assert coupling_index(planar_chart, again, replace(strayed, q=strayed.q)).of("x", "xi1") >= 0.2  # the worst counts
 
 
 def test_breakdown_adds_up_to_the_task_acceleration(planar_chart: oc.Chart, steps: Reference, q0: Array) -> None:
@@ -276,7 +274,9 @@ def test_noise_is_on_what_it_says(planar_chart: oc.Chart, q0: Array) -> None:
         errors = noise.sample(200, 3)
         k = 57
         measured = {"q": run.q[k] + errors[k, :3], "dq": run.dq[k] + errors[k, 3:]}
-        assert np.abs(errors[:, :3]).max() > 0 if gain == "q" else np.abs(errors[:, 3:]).max() > 0
+        quiet, noisy = (errors[:, 3:], errors[:, :3]) if gain == "q" else (errors[:, :3], errors[:, 3:])
+        assert np.abs(quiet).max() == 0
+        assert np.abs(noisy).max() > 0
         sent = torque_at(law, still, float(run.times[k]), measured["q"], measured["dq"])
         np.testing.assert_allclose(run.command[k], sent, rtol=1e-9)
 

@@ -5,15 +5,13 @@ import re
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 
 import casadi as ca
 
 from orthocas.archive import require_writable
 from orthocas.chart import Chart
-from orthocas.codegen.interface import template_values
+from orthocas.codegen.interface import filled, template_values
 from orthocas.codegen.kernels import generate_kernels
 from orthocas.control import Controller
 from orthocas.errors import ArchiveError, InvalidValueError
@@ -59,7 +57,7 @@ def generate_c(
     values = template_values(chart, controller, name, kernels)
     folder = _folder(Path(out))
     names = {"robot.h": f"{name}.h", "robot.c": f"{name}.c", "pkgconfig.pc": f"{name}.pc.in"}
-    _write(folder, {names.get(template, template): _filled(template, values) for template in _TEMPLATES})
+    _write(folder, {names.get(template, template): filled(template, values) for template in _TEMPLATES})
     return GeneratedC(folder, name, kernels.stack_bytes)
 
 
@@ -90,10 +88,6 @@ def _folder(out: Path) -> Path:
     require_writable(out / "README.md" if out.is_dir() else out, ArchiveError)
     out.mkdir(exist_ok=True)
     return out
-
-
-def _filled(template: str, values: Mapping[str, str]) -> str:
-    return Template((files("orthocas.codegen") / "templates" / f"{template}.in").read_text()).substitute(values)
 
 
 def _write(folder: Path, contents: Mapping[str, str]) -> None:

@@ -1,5 +1,6 @@
 """What stands in the generated files: names, sizes, tables and comments."""
 
+from collections.abc import Mapping
 from importlib.resources import files
 from string import Template
 
@@ -56,7 +57,7 @@ def template_values(chart: Chart, controller: Controller | None, name: str, kern
     if controller is not None:
         values |= _control_values(controller)
     for part, template in (("control_declarations", "control.h"), ("control_definitions", "control.c")):
-        values[part] = "" if controller is None else _template(template).substitute(values)
+        values[part] = "" if controller is None else filled(template, values)
     return values
 
 
@@ -104,5 +105,6 @@ def _numbers(values: Array) -> str:
     return ", ".join(words.get(float(value), repr(float(value))) for value in values)
 
 
-def _template(name: str) -> Template:
-    return Template((files("orthocas.codegen") / "templates" / f"{name}.in").read_text())
+def filled(template: str, values: Mapping[str, str]) -> str:
+    """A template of `templates/` with its words put in."""
+    return Template((files("orthocas.codegen") / "templates" / f"{template}.in").read_text()).substitute(values)
