@@ -18,7 +18,7 @@ from orthocas.fitting import Fit
 from orthocas.objective import Progress
 from orthocas.simulation import Outcome, Trajectory, animation
 from orthocas.simulation.animation import save_animation
-from orthocas.simulation.figure import ACTUAL, units_of
+from orthocas.simulation.figure import ACTUAL, trajectory_figure, units_of
 from orthocas.simulation.moving_picture import MovingPicture
 
 
@@ -49,7 +49,7 @@ def with_fallback(run: Trajectory) -> Trajectory:
 
 
 def test_figure_shows_values_references_joints_commands_and_storage(planar_run: Trajectory, planar_fit: Fit) -> None:
-    axes = planar_run.plot(units_of(planar_fit.chart.problem)).axes
+    axes = trajectory_figure(planar_run, units_of(planar_fit.chart.problem)).axes
     assert len(axes) == 6
     for i in range(3):
         actual, wanted = axes[i].lines
@@ -66,21 +66,21 @@ def test_figure_shows_values_references_joints_commands_and_storage(planar_run: 
 
 
 def test_velocity_controllers_have_no_storage_panel(spatial_run: Trajectory) -> None:
-    axes = spatial_run.plot().axes
+    axes = trajectory_figure(spatial_run).axes
     assert len(axes) == 7 + 2
     assert axes[-1].get_ylabel() == "velocity [rad/s or m/s]"
 
 
 def test_fallback_is_shaded_and_does_not_spoil_the_scales(planar_run: Trajectory) -> None:
-    figure = with_fallback(planar_run).plot()
+    figure = trajectory_figure(with_fallback(planar_run))
     (patch,) = figure.axes[0].patches
     data = patch.get_extents().transformed(figure.axes[0].transData.inverted())
     np.testing.assert_allclose(data.intervalx, [1, 1.5], atol=0.011)  # between instants
     assert figure.axes[0].get_ylim()[1] < 1
     assert figure.axes[5].get_ylim()[1] < 1e6
     assert "fallback, outside domain" in figure.get_suptitle()
-    assert not planar_run.plot().axes[0].patches
-    assert "diverged" in replace(planar_run, outcome=Outcome.DIVERGED).plot().get_suptitle()
+    assert not trajectory_figure(planar_run).axes[0].patches
+    assert "diverged" in trajectory_figure(replace(planar_run, outcome=Outcome.DIVERGED)).get_suptitle()
 
 
 def test_units_follow_task_and_joints() -> None:
@@ -215,7 +215,7 @@ def test_interrupted_animation_leaves_nothing_and_keeps_the_old_one(
 def test_a_run_of_one_instant_can_be_drawn(planar_run: Trajectory, planar_fit: Fit, tmp_path: Path) -> None:
     arrays = {name: value[:1] for name, value in vars(planar_run).items() if isinstance(value, np.ndarray)}
     instant = replace(planar_run, outcome=Outcome.DIVERGED, **arrays)
-    instant.plot().savefig(tmp_path / "a.png")
+    trajectory_figure(instant).savefig(tmp_path / "a.png")
     save_animation(tmp_path / "a.gif", instant, planar_fit.chart.problem)
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 1  # type: ignore[attr-defined]

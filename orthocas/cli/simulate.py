@@ -36,7 +36,7 @@ from orthocas.objective import Monitor
 from orthocas.progress import terminal_monitor
 from orthocas.simulation import Friction, Noise, Outcome, Trajectory
 from orthocas.simulation.animation import FORMATS, require_format, save_animation
-from orthocas.simulation.figure import units_of
+from orthocas.simulation.figure import trajectory_figure, units_of
 from orthocas.simulation.run import simulate as run_closed_loop
 from orthocas.simulation.steps_file import Plan, read_steps
 
@@ -180,7 +180,7 @@ def _finish(
     with tempfile.TemporaryDirectory(dir=out, prefix=".orthocas-") as folder:
         drafts = Path(folder)
         run.save(drafts / "trajectory.npz")
-        seen.plot(units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
+        trajectory_figure(seen, units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
         (drafts / "report.json").write_text(dumps(report, indent=1, allow_nan=False) + "\n")
         for draft in sorted(drafts.iterdir()):
             os.replace(draft, out / draft.name)

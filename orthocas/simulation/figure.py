@@ -1,7 +1,7 @@
 """A picture of a run: controlled quantities with their references, joints, commands and storage over time."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,9 +10,7 @@ from matplotlib.figure import Figure
 from orthocas.checks import Array
 from orthocas.control.status import ControlStatus
 from orthocas.problem import Problem
-
-if TYPE_CHECKING:
-    from orthocas.simulation.trajectory import Trajectory
+from orthocas.simulation.trajectory import Trajectory
 
 ACTUAL, FALLBACK = "#3d85c6", "#d62728"
 _WANTED, _STORAGE = "#222222", "#1b9e77"
@@ -34,7 +32,7 @@ def units_of(problem: Problem) -> dict[str, str]:
     return units | _TASK_UNITS.get(problem.task.name.partition(":")[0], {})
 
 
-def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None = None) -> Figure:
+def trajectory_figure(trajectory: Trajectory, units: Mapping[str, str] | None = None) -> Figure:
     """Left a panel for each controlled quantity, right joints, commands and storage; red where the law gave way.
 
     Args:
@@ -63,7 +61,7 @@ def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None 
     return figure
 
 
-def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str, str], drawn: bool = True) -> None:
+def draw_quantities(panels: Array, trajectory: Trajectory, units: Mapping[str, str], drawn: bool = True) -> None:
     """Reference and, if drawn, actual value of each quantity, one axes each."""
     good = (trajectory.status == ControlStatus.OK) & np.isfinite(trajectory.value).all(axis=1)
     seen = np.vstack([trajectory.value[good], trajectory.reference])  # charts mean nothing outside their domain
@@ -80,7 +78,7 @@ def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str,
         _style(axes, trajectory)
 
 
-def shade_fallback(axes: Axes, trajectory: "Trajectory") -> None:
+def shade_fallback(axes: Axes, trajectory: Trajectory) -> None:
     """Red where the controller gave its fallback."""
     edges = np.flatnonzero(np.diff(trajectory.status)) + 1
     for start, end in zip([0, *edges], [*edges, len(trajectory.times) - 1], strict=True):
@@ -89,7 +87,7 @@ def shade_fallback(axes: Axes, trajectory: "Trajectory") -> None:
             axes.axvspan(trajectory.times[start], trajectory.times[end], color=FALLBACK, alpha=0.15, linewidth=0)
 
 
-def _draw_others(panels: Array, trajectory: "Trajectory", units: Mapping[str, str]) -> None:
+def _draw_others(panels: Array, trajectory: Trajectory, units: Mapping[str, str]) -> None:
     """Joints, commands, and the storage of torque controllers."""
     torque = trajectory.kind == "torque"
     unit = " or ".join(sorted({units.get(name, "rad or m") for name in trajectory.joint_names}, reverse=True))
@@ -109,14 +107,14 @@ def _draw_others(panels: Array, trajectory: "Trajectory", units: Mapping[str, st
         _style(axes, trajectory)
 
 
-def _style(axes: Axes, trajectory: "Trajectory") -> None:
+def _style(axes: Axes, trajectory: Trajectory) -> None:
     axes.set_xlim(trajectory.times[0], max(trajectory.times[-1], 1e-9))
     axes.ticklabel_format(useOffset=False)
     axes.tick_params(labelsize=_SMALL)
     axes.grid(alpha=0.3)
 
 
-def _title(trajectory: "Trajectory") -> str:
+def _title(trajectory: Trajectory) -> str:
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
         text += f": {trajectory.outcome.value}, the run ends early"

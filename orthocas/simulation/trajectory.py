@@ -5,20 +5,17 @@ import os
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.integrate import cumulative_simpson
 
 from orthocas.archive import require_writable
 from orthocas.checks import Array
 from orthocas.errors import TrajectoryFileError
-from orthocas.simulation.figure import trajectory_figure
 
 _VERSION = 1
 _WRONG_CONTENT = (ValueError, KeyError, TypeError, AttributeError)
@@ -48,7 +45,10 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A closed loop over time: N instants, n joints, k controlled quantities."""
+    """A closed loop over time: N instants, n joints, k controlled quantities.
+
+    `orthocas.simulation.figure.trajectory_figure` draws it.
+    """
 
     controller: str
     kind: str  #: of the command, 'torque' or 'velocity'
@@ -86,14 +86,6 @@ class Trajectory:
     def tracking_error(self) -> Array:
         """Largest |value - reference| of each quantity, (k,)."""
         return np.asarray(np.abs(self.value - self.reference).max(axis=0))
-
-    def plot(self, units: Mapping[str, str] | None = None) -> Figure:
-        """A picture of everything over time, see `orthocas.simulation.figure`.
-
-        Args:
-            units: of the quantities and joints, by name, `units_of(problem)`; default none are shown.
-        """
-        return trajectory_figure(self, units)
 
     def save(self, path: str | Path) -> None:
         """Write an NPZ file with every array, names and units; it appears whole or not at all.
