@@ -57,7 +57,7 @@ def run(chart: oc.Chart, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
 @pytest.fixture
 def blank(monkeypatch: pytest.MonkeyPatch) -> None:
     """Empty pictures, for tests of numbers: drawing takes longer than the runs."""
-    monkeypatch.setattr(Trajectory, "plot", lambda self, units: Figure())
+    monkeypatch.setattr(command, "trajectory_figure", lambda run, units: Figure())
 
 
 def written() -> set[str]:
