@@ -3,6 +3,7 @@
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from orthocas.batch import dense_function
 from orthocas.checks import Array
@@ -32,15 +33,25 @@ def second_derivative(values: Any, q: Any, v: Any, w: Any) -> Any:
 
 
 def _from_basis(family: LinearFamily, theta: Array) -> dict[str, ca.Function]:
+    """Derivatives of basis functions are sums of basis functions: d xi / d q_i = C_i psi' with few of them, psi'.
+
+    For a polynomial of degree d, psi' are those of degree d - 1, and J is one table times psi'.
+    """
     n = family.space.n
-    point = [ca.SX.sym(name, n) for name in ("q", "v", "w")]
-    psi = family.basis(point[0])
-    basis = ca.Function("basis", point[:1], [psi])
-    slopes = ca.Function("basis_slopes", point[:1], [ca.jacobian(psi, point[0])])  # sparse
-    bends = ca.Function("basis_bends", point, [second_derivative(psi, *point)])
+    tables = family.derivative_tables(theta)
+    places = np.flatnonzero(tables.any(axis=(0, 1)))  # columns: 0 is the constant 1, 1 + k the basis function k
     table = ca.MX(ca.DM(theta.reshape(family.outputs, family.width)))
+    slopes = ca.MX(ca.DM(tables[:, :, places].reshape(n * family.outputs, len(places))))
+    point = [ca.SX.sym(name, n) for name in ("q", "v")]
+    psi = family.basis(point[0])
+    part = ca.vertcat(1, psi)[places.tolist()]
+    basis = ca.Function("basis", point[:1], [psi])
+    smaller_basis = ca.Function("smaller_basis", point[:1], [part])
+    change = ca.Function("smaller_basis_change", point, [ca.densify(ca.jtimes(part, *point))])
     q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
-    return _functions(table @ basis(q), table @ slopes(q), table @ bends(q, v, w), q, v, w)
+    jacobian = ca.reshape(slopes @ smaller_basis(q), family.outputs, n)
+    second = ca.reshape(slopes @ change(q, v), family.outputs, n) @ w
+    return _functions(table @ basis(q), jacobian, second, q, v, w)
 
 
 def _functions(xi: Any, jacobian: Any, second: Any, q: Any, v: Any, w: Any) -> dict[str, ca.Function]:

@@ -34,7 +34,7 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     generator = ca.CodeGenerator("kernels.c", _OPTIONS)
     for function in functions:
         generator.add(function)
-    items = _definitions(generator.dump().replace(_ACROSS, _ALONG))
+    items = _definitions(_with_products_of_known_sizes(generator.dump()))
     names = [function.name() for function in functions]
     code = "\n\n".join(_without_warnings(items[name]) for name in _needed(items, names))
     code = re.sub(r"CASADI_CAST\((\w+), ([^()]+)\)", r"(\1)(\2)", code)
@@ -44,13 +44,35 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     return Kernels(code, work)
 
 
-# CasADi's product of dense matrices walks across the columns of x; along them, compilers can vectorise it.
-_ACROSS = """      for (j=0; j<nrow_x; ++j) {
-        for (k=0; k<ncol_x; ++k) {
-"""
-_ALONG = """      for (k=0; k<ncol_x; ++k) {
-        for (j=0; j<nrow_x; ++j) {
-"""
+_PRODUCT = re.compile(r"casadi_mtimes_dense\((\w+), (\d+), (\d+), (\w+), (\d+), (\w+), 0\)")
+
+
+def _with_products_of_known_sizes(text: str) -> str:
+    """Dense products with their sizes as constants, which compilers vectorise; CasADi passes sizes as arguments."""
+    sizes = sorted({found.group(2, 3, 5) for found in _PRODUCT.finditer(text)})
+    calls = _PRODUCT.sub(r"casadi_product_\2_\3_\5(\1, \4, \6)", text)
+    return "\n\n".join([*(_product(*map(int, size)) for size in sizes), calls])
+
+
+def _product(rows: int, columns: int, count: int) -> str:
+    """C code of z += x y, x (rows, columns), y (columns, count); four columns at a time, to touch z less often."""
+    fours = columns - columns % 4
+    lines = [
+        f"void casadi_product_{rows}_{columns}_{count}(const double* restrict x, const double* restrict y,"
+        " double* restrict z) {",
+        "  int i, j, k;",
+        f"  for (i=0; i<{count}; ++i, y+={columns}, z+={rows}) {{",
+        "    const double* xk = x;",
+    ]
+    for start, stop, step in ((0, fours, 4), (fours, columns, 1)):
+        if start < stop:
+            terms = " + ".join(f"xk[j+{c * rows}]*y[k+{c}]" for c in range(step))
+            lines += [
+                f"    for (k={start}; k<{stop}; k+={step}, xk+={step * rows}) {{",
+                f"      for (j=0; j<{rows}; ++j) z[j] += {terms};",
+                "    }",
+            ]
+    return "\n".join([*lines, "  }", "}"])
 
 
 def _definitions(text: str) -> dict[str, str]:

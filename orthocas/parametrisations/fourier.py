@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from math import comb, sqrt
 
 import casadi as ca
+import numpy as np
 
-from orthocas.checks import require_count
+from orthocas.checks import Array, require_count
 from orthocas.errors import InvalidValueError
 from orthocas.parametrisations.family import JointSpace
 from orthocas.parametrisations.product_basis import LinearFamily, terms_up_to
@@ -55,5 +56,12 @@ class Fourier:
                 out += [sqrt(2) * ca.cos(k * q), sqrt(2) * ca.sin(k * q)]
             return out
 
+        def derivatives(i: int) -> Array:
+            """cos(k q)' = -k sin(k q), sin(k q)' = k cos(k q)."""
+            D = np.zeros((2 * self.degree + 1,) * 2)
+            for k in range(1, self.degree + 1):
+                D[2 * k - 1, 2 * k], D[2 * k, 2 * k - 1] = -k, k
+            return D
+
         degrees = [[0] + [k for k in range(1, self.degree + 1) for _ in range(2)]] * space.n
-        return LinearFamily(space, outputs, tuple(terms_up_to(degrees, self.degree)), waves)
+        return LinearFamily(space, outputs, tuple(terms_up_to(degrees, self.degree)), waves, derivatives)

@@ -44,7 +44,7 @@ class Linear:
         def displacement(i: int, q: ca.SX) -> list[ca.SX]:
             return [1 + 0 * q, q - space.centre[i]]
 
-        return LinearFamily(space, outputs, terms, displacement)
+        return LinearFamily(space, outputs, terms, displacement, lambda i: np.array([[0.0, 0.0], [1.0, 0.0]]))
 
     def normal_vectors(self, gradients: Array) -> Array:
         """Rows n_j with n_j . grad_A h_i = 0, unit length, (r, n).

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from math import comb, sqrt
 
 import casadi as ca
+import numpy as np
 
-from orthocas.checks import require_count
+from orthocas.checks import Array, require_count
 from orthocas.parametrisations.family import JointSpace
 from orthocas.parametrisations.product_basis import LinearFamily, terms_up_to
 
@@ -46,5 +47,11 @@ class Polynomial:
                 P.append(((2 * k - 1) * u * P[k - 1] - (k - 1) * P[k - 2]) / k)
             return [sqrt(2 * k + 1) * p for k, p in enumerate(P[: self.degree + 1])]
 
+        def derivatives(i: int) -> Array:
+            """P_a' = sum of (2 b + 1) P_b over b = a - 1, a - 3, ..., here for normalised ones."""
+            a, b = np.indices((self.degree + 1, self.degree + 1))
+            values: Array = np.sqrt((2 * a + 1) * (2 * b + 1)) * ((a > b) & ((a - b) % 2 == 1)) / space.half_width[i]
+            return values
+
         degrees = [list(range(self.degree + 1))] * space.n
-        return LinearFamily(space, outputs, tuple(terms_up_to(degrees, self.degree)), legendre)
+        return LinearFamily(space, outputs, tuple(terms_up_to(degrees, self.degree)), legendre, derivatives)

@@ -20,13 +20,15 @@ Term = tuple[int, ...]  #: for every joint, which one-joint function the term ta
 class LinearFamily:
     """xi_theta(q) = C psi(q), with theta the rows of C (r, K) one after the other.
 
-    psi_k(q) = prod_i f_i,k_i(q_i) over the joints. No term is constant: a constant does not change J_xi.
+    psi_k(q) = prod_i f_i,k_i(q_i) over the joints. No term is constant: a constant does not change J_xi. With a term,
+    the family has all whose factors are among those of the term or, if `one_joint_derivatives` needs them, below.
     """
 
     space: JointSpace
     outputs: int
     terms: tuple[Term, ...]
     one_joint_functions: Callable[[int, Any], list[Any]]
+    one_joint_derivatives: Callable[[int], Array]  #: D of joint i, with f_i,a' = sum_b D_ab f_i,b
     as_matrices: bool = False
 
     @property
@@ -61,6 +63,18 @@ class LinearFamily:
         order = np.array([np.count_nonzero(term) for term in self.terms])
         C = np.random.default_rng(seed).normal(size=(self.outputs, len(self.terms))) * 0.3**order
         return C.ravel()
+
+    def derivative_tables(self, theta: Array) -> Array:
+        """C_i with d xi / d q_i = C_i (1, psi), (n, r, 1 + K)."""
+        n, C = self.space.n, theta.reshape(self.outputs, self.width)
+        places = {(0,) * n: 0} | {term: 1 + k for k, term in enumerate(self.terms)}
+        tables = np.zeros((n, self.outputs, 1 + self.width))
+        for i in range(n):
+            D = self.one_joint_derivatives(i)
+            for k, term in enumerate(self.terms):
+                for b in np.flatnonzero(D[term[i]]):
+                    tables[i, :, places[(*term[:i], int(b), *term[i + 1 :])]] += D[term[i], b] * C[:, k]
+        return tables
 
     @cached_property
     def terms_of_joints(self) -> NDArray[np.int_]:
