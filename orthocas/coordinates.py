@@ -156,7 +156,8 @@ class Coordinates:
         if len(self.offset):
             parts, scale = point_functions(self.family, self.theta, len(active)), ca.DM(self.scale)
             xi.append((parts["xi"](q[active]) - ca.DM(self.offset)) * scale)
-            J.append(ca.diag(scale) @ parts["jacobian"](q[active]) @ ca.DM(unit[active]))
+            J_active = parts["jacobian"](q[active]) * ca.repmat(scale, 1, len(active))
+            J.append(J_active @ ca.DM(unit[active]) if idle else J_active)
             second.append(parts["second_derivative"](q[active], v[active], w[active]) * scale)
         if idle:
             xi.append(q[idle] - ca.DM(self.space.centre[idle]))

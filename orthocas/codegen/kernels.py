@@ -6,6 +6,8 @@ from typing import Any
 
 import casadi as ca
 
+from orthocas.codegen.work_arrays import compacted
+
 _OPTIONS: dict[str, Any] = {"with_header": False, "with_export": False, "casadi_int": "int"}
 _FUNCTION = re.compile(r"^(?:static |inline |const )*\w+\s?\*?\s+\**(\w+)\((.*)", re.DOTALL)
 _DATA = re.compile(r"^static const \w+ (\w+)\[")
@@ -34,13 +36,13 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     generator = ca.CodeGenerator("kernels.c", _OPTIONS)
     for function in functions:
         generator.add(function)
-    items = _definitions(_with_products_of_known_sizes(generator.dump()))
+    items, doubles = compacted(_definitions(_with_products_of_known_sizes(generator.dump())), functions)
     names = [function.name() for function in functions]
     code = "\n\n".join(_without_warnings(items[name]) for name in _needed(items, names))
     code = re.sub(r"CASADI_CAST\((\w+), ([^()]+)\)", r"(\1)(\2)", code)
     code = re.sub(r"\bcasadi_real\b", "double", re.sub(r"\bcasadi_int\b", "int", code))
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)
-    work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), f.sz_w()) for f in functions}
+    work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), doubles[f.name()]) for f in functions}
     return Kernels(code, work)
 
 

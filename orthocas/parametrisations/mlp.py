@@ -76,7 +76,9 @@ class MLPFamily:
         W_out = layers[-1][0]
         gradients = ca.horzcat(*(ca.repmat(W_out[j, :].T, 1, N) for j in range(self.outputs)))
         for (W, _), slope in zip(layers[-2::-1], reversed(slopes), strict=True):
-            gradients = W.T @ (gradients * ca.repmat(slope, 1, self.outputs))
+            gradients *= ca.repmat(slope, 1, self.outputs)
+            # of one sample as rows: generated C then needs no transposed copy of the weights
+            gradients = (gradients.T @ W).T if N == 1 else W.T @ gradients
         t = len(self._turning)
         by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[self._turning, :]), 1, self.outputs)
         by_angle -= gradients[t : 2 * t, :] * ca.repmat(ca.sin(q[self._turning, :]), 1, self.outputs)

@@ -1,0 +1,94 @@
+"""Work arrays of generated functions, without the room that CasADi keeps in them for constants.
+
+CasADi's C refers to constants where they stand, but its work array keeps a place for every one: for a network of a
+thousand neurons that is megabytes of stack that nothing reads or writes.
+"""
+
+import re
+
+import casadi as ca
+
+_PLACE = re.compile(r"\*w(\d+)=w\+(\d+)")
+_CALL = re.compile(r"\bcasadi_f\d+(?=\(arg1, res1, iw, w, 0\))")
+
+
+def compacted(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dict[str, str], dict[str, int]]:
+    """C code with smaller work arrays, and how many doubles each of the functions needs.
+
+    Args:
+        blocks: C code by name; what functions call is casadi_f0, casadi_f1, ... in the order in which CasADi meets it.
+        functions: those the code was generated from, in the same order.
+
+    Raises:
+        RuntimeError: if the code is not laid out as expected, because CasADi changed.
+    """
+    names = {hash(f): f"casadi_f{number}" for number, f in enumerate(_in_order_of_generation(functions))}
+    changed = dict(blocks)
+    needed: dict[str, int] = {}
+
+    def need(function: ca.Function) -> int:
+        name = names[hash(function)]
+        if name not in needed:
+            callees = _callees(function)
+            if set(_CALL.findall(blocks[name])) != {names[hash(callee)] for callee in callees}:
+                raise RuntimeError(f"the C code of {function.name()} does not call what its graph calls")
+            below = max(map(need, callees), default=0)
+            changed[name], needed[name] = _moved(blocks[name], function, below)
+        return needed[name]
+
+    return changed, {function.name(): need(function) for function in functions}
+
+
+def _in_order_of_generation(functions: list[ca.Function]) -> list[ca.Function]:
+    """The functions and all they call, callers before callees."""
+    found: dict[int, ca.Function] = {}
+
+    def visit(function: ca.Function) -> None:
+        if hash(function) not in found:
+            found[hash(function)] = function
+            for callee in _callees(function):
+                visit(callee)
+
+    for function in functions:
+        visit(function)
+    return list(found.values())
+
+
+def _callees(function: ca.Function) -> list[ca.Function]:
+    if not function.is_a("MXFunction"):
+        return []
+    calls = [k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CALL]
+    return [function.instruction_MX(k).which_function() for k in calls]
+
+
+def _moved(block: str, function: ca.Function, below: int) -> tuple[str, int]:
+    """Code whose places in the work array follow each other, from `below` on, and where the last ends."""
+    sizes = _place_sizes(function)
+    old_start = function.sz_w() - sum(sizes.values())
+    body = _PLACE.sub("", block.split("{", 1)[1])
+    if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
+        below = old_start  # an operation of its own works there, or the code has no places
+    new, old, end = {}, old_start, below
+    used = {int(place): int(offset) for place, offset in _PLACE.findall(block)}
+    for place, size in sorted(sizes.items()):
+        if place in used:
+            if used[place] != old:
+                raise RuntimeError(f"place {place} of {function.name()} is at {used[place]}, expected at {old}")
+            new[place] = end
+            old += size
+            end += size
+    return _PLACE.sub(lambda found: f"*w{found[1]}=w+{new[int(found[1])]}", block), end
+
+
+def _place_sizes(function: ca.Function) -> dict[int, int]:
+    """Numbers that every place of the work array holds."""
+    found: dict[int, int] = {}
+    for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
+        node = function.instruction_MX(k)
+        places = [] if function.instruction_id(k) == ca.OP_OUTPUT else function.instruction_output(k)
+        for index, place in enumerate(places):
+            if function.instruction_id(k) == ca.OP_CALL:
+                found[place] = node.which_function().nnz_out(index)
+            else:
+                found[place] = (node.get_output(index) if len(places) > 1 else node).nnz()
+    return {place: size for place, size in found.items() if place >= 0}
