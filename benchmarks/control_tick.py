@@ -15,7 +15,7 @@ import numpy as np
 import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import compile_shared, gain_numbers
-from orthocas.codegen.library import compiler
+from orthocas.codegen.library import compilers
 from orthocas.control import Controller, Impedance, Kinematic, PDPlus, Projector
 
 _HARNESS = r"""
@@ -80,7 +80,7 @@ def main(quick: bool = False) -> dict[str, dict[str, float]]:
         place, arguments, data = Path(folder), [], []
         (place / "harness.c").write_text(_HARNESS)
         harness = place / "harness"
-        subprocess.run([compiler(), "-O2", str(place / "harness.c"), "-o", str(harness), "-ldl"], check=True)
+        subprocess.run([compilers()[0], "-O2", str(place / "harness.c"), "-o", str(harness), "-ldl"], check=True)
         for number, (title, chart, law) in enumerate(laws(quick)):
             begin = time.perf_counter()
             generated = oc.generate_c(chart, place, law, f"tick{number}")

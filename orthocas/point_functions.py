@@ -37,21 +37,21 @@ def _from_basis(family: LinearFamily, theta: Array) -> dict[str, ca.Function]:
 
     For a polynomial of degree d, psi' are those of degree d - 1, and J is one table times psi'.
     """
-    n = family.space.n
+    n, r = family.space.n, family.outputs
     tables = family.derivative_tables(theta)
-    places = np.flatnonzero(tables.any(axis=(0, 1)))  # columns: 0 is the constant 1, 1 + k the basis function k
-    table = ca.MX(ca.DM(theta.reshape(family.outputs, family.width)))
-    slopes = ca.MX(ca.DM(tables[:, :, places].reshape(n * family.outputs, len(places))))
-    point = [ca.SX.sym(name, n) for name in ("q", "v")]
-    psi = family.basis(point[0])
-    part = ca.vertcat(1, psi)[places.tolist()]
-    basis = ca.Function("basis", point[:1], [psi])
-    smaller_basis = ca.Function("smaller_basis", point[:1], [part])
-    change = ca.Function("smaller_basis_change", point, [ca.densify(ca.jtimes(part, *point))])
+    places = np.flatnonzero(tables.any(axis=(0, 1)))
+    x, u = ca.SX.sym("q", n), ca.SX.sym("v", n)
+    psi = family.basis(x)
+    smaller = ca.vertcat(1, psi)[places.tolist()]
+    basis = ca.Function("basis", [x], [psi])
+    smaller_basis = ca.Function("smaller_basis", [x], [smaller])
+    change = ca.Function("smaller_basis_change", [x, u], [ca.densify(ca.jtimes(smaller, x, u))])
+    values = ca.MX(ca.DM(theta.reshape(r, family.width)))
+    slopes = ca.MX(ca.DM(tables[:, :, places].reshape(n * r, len(places))))
     q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
-    jacobian = ca.reshape(slopes @ smaller_basis(q), family.outputs, n)
-    second = ca.reshape(slopes @ change(q, v), family.outputs, n) @ w
-    return _functions(table @ basis(q), jacobian, second, q, v, w)
+    jacobian = ca.reshape(slopes @ smaller_basis(q), r, n)
+    second = ca.reshape(slopes @ change(q, v), r, n) @ w
+    return _functions(values @ basis(q), jacobian, second, q, v, w)
 
 
 def _functions(xi: Any, jacobian: Any, second: Any, q: Any, v: Any, w: Any) -> dict[str, ca.Function]:

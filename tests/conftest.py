@@ -1,21 +1,52 @@
 """Shared problems, charts and real robot descriptions."""
 
-from importlib.metadata import files
+from importlib import metadata
 from pathlib import Path
 
+import numpy as np
+import pinocchio as pin
 import pytest
 
 import orthocas as oc
 from orthocas import problems
 from orthocas.fitting import Fit
+from orthocas.robots import files
+
+ROBOTS = {
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef"),
+    "kinova": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
+    "tiago with its prismatic torso": ("tiago_description/robots/tiago.urdf", "arm_tool_link"),
+    "talos left arm": ("talos_data/robots/talos_left_arm.urdf", "gripper_left_base_link"),
+    "double pendulum, continuous": ("double_pendulum_description/urdf/double_pendulum_continuous.urdf", "link2"),
+    "z1": ("z1_description/urdf/z1.urdf", "link06"),
+    "talos, both arms and the torso": ("talos_data/robots/talos_reduced.urdf", "gripper_right_base_link"),
+}
 
 
 def robot_data(relative: str) -> Path:
     """A file of the example-robot-data package."""
-    for entry in files("example-robot-data") or []:
+    for entry in metadata.files("example-robot-data") or []:
         if str(entry).endswith(f"robots/{relative}"):
             return Path(str(entry.locate())).resolve()
     raise FileNotFoundError(relative)
+
+
+def arm(name: str) -> tuple[pin.Model, str]:
+    """Model and tip of one of ROBOTS, without the joints off the chain."""
+    file, tip = ROBOTS[name]
+    full = files.read_urdf(robot_data(file))
+    return full if "both arms" in name else files.lock_off_chain(full, tip), tip
+
+
+def pinocchio_position(model: pin.Model, q: np.ndarray) -> np.ndarray:
+    """Pinocchio's configuration: cos and sin for continuous joints."""
+    position = pin.neutral(model)
+    for i, joint in enumerate(model.joints[1:]):
+        position[joint.idx_q : joint.idx_q + joint.nq] = q[i] if joint.nq == 1 else (np.cos(q[i]), np.sin(q[i]))
+    return position
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import orthocas as oc
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
 from orthocas.parametrisations import JointSpace, component_gradients, embed, parse_parametrisation
 from orthocas.parametrisations.product_basis import LinearFamily
+from orthocas.point_functions import point_functions
 
 SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))
 SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE.joint_names)
@@ -43,6 +44,24 @@ def test_chain_rule_of_the_network_is_that_of_automatic_differentiation() -> Non
     by_hand, by_ad = family.jacobian(q, theta), component_gradients(family.expression(q, theta), q)
     ours, theirs = (np.array(ca.Function("J", [q], J)(points.T)) for J in (by_hand, by_ad))
     np.testing.assert_allclose(ours, theirs, atol=1e-14)
+
+
+@pytest.mark.parametrize("parametrisation", [*ALL, oc.Polynomial(6), oc.Fourier(3)], ids=lambda p: p.label)
+def test_functions_of_a_point_are_the_derivatives_of_the_expression(parametrisation: object) -> None:
+    """Those that C is made of, against automatic differentiation of the expression."""
+    family = parametrisation.family(SPACE, 2)
+    theta = family.initial(seed=4)
+    functions = point_functions(family, theta, 3)
+    q, v, w = (ca.MX.sym(name, 3) for name in "qvw")
+    xi = family.expression(q, ca.MX(ca.DM(theta)))
+    J = ca.jacobian(xi, q)
+    second = ca.jtimes(J @ w, q, v)
+    wanted = ca.Function("wanted", [q, v, w], [xi, J, second])
+    for point in np.random.default_rng(8).uniform(-0.5, 0.5, (5, 3, 3)):
+        found = functions["xi"](point[0]), functions["jacobian"](point[0]), functions["second_derivative"](*point)
+        for got, want in zip(found, wanted(*point), strict=True):
+            scale = max(1, np.abs(want.full()).max())
+            np.testing.assert_allclose(got.full(), want.full(), atol=1e-12 * scale)
 
 
 def test_given_coordinates_of_other_joints_are_refused() -> None:

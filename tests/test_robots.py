@@ -6,41 +6,17 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import robot_data
+from conftest import ROBOTS, arm, pinocchio_position, robot_data
 from orthocas.problems.iiwa import robot as iiwa_robot
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, RobotError, ShapeError, UnknownNameError
-from orthocas.robots import files
 from orthocas.robots.planar import planar_model
-
-ROBOTS = {
-    "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
-    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
-    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
-    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef"),
-    "kinova": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
-    "tiago with its prismatic torso": ("tiago_description/robots/tiago.urdf", "arm_tool_link"),
-    "talos left arm": ("talos_data/robots/talos_left_arm.urdf", "gripper_left_base_link"),
-    "double pendulum, continuous": ("double_pendulum_description/urdf/double_pendulum_continuous.urdf", "link2"),
-    "z1": ("z1_description/urdf/z1.urdf", "link06"),
-    "talos, both arms and the torso": ("talos_data/robots/talos_reduced.urdf", "gripper_right_base_link"),
-}
-
-
-def pinocchio_position(model: pin.Model, q: np.ndarray) -> np.ndarray:
-    """Pinocchio's configuration: cos and sin for continuous joints."""
-    position = pin.neutral(model)
-    for i, joint in enumerate(model.joints[1:]):
-        position[joint.idx_q : joint.idx_q + joint.nq] = q[i] if joint.nq == 1 else (np.cos(q[i]), np.sin(q[i]))
-    return position
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_dynamics_and_kinematics_match_pinocchio_on_random_states(name: str) -> None:
-    file, tip = ROBOTS[name]
-    full = files.read_urdf(robot_data(file))
-    model = full if "both arms" in name else files.lock_off_chain(full, tip)
+    model, tip = arm(name)
     robot = oc.Robot.from_model(model, tip)
     data, frame = model.createData(), model.getFrameId(tip)
     rng = np.random.default_rng(7)

@@ -69,6 +69,7 @@ def _report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:
         "lines": len(source.read_text().splitlines()),
         "stack_bytes": generated.stack_bytes,
         "checked_states": None if proof is None else proof.states,
+        "compilers": None if proof is None else list(proof.compilers),
         "relative_differences": None if proof is None else proof.differences,
     }
 
@@ -76,11 +77,12 @@ def _report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:
 def _rows(report: dict[str, Any]) -> dict[str, str]:
     rows = {
         "library": f"{report['name']}: {report['lines']} lines of C99, {report['source']}",
-        "stack": f"{report['stack_bytes']} bytes of work arrays",
+        "stack": f"{report['stack_bytes']} bytes at most for a call",
     }
     if differences := report["relative_differences"]:
         worst = max(differences, key=differences.get)
         rows["checked"] = (
-            f"{report['checked_states']} states, largest relative difference {differences[worst]:.1e} ({worst})"
+            f"{report['checked_states']} states with {' and '.join(report['compilers'])}, "
+            f"largest relative difference {differences[worst]:.1e} ({worst})"
         )
     return rows

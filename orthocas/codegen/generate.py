@@ -12,10 +12,11 @@ import casadi as ca
 from orthocas.archive import require_writable
 from orthocas.chart import Chart
 from orthocas.codegen.interface import filled, template_values
-from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.control import Controller
 from orthocas.errors import ArchiveError, InvalidValueError
 
+_LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/test_c_safety.py)
 _TEMPLATES = ("robot.h", "robot.c", "CMakeLists.txt", "pkgconfig.pc", "README.md")
 
 
@@ -25,7 +26,7 @@ class GeneratedC:
 
     folder: Path
     name: str  #: prefix of every C name, and of the files
-    stack_bytes: int  #: of the work arrays of the largest call
+    stack_bytes: int  #: that a call needs at most
 
 
 def generate_c(
@@ -49,16 +50,17 @@ def generate_c(
         ArchiveError: if the folder cannot be written.
     """
     name = _name(chart, controller) if name is None else name
-    if not re.fullmatch(r"[A-Za-z]\w*", name, flags=re.ASCII):
+    if not re.fullmatch(r"[A-Za-z]\w*", name, flags=re.ASCII) or name == "math":  # math.h is taken
         raise InvalidValueError("name", repr(name), "a C identifier, such as arm_controller")
     if controller is not None and controller.problem.robot is not chart.problem.robot:
         raise InvalidValueError("controller", f"one of another robot ({controller.name})", "one of the chart's robot")
     kernels = generate_kernels(_functions(chart, controller), f"{name}_kernel")
-    values = template_values(chart, controller, name, kernels)
+    stack_bytes = _stack_bytes(kernels, chart.n)
+    values = template_values(chart, controller, name, kernels, stack_bytes)
     folder = _folder(Path(out))
     names = {"robot.h": f"{name}.h", "robot.c": f"{name}.c", "pkgconfig.pc": f"{name}.pc.in"}
     _write(folder, {names.get(template, template): filled(template, values) for template in _TEMPLATES})
-    return GeneratedC(folder, name, kernels.stack_bytes)
+    return GeneratedC(folder, name, stack_bytes)
 
 
 def _functions(chart: Chart, controller: Controller | None) -> list[ca.Function]:
@@ -74,6 +76,13 @@ def _functions(chart: Chart, controller: Controller | None) -> list[ca.Function]
         inputs = graph.mx_in()
         found.append(ca.Function("control", inputs, graph.call(inputs)))
     return found
+
+
+def _stack_bytes(kernels: Kernels, n: int) -> int:
+    """Work arrays, those of the inverse map, and an allowance for local variables and for math.h."""
+    inverse = kernels.array_bytes("chart") + 8 * n * (n + 6)
+    locals_ = round(_LOCALS * max(1.0, n / 7) ** 2)  # compilers keep matrices there
+    return max(inverse, *map(kernels.array_bytes, kernels.work)) + locals_
 
 
 def _name(chart: Chart, controller: Controller | None) -> str:

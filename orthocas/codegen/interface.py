@@ -23,7 +23,9 @@ _LAWS = {
 }
 
 
-def template_values(chart: Chart, controller: Controller | None, name: str, kernels: Kernels) -> dict[str, str]:
+def template_values(
+    chart: Chart, controller: Controller | None, name: str, kernels: Kernels, stack_bytes: int
+) -> dict[str, str]:
     """Every word that the templates ask for."""
     problem, n = chart.problem, chart.n
     domain = problem.domain
@@ -48,7 +50,7 @@ def template_values(chart: Chart, controller: Controller | None, name: str, kern
         "domain_lines": _domain_lines(problem.robot.joint_names, lower, upper),
         "domain_lower": _numbers(lower),
         "domain_upper": _numbers(upper),
-        "stack_bytes": str(kernels.stack_bytes),
+        "stack_bytes": str(stack_bytes),
         "kernels": kernels.code,
     }
     for kernel, sizes in kernels.work.items():

@@ -20,10 +20,10 @@ class Kernels:
     code: str
     work: dict[str, tuple[int, int, int, int]]  #: by name: entries of arg, res, iw and w that a call needs
 
-    @property
-    def stack_bytes(self) -> int:
-        """Bytes of work arrays that the largest call needs."""
-        return max(8 * (arg + res + w) + 4 * iw for arg, res, iw, w in self.work.values())
+    def array_bytes(self, name: str) -> int:
+        """Bytes of work arrays that a call of a function needs."""
+        arg, res, iw, w = self.work[name]
+        return 8 * (arg + res + w) + 4 * iw
 
 
 def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:

@@ -17,27 +17,31 @@ from orthocas.errors import CompileError
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 
 
-def compiler() -> str:
-    """A C compiler on the path.
+def compilers() -> tuple[str, ...]:
+    """Gcc and clang, those that are on the path; if there is neither, cc.
 
     Raises:
         CompileError: if there is none.
     """
-    found = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-    if found is None:
-        raise CompileError("no C compiler found, expected cc, gcc or clang on the PATH")
-    return found
+    found = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
+    found = found or [path for path in (shutil.which("cc"),) if path is not None]
+    if not found:
+        raise CompileError("no C compiler found, expected gcc, clang or cc on the PATH")
+    return tuple(found)
 
 
-def compile_shared(generated: GeneratedC, folder: Path, flags: tuple[str, ...] = ("-O2",)) -> Path:
-    """Compile to a shared library in a folder, warnings as errors.
+def compile_shared(
+    generated: GeneratedC, folder: Path, flags: tuple[str, ...] = ("-O2",), compiler: str | None = None
+) -> Path:
+    """Compile to a shared library in a folder, warnings as errors; default the first of `compilers`.
 
     Raises:
         CompileError: with the first lines of what the compiler says.
     """
     library = folder / f"lib{generated.name}.so"
     source = generated.folder / f"{generated.name}.c"
-    command = [compiler(), *STRICT, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
+    compiler = compilers()[0] if compiler is None else compiler
+    command = [compiler, *STRICT, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise CompileError(f"{' '.join(command)} failed: {done.stderr[:500]}")

@@ -1,0 +1,183 @@
+"""Generated C on a robot: no traps, no state, no heap, bounded stack, free of warnings in every dialect."""
+
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
+from orthocas.codegen.library import STRICT, compilers
+from orthocas.control import Controller, PDPlus
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None and shutil.which("gcc") is None, reason="no C compiler")
+
+Generated = tuple[GeneratedC, Controller]
+PROGRAMS = Path(__file__).parent / "c"
+LIMIT = 90.0
+
+
+@pytest.fixture(scope="module")
+def pd_plus(planar_chart: oc.Chart, tmp_path_factory: pytest.TempPathFactory) -> Generated:
+    law = PDPlus(planar_chart, np.linspace(20, 80, 3), 0.6, "decoupled", limit=LIMIT)
+    return oc.generate_c(planar_chart, tmp_path_factory.mktemp("box"), law, "arm"), law
+
+
+@pytest.fixture(scope="module")
+def on_the_torus(tmp_path_factory: pytest.TempPathFactory) -> Generated:
+    """Linear coordinates on all joint positions: the stretched arm (0, 0, 0) is singular, and there is no outside."""
+    robot = oc.Robot.planar([1, 1, 1], [3, 3, 3])
+    problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Torus(3))
+    chart = oc.fit(problem, oc.Linear(base=(0.6, 0.8, 0.8))).chart
+    law = PDPlus(chart, 50.0, limit=LIMIT)
+    return oc.generate_c(chart, tmp_path_factory.mktemp("torus"), law, "arm"), law
+
+
+def built(generated: GeneratedC, program: str, out: Path, *flags: str) -> Path:
+    """A program of tests/c with the generated code."""
+    target = out / Path(program).stem
+    sources = [str(PROGRAMS / program), str(generated.folder / "arm.c")]
+    command = [compilers()[0], "-std=c99", "-O1", "-g", *flags, f"-I{generated.folder}", *sources, "-o", str(target)]
+    done = subprocess.run([*command, "-lm", "-pthread"], capture_output=True, text=True, check=False)
+    if done.returncode != 0 and "cannot find" in done.stderr:
+        pytest.skip("no sanitizer libraries")
+    assert done.returncode == 0, done.stderr
+    return target
+
+
+def random_ticks(generated: GeneratedC, ticks: int, out: Path, *flags: str) -> Path:
+    return built(generated, "random_ticks.c", out, f"-DTICKS={ticks}L", f"-DLIMIT={LIMIT}", "-DSINGULAR=0,0,0", *flags)
+
+
+@pytest.mark.parametrize("case", ["pd_plus", "on_the_torus"])
+def test_a_million_random_ticks_under_sanitizers_never_trap(
+    case: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    """Address and undefined-behaviour sanitizers; the program itself checks statuses, finiteness and the limit."""
+    flags = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    program = random_ticks(request.getfixturevalue(case)[0], 1_000_000, tmp_path, *flags)
+    done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{done.returncode}: {done.stderr}"
+    well, outside, singular, not_finite = (int(word) for word in done.stdout.split())
+    assert well + outside + singular + not_finite == 1_000_000
+    assert not_finite > 50_000
+    assert well > 100_000
+    if case == "pd_plus":
+        assert outside > 100_000
+    else:
+        assert outside == 0
+        assert singular > 50_000
+
+
+def test_valgrind_finds_nothing(pd_plus: Generated, tmp_path: Path) -> None:
+    if shutil.which("valgrind") is None:
+        pytest.skip("no valgrind")
+    program = random_ticks(pd_plus[0], 20_000, tmp_path)
+    command = ["valgrind", "--error-exitcode=9", "--leak-check=full", str(program)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_calls_take_no_more_stack_than_the_header_says(iiwa: oc.Problem, pd_plus: Generated, tmp_path: Path) -> None:
+    """Measured on a painted stack, with and without optimisation."""
+    problem = oc.Problem(iiwa.robot, iiwa.task, "inertia", iiwa.domain)
+    for parametrisation in (oc.Polynomial(2), oc.MLP((40, 30))):
+        solver = oc.solvers.LBFGS(max_iterations=3) if isinstance(parametrisation, oc.MLP) else None
+        chart = oc.fit(problem, parametrisation, samples=300, solver=solver).chart
+        generated = oc.generate_c(chart, tmp_path, PDPlus(chart, 50.0), "arm")
+        for flag in ("-O0", "-O2"):
+            program = built(generated, "stack_use.c", tmp_path, flag)
+            printed = subprocess.run([str(program)], capture_output=True, text=True, check=True).stdout
+            used = [int(word) for word in printed.split()]
+            assert len(used) == 4
+            assert 1000 < max(used) <= generated.stack_bytes
+
+
+def test_object_holds_no_state_and_calls_only_mathematics(pd_plus: Generated, tmp_path: Path) -> None:
+    """Symbols of the object file: functions and read-only data; undefined ones are of math.h, or copy memory."""
+    generated, _ = pd_plus
+    source = generated.folder / "arm.c"
+    subprocess.run([compilers()[0], "-std=c99", "-O1", "-c", str(source), "-o", str(tmp_path / "arm.o")], check=True)
+    if shutil.which("nm") is None:
+        pytest.skip("no nm")
+    symbols = subprocess.run(["nm", str(tmp_path / "arm.o")], capture_output=True, text=True, check=True).stdout
+    rows = [line.split()[-2:] for line in symbols.splitlines()]
+    assert {kind for kind, _ in rows} <= {"T", "t", "R", "r", "U"}
+    public = {name for kind, name in rows if kind in "TR"}
+    functions, tables = ("chart", "inverse", "dynamics", "control"), ("default_gains", "domain_lower", "domain_upper")
+    assert public == {f"arm_{name}" for name in (*functions, *tables)}
+    known = {"sin", "cos", "sincos", "sqrt", "pow", "cbrt", "fmax", "fmin", "memset", "memcpy"}
+    assert {name for kind, name in rows if kind == "U"} <= known | {"_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
+
+
+def test_two_threads_get_what_one_gets(pd_plus: Generated, tmp_path: Path) -> None:
+    generated, law = pd_plus
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3)
+    rng, gains = np.random.default_rng(4), gain_numbers(law)
+    states = [
+        (law.problem.domain.centre + 0.3 * rng.normal(size=3), *rng.normal(size=(1, 3)), rng.normal(size=9))
+        for _ in range(2000)
+    ]
+    alone = [library.control(*state, gains) for state in states]
+    together: list[list[tuple[np.ndarray, int]]] = [[], []]
+
+    def work(k: int) -> None:
+        together[k] += [library.control(*state, gains) for state in states]
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for results in together:
+        for (command, status), (want, want_status) in zip(results, alone, strict=True):
+            assert status == want_status
+            np.testing.assert_array_equal(command, want)
+
+
+@pytest.fixture
+def clang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Clang on the path: the machine's own, or the one that the package ziglang carries."""
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(tmp_path / "zig"))
+    monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(tmp_path / "zig"))
+    if shutil.which("clang") is None:
+        script = tmp_path / "bin" / "clang"
+        script.parent.mkdir()
+        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang cc -Wno-unused-command-line-argument "$@"\n')
+        script.chmod(0o755)
+        monkeypatch.setenv("PATH", str(script.parent), prepend=":")
+    return str(shutil.which("clang"))
+
+
+def test_clang_accepts_it_and_computes_the_same(planar_chart: oc.Chart, clang: str, tmp_path: Path) -> None:
+    law = PDPlus(planar_chart, 50.0, coupling="decoupled")
+    proof = check_c(oc.generate_c(planar_chart, tmp_path, law, "arm"), planar_chart, law)
+    assert "clang" in proof.compilers
+    assert len(proof.compilers) == len(compilers())
+    done = subprocess.run([clang, "--version"], capture_output=True, text=True, check=True)
+    assert "clang version" in done.stdout
+
+
+def test_every_dialect_accepts_it(pd_plus: Generated, tmp_path: Path) -> None:
+    """C99 and later, GNU's too; with more warnings than promised; the header in C++."""
+    generated, _ = pd_plus
+    source, compiler = generated.folder / "arm.c", compilers()[0]
+    more = ["-Wshadow", "-Wconversion", "-Wcast-qual", "-Wstrict-prototypes"]
+    target = ["-O2", "-c", "-o", str(tmp_path / "arm.o")]
+    for dialect in ("c99", "gnu99", "c11", "gnu17"):
+        command = [compiler, *STRICT, f"-std={dialect}", *more, *target, str(source)]
+        assert subprocess.run(command, capture_output=True, text=True, check=False).stderr == "", dialect
+    if shutil.which("c++") is None:
+        pytest.skip("no C++ compiler")
+    program = tmp_path / "main.cpp"
+    program.write_text(
+        '#include "arm.h"\nint main() { double q[3] = {0}, phi[3], J[9]; return arm_chart(q, phi, J); }\n'
+    )
+    command = ["c++", "-Wall", "-Wextra", "-Wpedantic", "-Werror", f"-I{generated.folder}", str(program)]
+    done = subprocess.run([*command, str(tmp_path / "arm.o"), "-o", str(tmp_path / "a"), "-lm"], check=False)
+    assert done.returncode == 0
+    assert subprocess.run([str(tmp_path / "a")], check=False).returncode == 1  # q = 0 lies outside the domain
