@@ -50,8 +50,8 @@ def compared(name: str, quick: bool, monitor: Monitor) -> Comparison:
     problem = build(name)
     if quick:
         return oc.compare(problem, BASES[name][:2], samples=200, held_out=2_000, monitor=monitor)
-    bases = oc.compare(problem, BASES[name], FOR_BASES, monitor=monitor)
-    networks = oc.compare(problem, NETWORKS[name], FOR_NETWORKS, monitor=monitor)
+    bases = oc.compare(problem, BASES[name], FOR_BASES, control_ticks=True, monitor=monitor)
+    networks = oc.compare(problem, NETWORKS[name], FOR_NETWORKS, control_ticks=True, monitor=monitor)
     return Comparison(bases.results + networks.results)
 
 

@@ -1,15 +1,17 @@
 """The front door: fit and distil, with a default parametrisation and solver, compare, and load."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from orthocas.archive import require_writable
 from orthocas.chart import Chart
 from orthocas.checks import as_float_array, require_count
 from orthocas.comparison import Cell, CellResult, run_cells
 from orthocas.comparison_report import Comparison
+from orthocas.comparison_ticks import with_control_ticks
 from orthocas.distillation import Distilled, distil_chart
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import Fit, fit_chart
@@ -134,6 +136,7 @@ def compare(
     executor: Executor | None = None,
     jobs: int | None = None,
     charts: str | Path | None = None,
+    control_ticks: bool = False,
     monitor: Monitor = silent,
 ) -> Comparison:
     """Fit every parametrisation with every solver and seed, and judge all on the same held-out samples.
@@ -153,6 +156,8 @@ def compare(
             machine. Those use one thread each, so seconds are those of one core.
         jobs: number of such processes, default one for each core.
         charts: folder to save charts in.
+        control_ticks: measure, after all fits, how long a control tick takes with each parametrisation: decoupled PD+
+            as generated C. NaN where there is no C compiler.
         monitor: called with progress.
 
     Call it under `if __name__ == "__main__"` in scripts, as all that starts processes.
@@ -166,21 +171,39 @@ def compare(
     held_out = require_count("held_out", held_out)
     _require_grid(parametrisations, solvers)
     if charts is not None:
-        charts = Path(charts)
-        require_writable(charts / "chart")
-    cells = []
+        require_writable(Path(charts) / "chart")
+    with TemporaryDirectory(prefix="orthocas-") as temporary:
+        folder = Path(charts) if charts is not None else Path(temporary) if control_ticks else None
+        cells = [
+            Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file)
+            for parametrisation, solver, seed, file in _fits(parametrisations, solvers, count, folder)
+        ]
+        return _run_grid(cells, executor, jobs, control_ticks, monitor)
+
+
+def _fits(
+    parametrisations: Sequence[Parametrisation | SEW], solvers: Sequence[Solver] | None, seeds: int, folder: Path | None
+) -> Iterator[tuple[Parametrisation | SEW, Solver, int, Path | None]]:
+    """Parametrisation, solver, seed and chart file of every fit of a grid."""
     for parametrisation in parametrisations:
         closed = isinstance(parametrisation, Linear | Given | SEW)
         fitting = [default_solver(parametrisation)] if closed or solvers is None else solvers
-        for solver, seed in product(fitting, range(1 if closed else count)):
+        for solver, seed in product(fitting, range(1 if closed else seeds)):
             name = f"{parametrisation.label}_{solver.name}_{seed}.orthocas".replace(":", "-")
-            file = None if charts is None else charts / name
-            cells.append(Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file))
+            yield parametrisation, solver, seed, None if folder is None else folder / name
+
+
+def _run_grid(
+    cells: Sequence[Cell], executor: Executor | None, jobs: int | None, control_ticks: bool, monitor: Monitor
+) -> Comparison:
+    """All fits, in the order of the grid; after Ctrl-C those that are done."""
     order = {(cell.parametrisation.label, cell.solver_name, cell.seed): k for k, cell in enumerate(cells)}
     results: list[CellResult] = []
     interrupted = False
     try:
         results.extend(run_cells(cells, executor, jobs, monitor))
+        if control_ticks:
+            results = with_control_ticks(results, cells, monitor)
     except KeyboardInterrupt:
         interrupted = True
     results.sort(key=lambda result: order[result.parametrisation, result.solver, result.seed])

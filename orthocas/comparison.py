@@ -67,6 +67,7 @@ class CellResult:
     conditioning_p01: float = float("nan")
     conditioning_mean: float = float("nan")
     folded_samples: int = 0
+    control_tick_us: float = float("nan")  #: of decoupled PD+ on the chart, as generated C, if it was measured
     history: tuple[tuple[float, float], ...] = ()  #: seconds and training loss as the fit went on
 
     @property

@@ -28,6 +28,7 @@ class Summary:
     mutual_std_deg: float
     conditioning_p01: float
     folded_samples: int
+    control_tick_us: float  #: of decoupled PD+ as generated C
     task_spread: float  #: (largest - smallest) / median
     mutual_spread: float
 
@@ -67,7 +68,8 @@ class Comparison:
 
     def rows(self) -> list[list[str]]:
         """A table for people, its head first."""
-        head = ["parametrisation", "solver", "parameters", "task std", "mutual std", "cond 1 %", "folded", "seconds"]
+        head = ["parametrisation", "solver", "parameters", "task std", "mutual std", "cond 1 %", "folded"]
+        head += ["seconds", "control tick"]
         return [head, *(_row(summary) for summary in self.summaries())]
 
 
@@ -95,6 +97,7 @@ def _summary(results: Sequence[CellResult]) -> Summary:
         mutual_std_deg=middle("mutual_std_deg"),
         conditioning_p01=middle("conditioning_p01"),
         folded_samples=max((result.folded_samples for result in good), default=0),
+        control_tick_us=middle("control_tick_us"),
         task_spread=spread("task_std_deg"),
         mutual_spread=spread("mutual_std_deg"),
     )
@@ -119,6 +122,7 @@ def _row(s: Summary) -> list[str]:
         f"{s.conditioning_p01:.3f}",
         str(s.folded_samples),
         f"{s.seconds:.2f}",
+        "-" if math.isnan(s.control_tick_us) else f"{s.control_tick_us:.3g} us",
     ]
 
 

@@ -5,6 +5,7 @@ import json
 import math
 import multiprocessing
 import os
+import shutil
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -122,6 +123,33 @@ def test_summaries_are_medians_and_spreads_over_seeds(grid: tuple[Comparison, Pa
     rows = found.rows()
     assert rows[-1][2].startswith("failed: InvalidValueError")
     assert "±" in rows[1][3]
+
+
+def test_control_ticks_are_measured_once_a_parametrisation(planar_x: oc.Problem) -> None:
+    """Failed fits have none."""
+    lbfgs = solvers.LBFGS(max_iterations=5)
+    parametrisations = [oc.Linear(), oc.MLP((4,)), Breaks()]
+    found = oc.compare(planar_x, parametrisations, [lbfgs], 2, executor=InThisThread(), control_ticks=True, **QUICK)
+    ticks = {r.parametrisation: r.control_tick_us for r in found.results}
+    assert math.isnan(ticks.pop("breaks"))
+    if shutil.which("cc") is None:
+        assert all(math.isnan(tick) for tick in ticks.values())
+        pytest.skip("no C compiler")
+    assert all(tick > 0 for tick in ticks.values())
+    for result in found.results:
+        assert result.failed or result.control_tick_us == ticks[result.parametrisation]
+    table = found.rows()
+    assert table[0][-1] == "control tick"
+    assert [row[-1].endswith(" us") for row in table[1:]] == [True, True, False]
+
+
+def test_ticks_are_left_out_without_a_compiler(
+    planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    found = oc.compare(planar_x, [oc.Linear()], executor=InThisThread(), control_ticks=True, **QUICK)
+    assert math.isnan(found.results[0].control_tick_us)
+    assert found.rows()[1][-1] == "-"
 
 
 def test_files_hold_the_same_numbers(grid: tuple[Comparison, Path], tmp_path: Path) -> None:

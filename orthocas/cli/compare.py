@@ -65,7 +65,7 @@ def compare(
     charts = _made(out)
     with terminal_monitor() as monitor:
         grid = (built, parametrisations, minimisers, seeds, loss, samples, held_out)
-        found = api.compare(*grid, jobs=jobs, charts=charts, monitor=monitor)
+        found = api.compare(*grid, jobs=jobs, charts=charts, control_ticks=True, monitor=monitor)
     save(found, out)
     if json:
         print_json(found.as_dict())

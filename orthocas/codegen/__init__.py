@@ -3,13 +3,17 @@
 from orthocas.codegen.generate import GeneratedC, generate_c
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
 from orthocas.codegen.proof import Proof, check_c
+from orthocas.codegen.ticks import Ticks, control_tick, time_ticks
 
 __all__ = [
     "CompiledLibrary",
     "GeneratedC",
     "Proof",
+    "Ticks",
     "check_c",
     "compile_shared",
+    "control_tick",
     "gain_numbers",
     "generate_c",
+    "time_ticks",
 ]

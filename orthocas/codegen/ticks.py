@@ -1,0 +1,77 @@
+"""How long a control tick takes: calls of compiled controllers, timed in C in one process."""
+
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.codegen.generate import generate_c
+from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
+from orthocas.control import Controller, PDPlus
+from orthocas.errors import CompileError
+
+_STATES = 64  # as in templates/ticks.c
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """Times of calls of one controller [us]."""
+
+    median: float
+    p99: float
+    worst: float
+    late: float  #: share of calls that took more than five medians
+
+
+def control_tick(chart: Chart, calls: int = 5_000) -> float:
+    """Median time of one call of decoupled PD+ on a chart, as generated C [us].
+
+    Raises:
+        CompileError: if there is no C compiler.
+    """
+    law = PDPlus(chart, 50.0, coupling="decoupled")
+    with TemporaryDirectory() as folder:
+        generated = generate_c(chart, folder, law, "tick")
+        library = CompiledLibrary(compile_shared(generated, Path(folder)), "tick", chart.n)
+        return time_ticks([(law, library)], calls)[0].median
+
+
+def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int = 100_000) -> list[Ticks]:
+    """Times of compiled controllers of one robot, with their own gains, on 64 states inside the domain.
+
+    Raises:
+        CompileError: if there is no C compiler, or the program that calls them cannot be built or run.
+    """
+    with TemporaryDirectory() as folder:
+        data, program = Path(folder) / "states", Path(folder) / "ticks"
+        np.concatenate([part.ravel() for law, _ in cases for part in (_states(law), gain_numbers(law))]).tofile(data)
+        source = files("orthocas.codegen") / "templates" / "ticks.c"
+        (Path(folder) / "ticks.c").write_text(source.read_text())
+        _run([compilers()[0], "-O2", str(Path(folder) / "ticks.c"), "-o", str(program), "-ldl"])
+        arguments = [str(program), str(data), str(calls), str(cases[0][0].problem.n)]
+        for law, library in cases:
+            sizes = (3 * len(law.labels), len(gain_numbers(law)))
+            arguments += [str(library.path), f"{library.name}_control", *map(str, sizes)]
+        lines = _run(arguments).splitlines()
+    return [Ticks(*map(float, line.split())) for line in lines]
+
+
+def _run(command: list[str]) -> str:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise CompileError(f"{command[0]} gave exit code {done.returncode}: {done.stderr[:500]}")
+    return done.stdout
+
+
+def _states(law: Controller) -> Array:
+    """States inside the domain with references nearby, (64, 2 n + 3 k)."""
+    rng, domain, n, k = np.random.default_rng(0), law.problem.domain, law.problem.n, len(law.labels)
+    q = domain.centre + 0.4 * domain.half_width * rng.uniform(-1, 1, (_STATES, n))
+    reference = np.array([law.measured(point).full().ravel() for point in q]) + 0.01 * rng.normal(size=(_STATES, k))
+    return np.hstack([q, rng.normal(size=(_STATES, n)), reference, rng.normal(size=(_STATES, 2 * k))])
