@@ -5,12 +5,15 @@ from typing import Literal
 import casadi as ca
 
 from orthocas.control.linear_algebra import square_root
+from orthocas.parametrisations.family import Expression
 
 DampingDesign = Literal["square_root", "double_diagonal"]
 DAMPING_DESIGNS: tuple[DampingDesign, ...] = ("square_root", "double_diagonal")
 
 
-def damping_matrix(design: DampingDesign, inertia: ca.SX, stiffness: ca.SX, damping_ratio: ca.SX) -> ca.SX:
+def damping_matrix(
+    design: DampingDesign, inertia: Expression, stiffness: Expression, damping_ratio: Expression
+) -> Expression:
     """D(q), (k, k), for an inertia (k, k), and diagonals of K and Z, (k, 1).
 
     - square_root: D = M^1/2 Z K^1/2 + K^1/2 Z M^1/2. Symmetric, but not always positive semi-definite.
@@ -22,11 +25,15 @@ def damping_matrix(design: DampingDesign, inertia: ca.SX, stiffness: ca.SX, damp
         square_root: [AS2023] eq. (29); double diagonalisation: [AOFH2003]; its form without eigenvectors and for
         several ratios is ours, docs/derivations.md#damping.
     """
-    root_K, Z = ca.diag(ca.sqrt(stiffness)), ca.diag(damping_ratio)
+    root_K = ca.sqrt(stiffness)
     if design == "square_root":
-        half = square_root(inertia) @ Z @ root_K
+        half = square_root(inertia) * _row(damping_ratio * root_K)
         return half + half.T
-    inverse_root = ca.diag(1 / ca.sqrt(stiffness))
-    quarter = square_root(square_root(inverse_root @ inertia @ inverse_root))
-    half = root_K @ quarter
-    return 2 * half @ Z @ half.T
+    quarter = square_root(square_root(inertia / (root_K @ root_K.T)))
+    half = quarter * _row(root_K).T
+    return 2 * (half * _row(damping_ratio)) @ half.T
+
+
+def _row(diagonal: Expression) -> Expression:
+    """The k numbers in every row of (k, k): A * _row(d) is A @ diag(d)."""
+    return ca.repmat(diagonal.T, diagonal.shape[0], 1)

@@ -3,7 +3,11 @@
 They end up in generated C, so there are no eigenvectors (which jump) and no loops that stop when they like.
 """
 
+from functools import cache
+
 import casadi as ca
+
+from orthocas.parametrisations.family import Expression
 
 _ROUNDS = 8  # rounding accuracy up to a condition number of 1e6 (tests/test_control_algebra.py)
 
@@ -19,14 +23,14 @@ def spd_inverse(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
     determinant = ca.SX(1)
     for i in range(k):
         determinant *= D[i]
-    return (inverse + inverse.T) / 2, determinant
+    return _symmetric(inverse), determinant
 
 
-def square_root(matrix: ca.SX) -> ca.SX:
+def square_root(matrix: Expression) -> Expression:
     """The symmetric positive definite S with S S = A, (k, k).
 
     Newton's iteration in the product form of Denman and Beavers, scaled by determinants, with a fixed number of rounds:
-    a rational function of the entries with square roots of determinants.
+    a rational function of the entries with square roots of determinants. Graphs (MX) call one function for all rounds.
 
     Source:
         [H2008] Sec. 6.3, product form of the Denman-Beavers iteration with determinantal scaling.
@@ -34,11 +38,23 @@ def square_root(matrix: ca.SX) -> ca.SX:
     k = matrix.shape[0]
     if k == 1:
         return ca.sqrt(matrix)
-    identity = ca.SX.eye(k)
     root, product = matrix, matrix
     for _ in range(_ROUNDS):
-        inverse, determinant = spd_inverse(product)
-        mu_squared = determinant ** (-1 / k)
-        root = ca.sqrt(mu_squared) * (root + root @ inverse / mu_squared) / 2
-        product = (identity + (mu_squared * product + inverse / mu_squared) / 2) / 2
-    return (root + root.T) / 2
+        root, product = _newton_round(k)(root, product)
+    return root
+
+
+@cache
+def _newton_round(k: int) -> ca.Function:
+    """One round: S and the product X, both (k, k), all of them rational functions of A and so symmetric."""
+    root, product, identity = ca.SX.sym("S", k, k), ca.SX.sym("X", k, k), ca.SX.eye(k)
+    inverse, determinant = spd_inverse(product)
+    mu_squared = determinant ** (-1 / k)
+    next_root = ca.sqrt(mu_squared) * (root + root @ inverse / mu_squared) / 2
+    next_product = (identity + (mu_squared * product + inverse / mu_squared) / 2) / 2
+    return ca.Function("newton_round", [root, product], [_symmetric(next_root), _symmetric(next_product)])
+
+
+def _symmetric(matrix: ca.SX) -> ca.SX:
+    """A matrix that is symmetric but for rounding from its lower triangle: half of the operations."""
+    return ca.SX(ca.tril2symm(ca.tril(matrix)))

@@ -223,7 +223,7 @@ class PDPlus(_OperationalSpace):
 def _block_damping(design: DampingDesign, blocks: tuple[int, ...]) -> ca.Function:
     """Lambda (block diagonal), stiffness, damping_ratio -> D with the same blocks."""
     n = sum(blocks)
-    Lambda, K, Z = ca.SX.sym("Lambda", n, n), ca.SX.sym("K", n), ca.SX.sym("Z", n)
+    Lambda, K, Z = ca.MX.sym("Lambda", n, n), ca.MX.sym("K", n), ca.MX.sym("Z", n)
     places = np.split(np.arange(n), np.cumsum(blocks)[:-1])
     parts = [damping_matrix(design, Lambda[p.tolist(), p.tolist()], K[p.tolist()], Z[p.tolist()]) for p in places]
     return ca.Function("damping", [Lambda, K, Z], [ca.densify(ca.diagcat(*parts))])

@@ -213,7 +213,7 @@ def _task_and_posture(problem: Problem) -> ca.Function:
 
 
 def _damping(size: int) -> ca.Function:
-    inertia, K, Z = ca.SX.sym("M", size, size), ca.SX.sym("K", size), ca.SX.sym("Z", size)
+    inertia, K, Z = ca.MX.sym("M", size, size), ca.MX.sym("K", size), ca.MX.sym("Z", size)
     return ca.Function("damping", [inertia, K, Z], [ca.densify(damping_matrix("square_root", inertia, K, Z))])
 
 
