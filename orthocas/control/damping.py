@@ -35,5 +35,5 @@ def damping_matrix(
 
 
 def _row(diagonal: Expression) -> Expression:
-    """The k numbers in every row of (k, k): A * _row(d) is A @ diag(d)."""
+    """Numbers (k, 1) in every row of (k, k): what columns are multiplied with, entry by entry."""
     return ca.repmat(diagonal.T, diagonal.shape[0], 1)
