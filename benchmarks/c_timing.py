@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
 
@@ -34,10 +35,16 @@ double time_calls(function f, const double* inputs, int n_in, const int* sizes, 
 """
 
 
-def nanoseconds_per_call(functions: dict[str, ca.Function], rounds: int = 9, calls: int = 100_000) -> dict[str, float]:
+def nanoseconds_per_call(
+    functions: dict[str, ca.Function],
+    rounds: int = 9,
+    calls: int = 100_000,
+    sources: Mapping[str, str] | None = None,
+) -> dict[str, float]:
     """Median time of each function over rounds that take turns, compiled together with gcc -O3 -march=native.
 
-    All functions take the same inputs; they are fed with 64 random states.
+    All functions take the same inputs; they are fed with 64 random states. The C code is CasADi's, but for those with
+    `sources` of their own, with the same interface.
     """
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
@@ -46,7 +53,7 @@ def nanoseconds_per_call(functions: dict[str, ca.Function], rounds: int = 9, cal
     sizes = np.array([first.numel_in(i) for i in range(first.n_in())], dtype=np.int32)
     inputs = np.random.default_rng(0).uniform(-1, 1, (64, int(sizes.sum())))
     with tempfile.TemporaryDirectory() as folder:
-        library = _compile(compiler, Path(folder), functions)
+        library = _compile(compiler, Path(folder), functions, sources or {})
         times: dict[str, list[float]] = {name: [] for name in functions}
         for _ in range(rounds):
             for name, function in functions.items():
@@ -54,16 +61,19 @@ def nanoseconds_per_call(functions: dict[str, ca.Function], rounds: int = 9, cal
     return {name: median(values) for name, values in times.items()}
 
 
-def _compile(compiler: str, folder: Path, functions: dict[str, ca.Function]) -> ctypes.CDLL:
-    sources = [folder / "harness.c"]
-    sources[0].write_text(_HARNESS)
+def _compile(compiler: str, folder: Path, functions: dict[str, ca.Function], sources: Mapping[str, str]) -> ctypes.CDLL:
+    files = [folder / "harness.c"]
+    files[0].write_text(_HARNESS)
     for name, function in functions.items():
+        files.append(folder / f"{name}.c")
+        if name in sources:
+            files[-1].write_text(sources[name])
+            continue
         generator = ca.CodeGenerator(f"{name}.c", {"main": False, "mex": False})
         generator.add(_renamed(name, function))
         generator.generate(f"{folder}/")
-        sources.append(folder / f"{name}.c")
     target = folder / "timing.so"
-    command = [compiler, "-O3", "-march=native", "-shared", "-fPIC", "-o", str(target), *map(str, sources), "-lm"]
+    command = [compiler, "-O3", "-march=native", "-shared", "-fPIC", "-o", str(target), *map(str, files), "-lm"]
     subprocess.run(command, check=True)
     return ctypes.CDLL(str(target))
 

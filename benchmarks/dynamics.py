@@ -1,6 +1,8 @@
 """Mass matrix and bias of the 7-DoF arm in compiled C: ours against adam-robotics, and Pinocchio's C++ from Python."""
 
+import tempfile
 import time
+from pathlib import Path
 
 import adam
 import casadi as ca
@@ -9,6 +11,8 @@ import pinocchio as pin
 from adam.casadi import KinDynComputations
 from c_timing import nanoseconds_per_call
 from orthocas.problems import iiwa
+
+import orthocas as oc
 
 
 def main() -> dict[str, float]:
@@ -31,10 +35,24 @@ def main() -> dict[str, float]:
     np.testing.assert_allclose(
         functions["orthocas"](state, state)[0].full(), functions["adam_robotics"](state, state)[0].full(), atol=1e-10
     )
-    times = nanoseconds_per_call(functions)
+    functions["generated_library"] = ca.Function("generated_library", [q, dq], [*ours, robot.function("gravity")(q)])
+    with tempfile.TemporaryDirectory() as folder:
+        times = nanoseconds_per_call(functions, sources={"generated_library": _generated(Path(folder))})
     times["pinocchio_from_python"] = _pinocchio_nanoseconds(model)
     times["ratio"] = times["orthocas"] / times["adam_robotics"]
     return times
+
+
+def _generated(folder: Path) -> str:
+    """C that calls what users get from `orthocas codegen`: mass matrix, bias and gravity, with a status."""
+    chart = oc.fit(iiwa.iiwa(), oc.Linear()).chart
+    generated = oc.generate_c(chart, folder, None, "arm")
+    return f"""
+#include "{generated.folder / "arm.c"}"
+int generated_library(const double** arg, double** res, long long* iw, double* w, int mem) {{
+  return arm_dynamics(arg[0], arg[1], res[0], res[1], res[2]) > ARM_OUTSIDE_DOMAIN;
+}}
+"""
 
 
 def _pinocchio_nanoseconds(model: pin.Model, calls: int = 20_000) -> float:

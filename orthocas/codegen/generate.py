@@ -15,6 +15,7 @@ from orthocas.codegen.interface import filled, template_values
 from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.control import Controller
 from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.scalar_code import scalar_code
 
 _LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/test_c_safety.py)
 _TEMPLATES = ("robot.h", "robot.c", "CMakeLists.txt", "pkgconfig.pc", "README.md")
@@ -64,12 +65,12 @@ def generate_c(
 
 
 def _functions(chart: Chart, controller: Controller | None) -> list[ca.Function]:
-    """The kernels; matrices row by row."""
+    """The kernels; matrices row by row. Mass matrix, bias and gravity share much, so they are written out together."""
     n, robot = chart.n, chart.problem.robot
     q, dq = ca.MX.sym("q", n), ca.MX.sym("dq", n)
     found = [
         ca.Function("chart", [q], [chart.function("phi")(q), chart.function("jacobian")(q).T]),
-        ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)]),
+        scalar_code(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)])),
     ]
     if controller is not None:
         graph = controller.graph
