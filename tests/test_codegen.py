@@ -112,7 +112,9 @@ def test_check_finds_what_is_wrong(planar_chart: oc.Chart, tmp_path: Path) -> No
         check_c(generated, planar_chart, law, states=50)
 
 
-def test_header_tells_what_a_user_needs(pd_plus: Generated, planar_x: oc.Problem) -> None:
+def test_header_and_readme_tell_what_a_user_needs(
+    pd_plus: Generated, planar_chart: oc.Chart, planar_x: oc.Problem
+) -> None:
     generated, law = pd_plus
     header = (generated.folder / "arm.h").read_text()
     for name in planar_x.robot.joint_names:
@@ -127,6 +129,8 @@ def test_header_tells_what_a_user_needs(pd_plus: Generated, planar_x: oc.Problem
     assert "arm_control" in readme
     assert "| `stiffness` | 20.0, 50.0, 80.0 |" in readme
     assert law.name in readme
+    q, phi = (np.array(json.loads(f"[{row}]")) for row in re.findall(r"    (?:q  |phi) = {(.*)}", readme))
+    np.testing.assert_array_equal(planar_chart.phi(q), phi)
 
 
 def test_what_cannot_be_generated_is_refused(planar_x: oc.Problem, planar_chart: oc.Chart, tmp_path: Path) -> None:

@@ -104,6 +104,6 @@ def _write(folder: Path, contents: Mapping[str, str]) -> None:
     """All files or, if one cannot be written, none."""
     with tempfile.TemporaryDirectory(dir=folder, prefix=".orthocas-") as drafts:
         for name, text in contents.items():
-            (Path(drafts) / name).write_text(text)
+            (Path(drafts) / name).write_text(text, encoding="utf-8")
         for name in contents:
             os.replace(Path(drafts) / name, folder / name)

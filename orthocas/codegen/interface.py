@@ -1,6 +1,6 @@
 """What stands in the generated files: names, sizes, tables and comments."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from string import Template
 
@@ -32,6 +32,8 @@ def template_values(
     everywhere = isinstance(domain, Torus)
     slack = np.inf if everywhere else domain.half_width * (1 + 1e-12)
     lower, upper = domain.centre - slack, domain.centre + slack
+    somewhere = np.round(domain.centre + 0.5 * domain.half_width, 3)
+    joints, labels = _words(problem.robot.joint_names), _words(chart.labels)
     values = {
         "name": name,
         "NAME": name.upper(),
@@ -42,15 +44,16 @@ def template_values(
         "m": str(chart.m),
         "r": str(chart.r),
         "nn": str(n * n),
-        "joint_list": ", ".join(problem.robot.joint_names),
-        "control_text": "" if controller is None else _control_text(controller, name),
-        "joint_lines": "\n".join(f" *   {i} {joint}" for i, joint in enumerate(problem.robot.joint_names)),
-        "task_labels": ", ".join(problem.task.labels),
-        "extra_labels": ", ".join(chart.labels[chart.m :]),
-        "domain_lines": _domain_lines(problem.robot.joint_names, lower, upper),
+        "joint_list": ", ".join(joints),
+        "joint_lines": "\n".join(f" *   {i} {joint}" for i, joint in enumerate(joints)),
+        "task_labels": ", ".join(labels[: chart.m]),
+        "extra_labels": ", ".join(labels[chart.m :]),
+        "domain_lines": _domain_lines(joints, lower, upper),
         "domain_lower": _numbers(lower),
         "domain_upper": _numbers(upper),
         "stack_bytes": str(stack_bytes),
+        "check_q": _numbers(somewhere),
+        "check_phi": _numbers(chart.phi(somewhere)),
         "kernels": kernels.code,
     }
     for kernel, sizes in kernels.work.items():
@@ -58,15 +61,23 @@ def template_values(
             values[f"{kernel}_{word}"] = str(max(1, size))
     if controller is not None:
         values |= _control_values(controller)
-    for part, template in (("control_declarations", "control.h"), ("control_definitions", "control.c")):
-        values[part] = "" if controller is None else filled(template, values)
+    for template in ("control.h", "control.c", "control.md"):
+        values[template.replace(".", "_")] = "" if controller is None else filled(template, values)
     return values
+
+
+def _words(names: Iterable[str]) -> list[str]:
+    """Names of joints and quantities, harmless in comments of C."""
+    return [" ".join(name.split()).replace("*/", "* /") for name in names]
 
 
 def _title(chart: Chart, controller: Controller | None) -> str:
     what = "chart" if controller is None else f"{controller.name} controller"
     metric = chart.problem.metric.name
-    return f"{what} of {chart.problem.name}: {chart.coordinates.label}, task {chart.problem.task.name}, metric {metric}"
+    title = (
+        f"{what} of {chart.problem.name}: {chart.coordinates.label}, task {chart.problem.task.name}, metric {metric}"
+    )
+    return _words([title])[0]
 
 
 def _control_values(controller: Controller) -> dict[str, str]:
@@ -74,10 +85,10 @@ def _control_values(controller: Controller) -> dict[str, str]:
     torque = controller.command == "torque"
     return {
         "k": str(len(controller.labels)),
-        "reference_labels": ", ".join(controller.labels),
-        "gain_text": "Gains, one number for each quantity; limit: the largest command of each joint.",
+        "reference_labels": ", ".join(_words(controller.labels)),
         "gain_fields": "\n".join(f"  double {gain}[{len(value)}];" for gain, value in gains.items()),
         "gain_values": ",\n".join(f"  {{{_numbers(value)}}}" for value in gains.values()),
+        "gain_table": "\n".join(f"| `{gain}` | {_numbers(value)} |" for gain, value in gains.items()),
         "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
         "law": _LAWS[controller.name],
         "fallback": "the torque of gravity, or zero where q is not finite" if torque else "zero",
@@ -85,16 +96,7 @@ def _control_values(controller: Controller) -> dict[str, str]:
     }
 
 
-def _control_text(controller: Controller, name: str) -> str:
-    gains = "\n".join(f"| `{gain}` | {_numbers(value)} |" for gain, value in controller.gains.items())
-    return (
-        f"`{name}_control` gives the joint {controller.command}; its reference is {', '.join(controller.labels)}, with "
-        f"two derivatives. Gains it was made with (`{name}_default_gains`):\n\n"
-        f"| gain | values |\n| --- | --- |\n{gains}"
-    )
-
-
-def _domain_lines(names: tuple[str, ...], lower: Array, upper: Array) -> str:
+def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
     if np.isinf(lower).all():
         return " *   all joint positions"
     rows = zip(names, lower, upper, strict=True)
