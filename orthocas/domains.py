@@ -12,6 +12,7 @@ from orthocas.robots import Robot
 
 REVOLUTE_HALF_WIDTH = np.pi / 4  #: default half-width [rad], the hyper-cube of [AS2023] Sec. 9
 PRISMATIC_HALF_WIDTH = 0.25  #: default half-width [m] of an unlimited prismatic joint
+BORDER = 1e-12  #: share of a half-width that points may lie outside: borders belong to domains, however rounded
 _WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes and overflow later
 
 
@@ -121,7 +122,7 @@ def contains(domain: Domain, q: ArrayLike) -> Array:
     if isinstance(domain, Torus):
         inside = np.ones(len(points), dtype=bool)
     else:
-        inside = np.all(np.abs(points - domain.centre) <= domain.half_width * (1 + 1e-12), axis=1)
+        inside = np.all(np.abs(points - domain.centre) <= domain.half_width * (1 + BORDER), axis=1)
     return inside[0] if single else inside
 
 

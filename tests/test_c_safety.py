@@ -7,12 +7,14 @@ import threading
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
 from orthocas.codegen.library import STRICT, compilers
-from orthocas.control import Controller, PDPlus
+from orthocas.control import Controller, ControlStatus, PDPlus
+from orthocas.errors import CompileError
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None and shutil.which("gcc") is None, reason="no C compiler")
 
@@ -37,11 +39,21 @@ def on_the_torus(tmp_path_factory: pytest.TempPathFactory) -> Generated:
     return oc.generate_c(chart, tmp_path_factory.mktemp("torus"), law, "arm"), law
 
 
-def built(generated: GeneratedC, program: str, out: Path, *flags: str) -> Path:
+def built(generated: GeneratedC, program: str, out: Path, *flags: str, compiler: str | None = None) -> Path:
     """A program of tests/c with the generated code."""
     target = out / Path(program).stem
     sources = [str(PROGRAMS / program), str(generated.folder / "arm.c")]
-    command = [compilers()[0], "-std=c99", "-O1", "-g", *flags, f"-I{generated.folder}", *sources, "-o", str(target)]
+    command = [
+        compiler or compilers()[0],
+        "-std=c99",
+        "-O1",
+        "-g",
+        *flags,
+        f"-I{generated.folder}",
+        *sources,
+        "-o",
+        str(target),
+    ]
     done = subprocess.run([*command, "-lm", "-pthread"], capture_output=True, text=True, check=False)
     if done.returncode != 0 and "cannot find" in done.stderr:
         pytest.skip("no sanitizer libraries")
@@ -73,6 +85,37 @@ def test_a_million_random_ticks_under_sanitizers_never_trap(
         assert singular > 50_000
 
 
+def test_inverse_may_write_on_its_inputs(pd_plus: Generated, tmp_path: Path) -> None:
+    program = built(pd_plus[0], "in_place.c", tmp_path, "-O2")
+    assert subprocess.run([str(program)], check=False).returncode == 0
+
+
+def test_compilers_that_remove_tests_for_nan_are_refused(pd_plus: Generated, tmp_path: Path) -> None:
+    for flag in ("-ffast-math", "-Ofast", "-ffinite-math-only"):
+        with pytest.raises(CompileError, match="they remove the tests for NaN"):
+            compile_shared(pd_plus[0], tmp_path, (flag,))
+
+
+def test_speeds_that_overflow_give_zeros(tmp_path: Path) -> None:
+    """inf - inf in q q dq^2 of crossed slides."""
+    axes, zero = ("RZ", "PX", "PY"), pin.SE3.Identity()
+    model, joint = pin.Model(), 0
+    for axis in axes:
+        joint = model.addJoint(joint, getattr(pin, f"JointModel{axis}")(), zero, axis)
+        model.appendBodyToJoint(joint, pin.Inertia(2.0, np.array([0.1, 0.2, 0.3]), np.eye(3)), zero)
+    model.addFrame(pin.Frame("tip", joint, pin.SE3(np.eye(3), np.array([0.3, 0.1, 0])), pin.FrameType.OP_FRAME))
+    robot = oc.Robot.from_model(model, "tip")
+    problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box([0.5, 0.5, 0.5], 0.2))
+    generated = oc.generate_c(oc.fit(problem, oc.Linear()).chart, tmp_path, None, "arm")
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3)
+    with np.errstate(all="ignore"):
+        assert not np.isfinite(robot.bias(np.full(3, 1e90), np.full(3, 1e90))).all()
+    *values, status = library.dynamics(np.full(3, 1e90), np.full(3, 1e90))
+    assert status == ControlStatus.NOT_FINITE
+    assert not any(value.any() for value in values)
+    assert "1 PX (slides)" in (tmp_path / "arm.h").read_text()
+
+
 def test_valgrind_finds_nothing(pd_plus: Generated, tmp_path: Path) -> None:
     if shutil.which("valgrind") is None:
         pytest.skip("no valgrind")
@@ -82,15 +125,15 @@ def test_valgrind_finds_nothing(pd_plus: Generated, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
 
 
-def test_calls_take_no_more_stack_than_the_header_says(iiwa: oc.Problem, pd_plus: Generated, tmp_path: Path) -> None:
-    """Measured on a painted stack, with and without optimisation."""
+def test_calls_take_no_more_stack_than_the_header_says(iiwa: oc.Problem, clang: str, tmp_path: Path) -> None:
+    """Measured on a painted stack, for what needs most, by two compilers, with and without optimisation."""
     problem = oc.Problem(iiwa.robot, iiwa.task, "inertia", iiwa.domain)
-    for parametrisation in (oc.Polynomial(2), oc.MLP((40, 30))):
-        solver = oc.solvers.LBFGS(max_iterations=3) if isinstance(parametrisation, oc.MLP) else None
-        chart = oc.fit(problem, parametrisation, samples=300, solver=solver).chart
-        generated = oc.generate_c(chart, tmp_path, PDPlus(chart, 50.0), "arm")
-        for flag in ("-O0", "-O2"):
-            program = built(generated, "stack_use.c", tmp_path, flag)
+    polynomial = oc.fit(problem, oc.Polynomial(2)).chart
+    network = oc.fit(problem, oc.MLP((40, 30)), samples=300, solver=oc.solvers.LBFGS(max_iterations=3)).chart
+    for law in (PDPlus(polynomial, 50.0), PDPlus(polynomial, 50.0, damping="double_diagonal"), PDPlus(network, 50.0)):
+        generated = oc.generate_c(law.chart, tmp_path, law, "arm")
+        for compiler, flag in ((compilers()[0], "-O0"), (compilers()[0], "-O2"), (clang, "-O2")):
+            program = built(generated, "stack_use.c", tmp_path, flag, compiler=compiler)
             printed = subprocess.run([str(program)], capture_output=True, text=True, check=True).stdout
             used = [int(word) for word in printed.split()]
             assert len(used) == 4

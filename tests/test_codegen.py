@@ -2,12 +2,14 @@
 
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -16,6 +18,7 @@ from conftest import ROBOTS, arm, pinocchio_position
 import orthocas as oc
 from orthocas.cli import main
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared
+from orthocas.codegen.library import compilers
 from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector
 from orthocas.errors import CompileError, InvalidValueError, NoExpressionError, ProofError
 
@@ -76,40 +79,130 @@ def test_chart_on_the_torus_has_no_outside(tmp_path: Path) -> None:
     assert "all joint positions" in (tmp_path / "free_arm.h").read_text()
 
 
-def test_cmake_builds_and_installs_both_libraries(pd_plus: Generated, tmp_path: Path) -> None:
-    if shutil.which("cmake") is None:
-        pytest.skip("no cmake")
-    generated, _ = pd_plus
-    build, place = tmp_path / "build", tmp_path / "installed"
-    steps = (
-        ["cmake", "-S", str(generated.folder), "-B", str(build), f"-DCMAKE_INSTALL_PREFIX={place}"],
-        ["cmake", "--build", str(build)],
-        ["cmake", "--install", str(build)],
-    )
-    for step in steps:
-        done = subprocess.run(step, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-    assert (place / "include" / "arm.h").exists()
+_CONSUMER = """
+cmake_minimum_required(VERSION 3.16)
+project(consumer LANGUAGES C)
+find_package(arm REQUIRED)
+add_executable(consumer main.c)
+target_link_libraries(consumer PRIVATE arm::shared)
+"""
+_MAIN = """
+#include <arm.h>
+int main(void) {
+  double q[3] = {0.6, 0.8, 0.8}, phi[3], J[9];
+  return (int)arm_chart(q, phi, J);
+}
+"""
+
+
+def run(*command: str | Path) -> str:
+    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
+def test_installed_libraries_are_found_and_linked(pd_plus: Generated, tmp_path: Path) -> None:
+    """By CMake and pkg-config, from a folder with a space, after it has been moved."""
+    first, place, project = tmp_path / "first place", tmp_path / "second place", tmp_path / "consumer"
+    run("cmake", "-S", pd_plus[0].folder, "-B", tmp_path / "build")
+    run("cmake", "--build", tmp_path / "build")
+    run("cmake", "--install", tmp_path / "build", "--prefix", first)
+    first.rename(place)
     assert len(list(place.rglob("libarm.a"))) == 1
-    assert list(place.rglob("libarm.so")) or list(place.rglob("libarm.dylib"))
+    assert (place / "include" / "arm.h").exists()
+    project.mkdir()
+    (project / "CMakeLists.txt").write_text(_CONSUMER)
+    (project / "main.c").write_text(_MAIN)
+    run("cmake", "-S", project, "-B", project / "build", f"-DCMAKE_PREFIX_PATH={place}")
+    run("cmake", "--build", project / "build")
+    run(project / "build" / "consumer")
+    if shutil.which("pkg-config") is None:
+        return
     (package,) = place.rglob("arm.pc")
-    assert f"prefix={place}" in package.read_text()
-    assert "-larm" in package.read_text()
+    flags = run("env", f"PKG_CONFIG_PATH={package.parent}", "pkg-config", "--cflags", "--libs", "arm")
+    program, library = project / "by_package", package.parent.parent
+    run(compilers()[0], project / "main.c", "-o", program, *shlex.split(flags), f"-Wl,-rpath,{library}")
+    run(program)
 
 
-def test_check_finds_what_is_wrong(planar_chart: oc.Chart, tmp_path: Path) -> None:
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
+def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: Generated, tmp_path: Path) -> None:
+    (tmp_path / "main.c").write_text(_MAIN)
+    text = _CONSUMER.replace("find_package(arm REQUIRED)", f'add_subdirectory("{pd_plus[0].folder}" arm)')
+    (tmp_path / "CMakeLists.txt").write_text(text.replace("arm::shared", "arm::static"))
+    run("cmake", "-S", tmp_path, "-B", tmp_path / "build")
+    run("cmake", "--build", tmp_path / "build")
+    run(tmp_path / "build" / "consumer")
+    run("cmake", "--install", tmp_path / "build", "--prefix", tmp_path / "installed")
+    assert not list((tmp_path / "installed").rglob("*arm*"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("gains->stiffness", "gains->damping_ratio", "in control"),
+        ("return inside(q)", "return 7 +", "failed"),
+        ("return inside(q) ?", "return inside(q) + 1 ?", "the status of chart"),
+        ("if (!(fabs(x[i]) <= LARGEST)) return 0;", "(void)x;", "the status of chart is . at"),
+        ("arm_domain_upper[N] = {", "arm_domain_upper[N] = {1e-3 + ", "the domain in C"),
+        ("memcpy(q, now, sizeof now);", "", "inverse"),
+        ("res[1] = bias;", "res[1] = gravity;", "in (bias|gravity)"),
+    ],
+)
+def test_check_finds_what_is_wrong(planar_chart: oc.Chart, tmp_path: Path, old: str, new: str, message: str) -> None:
     law = laws(planar_chart)[0]
     generated = oc.generate_c(planar_chart, tmp_path, law, "arm")
-    with pytest.raises(ProofError, match="default gains"):
-        check_c(generated, planar_chart, Impedance(planar_chart, 51.0, limit=90.0), states=50)
     source = tmp_path / "arm.c"
     text = source.read_text()
-    source.write_text(text.replace("gains->stiffness", "gains->damping_ratio"))
-    with pytest.raises(ProofError, match="in control"):
-        check_c(generated, planar_chart, law, states=50)
-    source.write_text(text.replace("return inside(q)", "return 7 +"))
-    with pytest.raises(CompileError, match="failed"):
-        check_c(generated, planar_chart, law, states=50)
+    assert old in text
+    source.write_text(text.replace(old, new))
+    with pytest.raises((ProofError, CompileError), match=message):
+        check_c(generated, planar_chart, law, states=100)
+
+
+def test_check_compares_with_the_gains_of_the_controller(planar_chart: oc.Chart, tmp_path: Path) -> None:
+    generated = oc.generate_c(planar_chart, tmp_path, laws(planar_chart)[0], "arm")
+    with pytest.raises(ProofError, match="default gains"):
+        check_c(generated, planar_chart, Impedance(planar_chart, 51.0, limit=90.0), states=50)
+
+
+def test_coordinates_without_a_value_everywhere(planar_x: oc.Problem, tmp_path: Path) -> None:
+    """NaN in Python is a status and zeros in C; branches with infinities are code like any other."""
+    for k, expression in enumerate((lambda q: ca.sqrt(q[1] - 0.4), lambda q: ca.if_else(q[1] > 0.4, q[1], ca.inf))):
+        given = oc.Given.from_function("partial", 3, lambda q, f=expression: ca.vertcat(f(q) + q[0], q[2] - q[0]))
+        chart = oc.fit(planar_x, given).chart
+        generated = oc.generate_c(chart, tmp_path, None, f"arm{k}")
+        check_c(generated, chart, None, states=300)
+        library = CompiledLibrary(compile_shared(generated, tmp_path), f"arm{k}", 3)
+        phi, _, status = library.chart(np.array([0.6, 0.39, 0.8]))
+        assert status == 2
+        assert not phi.any()
+
+
+def test_words_of_others_do_not_become_code(tmp_path: Path) -> None:
+    evil = "a */ int evil; /* \n@x@ b /* ω"
+    robot = oc.Robot.planar([1, 1, 1], [3, 3, 3])
+    task = oc.Task.custom(robot, "custom", lambda q: ca.vertcat(ca.sin(q[0]) + q[1]), ["p*/"])
+    problem = oc.Problem(robot, task, "inertia", oc.Box([0.5, 0.5, 0.5], 0.2), evil)
+    chart = oc.fit(problem, oc.Linear()).chart
+    generated = oc.generate_c(chart, tmp_path, None, "arm")
+    check_c(generated, chart, None, states=100)
+    assert "evil" not in subprocess.run(
+        [compilers()[0], "-E", "-P", str(tmp_path / "arm.c")], capture_output=True, text=True, check=True
+    ).stdout.replace("evil_", "")
+    assert re.fullmatch(r"[a-z_]\w*", oc.generate_c(chart, tmp_path).name, flags=re.ASCII)
+
+
+def test_files_of_the_user_stay(planar_chart: oc.Chart, tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("# My robot\n")
+    with pytest.raises(InvalidValueError, match=r"a folder with a README\.md that orthocas did not write"):
+        oc.generate_c(planar_chart, tmp_path, None, "arm")
+    (tmp_path / "README.md").unlink()
+    (tmp_path / "CMakeLists.txt").mkdir()
+    with pytest.raises(InvalidValueError, match=r"CMakeLists\.txt that orthocas did not write"):
+        oc.generate_c(planar_chart, tmp_path, None, "arm")
+    assert [path.name for path in tmp_path.iterdir()] == ["CMakeLists.txt"]
 
 
 def test_header_and_readme_tell_what_a_user_needs(
@@ -136,11 +229,11 @@ def test_header_and_readme_tell_what_a_user_needs(
 def test_what_cannot_be_generated_is_refused(planar_x: oc.Problem, planar_chart: oc.Chart, tmp_path: Path) -> None:
     with pytest.raises(NoExpressionError, match="distil"):
         oc.generate_c(oc.grow(planar_x, leaf="linear"), tmp_path / "new")
-    for name in ("2arm", "my arm", "", "größe", "math"):
+    for name in ("2arm", "my arm", "", "größe", "math", "string", "a" * 300):
         with pytest.raises(InvalidValueError, match="a C identifier"):
             oc.generate_c(planar_chart, tmp_path / "new", None, name)
     other = oc.problems.get("planar_3r_x")
-    with pytest.raises(InvalidValueError, match="one of another robot"):
+    with pytest.raises(InvalidValueError, match="one of another chart"):
         oc.generate_c(planar_chart, tmp_path / "new", Projector(other, 1.0, 1.0))
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidValueError, match="expected a folder"):

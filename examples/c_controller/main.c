@@ -14,6 +14,10 @@
 
 #include "arm.h"
 
+#if !ARM_COMMANDS_TORQUE || ARM_REFERENCE != ARM_JOINTS
+#error "generate impedance or pd_plus: this loop sends torques, and its reference is all coordinates of the chart"
+#endif
+
 #define N ARM_JOINTS
 #define PERIOD 0.001 /* [s] */
 #define BINS 24      /* of the histogram, each twice as wide as the one before */
@@ -100,7 +104,8 @@ int main(int argc, char **argv) {
     fprintf(stderr, "usage: %s [TICKS >= 1] [--free]\n", argv[0]);
     return 2;
   }
-  for (i = 0; i < N; ++i) robot.q[i] = 0.5 * (arm_domain_lower[i] + arm_domain_upper[i]);
+  for (i = 0; i < N; ++i) /* the middle of the domain, or a bent arm if there are no borders */
+    robot.q[i] = isfinite(arm_domain_lower[i]) ? 0.5 * (arm_domain_lower[i] + arm_domain_upper[i]) : 0.6;
   arm_chart(robot.q, start_phi, jacobian);
   memset(&reference, 0, sizeof reference);
   begin = now();

@@ -1,5 +1,6 @@
 """What stands in the generated files: names, sizes, tables and comments."""
 
+import re
 from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from string import Template
@@ -11,9 +12,18 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.kernels import Kernels
 from orthocas.control import Controller
-from orthocas.domains import Torus
+from orthocas.domains import BORDER, Torus
 from orthocas.version import VERSION
 
+MAX_EVALUATIONS = 100  #: of the chart in one call of the inverse map
+_IN_DOMAIN = "OUTSIDE_DOMAIN: q lies outside the domain of the chart."
+_EVERYWHERE = "This law needs no chart: it is never OUTSIDE_DOMAIN."
+_GAINS = {
+    "stiffness": "J per squared unit of the quantity, > 0",
+    "damping_ratio": "1 is critical damping",
+    "feedback": "1/s",
+    "limit": "largest command, by joints, > 0; INFINITY for none",
+}
 _LAWS = {
     "impedance": "Impedance control: tau = J^T (-K (phi - phi_d) - D J dq) + g(q).",
     "pd_plus": "Operational space PD+: tau = J^T (f_imp + f_FF) + g(q).",
@@ -29,11 +39,11 @@ def template_values(
     """Every word that the templates ask for."""
     problem, n = chart.problem, chart.n
     domain = problem.domain
-    everywhere = isinstance(domain, Torus)
-    slack = np.inf if everywhere else domain.half_width * (1 + 1e-12)
-    lower, upper = domain.centre - slack, domain.centre + slack
+    half_width = np.full(n, np.inf) if isinstance(domain, Torus) else domain.half_width
+    lower, upper = domain.centre - half_width, domain.centre + half_width
     somewhere = np.round(domain.centre + 0.5 * domain.half_width, 3)
     joints, labels = _words(problem.robot.joint_names), _words(chart.labels)
+    slides = [" (slides)" if sliding else "" for sliding in problem.robot.tree.prismatic]
     values = {
         "name": name,
         "NAME": name.upper(),
@@ -45,12 +55,15 @@ def template_values(
         "r": str(chart.r),
         "nn": str(n * n),
         "joint_list": ", ".join(joints),
-        "joint_lines": "\n".join(f" *   {i} {joint}" for i, joint in enumerate(joints)),
+        "joint_lines": "\n".join(f" *   {i} {joint}{slides[i]}" for i, joint in enumerate(joints)),
         "task_labels": ", ".join(labels[: chart.m]),
         "extra_labels": ", ".join(labels[chart.m :]),
         "domain_lines": _domain_lines(joints, lower, upper),
         "domain_lower": _numbers(lower),
         "domain_upper": _numbers(upper),
+        "domain_centre": _numbers(domain.centre),
+        "domain_reach": _numbers(half_width * (1 + BORDER)),
+        "max_evaluations": str(MAX_EVALUATIONS),
         "stack_bytes": str(stack_bytes),
         "check_q": _numbers(somewhere),
         "check_phi": _numbers(chart.phi(somewhere)),
@@ -67,16 +80,14 @@ def template_values(
 
 
 def _words(names: Iterable[str]) -> list[str]:
-    """Names of joints and quantities, harmless in comments of C."""
-    return [" ".join(name.split()).replace("*/", "* /") for name in names]
+    """Words from files of others, harmless in comments of C and in what CMake fills in."""
+    return [re.sub(r"[\x00-\x1f\x7f@]+|/(?=\*)|\*(?=/)", " ", name) for name in names]
 
 
 def _title(chart: Chart, controller: Controller | None) -> str:
     what = "chart" if controller is None else f"{controller.name} controller"
-    metric = chart.problem.metric.name
-    title = (
-        f"{what} of {chart.problem.name}: {chart.coordinates.label}, task {chart.problem.task.name}, metric {metric}"
-    )
+    problem, label = chart.problem, chart.coordinates.label
+    title = f"{what} of {problem.name}: {label}, task {problem.task.name}, metric {problem.metric.name}"
     return _words([title])[0]
 
 
@@ -86,12 +97,14 @@ def _control_values(controller: Controller) -> dict[str, str]:
     return {
         "k": str(len(controller.labels)),
         "reference_labels": ", ".join(_words(controller.labels)),
-        "gain_fields": "\n".join(f"  double {gain}[{len(value)}];" for gain, value in gains.items()),
+        "gain_fields": "\n".join(f"  double {gain}[{len(gains[gain])}]; /* {_GAINS[gain]} */" for gain in gains),
         "gain_values": ",\n".join(f"  {{{_numbers(value)}}}" for value in gains.values()),
         "gain_table": "\n".join(f"| `{gain}` | {_numbers(value)} |" for gain, value in gains.items()),
         "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
+        "commands_torque": str(int(torque)),
         "law": _LAWS[controller.name],
-        "fallback": "the torque of gravity, or zero where q is not finite" if torque else "zero",
+        "fallback": "the torque of gravity, or zero where that is not finite" if torque else "zero velocity",
+        "where": _IN_DOMAIN if hasattr(controller, "chart") else _EVERYWHERE,
         "command": controller.command,
     }
 

@@ -39,6 +39,7 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     items, doubles = compacted(_definitions(_with_products_of_known_sizes(generator.dump())), functions)
     names = [function.name() for function in functions]
     code = "\n\n".join(_without_warnings(items[name]) for name in _needed(items, names))
+    code = re.sub(r"\bcasadi_inf\b", "INFINITY", re.sub(r"\bcasadi_nan\b", "NAN", code))
     code = re.sub(r"CASADI_CAST\((\w+), ([^()]+)\)", r"(\1)(\2)", code)
     code = re.sub(r"\bcasadi_real\b", "double", re.sub(r"\bcasadi_int\b", "int", code))
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)

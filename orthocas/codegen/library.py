@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from orthocas.checks import Array
+from orthocas.checks import Array, require_shape
 from orthocas.codegen.generate import GeneratedC
 from orthocas.control import Controller
 from orthocas.errors import CompileError
@@ -76,9 +76,18 @@ class CompiledLibrary:
         command = np.empty(self.n)
         return command, self._call("control", [q, dq, reference, gains], [command])
 
+    @property
+    def domain(self) -> tuple[Array, Array]:
+        """Lower and upper borders, (n,) each."""
+        lower, upper = (self._table(f"domain_{side}", self.n) for side in ("lower", "upper"))
+        return lower, upper
+
     def default_gains(self, count: int) -> Array:
         """The gains it was generated with, (count,)."""
-        return np.array((ctypes.c_double * count).in_dll(self._c, f"{self.name}_default_gains"))
+        return self._table("default_gains", count)
+
+    def _table(self, name: str, count: int) -> Array:
+        return np.array((ctypes.c_double * count).in_dll(self._c, f"{self.name}_{name}"))
 
     @cached_property
     def _c(self) -> ctypes.CDLL:
@@ -87,6 +96,8 @@ class CompiledLibrary:
     def _call(self, function: str, inputs: list[Array], outputs: list[Array]) -> int:
         run = getattr(self._c, f"{self.name}_{function}")
         arrays = [np.ascontiguousarray(array, dtype=float) for array in inputs] + outputs
+        for array in arrays[:2]:  # q and dq, or q and an output: what C would read beyond
+            require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
         return int(run(*(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
 
 

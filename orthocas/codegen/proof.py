@@ -5,13 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.batch import Batched
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.generate import GeneratedC
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
-from orthocas.control import Controller
+from orthocas.control import Controller, ControlStatus
+from orthocas.control.status import LARGEST
+from orthocas.domains import Torus, contains
 from orthocas.errors import ProofError
 
 TOLERANCE = 1e-10  #: largest difference, relative to the largest entry of the result
@@ -33,8 +36,8 @@ def check_c(
 ) -> Proof:
     """Compile (C99, warnings are errors) with gcc and clang, those that are there, and compare with Python.
 
-    Random states inside and around the domain, some of them with NaN, infinities and huge numbers; and at rest, the
-    centre of the domain, its lowest and highest corner, and the centres of its faces.
+    Numbers and statuses, of random states inside and around the domain, some of them with NaN, infinities and huge
+    numbers; and at rest, of the centre of the domain, its lowest and highest corner, and the centres of its faces.
 
     Raises:
         CompileError: if there is no compiler, or one complains.
@@ -61,10 +64,13 @@ def _compared(
     library: CompiledLibrary, chart: Chart, controller: Controller | None, q: Array, seed: int
 ) -> dict[str, float]:
     """Largest relative differences by function; the last positions are corner cases, taken at rest."""
-    rng = np.random.default_rng(seed)
+    rng, domain = np.random.default_rng(seed), chart.problem.domain
+    half_width = np.inf if isinstance(domain, Torus) else domain.half_width
+    if not np.array_equal(library.domain, (domain.centre - half_width, domain.centre + half_width)):
+        raise ProofError("the domain in C is not that of the chart")
     dq = rng.normal(size=q.shape)
     dq[len(q) - len(_corner_cases(chart.n)) :] = 0
-    differences = _chart_and_dynamics(library, chart, q, dq)
+    differences = _chart_and_dynamics(library, chart, *_spoiled(rng, q, dq))
     differences["inverse"] = _inverse(library, chart, q)
     if controller is not None:
         differences["control"] = _control(library, controller, q, dq, rng)
@@ -76,50 +82,101 @@ def _corner_cases(n: int) -> Array:
     return np.vstack([np.zeros(n), np.full(n, -1), np.full(n, 1), -np.eye(n), np.eye(n)])
 
 
+def _spoiled(rng: np.random.Generator, *arrays: Array) -> list[Array]:
+    """Copies in which every twentieth row has a number that is none, in one of the arrays; not in corner cases."""
+    copies = [array.copy() for array in arrays]
+    for row in range(0, len(arrays[0]) - len(_corner_cases(arrays[0].shape[1])), 20):
+        array = copies[rng.integers(len(copies))]
+        array[row, rng.integers(array.shape[1])] = _BAD[rng.integers(len(_BAD))]
+    return copies
+
+
 def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Array) -> dict[str, float]:
-    found = [(*library.chart(a)[:2], *library.dynamics(a, b)[:3]) for a, b in zip(q, dq, strict=True)]
-    robot = chart.problem.robot
-    wanted = (chart.phi(q), chart.jacobian(q), robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q))
-    names = ("phi", "jacobian", "mass_matrix", "bias", "gravity")
-    return {name: _difference(np.array([row[k] for row in found]), wanted[k]) for k, name in enumerate(names)}
+    domain, robot = chart.problem.domain, chart.problem.robot
+    known, moving = _are_numbers(q), _are_numbers(q, dq)
+    somewhere, speed = np.where(known[:, None], q, domain.centre), np.where(moving[:, None], dq, 0)
+    inside = np.where(contains(domain, somewhere), ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN)
+    wanted = {"phi": chart.phi(somewhere), "jacobian": chart.jacobian(somewhere)}
+    has_value = known & np.isfinite(wanted["phi"]).all(axis=1) & np.isfinite(wanted["jacobian"]).all(axis=(1, 2))
+    status = np.select([~known, ~has_value], [ControlStatus.NOT_FINITE, ControlStatus.SINGULAR], inside)
+    found = [library.chart(row) for row in q]
+    _require_status("chart", [row[-1] for row in found], status, q)
+    differences = {
+        name: _difference(np.array([row[k] for row in found]), _zero_unless(has_value, value))
+        for k, (name, value) in enumerate(wanted.items())
+    }
+    wanted = {
+        "mass_matrix": robot.mass_matrix(somewhere),
+        "bias": robot.bias(somewhere, speed),
+        "gravity": robot.gravity(somewhere),
+    }
+    pushed = [library.dynamics(*row) for row in zip(q, dq, strict=True)]
+    _require_status("dynamics", [row[-1] for row in pushed], np.where(moving, inside, ControlStatus.NOT_FINITE), q)
+    return differences | {
+        name: _difference(np.array([row[k] for row in pushed]), _zero_unless(moving, value))
+        for k, (name, value) in enumerate(wanted.items())
+    }
 
 
 def _inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
     """Largest remaining error in phi, of the solutions that are found; most must be, from nearby."""
     inner = q[: len(q) // 10]
+    inner = inner[np.isfinite(chart.phi(inner)).all(axis=1)]
     targets, solved, worst = chart.phi(inner), 0, 0.0
     for target, start in zip(targets, inner, strict=True):
         solution, status = library.inverse(target, start + 0.01)
-        if status in (0, 1):
+        if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
             solved += 1
             worst = max(worst, float(np.abs(chart.phi(solution) - target).max()))
+            if (status == ControlStatus.OK) != contains(chart.problem.domain, solution):
+                raise ProofError(f"the status of inverse is {status} at q = {solution.tolist()}")
+        elif status != ControlStatus.SINGULAR or not np.array_equal(solution, start + 0.01):
+            raise ProofError(f"inverse gives {solution.tolist()} with status {status}, expected its start")
     if solved < 0.9 * len(inner):
         raise ProofError(f"the inverse map found {solved} of {len(inner)} positions 0.01 away, expected most")
+    nothing = np.full(chart.n, np.nan)
+    for given in ((nothing, inner[0]), (inner[0], nothing)):
+        solution, status = library.inverse(*given)
+        if status != ControlStatus.NOT_FINITE or solution.any():
+            raise ProofError(f"inverse of NaN gives {solution.tolist()} with status {status}, expected zeros and 3")
     return worst
 
 
 def _control(library: CompiledLibrary, controller: Controller, q: Array, dq: Array, rng: np.random.Generator) -> float:
     k = len(controller.labels)
-    around = Batched(controller.measured)(q)[0]
-    parts = [around + 0.1 * rng.normal(size=around.shape), *rng.normal(size=(2, len(q), k))]
-    q, dq = q.copy(), dq.copy()
-    for row in range(0, len(q) - len(_corner_cases(q.shape[1])), 20):  # some numbers that are none, in every argument
-        arrays = (q, dq, *parts)
-        array = arrays[rng.integers(len(arrays))]
-        array[row, rng.integers(array.shape[1])] = _BAD[rng.integers(len(_BAD))]
+    around = np.nan_to_num(Batched(controller.measured)(q)[0])
+    reference = (around + 0.1 * rng.normal(size=around.shape), *rng.normal(size=(2, len(q), k)))
+    q, dq, *parts = _spoiled(rng, q, dq, *reference)
     gains = [np.tile(gain, (len(q), 1)) for gain in controller.gains.values()]
     command, status = Batched(controller.function)(q, dq, *parts, *gains)
+    if not (status == ControlStatus.OK).any():
+        raise ProofError(f"{controller.name} is well defined at none of {len(q)} states, expected some to compare")
     numbers = gain_numbers(controller)
     if not np.array_equal(library.default_gains(len(numbers)), numbers):
         raise ProofError("the default gains in C are not those of the controller")
     found = [library.control(a, b, np.concatenate(c), numbers) for a, b, *c in zip(q, dq, *parts, strict=True)]
-    unequal = np.flatnonzero(np.array([row[1] for row in found]) != status[:, 0])
+    _require_status("control", [row[1] for row in found], status[:, 0], q)
+    return _difference(np.array([row[0] for row in found]), command)
+
+
+def _are_numbers(*arrays: Array) -> NDArray[np.bool_]:
+    """Rows without NaN, infinities and numbers that C refuses."""
+    known: NDArray[np.bool_] = np.all([(np.abs(array) <= LARGEST).all(axis=1) for array in arrays], axis=0)
+    return known
+
+
+def _zero_unless(good: NDArray[np.bool_], values: Array) -> Array:
+    """Values of the states that are good, zeros for the others."""
+    return np.where(good.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0)
+
+
+def _require_status(function: str, found: list[int], wanted: Array, q: Array) -> None:
+    unequal = np.flatnonzero(np.array(found) != wanted)
     if unequal.size:
         row = int(unequal[0])
         raise ProofError(
-            f"the status of control is {found[row][1]} at q = {q[row].tolist()}, expected {status[row, 0]:.0f}"
+            f"the status of {function} is {found[row]} at q = {q[row].tolist()}, expected {wanted[row]:.0f}"
         )
-    return _difference(np.array([row[0] for row in found]), command)
 
 
 def _difference(found: Array, wanted: Array) -> float:

@@ -8,6 +8,9 @@ import re
 
 import casadi as ca
 
+from orthocas.errors import CompileError
+
+_VERSION = f"by CasADi {ca.CasadiMeta.version()}"
 _PLACE = re.compile(r"\*w(\d+)=w\+(\d+)")
 _CALL = re.compile(r"\bcasadi_f\d+(?=\(arg1, res1, iw, w, 0\))")
 
@@ -20,7 +23,7 @@ def compacted(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dic
         functions: those the code was generated from, in the same order.
 
     Raises:
-        RuntimeError: if the code is not laid out as expected, because CasADi changed.
+        CompileError: if the code is not laid out as expected, because CasADi changed.
     """
     names = {hash(f): f"casadi_f{number}" for number, f in enumerate(_in_order_of_generation(functions))}
     changed = dict(blocks)
@@ -31,7 +34,7 @@ def compacted(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dic
         if name not in needed:
             callees = _callees(function)
             if set(_CALL.findall(blocks[name])) != {names[hash(callee)] for callee in callees}:
-                raise RuntimeError(f"the C code of {function.name()} does not call what its graph calls")
+                raise CompileError(f"the C code of {function.name()} does not call what its graph calls, {_VERSION}")
             below = max(map(need, callees), default=0)
             changed[name], needed[name] = _moved(blocks[name], function, below)
         return needed[name]
@@ -73,7 +76,9 @@ def _moved(block: str, function: ca.Function, below: int) -> tuple[str, int]:
     for place, size in sorted(sizes.items()):
         if place in used:
             if used[place] != old:
-                raise RuntimeError(f"place {place} of {function.name()} is at {used[place]}, expected at {old}")
+                raise CompileError(
+                    f"place {place} of {function.name()} is at {used[place]}, expected at {old}, {_VERSION}"
+                )
             new[place] = end
             old += size
             end += size

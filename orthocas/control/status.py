@@ -4,9 +4,9 @@ from enum import IntEnum
 
 import casadi as ca
 
-from orthocas.domains import Domain, Torus
+from orthocas.domains import BORDER, Domain, Torus
 
-_LARGEST = 1e100  # numbers beyond are treated as not finite: their squares may overflow
+LARGEST = 1e100  #: numbers beyond are treated as not finite: their squares may overflow
 _SMALLEST_VOLUME = 1e-3  # of the parallelepiped of the gradients, relative to its median over the domain
 
 
@@ -55,12 +55,12 @@ def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
     """Whether q (n, 1) lies in the domain; angles of a torus always do."""
     if domain is None or isinstance(domain, Torus):
         return ca.SX(1)
-    return ca.logic_all(ca.fabs(q - ca.DM(domain.centre)) <= ca.DM(domain.half_width * (1 + 1e-12)))
+    return ca.logic_all(ca.fabs(q - ca.DM(domain.centre)) <= ca.DM(domain.half_width * (1 + BORDER)))
 
 
 def _is_finite(value: ca.SX) -> ca.SX:
     """False for NaN too, since comparisons with NaN are."""
-    return ca.fabs(value) <= _LARGEST
+    return ca.fabs(value) <= LARGEST
 
 
 def _all_finite(values: ca.SX) -> ca.SX:
