@@ -97,16 +97,20 @@ def _control_values(controller: Controller) -> dict[str, str]:
     return {
         "k": str(len(controller.labels)),
         "reference_labels": ", ".join(_words(controller.labels)),
-        "gain_fields": "\n".join(f"  double {gain}[{len(gains[gain])}]; /* {_GAINS[gain]} */" for gain in gains),
+        "gain_fields": "\n".join(f"  double {gain}[{len(gains[gain])}];{_remark(gain)}" for gain in gains),
         "gain_values": ",\n".join(f"  {{{_numbers(value)}}}" for value in gains.values()),
         "gain_table": "\n".join(f"| `{gain}` | {_numbers(value)} |" for gain, value in gains.items()),
         "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
         "commands_torque": str(int(torque)),
-        "law": _LAWS[controller.name],
+        "law": _LAWS.get(controller.name, f"The law {controller.name}."),
         "fallback": "the torque of gravity, or zero where that is not finite" if torque else "zero velocity",
         "where": _IN_DOMAIN if hasattr(controller, "chart") else _EVERYWHERE,
         "command": controller.command,
     }
+
+
+def _remark(gain: str) -> str:
+    return f" /* {_GAINS[gain]} */" if gain in _GAINS else ""
 
 
 def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:

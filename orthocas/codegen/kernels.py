@@ -83,12 +83,12 @@ def _definitions(text: str) -> dict[str, str]:
     found: dict[str, str] = {}
     lines = iter(text.splitlines())
     for line in lines:
-        name = _FUNCTION.match(line) or _DATA.match(line)
+        data = _DATA.match(line)
+        name = data or _FUNCTION.match(line)
         if name is None:
             continue
         block = [line]
-        end = ";" if _DATA.match(line) else "}"
-        while not (block[-1].endswith(";") if end == ";" else block[-1] == "}" or line.endswith("}")):
+        while not (block[-1].endswith(";") if data else block[-1] == "}" or line.endswith("}")):  # or in one line
             block.append(next(lines))
         found[name.group(1)] = "\n".join(block)
     return found

@@ -5,6 +5,7 @@ thousand neurons that is megabytes of stack that nothing reads or writes.
 """
 
 import re
+from itertools import pairwise
 
 import casadi as ca
 
@@ -65,24 +66,19 @@ def _callees(function: ca.Function) -> list[ca.Function]:
 
 
 def _moved(block: str, function: ca.Function, below: int) -> tuple[str, int]:
-    """Code whose places in the work array follow each other, from `below` on, and where the last ends."""
-    sizes = _place_sizes(function)
-    old_start = function.sz_w() - sum(sizes.values())
+    """Code whose places in the work array begin at `below`, and where they end."""
     body = _PLACE.sub("", block.split("{", 1)[1])
     if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
-        below = old_start  # an operation of its own works there, or the code has no places
-    new, old, end = {}, old_start, below
-    used = {int(place): int(offset) for place, offset in _PLACE.findall(block)}
-    for place, size in sorted(sizes.items()):
-        if place in used:
-            if used[place] != old:
-                raise CompileError(
-                    f"place {place} of {function.name()} is at {used[place]}, expected at {old}, {_VERSION}"
-                )
-            new[place] = end
-            old += size
-            end += size
-    return _PLACE.sub(lambda found: f"*w{found[1]}=w+{new[int(found[1])]}", block), end
+        return block, function.sz_w()  # an operation uses the array in its own way
+    sizes = _place_sizes(function)
+    places = sorted((int(offset), sizes[int(place)]) for place, offset in _PLACE.findall(block))
+    for (offset, size), (following, _) in pairwise(places):
+        if offset + size > following:
+            raise CompileError(f"places at {offset} and {following} of {function.name()} overlap, {_VERSION}")
+    if not places:
+        return block, below
+    shift = below - places[0][0]
+    return _PLACE.sub(lambda found: f"*w{found[1]}=w+{int(found[2]) + shift}", block), sum(places[-1]) + shift
 
 
 def _place_sizes(function: ca.Function) -> dict[int, int]:

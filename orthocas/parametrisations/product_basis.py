@@ -20,8 +20,8 @@ Term = tuple[int, ...]  #: for every joint, which one-joint function the term ta
 class LinearFamily:
     """xi_theta(q) = C psi(q), with theta the rows of C (r, K) one after the other.
 
-    psi_k(q) = prod_i f_i,k_i(q_i) over the joints. No term is constant: a constant does not change J_xi. With a term,
-    the family has all whose factors are among those of the term or, if `one_joint_derivatives` needs them, below.
+    psi_k(q) = prod_i f_i,k_i(q_i) over the joints. No term is constant: a constant does not change J_xi. Derivatives of
+    terms are sums of terms: with a term, the family has those that come from it when a factor is differentiated.
     """
 
     space: JointSpace
