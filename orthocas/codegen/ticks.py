@@ -25,8 +25,8 @@ class Ticks:
 
     median: float
     p99: float
-    worst: float
-    late: float  #: share of calls that took more than five medians
+    worst: float  #: interrupts and whatever else the machine does included
+    slowest_state: float  #: of 64 states, at its best: without what the machine does
 
 
 def control_tick(chart: Chart, calls: int = 5_000) -> float:
