@@ -17,6 +17,7 @@ from orthocas.control import Controller, PDPlus
 from orthocas.errors import CompileError
 
 _STATES = 64  # as in templates/ticks.c
+_MICROSECONDS = 3e5  # to spend on one measurement
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,8 @@ class Ticks:
     slowest_state: float  #: of 64 states, at its best: without what the machine does
 
 
-def control_tick(chart: Chart, calls: int = 5_000) -> float:
-    """Median time of one call of decoupled PD+ on a chart, as generated C [us].
+def control_tick(chart: Chart) -> float:
+    """Time of one call of decoupled PD+ on a chart, as generated C [us]: the slowest of 64 states, at its best.
 
     Raises:
         CompileError: if there is no C compiler.
@@ -39,7 +40,9 @@ def control_tick(chart: Chart, calls: int = 5_000) -> float:
     with TemporaryDirectory() as folder:
         generated = generate_c(chart, folder, law, "tick")
         library = CompiledLibrary(compile_shared(generated, Path(folder)), "tick", chart.n)
-        return time_ticks([(law, library)], calls)[0].median
+        about = time_ticks([(law, library)], 200)[0].median
+        calls = int(np.clip(_MICROSECONDS / about, 1_000, 100_000))
+        return time_ticks([(law, library)], calls)[0].slowest_state
 
 
 def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int = 100_000) -> list[Ticks]:
