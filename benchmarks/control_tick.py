@@ -55,7 +55,7 @@ def main(quick: bool = False) -> dict[str, dict[str, float]]:
     with tempfile.TemporaryDirectory() as folder:
         for number, (title, chart, law) in enumerate(laws(quick)):
             begin = time.perf_counter()
-            generated = oc.generate_c(chart, folder, law, f"tick{number}")
+            generated = oc.generate_c(chart, Path(folder) / str(number), law, f"tick{number}")
             written = time.perf_counter()
             library = compile_shared(generated, Path(folder))
             done = time.perf_counter()

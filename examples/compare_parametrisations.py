@@ -45,13 +45,13 @@ def build(name: str) -> oc.Problem:
     return oc.Problem(base.robot, task, base.metric, base.domain, name)
 
 
-def compared(name: str, quick: bool, monitor: Monitor) -> Comparison:
+def compared(name: str, charts: Path, quick: bool, monitor: Monitor) -> Comparison:
     """Bases with every solver, networks with those that can."""
     problem = build(name)
     if quick:
         return oc.compare(problem, BASES[name][:2], samples=200, held_out=2_000, monitor=monitor)
-    bases = oc.compare(problem, BASES[name], FOR_BASES, control_ticks=True, monitor=monitor)
-    networks = oc.compare(problem, NETWORKS[name], FOR_NETWORKS, control_ticks=True, monitor=monitor)
+    bases = oc.compare(problem, BASES[name], FOR_BASES, charts=charts, control_ticks=True, monitor=monitor)
+    networks = oc.compare(problem, NETWORKS[name], FOR_NETWORKS, charts=charts, control_ticks=True, monitor=monitor)
     return Comparison(bases.results + networks.results)
 
 
@@ -59,9 +59,9 @@ def main(out: Path, quick: bool = False, monitor: Monitor = silent) -> dict[str,
     """Compare, draw, and return the best task deviation of every problem [deg]."""
     best = {}
     for name in ("planar_3r_xy",) if quick else BASES:
-        found = compared(name, quick, monitor)
         folder = out / name
-        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "charts").mkdir(parents=True, exist_ok=True)
+        found = compared(name, folder / "charts", quick, monitor)
         found.write(folder)
         front_figure(found).savefig(folder / "front.png", dpi=110)
         convergence_figure(found).savefig(folder / "convergence.png", dpi=110)

@@ -1,10 +1,10 @@
 """The front door: fit and distil, with a default parametrisation and solver, compare, and load."""
 
+import re
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from itertools import product
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from orthocas.archive import require_writable
 from orthocas.chart import Chart
@@ -157,7 +157,7 @@ def compare(
         jobs: number of such processes, default one for each core.
         charts: folder to save charts in.
         control_ticks: measure, after all fits, how long a control tick takes with each parametrisation: decoupled PD+
-            as generated C. NaN where there is no C compiler.
+            as generated C, on a chart of the folder. NaN where there is no C compiler.
         monitor: called with progress.
 
     Call it under `if __name__ == "__main__"` in scripts, as all that starts processes.
@@ -170,15 +170,16 @@ def compare(
     jobs = None if jobs is None else require_count("jobs", jobs)
     held_out = require_count("held_out", held_out)
     _require_grid(parametrisations, solvers)
-    if charts is not None:
-        require_writable(Path(charts) / "chart")
-    with TemporaryDirectory(prefix="orthocas-") as temporary:
-        folder = Path(charts) if charts is not None else Path(temporary) if control_ticks else None
-        cells = [
-            Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file)
-            for parametrisation, solver, seed, file in _fits(parametrisations, solvers, count, folder)
-        ]
-        return _run_grid(cells, executor, jobs, control_ticks, monitor)
+    folder = None if charts is None else Path(charts)
+    if folder is not None:
+        require_writable(folder / "chart")
+    elif control_ticks:
+        raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
+    cells = [
+        Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file)
+        for parametrisation, solver, seed, file in _fits(parametrisations, solvers, count, folder)
+    ]
+    return _run_grid(cells, executor, jobs, control_ticks, monitor)
 
 
 def _fits(
@@ -189,7 +190,7 @@ def _fits(
         closed = isinstance(parametrisation, Linear | Given | SEW)
         fitting = [default_solver(parametrisation)] if closed or solvers is None else solvers
         for solver, seed in product(fitting, range(1 if closed else seeds)):
-            name = f"{parametrisation.label}_{solver.name}_{seed}.orthocas".replace(":", "-")
+            name = re.sub(r"[^\w.-]", "-", f"{parametrisation.label}_{solver.name}_{seed}.orthocas")
             yield parametrisation, solver, seed, None if folder is None else folder / name
 
 

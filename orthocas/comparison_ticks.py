@@ -33,5 +33,5 @@ def with_control_ticks(results: Sequence[CellResult], cells: Sequence[Cell], mon
 def _control_tick(file: Path) -> float:
     try:
         return control_tick(Chart.load(file))
-    except OrthocasError:  # the fits are worth more than their ticks
+    except (OrthocasError, OSError, RuntimeError, MemoryError):  # the fits are worth more than their ticks
         return math.nan

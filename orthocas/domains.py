@@ -12,7 +12,6 @@ from orthocas.robots import Robot
 
 REVOLUTE_HALF_WIDTH = np.pi / 4  #: default half-width [rad], the hyper-cube of [AS2023] Sec. 9
 PRISMATIC_HALF_WIDTH = 0.25  #: default half-width [m] of an unlimited prismatic joint
-BORDER = 1e-12  #: share of a half-width that points may lie outside: borders belong to domains, however rounded
 _WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes and overflow later
 
 
@@ -122,8 +121,15 @@ def contains(domain: Domain, q: ArrayLike) -> Array:
     if isinstance(domain, Torus):
         inside = np.ones(len(points), dtype=bool)
     else:
-        inside = np.all(np.abs(points - domain.centre) <= domain.half_width * (1 + BORDER), axis=1)
+        inside = np.all(np.abs(points - domain.centre) <= reach(domain), axis=1)
     return inside[0] if single else inside
+
+
+def reach(domain: Domain) -> Array:
+    """Half-widths and a little more, (n,): borders belong to a domain, whichever way they are rounded."""
+    slack = 1e-12 * domain.half_width + 4 * np.finfo(float).eps * np.abs(domain.centre)
+    values: Array = domain.half_width + slack
+    return values
 
 
 def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: float | None = None) -> Box:

@@ -47,7 +47,7 @@ def pd_plus(planar_chart: oc.Chart, tmp_path_factory: pytest.TempPathFactory) ->
 def test_every_controller_equals_its_python(planar_chart: oc.Chart, tmp_path: Path) -> None:
     """Also NaN, infinities and huge numbers: same status, same fallback."""
     for law in (*laws(planar_chart), None):
-        generated = oc.generate_c(planar_chart, tmp_path, law)
+        generated = oc.generate_c(planar_chart, tmp_path / law.name if law else tmp_path / "none", law)
         proof = check_c(generated, planar_chart, law, states=300)
         assert set(proof.differences) >= {"phi", "jacobian", "mass_matrix", "bias", "gravity", "inverse"}
         assert ("control" in proof.differences) == (law is not None)
@@ -82,7 +82,7 @@ def test_chart_on_the_torus_has_no_outside(tmp_path: Path) -> None:
 _CONSUMER = """
 cmake_minimum_required(VERSION 3.16)
 project(consumer LANGUAGES C)
-find_package(arm REQUIRED)
+find_package(arm 0.1 REQUIRED)
 add_executable(consumer main.c)
 target_link_libraries(consumer PRIVATE arm::shared)
 """
@@ -129,7 +129,7 @@ def test_installed_libraries_are_found_and_linked(pd_plus: Generated, tmp_path: 
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
 def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: Generated, tmp_path: Path) -> None:
     (tmp_path / "main.c").write_text(_MAIN)
-    text = _CONSUMER.replace("find_package(arm REQUIRED)", f'add_subdirectory("{pd_plus[0].folder}" arm)')
+    text = _CONSUMER.replace("find_package(arm 0.1 REQUIRED)", f'add_subdirectory("{pd_plus[0].folder}" arm)')
     (tmp_path / "CMakeLists.txt").write_text(text.replace("arm::shared", "arm::static"))
     run("cmake", "-S", tmp_path, "-B", tmp_path / "build")
     run("cmake", "--build", tmp_path / "build")
@@ -147,6 +147,9 @@ def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: Generated, t
         ("if (!(fabs(x[i]) <= LARGEST)) return 0;", "(void)x;", "the status of chart is . at"),
         ("arm_domain_upper[N] = {", "arm_domain_upper[N] = {1e-3 + ", "the domain in C"),
         ("memcpy(q, now, sizeof now);", "", "inverse"),
+        ("(error >= 0.0 && error <= SOLVED)", "(error < 1e300)", "in inverse"),
+        ("arg[7] = gains->limit;", "arg[7] = arm_default_gains.limit;", "control"),
+        ("arg[5] = gains->stiffness;", "arg[5] = arm_default_gains.stiffness;", "in control"),
         ("res[1] = bias;", "res[1] = gravity;", "in (bias|gravity)"),
     ],
 )
@@ -172,7 +175,7 @@ def test_coordinates_without_a_value_everywhere(planar_x: oc.Problem, tmp_path: 
     for k, expression in enumerate((lambda q: ca.sqrt(q[1] - 0.4), lambda q: ca.if_else(q[1] > 0.4, q[1], ca.inf))):
         given = oc.Given.from_function("partial", 3, lambda q, f=expression: ca.vertcat(f(q) + q[0], q[2] - q[0]))
         chart = oc.fit(planar_x, given).chart
-        generated = oc.generate_c(chart, tmp_path, None, f"arm{k}")
+        generated = oc.generate_c(chart, tmp_path / str(k), None, f"arm{k}")
         check_c(generated, chart, None, states=300)
         library = CompiledLibrary(compile_shared(generated, tmp_path), f"arm{k}", 3)
         phi, _, status = library.chart(np.array([0.6, 0.39, 0.8]))
@@ -191,7 +194,21 @@ def test_words_of_others_do_not_become_code(tmp_path: Path) -> None:
     assert "evil" not in subprocess.run(
         [compilers()[0], "-E", "-P", str(tmp_path / "arm.c")], capture_output=True, text=True, check=True
     ).stdout.replace("evil_", "")
-    assert re.fullmatch(r"[a-z_]\w*", oc.generate_c(chart, tmp_path).name, flags=re.ASCII)
+    assert re.fullmatch(r"[a-z]\w*", oc.generate_c(chart, tmp_path / "unnamed").name, flags=re.ASCII)
+
+
+def test_check_is_fair_near_singularities(tmp_path: Path) -> None:
+    """A good fit whose box holds postures where commands amplify rounding by a million, and its coupled laws."""
+    robot = oc.Robot.planar([1, 1, 1], [1, 1, 1])
+    problem = oc.Problem(robot, oc.Task.position(robot, "xy"), "inertia", oc.Box([0.3] * 3, np.pi / 4))
+    chart = oc.fit(problem, oc.Polynomial(3)).chart
+    for law in (PDPlus(chart, 50.0), Kinematic(chart)):
+        generated = oc.generate_c(chart, tmp_path / law.name, law, "arm")
+        check_c(generated, chart, law)
+        source = tmp_path / law.name / "arm.c"
+        source.write_text(source.read_text().replace("arg[3] = reference->velocity", "arg[3] = reference->value"))
+        with pytest.raises(ProofError, match="control"):
+            check_c(generated, chart, law)
 
 
 def test_files_of_the_user_stay(planar_chart: oc.Chart, tmp_path: Path) -> None:
@@ -203,6 +220,11 @@ def test_files_of_the_user_stay(planar_chart: oc.Chart, tmp_path: Path) -> None:
     with pytest.raises(InvalidValueError, match=r"CMakeLists\.txt that orthocas did not write"):
         oc.generate_c(planar_chart, tmp_path, None, "arm")
     assert [path.name for path in tmp_path.iterdir()] == ["CMakeLists.txt"]
+    (tmp_path / "CMakeLists.txt").rmdir()
+    oc.generate_c(planar_chart, tmp_path, None, "arm")
+    oc.generate_c(planar_chart, tmp_path, None, "arm")
+    with pytest.raises(InvalidValueError, match="a folder with a library of another name"):
+        oc.generate_c(planar_chart, tmp_path, None, "leg")
 
 
 def test_header_and_readme_tell_what_a_user_needs(
@@ -258,7 +280,7 @@ def test_command_writes_checks_and_refuses(
     assert report["checked_states"] == 1009
     assert max(report["relative_differences"].values()) < 1e-10
     assert Path(report["source"]).exists()
-    code, out, _ = run("--controller", "none", "--out", str(tmp_path / "c"), "--name", "arm")
+    code, out, _ = run("--controller", "none", "--out", str(tmp_path / "d"), "--name", "arm")
     assert code == 0
     assert "lines of C99" in out
     for words, message in (

@@ -125,11 +125,14 @@ def test_summaries_are_medians_and_spreads_over_seeds(grid: tuple[Comparison, Pa
     assert "±" in rows[1][3]
 
 
-def test_control_ticks_are_measured_once_a_parametrisation(planar_x: oc.Problem) -> None:
+def test_control_ticks_are_measured_once_a_parametrisation(planar_x: oc.Problem, tmp_path: Path) -> None:
     """Failed fits have none."""
     lbfgs = solvers.LBFGS(max_iterations=5)
     parametrisations = [oc.Linear(), oc.MLP((4,)), Breaks()]
-    found = oc.compare(planar_x, parametrisations, [lbfgs], 2, executor=InThisThread(), control_ticks=True, **QUICK)
+    places: dict[str, Any] = {"executor": InThisThread(), "charts": tmp_path, "control_ticks": True}
+    found = oc.compare(planar_x, parametrisations, [lbfgs], 2, **places, **QUICK)
+    with pytest.raises(InvalidValueError, match="a folder for charts"):
+        oc.compare(planar_x, parametrisations, control_ticks=True)
     ticks = {r.parametrisation: r.control_tick_us for r in found.results}
     assert math.isnan(ticks.pop("breaks"))
     if shutil.which("cc") is None:
@@ -147,7 +150,8 @@ def test_ticks_are_left_out_without_a_compiler(
     planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    found = oc.compare(planar_x, [oc.Linear()], executor=InThisThread(), control_ticks=True, **QUICK)
+    places: dict[str, Any] = {"executor": InThisThread(), "charts": tmp_path, "control_ticks": True}
+    found = oc.compare(planar_x, [oc.Linear()], **places, **QUICK)
     assert math.isnan(found.results[0].control_tick_us)
     assert found.rows()[1][-1] == "-"
 

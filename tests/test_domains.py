@@ -7,7 +7,7 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas.domains import default_box, require_within_limits, sample_evenly, sample_uniform
+from orthocas.domains import Box, contains, default_box, require_within_limits, sample_evenly, sample_uniform
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
 
 
@@ -118,3 +118,13 @@ def test_bad_boxes_are_refused() -> None:
     robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
     with pytest.raises(ShapeError, match="domain"):
         require_within_limits(robot, oc.Torus(3))
+
+
+def test_borders_of_small_boxes_far_out_belong_to_them() -> None:
+    rng = np.random.default_rng(0)
+    for half_width in (1e-6, 1e-4, 1.0):
+        for centre in rng.uniform(-3, 3, (200, 2)):
+            box = Box(centre, half_width)
+            assert contains(box, centre - half_width)
+            assert contains(box, centre + half_width)
+            assert not contains(box, centre + half_width * (1 + 1e-8))

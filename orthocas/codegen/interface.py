@@ -12,7 +12,7 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.kernels import Kernels
 from orthocas.control import Controller
-from orthocas.domains import BORDER, Torus
+from orthocas.domains import Torus, reach
 from orthocas.version import VERSION
 
 MAX_EVALUATIONS = 100  #: of the chart in one call of the inverse map
@@ -62,7 +62,7 @@ def template_values(
         "domain_lower": _numbers(lower),
         "domain_upper": _numbers(upper),
         "domain_centre": _numbers(domain.centre),
-        "domain_reach": _numbers(half_width * (1 + BORDER)),
+        "domain_reach": _numbers(half_width if isinstance(domain, Torus) else reach(domain)),
         "max_evaluations": str(MAX_EVALUATIONS),
         "stack_bytes": str(stack_bytes),
         "check_q": _numbers(somewhere),

@@ -19,6 +19,7 @@ from orthocas.errors import ProofError
 
 TOLERANCE = 1e-10  #: largest difference, relative to the largest entry of the result
 _REACH = 1.2  # random states lie in the domain and this much around it
+_ROUNDING = 1e-12  # where Python changes by more than this if q moves by one rounding, C may differ in proportion
 _BAD = (np.nan, np.inf, -np.inf, 1e200)
 
 
@@ -41,7 +42,8 @@ def check_c(
 
     Raises:
         CompileError: if there is no compiler, or one complains.
-        ProofError: if a result differs by more than 1e-10 of its largest entry, or a status differs.
+        ProofError: if a result differs by more than 1e-10 of its largest entry, or a status differs. Near
+            singularities, where commands change by more than 1e-12 if q moves by one rounding, a hundred times that.
     """
     n, domain, places = chart.n, chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, chart.n))
     q = domain.centre + domain.half_width * np.vstack([_REACH * places, _corner_cases(n)])
@@ -119,27 +121,38 @@ def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Ar
 
 
 def _inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
-    """Largest remaining error in phi, of the solutions that are found; most must be, from nearby."""
+    """Largest remaining error in phi, of the solutions that are found; most must be, from nearby, if not from afar."""
     inner = q[: len(q) // 10]
-    inner = inner[np.isfinite(chart.phi(inner)).all(axis=1)]
-    targets, solved, worst = chart.phi(inner), 0, 0.0
-    for target, start in zip(targets, inner, strict=True):
-        solution, status = library.inverse(target, start + 0.01)
-        if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
-            solved += 1
-            worst = max(worst, float(np.abs(chart.phi(solution) - target).max()))
-            if (status == ControlStatus.OK) != contains(chart.problem.domain, solution):
-                raise ProofError(f"the status of inverse is {status} at q = {solution.tolist()}")
-        elif status != ControlStatus.SINGULAR or not np.array_equal(solution, start + 0.01):
-            raise ProofError(f"inverse gives {solution.tolist()} with status {status}, expected its start")
+    regular = [_is_regular(*pair) for pair in zip(chart.phi(inner), chart.jacobian(inner), strict=True)]
+    inner = inner[np.array(regular, dtype=bool)]
+    targets = chart.phi(inner)
+    near = [_inverse_error(library, chart, *pair) for pair in zip(targets, inner + 0.01, strict=True)]
+    far = [_inverse_error(library, chart, *pair) for pair in zip(targets + 1e3, inner, strict=True)]
+    solved = np.isfinite(near).sum()
     if solved < 0.9 * len(inner):
         raise ProofError(f"the inverse map found {solved} of {len(inner)} positions 0.01 away, expected most")
     nothing = np.full(chart.n, np.nan)
-    for given in ((nothing, inner[0]), (inner[0], nothing)):
+    for given in ((nothing, q[0]), (q[0], nothing)):
         solution, status = library.inverse(*given)
         if status != ControlStatus.NOT_FINITE or solution.any():
             raise ProofError(f"inverse of NaN gives {solution.tolist()} with status {status}, expected zeros and 3")
-    return worst
+    return max((error for error in (*near, *far) if np.isfinite(error)), default=0.0)
+
+
+def _is_regular(phi: Array, J: Array) -> bool:
+    return bool(np.isfinite(phi).all() and np.isfinite(J).all() and np.linalg.cond(J) < 1e6)
+
+
+def _inverse_error(library: CompiledLibrary, chart: Chart, target: Array, start: Array) -> float:
+    """Largest remaining error in phi; infinite if no solution is found, and then said and done as documented."""
+    solution, status = library.inverse(target, start)
+    if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
+        if (status == ControlStatus.OK) != contains(chart.problem.domain, solution):
+            raise ProofError(f"the status of inverse is {status} at q = {solution.tolist()}")
+        return float(np.abs(chart.phi(solution) - target).max())
+    if status != ControlStatus.SINGULAR or not np.array_equal(solution, start):
+        raise ProofError(f"inverse gives {solution.tolist()} with status {status}, expected its start")
+    return np.inf
 
 
 def _control(library: CompiledLibrary, controller: Controller, q: Array, dq: Array, rng: np.random.Generator) -> float:
@@ -147,16 +160,32 @@ def _control(library: CompiledLibrary, controller: Controller, q: Array, dq: Arr
     around = np.nan_to_num(Batched(controller.measured)(q)[0])
     reference = (around + 0.1 * rng.normal(size=around.shape), *rng.normal(size=(2, len(q), k)))
     q, dq, *parts = _spoiled(rng, q, dq, *reference)
-    gains = [np.tile(gain, (len(q), 1)) for gain in controller.gains.values()]
-    command, status = Batched(controller.function)(q, dq, *parts, *gains)
+    gains = _random_gains(controller, len(q), rng)
+    law = Batched(controller.function)
+    command, status = law(q, dq, *parts, *gains)
+    moved, status_there = law(np.nextafter(q, np.inf), dq, *parts, *gains)
     if not (status == ControlStatus.OK).any():
         raise ProofError(f"{controller.name} is well defined at none of {len(q)} states, expected some to compare")
     numbers = gain_numbers(controller)
     if not np.array_equal(library.default_gains(len(numbers)), numbers):
         raise ProofError("the default gains in C are not those of the controller")
-    found = [library.control(a, b, np.concatenate(c), numbers) for a, b, *c in zip(q, dq, *parts, strict=True)]
+    references, all_gains = np.hstack(parts), np.hstack(gains)
+    found = [library.control(*row) for row in zip(q, dq, references, all_gains, strict=True)]
     _require_status("control", [row[1] for row in found], status[:, 0], q)
-    return _difference(np.array([row[0] for row in found]), command)
+    change = np.where(status_there[:, 0] == status[:, 0], _differences(moved, command), 0).clip(_ROUNDING, 1)
+    sensitivity = change / _ROUNDING
+    return float((_differences(np.array([row[0] for row in found]), command) / sensitivity).max())
+
+
+def _random_gains(controller: Controller, rows: int, rng: np.random.Generator) -> list[Array]:
+    """Gains around those of the controller, (rows, length) each; limits are finite, and now and then no limits."""
+    gains = []
+    for name, gain in controller.gains.items():
+        values = np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
+        if name == "limit":
+            values[7::40, 0] = rng.choice([0.0, -1.0, np.nan, np.inf], size=len(values[7::40]))
+        gains.append(values)
+    return gains
 
 
 def _are_numbers(*arrays: Array) -> NDArray[np.bool_]:
@@ -180,8 +209,13 @@ def _require_status(function: str, found: list[int], wanted: Array, q: Array) ->
 
 
 def _difference(found: Array, wanted: Array) -> float:
-    """Largest difference, each state relative to its largest entry; infinite if anything is not finite."""
+    """Largest of `_differences`."""
+    return float(_differences(found, wanted).max())
+
+
+def _differences(found: Array, wanted: Array) -> Array:
+    """Difference at each state relative to its largest entry, (N,); infinite where anything is not finite."""
     flat = (len(found), -1)
     scale = np.abs(wanted.reshape(flat)).max(axis=1).clip(1e-300)
     difference = np.abs(found - wanted).reshape(flat).max(axis=1) / scale
-    return float(difference.max()) if np.isfinite(difference).all() else np.inf
+    return np.where(np.isfinite(difference), difference, np.inf)

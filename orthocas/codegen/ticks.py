@@ -15,6 +15,7 @@ from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
 from orthocas.control import Controller, PDPlus
 from orthocas.errors import CompileError
+from orthocas.interrupts import deferred
 
 _STATES = 64  # as in templates/ticks.c
 _MICROSECONDS = 3e5  # to spend on one measurement
@@ -36,9 +37,10 @@ def control_tick(chart: Chart) -> float:
     Raises:
         CompileError: if there is no C compiler.
     """
-    law = PDPlus(chart, 50.0, coupling="decoupled")
     with TemporaryDirectory() as folder:
-        generated = generate_c(chart, folder, law, "tick")
+        with deferred():  # CasADi may lose Ctrl-C while it builds functions
+            law = PDPlus(chart, 50.0, coupling="decoupled")
+            generated = generate_c(chart, folder, law, "tick")
         library = CompiledLibrary(compile_shared(generated, Path(folder)), "tick", chart.n)
         about = time_ticks([(law, library)], 200)[0].median
         calls = int(np.clip(_MICROSECONDS / about, 1_000, 100_000))

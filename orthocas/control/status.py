@@ -4,7 +4,7 @@ from enum import IntEnum
 
 import casadi as ca
 
-from orthocas.domains import BORDER, Domain, Torus
+from orthocas.domains import Domain, Torus, reach
 
 LARGEST = 1e100  #: numbers beyond are treated as not finite: their squares may overflow
 _SMALLEST_VOLUME = 1e-3  # of the parallelepiped of the gradients, relative to its median over the domain
@@ -55,7 +55,7 @@ def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
     """Whether q (n, 1) lies in the domain; angles of a torus always do."""
     if domain is None or isinstance(domain, Torus):
         return ca.SX(1)
-    return ca.logic_all(ca.fabs(q - ca.DM(domain.centre)) <= ca.DM(domain.half_width * (1 + BORDER)))
+    return ca.logic_all(ca.fabs(q - ca.DM(domain.centre)) <= ca.DM(reach(domain)))
 
 
 def _is_finite(value: ca.SX) -> ca.SX:
