@@ -118,17 +118,21 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
 def contains(domain: Domain, q: ArrayLike) -> Array:
     """Whether points (n,) or (N, n) lie in the domain; angles of a torus always do."""
     points, single = as_point_set("q", q, len(domain.centre))
-    if isinstance(domain, Torus):
-        inside = np.ones(len(points), dtype=bool)
-    else:
-        inside = np.all(np.abs(points - domain.centre) <= reach(domain), axis=1)
+    inside: Array = np.all(np.abs(points - domain.centre) <= reach(domain), axis=1)
     return inside[0] if single else inside
 
 
+def borders(domain: Domain) -> tuple[Array, Array]:
+    """Lowest and highest joint positions, (n,) each; infinite for a torus, which has no borders."""
+    half_width = np.inf if isinstance(domain, Torus) else domain.half_width
+    return domain.centre - half_width, domain.centre + half_width
+
+
 def reach(domain: Domain) -> Array:
-    """Half-widths and a little more, (n,): borders belong to a domain, whichever way they are rounded."""
+    """Distance from the centre that is still inside, (n,): the borders are, whichever way they are rounded."""
+    lower, upper = borders(domain)
     slack = 1e-12 * domain.half_width + 4 * np.finfo(float).eps * np.abs(domain.centre)
-    values: Array = domain.half_width + slack
+    values: Array = (upper - lower) / 2 + slack
     return values
 
 

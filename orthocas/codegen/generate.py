@@ -48,8 +48,8 @@ def generate_c(
 
     Args:
         chart: a chart with a closed expression.
-        out: folder, made if its parent exists; files in it with the same names are replaced.
-        controller: of the same robot; default none.
+        out: folder, made if its parent exists; what was generated there before under the same name is replaced.
+        controller: of this very chart, or of its problem (projectors); default none.
         name: a C identifier; default from the problem and the controller.
 
     Raises:

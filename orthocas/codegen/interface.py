@@ -12,10 +12,10 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.kernels import Kernels
 from orthocas.control import Controller
-from orthocas.domains import Torus, reach
+from orthocas.domains import borders, reach
 from orthocas.version import VERSION
 
-MAX_EVALUATIONS = 100  #: of the chart in one call of the inverse map
+_MAX_EVALUATIONS = 100  # of the chart in one call of the inverse map
 _IN_DOMAIN = "OUTSIDE_DOMAIN: q lies outside the domain of the chart."
 _EVERYWHERE = "This law needs no chart: it is never OUTSIDE_DOMAIN."
 _GAINS = {
@@ -39,8 +39,7 @@ def template_values(
     """Every word that the templates ask for."""
     problem, n = chart.problem, chart.n
     domain = problem.domain
-    half_width = np.full(n, np.inf) if isinstance(domain, Torus) else domain.half_width
-    lower, upper = domain.centre - half_width, domain.centre + half_width
+    lower, upper = borders(domain)
     somewhere = np.round(domain.centre + 0.5 * domain.half_width, 3)
     joints, labels = _words(problem.robot.joint_names), _words(chart.labels)
     slides = [" (slides)" if sliding else "" for sliding in problem.robot.tree.prismatic]
@@ -62,8 +61,8 @@ def template_values(
         "domain_lower": _numbers(lower),
         "domain_upper": _numbers(upper),
         "domain_centre": _numbers(domain.centre),
-        "domain_reach": _numbers(half_width if isinstance(domain, Torus) else reach(domain)),
-        "max_evaluations": str(MAX_EVALUATIONS),
+        "domain_reach": _numbers(reach(domain)),
+        "max_evaluations": str(_MAX_EVALUATIONS),
         "stack_bytes": str(stack_bytes),
         "check_q": _numbers(somewhere),
         "check_phi": _numbers(chart.phi(somewhere)),

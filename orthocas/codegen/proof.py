@@ -14,7 +14,7 @@ from orthocas.codegen.generate import GeneratedC
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
 from orthocas.control import Controller, ControlStatus
 from orthocas.control.status import LARGEST
-from orthocas.domains import Torus, contains
+from orthocas.domains import borders, contains
 from orthocas.errors import ProofError
 
 TOLERANCE = 1e-10  #: largest difference, relative to the largest entry of the result
@@ -66,9 +66,8 @@ def _compared(
     library: CompiledLibrary, chart: Chart, controller: Controller | None, q: Array, seed: int
 ) -> dict[str, float]:
     """Largest relative differences by function; the last positions are corner cases, taken at rest."""
-    rng, domain = np.random.default_rng(seed), chart.problem.domain
-    half_width = np.inf if isinstance(domain, Torus) else domain.half_width
-    if not np.array_equal(library.domain, (domain.centre - half_width, domain.centre + half_width)):
+    rng = np.random.default_rng(seed)
+    if not np.array_equal(library.domain, borders(chart.problem.domain)):
         raise ProofError("the domain in C is not that of the chart")
     dq = rng.normal(size=q.shape)
     dq[len(q) - len(_corner_cases(chart.n)) :] = 0
