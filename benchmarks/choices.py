@@ -6,8 +6,10 @@ from unittest.mock import patch
 import numpy as np
 
 import orthocas as oc
-from orthocas import fitting, problems, spectral
+from orthocas import problems
 from orthocas.domains import sample_uniform
+from orthocas.fitting import fit as fitting
+from orthocas.fitting import spectral_start as spectral
 
 HEADER = (
     "| choice | task std [deg] | mutual std [deg] | conditioning mean | 1 % quantile |\n| --- | --- | --- | --- | --- |"

@@ -7,8 +7,8 @@ import casadi as ca
 import numpy as np
 from c_timing import nanoseconds_per_call
 
-from orthocas.columns import COLUMNS
-from orthocas.loss import LossShape, Weights, loss_columns
+from orthocas.casadi_tools.columns import COLUMNS
+from orthocas.fitting.loss import LossShape, Weights, loss_columns
 
 BLOCKS = 16
 

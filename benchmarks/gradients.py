@@ -14,10 +14,10 @@ from torch_loss import WEIGHTS, Step, basis_step, network_step
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.coordinates import joint_space
-from orthocas.graph_objective import GraphObjective
-from orthocas.linear_objective import LinearObjective
-from orthocas.loss import Weights
+from orthocas.coordinates.fitted import joint_space
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.graph_objective import GraphObjective
+from orthocas.fitting.loss import Weights
 from orthocas.parametrisations import LinearFamily
 from orthocas.samples import sample_problem
 
@@ -62,7 +62,7 @@ def basis_row(parametrisation: oc.Polynomial | oc.Fourier, samples: int, rounds:
     family = parametrisation.family(joint_space(problem), problem.r)
     assert isinstance(family, LinearFamily)
     drawn, theta = sample_problem(problem, samples, 0), family.initial(0)
-    ours = LinearObjective(family, drawn, Weights(*WEIGHTS), theta, lambda count, seed: drawn)
+    ours = BasisObjective(family, drawn, Weights(*WEIGHTS), theta, lambda count, seed: drawn)
     C, G = theta.reshape(problem.r, -1), family.dense_gradients(ours.G, samples)
     peers = {str(dtype): basis_step(C, G, drawn.unit_task_gradients, dtype) for dtype in (torch.float64, torch.float32)}
     times = _times({"ours": lambda: ours.value_and_gradient(theta), **peers}, rounds)

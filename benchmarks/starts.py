@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.comparison_report import Comparison
-from orthocas.objective import Solver
+from orthocas.comparing.report import Comparison
+from orthocas.minimising.solver import Solver
 
 HEADER = (
     "| parametrisation | solver | task std [deg], smallest to largest | spread | mutual std [deg], smallest to largest "

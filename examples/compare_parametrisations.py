@@ -10,10 +10,11 @@ from pathlib import Path
 
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.comparison_figures import convergence_figure, front_figure
-from orthocas.comparison_report import Comparison
-from orthocas.objective import Monitor, Solver, silent
-from orthocas.progress import terminal_monitor
+from orthocas.cli.progress import terminal_monitor
+from orthocas.comparing.figures import convergence_figure, front_figure
+from orthocas.comparing.report import Comparison
+from orthocas.minimising.solver import Solver
+from orthocas.minimising.watch import Monitor, silent
 
 Parametrisations = Sequence[oc.parametrisations.Parametrisation | oc.SEW]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.distillation import Distilled
+from orthocas.distil import Distilled
 from orthocas.parametrisations import Parametrisation
 
 

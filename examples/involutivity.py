@@ -22,7 +22,7 @@ from scipy.stats import spearmanr
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.loss import DEFAULT_WEIGHTS
+from orthocas.fitting.loss import DEFAULT_WEIGHTS
 from orthocas.samples import sample_problem
 
 METRICS = {"euclidean": "I", "inertia": "M"}

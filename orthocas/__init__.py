@@ -8,19 +8,20 @@ if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
 from orthocas import control, problems, simulation, solvers
-from orthocas.api import compare, distil, fit, load
-from orthocas.chart import Chart
+from orthocas.chart import Chart, GrownChart, load
 from orthocas.codegen import generate_c
+from orthocas.comparing.compare import compare
+from orthocas.distil import distil
 from orthocas.domains import Box, Torus, contains
-from orthocas.grown_chart import GrownChart, grow
-from orthocas.involutivity import Involutivity, involutivity
+from orthocas.fitting.fit import fit
+from orthocas.grow import grow
+from orthocas.involutivity import Involutivity, involutivity, lie_bracket
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial
 from orthocas.problem import Problem, check
 from orthocas.quality import Report, evaluate
 from orthocas.robots import Robot
 from orthocas.simulation import simulate
 from orthocas.singularities import jumps, singular_points
-from orthocas.task_brackets import lie_bracket
 from orthocas.tasks import Task
 from orthocas.version import VERSION as _VERSION
 

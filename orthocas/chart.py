@@ -11,13 +11,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.chart_file import read_chart, write_chart
+from orthocas.casadi_tools.interrupts import deferred
+from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.checks import Array, as_point_set, require_known
-from orthocas.coordinates import CoordinateMap, Coordinates, InvertibleMap
-from orthocas.errors import InverseError, ShapeError
-from orthocas.interrupts import deferred
+from orthocas.coordinates.fitted import Coordinates
+from orthocas.coordinates.map import CoordinateMap, InvertibleMap
+from orthocas.errors import InvalidValueError, InverseError, ShapeError
+from orthocas.files.chart_file import read_chart, write_chart
+from orthocas.growing import GrownCoordinates
 from orthocas.problem import Problem, task_jacobians
-from orthocas.scalar_code import scalar_code
 
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
 _SINGULAR = 1e-8  # ratio of singular values of J where the inverse map is given up
@@ -197,3 +199,26 @@ class Chart:
         singular = np.flatnonzero(values[:, -1] < _SINGULAR * values[:, 0])
         if singular.size:
             raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}, q is not unique there")
+
+
+@dataclass(frozen=True, eq=False)
+class GrownChart(Chart):
+    """A chart with grown coordinates, apart from `function` with the interface of fitted ones.
+
+    `coordinates` tells more: its base `leaf`, and where points meet it (`pull`), with a status for each.
+    """
+
+    coordinates: GrownCoordinates
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.coordinates, GrownCoordinates):
+            raise InvalidValueError("chart", f"one with {self.coordinates.label} coordinates", "a grown chart")
+        Chart.__post_init__(self)
+
+
+def load(path: str | Path) -> Chart:
+    """Read a chart file; see `Chart.load`. A grown chart comes back as a `GrownChart`."""
+    chart = Chart.load(path)
+    if isinstance(chart.coordinates, GrownCoordinates):
+        return GrownChart(chart.problem, chart.coordinates, chart.notes)
+    return chart

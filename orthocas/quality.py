@@ -9,7 +9,8 @@ from orthocas.chart import Chart
 from orthocas.checks import Array, require_count, require_memory
 from orthocas.domains import sample_uniform
 from orthocas.errors import SingularTaskError
-from orthocas.loss import pairs
+from orthocas.files.json import plain
+from orthocas.fitting.loss import pairs
 from orthocas.samples import Samples, samples_at
 
 DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
@@ -71,10 +72,10 @@ class Report:
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON; NaN becomes None."""
 
-        def angle(s: AngleStatistics) -> dict[str, float | None]:
-            return {k: None if np.isnan(v) else v for k, v in (("mean", s.mean), ("std", s.std), ("max", s.max))}
+        def angle(s: AngleStatistics) -> dict[str, float]:
+            return {"mean": s.mean, "std": s.std, "max": s.max}
 
-        return {
+        data = {
             "n": self.n,
             "m": self.m,
             "r": self.r,
@@ -90,6 +91,7 @@ class Report:
             "length_ratio": self.length_ratio,
             "degenerate": self.degenerate,
         }
+        return dict(plain(data))
 
 
 def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:

@@ -76,7 +76,7 @@ class Samples:
         return 1.0 if np.median(np.linalg.det(coordinate_jacobians @ self.null_basis)) >= 0 else -1.0
 
     def loss_data(self, orientation: float | None) -> list[Array]:
-        """What the residuals need of every sample; see `orthocas.loss.LossShape.symbols`.
+        """What the residuals need of every sample; see `orthocas.fitting.loss.LossShape.symbols`.
 
         Args:
             orientation: of the coordinates, as `orientation` gives it for those a fit starts from: the null basis is

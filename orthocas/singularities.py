@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial import cKDTree
 
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.domains import contains, sample_evenly

@@ -9,9 +9,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.user_expression import expression_of
 from orthocas.checks import frozen_array
-from orthocas.custom_expression import expression_of
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots import Robot
 

@@ -1,4 +1,4 @@
-"""Minimisers behind one protocol (`orthocas.objective.Solver`)."""
+"""Minimisers behind one protocol (`orthocas.minimising.objective.Solver`)."""
 
 from orthocas.solvers.adam import Adam
 from orthocas.solvers.gauss_newton import GaussNewton
@@ -7,7 +7,7 @@ from orthocas.solvers.ipopt import Ipopt
 from orthocas.solvers.lbfgs import LBFGS
 
 from orthocas.checks import require_known
-from orthocas.objective import Solver
+from orthocas.minimising.solver import Solver
 
 __all__ = ["LBFGS", "SOLVERS", "Adam", "GaussNewton", "GradientFlow", "Ipopt", "get"]
 

@@ -6,9 +6,11 @@ from itertools import repeat
 
 import numpy as np
 
-from orthocas.best_point import BestPoint
 from orthocas.checks import Array, require_at_least, require_count
-from orthocas.objective import UNWATCHED, Objective, SampledObjective, SolveResult, Status, Watch
+from orthocas.minimising.best_point import BestPoint
+from orthocas.minimising.objective import Objective, SampledObjective
+from orthocas.minimising.solver import SolveResult, Status
+from orthocas.minimising.watch import UNWATCHED, Watch
 
 _MOMENT, _SQUARE, _SMALL = 0.9, 0.999, 1e-8  # the usual constants of [KB2015]
 

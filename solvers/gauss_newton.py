@@ -4,10 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orthocas.best_point import BestPoint
 from orthocas.checks import Array, require_at_least, require_count
 from orthocas.errors import InvalidValueError
-from orthocas.objective import UNWATCHED, LeastSquaresObjective, Objective, SolveResult, Status, Watch
+from orthocas.minimising.best_point import BestPoint
+from orthocas.minimising.objective import LeastSquaresObjective, Objective
+from orthocas.minimising.solver import SolveResult, Status
+from orthocas.minimising.watch import UNWATCHED, Watch
 
 _MAX_REJECTIONS = 10
 

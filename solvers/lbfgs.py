@@ -4,9 +4,11 @@ from dataclasses import dataclass, replace
 
 import scipy.optimize
 
-from orthocas.best_point import BestPoint
 from orthocas.checks import Array, require_at_least, require_count
-from orthocas.objective import UNWATCHED, Objective, SolveResult, Status, Watch
+from orthocas.minimising.best_point import BestPoint
+from orthocas.minimising.objective import Objective
+from orthocas.minimising.solver import SolveResult, Status
+from orthocas.minimising.watch import UNWATCHED, Watch
 
 
 @dataclass(frozen=True)

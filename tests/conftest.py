@@ -9,7 +9,7 @@ import pytest
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.fitting import Fit
+from orthocas.fitting.fit import Fit
 from orthocas.robots import files
 
 ROBOTS = {

@@ -5,13 +5,13 @@ import pytest
 
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.bounded_mutual import BoundedMutual
-from orthocas.coordinates import joint_space
+from orthocas.coordinates.fitted import joint_space
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
-from orthocas.fit_stages import StageRunner
-from orthocas.linear_objective import LinearObjective
-from orthocas.loss import Weights
-from orthocas.objective import SolveResult, Status
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.bounded_mutual import BoundedMutual
+from orthocas.fitting.loss import Weights
+from orthocas.fitting.stages import StageRunner
+from orthocas.minimising.solver import SolveResult, Status
 from orthocas.samples import sample_problem
 
 
@@ -21,7 +21,7 @@ def bounded() -> BoundedMutual:
     family = oc.Polynomial(2).family(joint_space(problem), problem.r)
     samples = sample_problem(problem, 60, 3)
     weights = Weights(1000.0, 30.0, 100.0)
-    return BoundedMutual(LinearObjective(family, samples, weights, family.initial(0), lambda n, s: samples), 0.05)
+    return BoundedMutual(BasisObjective(family, samples, weights, family.initial(0), lambda n, s: samples), 0.05)
 
 
 def theta_of(bounded: BoundedMutual) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, InverseError, ShapeError, UnknownNameError
-from orthocas.fitting import Fit
+from orthocas.fitting.fit import Fit
 
 
 def test_shapes_of_single_and_batched_calls(iiwa_fit: Fit) -> None:

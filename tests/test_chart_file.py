@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas import archive
 from orthocas.errors import ChartFileError, InvalidValueError, OrthocasError
-from orthocas.fitting import Fit
+from orthocas.files import archive
+from orthocas.fitting.fit import Fit
 
 
 @pytest.fixture
@@ -255,7 +255,7 @@ def test_failed_write_leaves_the_old_file(planar_fit: Fit, saved: Path, monkeypa
     def full_disk(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(archive.os, "fsync", full_disk)
+    monkeypatch.setattr("orthocas.files.atomic.os.fsync", full_disk)
     with pytest.raises(ChartFileError, match="No space left"):
         planar_fit.chart.save(saved)
     assert saved.read_bytes() == before

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas import checkpoint, solvers
-from orthocas.checkpoint import Checkpoint
+from orthocas import solvers
 from orthocas.errors import CheckpointError
-from orthocas.objective import Progress, Status
+from orthocas.fitting import checkpoint
+from orthocas.fitting.checkpoint import Checkpoint
+from orthocas.minimising.solver import Status
+from orthocas.minimising.watch import Progress
 
 
 @pytest.fixture(autouse=True)
@@ -138,7 +140,7 @@ def test_killed_process_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None
     """The real thing: a process killed by the system, and a new one."""
     file = tmp_path / "run.checkpoint"
     code = (
-        "import orthocas as oc; from orthocas import checkpoint, problems, solvers; "
+        "import orthocas as oc; from orthocas import problems, solvers; from orthocas.fitting import checkpoint; "
         "checkpoint._SECONDS = 0.0; "
         "fit = oc.fit(problems.get('planar_3r_xy'), oc.MLP((8, 8)), solvers.Adam(epochs=150, steps=20), samples=200, "
         f"checkpoint={str(file)!r}); "

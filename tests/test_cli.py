@@ -12,9 +12,8 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas import api
 from orthocas.cli import main
-from orthocas.fitting import Fit
+from orthocas.fitting.fit import Fit
 
 
 @pytest.fixture
@@ -186,7 +185,7 @@ def test_output_folder_is_checked_before_the_long_work(run, monkeypatch: pytest.
     def never(*args: object) -> None:
         raise AssertionError("the fit was started")
 
-    monkeypatch.setattr(api, "fit", never)
+    monkeypatch.setattr(sys.modules["orthocas.cli.fit"], "fit_chart", never)
     code, _, err = run("fit", "iiwa", "--out", "no/x.orthocas")
     assert code == 2
     assert "folder no does not exist" in err

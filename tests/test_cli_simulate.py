@@ -19,8 +19,8 @@ from orthocas.cli import main
 from orthocas.cli import simulate as command
 from orthocas.cli.controller_argument import ControllerOptions, build_controller
 from orthocas.domains import sample_uniform
-from orthocas.fitting import Fit
-from orthocas.objective import Monitor, Progress
+from orthocas.fitting.fit import Fit
+from orthocas.minimising.watch import Monitor, Progress
 from orthocas.simulation import Trajectory
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

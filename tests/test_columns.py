@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from orthocas.columns import COLUMNS, ColumnFunction, blocked, by_sample, shares
+from orthocas.casadi_tools.columns import COLUMNS, ColumnFunction, blocked, by_sample, shares
 
 
 def example() -> ca.Function:

@@ -10,7 +10,7 @@ from orthocas.problems.iiwa import urdf_path
 from scipy.linalg import block_diag, sqrtm
 
 import orthocas as oc
-from orthocas.batch import Batched
+from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array
 from orthocas.control import (
     ControlStatus,

@@ -8,8 +8,9 @@ import time
 import pytest
 
 import orthocas as oc
-from orthocas import interrupts, solvers
-from orthocas.objective import Status
+from orthocas import solvers
+from orthocas.casadi_tools import interrupts
+from orthocas.minimising.solver import Status
 
 FITS = {
     "network, lbfgs": (oc.MLP((32, 32)), solvers.LBFGS(max_iterations=100_000, tolerance=0.0), {}),

@@ -16,7 +16,7 @@ from scipy.linalg import inv, sqrtm
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.batch import Batched
+from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array
 from orthocas.cli import main
 from orthocas.domains import sample_uniform

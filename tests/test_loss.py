@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas import graph_objective
-from orthocas.coordinates import joint_space
+from orthocas.coordinates.fitted import joint_space
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.graph_objective import GraphObjective
-from orthocas.linear_objective import LinearObjective
-from orthocas.loss import REGULAR_VOLUME, LossShape, Weights, mutual_cosines, pairs, task_cosines
+from orthocas.fitting import graph_objective
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.graph_objective import GraphObjective
+from orthocas.fitting.loss import REGULAR_VOLUME, LossShape, Weights, mutual_cosines, pairs, task_cosines
+from orthocas.fitting.spectral_start import spectral_start
 from orthocas.samples import Draw, Samples, sample_problem, samples_at
-from orthocas.spectral import spectral_start
 
 WEIGHTS = Weights(1000.0, 30.0)
 REGULAR = Weights(1000.0, 30.0, 120.0)
@@ -48,12 +48,12 @@ def draw_from(problem: oc.Problem) -> Draw:
 
 def objectives(
     problem: oc.Problem, parametrisation: oc.Polynomial, weights: Weights = WEIGHTS
-) -> tuple[LinearObjective, GraphObjective, Samples]:
+) -> tuple[BasisObjective, GraphObjective, Samples]:
     samples = sample_problem(problem, 60, 9)
     family = parametrisation.family(joint_space(problem), problem.r)
     theta = family.initial(3)
     settings = (family, samples, weights, theta, draw_from(problem))
-    return LinearObjective(*settings), GraphObjective(*settings), samples
+    return BasisObjective(*settings), GraphObjective(*settings), samples
 
 
 @pytest.fixture(params=["planar_x", "planar_xy", "iiwa"])
@@ -140,7 +140,7 @@ def test_gauss_newton_matrix_is_that_of_the_residuals(planar_x: oc.Problem) -> N
     twice = samples_at(planar_x, np.repeat(sample_problem(planar_x, 40, 9).points, 2, axis=0))  # every second is used
     family = oc.Polynomial(2).family(joint_space(planar_x), 2)
     theta = family.initial(3)
-    objective = LinearObjective(family, twice, REGULAR, theta, draw_from(planar_x))
+    objective = BasisObjective(family, twice, REGULAR, theta, draw_from(planar_x))
     shape = LossShape(3, 1, 2, False, REGULAR)
     J, data = ca.SX.sym("J", 2, 3), shape.symbols()
     rho = ca.Function("rho", [J, *data], [shape.residuals(J, data)])
@@ -211,7 +211,7 @@ def test_spectral_start_finds_an_exact_linear_coordinate() -> None:
     problem = oc.Problem(robot, task, domain=oc.Box([0.0, 0.0], 1.0))
     family = oc.Polynomial(2).family(joint_space(problem), 1)
     theta = spectral_start(family, sample_problem(problem, 100, 0))
-    objective = LinearObjective(family, sample_problem(problem, 100, 1), WEIGHTS, theta, draw_from(problem))
+    objective = BasisObjective(family, sample_problem(problem, 100, 1), WEIGHTS, theta, draw_from(problem))
     directions = objective.coordinate_jacobians(theta)[:, 0]
     np.testing.assert_allclose(directions @ np.array([1.0, 2.0]), 0, atol=1e-6 * np.abs(directions).max())
 

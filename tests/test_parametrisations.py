@@ -6,10 +6,10 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
+from orthocas.coordinates.point_functions import point_functions
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
 from orthocas.parametrisations import JointSpace, component_gradients, embed, parse_parametrisation
 from orthocas.parametrisations.product_basis import LinearFamily
-from orthocas.point_functions import point_functions
 
 SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))
 SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE.joint_names)

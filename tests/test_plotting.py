@@ -7,7 +7,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.errors import InverseError
-from orthocas.fitting import Fit
+from orthocas.fitting.fit import Fit
 from orthocas.plotting import quality_figure, self_motion_figure
 
 

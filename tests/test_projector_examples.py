@@ -10,7 +10,7 @@ import pytest
 import self_motion_on_command
 
 import orthocas as oc
-from orthocas.batch import Batched
+from orthocas.casadi_tools.batch import Batched
 from orthocas.control import Impedance
 
 IMPEDANCE = ("impedance, coupled", "impedance, decoupled")

@@ -7,10 +7,10 @@ import scipy.linalg
 
 import orthocas as oc
 from orthocas.chart import Chart
-from orthocas.coordinates import Coordinates, joint_space
+from orthocas.coordinates.fitted import Coordinates, joint_space
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError, MemoryNeedError, SingularTaskError
-from orthocas.fitting import Fit
+from orthocas.fitting.fit import Fit
 from orthocas.quality import AngleStatistics
 
 

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from orthocas import problems
 from orthocas.cli import main
 from orthocas.errors import InvalidValueError, SolveError, UnknownNameError
-from orthocas.objective import Progress
+from orthocas.minimising.watch import Progress
 from orthocas.reproduce import FIGURES, Drawing, Recipe, Scene, registry, reproduce, save, solids
 from orthocas.reproduce.fig06 import embedded, torus_faces
 from orthocas.reproduce.fig08 import encircles, postures

@@ -14,8 +14,8 @@ from orthocas.problems.iiwa import robot as iiwa_robot
 
 import orthocas as oc
 from orthocas.errors import RobotError, UnknownNameError
+from orthocas.parametrisations.shoulder_elbow_wrist import SEW_KINDS, sew_angle
 from orthocas.robots import files
-from orthocas.shoulder_elbow_wrist import SEW_KINDS, sew_angle
 
 Z = np.array([0.0, 0.0, 1.0])
 

@@ -16,7 +16,7 @@ from orthocas.checks import Array
 from orthocas.control import ControlStatus, Impedance, Kinematic, KinematicProjector, PDPlus, Projector, Reference
 from orthocas.control.controller import Controller
 from orthocas.errors import InvalidValueError, ShapeError, TrajectoryFileError, UnreachableReferenceError
-from orthocas.objective import Progress
+from orthocas.minimising.watch import Progress
 from orthocas.robots.planar import planar_model
 from orthocas.simulation import (
     Friction,

@@ -14,8 +14,8 @@ from PIL import Image
 import orthocas as oc
 from orthocas.control import ControlStatus, Kinematic, PDPlus, Reference
 from orthocas.errors import ArchiveError, InvalidValueError, UnknownNameError
-from orthocas.fitting import Fit
-from orthocas.objective import Progress
+from orthocas.fitting.fit import Fit
+from orthocas.minimising.watch import Progress
 from orthocas.simulation import Outcome, Trajectory, animation
 from orthocas.simulation.animation import save_animation
 from orthocas.simulation.figure import ACTUAL, trajectory_figure, units_of

@@ -9,18 +9,9 @@ import pytest
 import orthocas as oc
 from orthocas import solvers
 from orthocas.errors import InvalidValueError, SolveError, UnknownNameError
-from orthocas.objective import (
-    ConstrainedObjective,
-    LeastSquaresObjective,
-    Objective,
-    Progress,
-    SmoothObjective,
-    Solver,
-    SolveResult,
-    State,
-    Status,
-    Watch,
-)
+from orthocas.minimising.objective import ConstrainedObjective, LeastSquaresObjective, Objective, SmoothObjective
+from orthocas.minimising.solver import Solver, SolveResult, Status
+from orthocas.minimising.watch import Progress, State, Watch
 
 ALL = [
     solvers.GaussNewton(max_iterations=60, tolerance=1e-12),

@@ -7,8 +7,8 @@ import pytest
 from orthocas.problems.iiwa import robot as iiwa_robot
 
 import orthocas as oc
+from orthocas.casadi_tools.tape import from_tape, to_tape
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
-from orthocas.expression_tape import from_tape, to_tape
 
 Q = np.array([0.3, 0.7, -0.4, -1.0, 0.5, 0.9, 0.2])
 

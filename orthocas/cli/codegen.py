@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from orthocas.casadi_tools.interrupts import deferred
 from orthocas.chart import Chart
 from orthocas.cli.controller_argument import (
     CONTROLLERS,
@@ -22,7 +23,6 @@ from orthocas.cli.controller_argument import (
 from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.codegen import GeneratedC, Proof, check_c, generate_c
 from orthocas.errors import InvalidValueError
-from orthocas.interrupts import deferred
 
 _NONE = "none"
 

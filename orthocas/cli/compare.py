@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from orthocas import api
 from orthocas.cli.fit import WEIGHTS_TEXT, parse_weights
 from orthocas.cli.output import AsJson, note, print_json, print_table, whole_number
 from orthocas.cli.problem_argument import (
@@ -18,11 +17,12 @@ from orthocas.cli.problem_argument import (
     TipName,
     build_problem,
 )
-from orthocas.comparison_figures import convergence_figure, front_figure
-from orthocas.comparison_report import Comparison
-from orthocas.errors import InvalidValueError
+from orthocas.cli.progress import terminal_monitor
+from orthocas.comparing.compare import compare as compare_fits
+from orthocas.comparing.figures import convergence_figure, front_figure
+from orthocas.comparing.report import Comparison
+from orthocas.files.atomic import made_folder
 from orthocas.parametrisations import parse_parametrisation
-from orthocas.progress import terminal_monitor
 from orthocas.solvers import get as get_solver
 
 _PARAMETRISATIONS = ["linear", "polynomial:2", "polynomial:3", "polynomial:4", "mlp:32x32"]
@@ -62,10 +62,21 @@ def compare(
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers = [get_solver(name) for name in solver] if solver else None
     loss = parse_weights(weights)
-    charts = _made(out)
+    charts = made_folder("--out", out / "charts")
     with terminal_monitor() as monitor:
-        grid = (built, parametrisations, minimisers, seeds, loss, samples, held_out)
-        found = api.compare(*grid, jobs=jobs, charts=charts, control_ticks=True, monitor=monitor)
+        found = compare_fits(
+            built,
+            parametrisations,
+            minimisers,
+            seeds=seeds,
+            weights=loss,
+            samples=samples,
+            held_out=held_out,
+            jobs=jobs,
+            charts=charts,
+            control_ticks=True,
+            monitor=monitor,
+        )
     save(found, out)
     if json:
         print_json(found.as_dict())
@@ -87,12 +98,3 @@ def save(found: Comparison, out: Path) -> None:
         return
     front_figure(found).savefig(out / "front.png", dpi=150)
     convergence_figure(found).savefig(out / "convergence.png", dpi=150)
-
-
-def _made(out: Path) -> Path:
-    """The output folder with its folder for charts."""
-    try:
-        (out / "charts").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidValueError("--out", str(out), f"a folder that can be written ({error.strerror})") from None
-    return out / "charts"

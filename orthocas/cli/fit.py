@@ -1,13 +1,10 @@
 """`orthocas fit`: from a robot to a chart file."""
 
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from orthocas import api
-from orthocas.archive import require_writable
 from orthocas.cli.output import AsJson, note, number, print_json, print_rows, report_rows, whole_number
 from orthocas.cli.problem_argument import (
     CentreText,
@@ -20,12 +17,14 @@ from orthocas.cli.problem_argument import (
     build_problem,
     parse_numbers,
 )
-from orthocas.errors import InvalidValueError
-from orthocas.fitting import Fit
-from orthocas.loss import DEFAULT_WEIGHTS
-from orthocas.objective import Status
+from orthocas.cli.progress import terminal_monitor
+from orthocas.errors import ChartFileError, InvalidValueError
+from orthocas.files.atomic import require_writable
+from orthocas.fitting.fit import Fit
+from orthocas.fitting.fit import fit as fit_chart
+from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers
+from orthocas.minimising.solver import Status
 from orthocas.parametrisations import parse_parametrisation
-from orthocas.progress import terminal_monitor
 from orthocas.quality import Report, evaluate
 from orthocas.solvers import get as get_solver
 
@@ -71,12 +70,22 @@ def fit(
     """Fit extra coordinates to a problem and save the chart."""
     built = build_problem(problem, ProblemOptions(tip, task, metric, centre, half_width))
     target = out or Path(f"{built.name}.orthocas")
-    require_writable(target)
+    require_writable(target, ChartFileError)
     parametrisation = parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
     loss = parse_weights(weights)
     with terminal_monitor() as monitor:
-        result = api.fit(built, parametrisation, minimiser, loss, samples, seed, monitor, max_mutual_deg, checkpoint)
+        result = fit_chart(
+            built,
+            parametrisation,
+            minimiser,
+            weights=loss,
+            samples=samples,
+            seed=seed,
+            monitor=monitor,
+            max_mutual_deg=max_mutual_deg,
+            checkpoint=checkpoint,
+        )
     result.chart.save(target)
     report = evaluate(result.chart, seed=seed + 1)
     if json:
@@ -88,7 +97,7 @@ def fit(
         raise typer.Exit(130)
 
 
-def parse_weights(text: str) -> api.WeightNumbers:
+def parse_weights(text: str) -> WeightNumbers:
     """Read "1000,30", "1000,30,150" or "1000,30,150,0.01"."""
     match parse_numbers("--weights", text).tolist():
         case [task, mutual]:
@@ -129,7 +138,7 @@ def _as_dict(result: Fit, report: Report, target: Path) -> dict[str, Any]:
                 "parametrisation": stage.label,
                 "parameters": stage.parameters,
                 "samples": stage.samples,
-                "loss": stage.result.value if isfinite(stage.result.value) else None,
+                "loss": stage.result.value,
                 "status": stage.result.status.value,
                 "iterations": stage.result.iterations,
                 "seconds": stage.result.seconds,

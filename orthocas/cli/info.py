@@ -3,14 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from orthocas import problems
 from orthocas.chart import Chart
-from orthocas.checks import Array
 from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.cli.problem_argument import ProblemName, ProblemOptions, TipName, build_problem, is_robot_file
 from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.files.json import plain
 from orthocas.involutivity import involutivity
 from orthocas.problem import Problem, check
 from orthocas.robots import Robot
@@ -50,8 +48,8 @@ def _robot(robot: Robot) -> dict[str, Any]:
     return {
         "joints": list(robot.joint_names),
         "kinds": list(robot.tree.joint_kinds),
-        "lower": _finite(robot.lower),
-        "upper": _finite(robot.upper),
+        "lower": plain(robot.lower),
+        "upper": plain(robot.upper),
         "tip": robot.tree.tip_name,
         "mass_kg": float(robot.tree.masses.sum()),
     }
@@ -86,11 +84,6 @@ def _involutivity(problem: Problem) -> dict[str, Any]:
         "expected_angle_deg": found.expected_angle_deg,
         "verdict": found.verdict,
     }
-
-
-def _finite(limits: Array) -> list[float | None]:
-    """Limits for JSON, which has no infinity."""
-    return [float(value) if np.isfinite(value) else None for value in limits]
 
 
 def _text(value: Any) -> str:

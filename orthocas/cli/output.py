@@ -1,11 +1,11 @@
 """What commands print: aligned text for people, or one JSON object."""
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
 
+from orthocas.files.json import to_json
 from orthocas.quality import Report
 
 
@@ -32,7 +32,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on s
 
 def print_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object."""
-    typer.echo(json.dumps(data, allow_nan=False))
+    typer.echo(to_json(data))
 
 
 def print_rows(rows: Mapping[str, str]) -> None:

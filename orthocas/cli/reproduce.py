@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from orthocas.cli.output import AsJson, print_json, print_rows
-from orthocas.progress import terminal_monitor
-from orthocas.reproduce.drawing import made_folder
+from orthocas.cli.progress import terminal_monitor
+from orthocas.files.atomic import made_folder
 from orthocas.reproduce.registry import FIGURES, chosen
 from orthocas.reproduce.registry import reproduce as reproduce_figures
 

@@ -8,6 +8,7 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.control import Controller, ControlStatus, Reference
 from orthocas.domains import contains
+from orthocas.files.json import plain
 from orthocas.problem import Problem
 from orthocas.simulation import Outcome, Trajectory, coupling_index
 from orthocas.simulation.figure import units_of
@@ -35,13 +36,13 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
     inside = np.asarray(contains(chart.problem.domain, seen.q))
     judged = plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
     largest = np.abs(seen.command).max(axis=0)
-    return {
+    report = {
         "controller": controller.name,
         "coupling": getattr(controller, "coupling", None),
-        "gains": {name: [_finite(value) for value in gain] for name, gain in controller.gains.items()},
+        "gains": controller.gains,
         "outcome": seen.outcome.value,
         "duration": float(seen.times[-1]),
-        "tracking_error": dict(zip(seen.labels, map(_finite, seen.tracking_error), strict=True)),
+        "tracking_error": dict(zip(seen.labels, seen.tracking_error, strict=True)),
         "coupling_index": _coupling(chart, plan.reference, seen) if judged else None,
         "fallback": {
             "share": len(bad) / len(seen.times),
@@ -50,10 +51,11 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
         },
         "share_inside_domain": float(inside.mean()),
         "command": seen.kind,
-        "largest_command": dict(zip(seen.joint_names, map(_finite, largest), strict=True)),
+        "largest_command": dict(zip(seen.joint_names, largest, strict=True)),
         "energy": _energy(seen) if seen.kind == "torque" and not bad.size else None,
         "seconds": seconds,
     }
+    return dict(plain(report))
 
 
 def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
@@ -120,22 +122,17 @@ def _worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, ...]) 
     return ", ".join(texts) or "see report.json"
 
 
-def _energy(seen: Trajectory) -> dict[str, float | None]:
+def _energy(seen: Trajectory) -> dict[str, float]:
     """Storage and what the controller's damping took, [J]."""
     taken = seen.energy_balance[-1] - seen.storage[-1] + seen.storage[0]
     return {
-        "storage_start": _finite(seen.storage[0]),
-        "storage_end": _finite(seen.storage[-1]),
-        "storage_largest": _finite(seen.storage.max()),
-        "storage_rise": _finite(seen.storage_rise),
-        "dissipated": _finite(taken),
+        "storage_start": seen.storage[0],
+        "storage_end": seen.storage[-1],
+        "storage_largest": seen.storage.max(),
+        "storage_rise": seen.storage_rise,
+        "dissipated": taken,
     }
 
 
 def _text(value: float | None) -> str:
     return "not finite" if value is None else f"{value:.3g}"
-
-
-def _finite(value: float) -> float | None:
-    """JSON knows no infinity."""
-    return float(value) if isfinite(value) else None

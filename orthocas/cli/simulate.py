@@ -1,17 +1,14 @@
 """`orthocas simulate`: a controller in the coordinates of a chart, run in closed loop."""
 
-import os
-import tempfile
 import time
 from dataclasses import replace
 from functools import partial
-from json import dumps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from orthocas.archive import require_writable
+from orthocas.casadi_tools.interrupts import deferred
 from orthocas.chart import Chart
 from orthocas.cli.controller_argument import (
     CONTROLLERS,
@@ -28,12 +25,13 @@ from orthocas.cli.controller_argument import (
 )
 from orthocas.cli.output import AsJson, note, number, print_json, print_rows, whole_number
 from orthocas.cli.problem_argument import parse_numbers
+from orthocas.cli.progress import terminal_monitor
 from orthocas.cli.run_report import fallback_text, run_report, run_rows
 from orthocas.control import Controller, Impedance, PDPlus, Reference, posture_reference
 from orthocas.errors import ArchiveError, InvalidValueError
-from orthocas.interrupts import deferred
-from orthocas.objective import Monitor
-from orthocas.progress import terminal_monitor
+from orthocas.files.atomic import published, require_writable
+from orthocas.files.json import to_json
+from orthocas.minimising.watch import Monitor
 from orthocas.simulation import Friction, Noise, Outcome, Trajectory
 from orthocas.simulation.animation import FORMATS, require_format, save_animation
 from orthocas.simulation.figure import trajectory_figure, units_of
@@ -177,13 +175,10 @@ def _finish(
     seen = _in_chart(chart, plan.reference, run)
     report = run_report(law, chart, plan, seen, seconds)
     out.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out, prefix=".orthocas-") as folder:
-        drafts = Path(folder)
+    with published(out) as drafts:
         run.save(drafts / "trajectory.npz")
         trajectory_figure(seen, units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
-        (drafts / "report.json").write_text(dumps(report, indent=1, allow_nan=False) + "\n")
-        for draft in sorted(drafts.iterdir()):
-            os.replace(draft, out / draft.name)
+        (drafts / "report.json").write_text(to_json(report, indent=1) + "\n")
     for kind in FORMATS:
         (out / f"animation.{kind}").unlink(missing_ok=True)
     return seen, report

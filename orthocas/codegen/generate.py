@@ -1,21 +1,19 @@
 """`generate_c`: a chart, the robot's dynamics and a controller as a small C library."""
 
-import os
 import re
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import casadi as ca
 
-from orthocas.archive import require_writable
+from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.chart import Chart
 from orthocas.codegen.interface import filled, template_values
 from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.control import Controller
 from orthocas.errors import ArchiveError, InvalidValueError
-from orthocas.scalar_code import scalar_code
+from orthocas.files.atomic import published, require_writable
 
 _LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/test_c_safety.py)
 _TAKEN = (  # headers and libraries of C
@@ -130,10 +128,8 @@ def _folder(out: Path, name: str, files: Iterable[str]) -> Path:
 def _write(folder: Path, contents: Mapping[str, str]) -> None:
     """All files or, if one cannot be written, none."""
     try:
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".orthocas-") as drafts:
+        with published(folder) as drafts:
             for name, text in contents.items():
-                (Path(drafts) / name).write_text(text, encoding="utf-8")
-            for name in contents:
-                os.replace(Path(drafts) / name, folder / name)
+                (drafts / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise ArchiveError(f"cannot write to {folder}: {error.strerror}") from error

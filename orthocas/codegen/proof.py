@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.batch import Batched
+from orthocas.casadi_tools.batch import Batched
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.generate import GeneratedC

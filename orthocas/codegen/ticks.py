@@ -9,13 +9,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from orthocas.casadi_tools.interrupts import deferred
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
 from orthocas.control import Controller, PDPlus
 from orthocas.errors import CompileError
-from orthocas.interrupts import deferred
 
 _STATES = 64  # as in templates/ticks.c
 _MICROSECONDS = 3e5  # to spend on one measurement

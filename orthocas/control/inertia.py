@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.control.linear_algebra import spd_inverse
 from orthocas.domains import sample_uniform
 from orthocas.metrics import Metric

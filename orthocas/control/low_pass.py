@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from orthocas.batch import dense_function
+from orthocas.casadi_tools.batch import dense_function
 
 
 def low_pass_response(k: int, natural_frequency: float, damping_ratio: float) -> ca.Function:

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.control.gains import positive_gains

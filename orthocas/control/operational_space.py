@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.batch import Batched
+from orthocas.casadi_tools.batch import Batched
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_known
 from orthocas.control.controller import Command, guarded_graph, named_function, named_inputs

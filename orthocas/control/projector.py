@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.checks import Array, frozen_array
 from orthocas.control.controller import Command, guarded_graph, named_function, named_inputs
 from orthocas.control.damping import damping_matrix
@@ -16,7 +17,6 @@ from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reference import Reference
 from orthocas.errors import UnreachableReferenceError
 from orthocas.problem import Problem
-from orthocas.scalar_code import scalar_code
 
 
 @dataclass(frozen=True, eq=False)

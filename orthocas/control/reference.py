@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.checks import Array, as_float_array, frozen_array, require_known, require_shape
 from orthocas.control.low_pass import low_pass_response
 from orthocas.errors import InvalidValueError

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
+from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array, frozen_array
 from orthocas.errors import GrowError, InvalidValueError
 from orthocas.growing.leaf import LeafValues, require_on_leaf, turning_joints, without_turns
-from orthocas.interrupts import deferred
 from orthocas.problem import Problem, task_jacobians
 
 SAMPLES = 2000  #: of the curve; the spline through them is good to about 1e-12

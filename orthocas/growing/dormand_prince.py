@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.columns import ColumnFunction, blocked, by_sample
 from orthocas.checks import Array
-from orthocas.columns import ColumnFunction, blocked, by_sample
 
 _STAGES = 12
 _FEW = 64  # trajectories that are not worth a block of columns

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.batch import dense_function
+from orthocas.casadi_tools.batch import dense_function
 from orthocas.checks import Array
 from orthocas.growing.dormand_prince import BatchedFlow
 from orthocas.metrics import metric_matrices

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.checks import Array
 from orthocas.errors import GrowError
 from orthocas.growing.flow import Arrival, Moved, TaskFlow

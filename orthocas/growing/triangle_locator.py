@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from orthocas.batch import THREADS
+from orthocas.casadi_tools.batch import THREADS
 from orthocas.checks import Array, frozen_array, require_shape
 from orthocas.errors import InvalidValueError
 from orthocas.growing.triangle_mesh import Indices

@@ -7,10 +7,10 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from orthocas.batch import dense_function
+from orthocas.casadi_tools.batch import dense_function
+from orthocas.casadi_tools.tape import Tape, replay, to_tape
+from orthocas.casadi_tools.user_expression import expression_of
 from orthocas.checks import Array, require_shape
-from orthocas.custom_expression import expression_of
-from orthocas.expression_tape import Tape, replay, to_tape
 from orthocas.parametrisations.family import Expression, JointSpace, component_gradients
 
 
@@ -21,7 +21,7 @@ class Given:
     Args:
         label: a name for reports.
         n: number of joints.
-        tape: the expression as plain data; see `orthocas.expression_tape`.
+        tape: the expression as plain data; see `orthocas.casadi_tools.tape`.
     """
 
     label: str

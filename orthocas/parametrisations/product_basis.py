@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.casadi_tools.columns import ColumnFunction, blocked
 from orthocas.checks import Array
-from orthocas.columns import ColumnFunction, blocked
 from orthocas.parametrisations.family import Expression, JointSpace, component_gradients
 
 Term = tuple[int, ...]  #: for every joint, which one-joint function the term takes; 0 is the constant 1
@@ -89,7 +89,7 @@ class LinearFamily:
     def basis_gradients(self, points: Array) -> Array:
         """The gradients d psi_k / dq_i that are not zero, at points (N, n), in blocks of c samples, (B, n, W, c).
 
-        Entry w of joint i belongs to term `terms_of_joints[i, w]`; blocks as in `orthocas.columns`.
+        Entry w of joint i belongs to term `terms_of_joints[i, w]`; blocks as in `orthocas.casadi_tools.columns`.
         """
         gradients = self._gradient_columns(blocked(points))[0]
         return gradients.reshape(len(gradients), self.space.n, -1, gradients.shape[2])

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from orthocas.checks import require_known
 from orthocas.errors import InvalidValueError
 from orthocas.parametrisations.given import Given
+from orthocas.parametrisations.shoulder_elbow_wrist import SEW_KINDS, sew_angle
 from orthocas.problem import Problem
-from orthocas.shoulder_elbow_wrist import SEW_KINDS, sew_angle
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class SEW:
     A baseline: it names the self-motion well, but nothing makes its gradient orthogonal to the task's.
 
     Args:
-        kind: "conventional" or "stereographic"; see `orthocas.shoulder_elbow_wrist.sew_angle`.
+        kind: "conventional" or "stereographic"; see `orthocas.parametrisations.shoulder_elbow_wrist.sew_angle`.
     """
 
     kind: str = "stereographic"

@@ -1,8 +1,6 @@
 """What a recipe returns: pictures, numbers and meshes, and how they become files."""
 
 import json
-import os
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -11,7 +9,7 @@ from pathlib import Path
 import trimesh
 from matplotlib.figure import Figure
 
-from orthocas.errors import InvalidValueError
+from orthocas.files.atomic import published
 from orthocas.reproduce.style import DPI
 
 
@@ -47,25 +45,7 @@ def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
     for suffix, mesh in drawing.meshes.items():
         writers[f"{name}_{suffix}.stl"] = mesh.export
     writers[f"{name}.json"] = lambda draft: draft.write_text(text)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".reproduce-") as drafts:
+    with published(folder) as drafts:  # all at once, so that numbers belong to the picture beside them
         for file, write in writers.items():
-            write(Path(drafts) / file)
-        for file in writers:  # all at once, so that numbers belong to the picture beside them
-            os.replace(Path(drafts) / file, folder / file)
+            write(drafts / file)
     return [folder / file for file in writers]
-
-
-def made_folder(name: str, out: str | Path) -> Path:
-    """The output folder, made if need be, after a check that files can be written there.
-
-    Raises:
-        InvalidValueError: if they cannot; `name` says which argument it was.
-    """
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InvalidValueError(name, str(folder), f"a folder that can be written ({error.strerror})") from None
-    return folder

@@ -9,7 +9,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 from orthocas import problems
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.checks import Array
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.painting import Isolines

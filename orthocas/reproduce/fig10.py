@@ -11,18 +11,18 @@ area of the two gradients, and X_1, X_2 are dual to them.
 import casadi as ca
 import numpy as np
 
-from orthocas.api import fit
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
 from orthocas.checks import Array
+from orthocas.fitting.fit import fit
 from orthocas.growing.flow import TaskFlow
+from orthocas.involutivity import TaskBrackets, lie_bracket
 from orthocas.parametrisations import Polynomial
 from orthocas.problem import Problem
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.section import curves_inside, isosurface, section, tilts, unit_gradients
 from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, add_3d, joint_cube, line_legend, new_figure
-from orthocas.task_brackets import TaskBrackets, lie_bracket
 from orthocas.tasks import Task
 
 RED, GREEN = "#c8102e", "#2a9d4a"  #: gradients of x and y

@@ -15,12 +15,12 @@ from matplotlib.colors import to_rgb, to_rgba
 from orthocas import problems
 from orthocas.checks import Array
 from orthocas.domains import Box, sample_uniform
+from orthocas.grow import grow
 from orthocas.growing.disk_leaf import DiskLeaf, disk_leaf
 from orthocas.growing.flow import TaskFlow
 from orthocas.growing.grown import GrownCoordinates
 from orthocas.growing.harmonic import signed_areas
 from orthocas.growing.level_surface import level_surface
-from orthocas.grown_chart import grow
 from orthocas.problem import Problem, task_jacobians
 from orthocas.reproduce.charted_surface import add_with_edges, add_with_lines, part_below
 from orthocas.reproduce.drawing import Drawing

@@ -6,10 +6,10 @@ isosurfaces, 0.03 rad above them on the side of the viewer, so that their tilt c
 
 import numpy as np
 
-from orthocas.api import fit
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
+from orthocas.fitting.fit import fit
 from orthocas.involutivity import involutivity
 from orthocas.parametrisations import Polynomial
 from orthocas.problem import Problem

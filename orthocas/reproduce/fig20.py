@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from orthocas import api, problems
+from orthocas import problems
+from orthocas.fitting.fit import fit
 from orthocas.parametrisations import Polynomial
 from orthocas.quality import AngleStatistics, Report, evaluate
 from orthocas.reproduce.drawing import Drawing
@@ -43,8 +44,8 @@ def draw(quick: bool) -> Drawing:
 
 
 def _judged(name: str, quick: bool) -> Report:
-    fit = api.fit(problems.get(name), Polynomial(4 if quick else 6), samples=1500 if quick else None)
-    return evaluate(fit.chart, 10_000 if quick else 100_000)
+    found = fit(problems.get(name), Polynomial(4 if quick else 6), samples=1500 if quick else None)
+    return evaluate(found.chart, 10_000 if quick else 100_000)
 
 
 def _draw_histogram(axes: Any, angles: AngleStatistics, title: str, colour: str) -> None:

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from matplotlib.patches import Circle, FancyBboxPatch
 
-from orthocas import api, problems
-from orthocas.batch import Batched
+from orthocas import problems
+from orthocas.casadi_tools.batch import Batched
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.control import PDPlus, Reference
 from orthocas.control.reference import DAMPING_RATIO, NATURAL_FREQUENCY
 from orthocas.domains import sample_uniform
+from orthocas.fitting.fit import fit
 from orthocas.parametrisations import Polynomial
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, THIRD, TICK, new_figure
@@ -134,7 +135,7 @@ def _low_pass_numbers(response: Reference) -> dict[str, float]:
 
 def _loop_numbers() -> dict[str, float]:
     """The torque of the controller against the sum in the diagram, at random states and references."""
-    chart = api.fit(problems.get("planar_3r_x"), Polynomial(4), samples=1500).chart
+    chart = fit(problems.get("planar_3r_x"), Polynomial(4), samples=1500).chart
     controller = PDPlus(chart, _STIFFNESS)
     q = sample_uniform(chart.problem.domain, _STATES, 0)
     dq, *wanted = np.random.default_rng(1).normal(size=(4, _STATES, chart.n))

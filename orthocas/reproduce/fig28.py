@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from orthocas import api, problems
+from orthocas import problems
 from orthocas.chart import Chart
 from orthocas.control import Kinematic, Reference
+from orthocas.fitting.fit import fit
 from orthocas.parametrisations import Polynomial
 from orthocas.quality import evaluate
 from orthocas.reproduce.drawing import Drawing
@@ -31,7 +32,7 @@ _COLOURS = ("#1f5fa8", "#d95f02", "#1b9e77", "#e7298a", "#7570b3", "#a6761d", "#
 
 def draw(quick: bool) -> Drawing:
     """Task, coordinates and joints over time; numbers tell how exactly the arm returns."""
-    chart = api.fit(problems.get("iiwa"), Polynomial(4)).chart
+    chart = fit(problems.get("iiwa"), Polynomial(4)).chart
     reference = journey(chart)
     run = simulate(Kinematic(chart), reference, chart.problem.domain.centre, tolerance=_TOLERANCE)
     figure = new_figure(6.2)

@@ -12,11 +12,12 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import root
 
-from orthocas import api, problems
+from orthocas import problems
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.domains import Box
 from orthocas.errors import SolveError
+from orthocas.fitting.fit import fit
 from orthocas.parametrisations import Polynomial
 from orthocas.problem import Problem
 from orthocas.reproduce.self_motion import trace
@@ -48,7 +49,7 @@ class HiddenSpring:
     @cached_property
     def chart(self) -> Chart:
         """Fitted coordinates."""
-        return api.fit(self.problem, Polynomial(_DEGREE)).chart
+        return fit(self.problem, Polynomial(_DEGREE)).chart
 
     @cached_property
     def start(self) -> Array:

@@ -10,14 +10,14 @@ from functools import partial
 import casadi as ca
 import numpy as np
 
-from orthocas import api
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
 from orthocas.checks import Array
-from orthocas.coordinates import Coordinates, joint_space
+from orthocas.coordinates.fitted import Coordinates, joint_space
 from orthocas.domains import sample_evenly
-from orthocas.linear_objective import LinearObjective
-from orthocas.loss import Weights
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.fit import fit
+from orthocas.fitting.loss import Weights
 from orthocas.parametrisations import Fourier
 from orthocas.parametrisations.product_basis import LinearFamily
 from orthocas.problem import Problem
@@ -30,7 +30,7 @@ _WEIGHTS = Weights(1000.0, 0.0)  # one coordinate: no mutual angles
 
 def freely_fitted(problem: Problem, quick: bool) -> Chart:
     """What `oc.fit` finds without a start."""
-    return api.fit(problem, _series(quick), weights=(_WEIGHTS.task, 0.0), samples=_sample_count(quick)).chart
+    return fit(problem, _series(quick), weights=(_WEIGHTS.task, 0.0), samples=_sample_count(quick)).chart
 
 
 def fitted_from_grown(problem: Problem, quick: bool) -> Chart:
@@ -40,7 +40,7 @@ def fitted_from_grown(problem: Problem, quick: bool) -> Chart:
     points = sample_evenly(problem.domain, _sample_count(quick), 0)
     start = _cosine_of_grown(problem, family, points)
 
-    objective = LinearObjective(family, samples_at(problem, points), _WEIGHTS, start, partial(sample_problem, problem))
+    objective = BasisObjective(family, samples_at(problem, points), _WEIGHTS, start, partial(sample_problem, problem))
     theta = GaussNewton().minimise(objective, start).theta
     return Chart(problem, Coordinates(series, space, (), theta, np.zeros(1), np.ones(1)))
 

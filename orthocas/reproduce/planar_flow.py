@@ -13,10 +13,10 @@ from orthocas import problems
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.domains import Torus
+from orthocas.grow import grow
 from orthocas.growing.circle_leaf import CircleLeaf
 from orthocas.growing.flow import TaskFlow
 from orthocas.growing.grown import GrownCoordinates
-from orthocas.grown_chart import grow
 from orthocas.problem import Problem
 from orthocas.reproduce.self_motion import pieces_in_cube, wrapped
 from orthocas.reproduce.style import INK, TURN

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from orthocas import api
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.control import ControlStatus, Impedance, PDPlus, Reference
 from orthocas.control.damping import DampingDesign
-from orthocas.coordinates import Coordinates
+from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import Box, Domain, Torus
+from orthocas.fitting.fit import fit
 from orthocas.parametrisations import Linear, Polynomial
 from orthocas.problem import Problem
 from orthocas.quality import evaluate
@@ -88,7 +88,7 @@ class Arm:
     def linear(self, axes: Axes, place: Place) -> Chart:
         """The coordinates (37) or (39), for all angles: they have no border at which a controller gives up."""
         base = tuple(self.base(place).tolist())
-        return api.fit(self.problem(axes, Torus(3)), Linear(base, "paper")).chart
+        return fit(self.problem(axes, Torus(3)), Linear(base, "paper")).chart
 
     def fitted(self, axes: Axes, place: Place, quick: bool) -> Chart:
         """Polynomials fitted on the box of the place, in the combination that agrees with `linear` at the base.
@@ -103,7 +103,7 @@ def _fitted(arm: Arm, axes: Axes, place: Place, quick: bool) -> Chart:
     """Several figures share a chart."""
     degree = 8 if axes == "x" and not quick else 6
     samples = 1500 if quick else 4000
-    chart = api.fit(arm.problem(axes, arm.box(place)), Polynomial(degree), samples=samples).chart
+    chart = fit(arm.problem(axes, arm.box(place)), Polynomial(degree), samples=samples).chart
     base = arm.base(place)
     return combined(chart, base, arm.linear(axes, place).jacobian(base)[chart.m :])
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthocas.errors import UnknownNameError
-from orthocas.objective import Monitor, Progress, silent
+from orthocas.files.atomic import made_folder
+from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.reproduce import (
     fig01,
     fig02,
@@ -33,7 +34,7 @@ from orthocas.reproduce import (
     fig28,
     fig30,
 )
-from orthocas.reproduce.drawing import Drawing, made_folder, save
+from orthocas.reproduce.drawing import Drawing, save
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_known
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar

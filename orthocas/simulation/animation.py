@@ -1,6 +1,5 @@
 """Animations of runs as GIF or MP4 files."""
 
-import os
 import shutil
 import subprocess
 import tempfile
@@ -12,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from orthocas.archive import require_writable
 from orthocas.checks import require_known
 from orthocas.errors import ArchiveError, InvalidValueError
-from orthocas.objective import Monitor, Progress, silent
+from orthocas.files.atomic import published, require_writable
+from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.problem import Problem
 from orthocas.simulation.moving_picture import MovingPicture, Picture
 from orthocas.simulation.trajectory import Trajectory
@@ -60,13 +59,12 @@ def save_animation(path: str | Path, trajectory: Trajectory, problem: Problem, m
     film = MovingPicture(trajectory, problem, speed)
     samples = np.vstack(list(film.pictures(instants[[0, -1]])))
     pictures = _watched(film.pictures(instants), len(instants), monitor)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".orthocas-") as folder:
-        draft = Path(folder) / target.name
+    with published(target.parent) as folder:
+        draft = folder / target.name
         if target.suffix == ".gif":
             _write_gif(draft, pictures, samples)
         else:
             _write_mp4(draft, pictures, (len(samples) // 2, samples.shape[1]))
-        os.replace(draft, target)
 
 
 def _chosen(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], float]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from orthocas.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.errors import InvalidValueError

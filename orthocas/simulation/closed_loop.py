@@ -8,12 +8,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.interrupts import deferred
+from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.errors import SimulationError
-from orthocas.interrupts import deferred
 from orthocas.robots import Robot
-from orthocas.scalar_code import scalar_code
 from orthocas.simulation.disturbances import Friction
 
 

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.batch import Batched
+from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array, as_float_array, frozen_array
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, SimulationError
-from orthocas.objective import Monitor, Progress, silent
+from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.robots import Robot
 from orthocas.simulation.closed_loop import ClosedLoop
 from orthocas.simulation.continuous import integrate

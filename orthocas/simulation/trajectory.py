@@ -1,8 +1,6 @@
 """What a simulation returns: arrays over time, with names and units, in and out of NPZ files."""
 
 import json
-import os
-import tempfile
 import zipfile
 import zlib
 from dataclasses import dataclass, fields
@@ -13,9 +11,9 @@ from typing import Any, Self
 import numpy as np
 from scipy.integrate import cumulative_simpson
 
-from orthocas.archive import require_writable
 from orthocas.checks import Array
 from orthocas.errors import TrajectoryFileError
+from orthocas.files.atomic import published, require_writable
 
 _VERSION = 1
 _WRONG_CONTENT = (ValueError, KeyError, TypeError, AttributeError)
@@ -105,10 +103,8 @@ class Trajectory:
             "units": _ARRAYS,
         }
         arrays = {name: getattr(self, name) for name in _ARRAYS}
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".orthocas-") as folder:
-            draft = Path(folder) / "draft.npz"
+        with published(target.parent) as drafts, (drafts / target.name).open("wb") as draft:
             np.savez_compressed(draft, header=json.dumps(header), **arrays)
-            os.replace(draft, target)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -1,0 +1,3 @@
+"""CasADi made to fit: evaluation on many samples, expressions as data, Ctrl-C."""
+
+__all__: list[str] = []

@@ -1,0 +1,97 @@
+"""Evaluation of CasADi functions on whole sample sets, without copies through DM.
+
+NumPy sample sets are (N, n); a stack of matrices is (N, rows, columns).
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.casadi_tools.interrupts import deferred
+from orthocas.checks import Array
+
+_CHUNKS = (1, 64, 512)  # samples evaluated in one call: the smallest that holds the set, or the largest
+_THREADED = 512  # chunks of this size are worth starting threads for
+
+
+def _threads() -> int:
+    """All cores this process may use, or what OMP_NUM_THREADS says, as other libraries do."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isdigit() and int(wanted) > 0:
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+THREADS = _threads()  #: of the mapped functions of this process
+
+
+def dense_function(
+    name: str, inputs: Sequence[Any], outputs: Sequence[Any], input_names: Sequence[str] = ()
+) -> ca.Function:
+    """A CasADi function, SX or MX, whose outputs have no structural zeros, as `Batched` needs.
+
+    Its first output is called `out`; a single input is called `q` unless `input_names` says otherwise.
+    """
+    names = list(input_names) or (["q"] if len(inputs) == 1 else [f"i{k}" for k in range(len(inputs))])
+    results = ["out", *(f"out{k}" for k in range(1, len(outputs)))]
+    return ca.Function(name, inputs, [ca.densify(out) for out in outputs], names, results)
+
+
+@dataclass(frozen=True)
+class Batched:
+    """A function of one sample, to be called with N samples.
+
+    Takes one array per input, (N, rows) for a column or (N, rows, columns) for a matrix, and returns one array per
+    output in the same form. Inputs and outputs are dense.
+    """
+
+    function: ca.Function
+    _mapped: dict[int, ca.Function] = field(default_factory=dict, repr=False)
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate N samples."""
+        chunk = next((size for size in _CHUNKS if size >= len(arguments[0])), _CHUNKS[-1])
+        if chunk not in self._mapped:
+            how = ("thread", THREADS) if chunk >= _THREADED and THREADS > 1 else ()
+            self._mapped[chunk] = self.function.map(chunk, *how)
+        return evaluate_columns(self._mapped[chunk], chunk, *arguments)
+
+
+def evaluate_columns(function: ca.Function, chunk: int, *arguments: Array) -> list[Array]:
+    """As `Batched`, for a function that itself takes `chunk` samples side by side as columns."""
+    N = len(arguments[0])
+    arguments = tuple(_column_major(a) for a in arguments)
+    buffer: Any
+    buffer, run = function.buffer()  # the stub of set_arg and set_res asks for a size, the method takes none
+    inputs = [np.empty((chunk, *a.shape[1:])) for a in arguments]
+    shapes = [function.size_out(i) for i in range(function.n_out())]
+    outputs = [np.empty((chunk, columns // chunk, rows)) for rows, columns in shapes]
+    for i, array in enumerate(inputs):
+        buffer.set_arg(i, array.data)
+    for i, array in enumerate(outputs):
+        buffer.set_res(i, array.data)
+    results = [np.empty((N, *out.shape[1:])) for out in outputs]
+    for start in range(0, N, chunk):
+        count = min(chunk, N - start)
+        for array, argument in zip(inputs, arguments, strict=True):
+            array[:count] = argument[start : start + count]
+            array[count:] = argument[start]  # pad the last chunk with a valid sample
+        with deferred():
+            run()
+        for result, out in zip(results, outputs, strict=True):
+            result[start : start + count] = out[:count]
+    return [_row_major(result) for result in results]
+
+
+def _column_major(array: Array) -> Array:
+    """CasADi stores matrices column by column, so one sample's (rows, columns) goes in transposed."""
+    return array if array.ndim == 2 else array.transpose(0, 2, 1)
+
+
+def _row_major(result: Array) -> Array:
+    """Undo the transposition; a single column becomes a vector."""
+    return result[:, 0, :] if result.shape[1] == 1 else result.transpose(0, 2, 1)

@@ -1,0 +1,154 @@
+"""Dense MX graphs at BLAS speed: matrix products and tanh of a finished graph handed to NumPy.
+
+CasADi multiplies dense matrices with a triple loop, and differentiation drops any other choice of kernel. So the graph,
+derivatives included, is built by CasADi as usual and rewritten last.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.casadi_tools.interrupts import deferred
+from orthocas.checks import Array
+
+
+class NumpyNode(ca.Callback):
+    """A node of an MX graph that NumPy evaluates in place; it has no derivatives of its own."""
+
+    def __init__(self, name: str, inputs: Sequence[tuple[int, int]], output: tuple[int, int]) -> None:
+        ca.Callback.__init__(self)
+        self._inputs, self._output = tuple(inputs), output
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        """Number of matrices that come in."""
+        return len(self._inputs)
+
+    def get_n_out(self) -> int:
+        """One matrix goes out."""
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Dense."""
+        return ca.Sparsity.dense(*self._inputs[i])
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Dense."""
+        return ca.Sparsity.dense(*self._output)
+
+    def has_eval_buffer(self) -> bool:
+        """Buffers, so that nothing is copied."""
+        return True
+
+    def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
+        """Evaluate; CasADi stores columns one after the other, so NumPy sees transposed matrices."""
+        inputs = [np.frombuffer(memory).reshape(shape[::-1]) for memory, shape in zip(arg, self._inputs, strict=True)]
+        self.compute(inputs, np.frombuffer(res[0]).reshape(self._output[::-1]))
+        return 0
+
+    def compute(self, transposed: list[Array], result: Array) -> None:
+        """Write the transposed output for transposed inputs."""
+        raise NotImplementedError
+
+
+class Product(NumpyNode):
+    """op(A) op(B), where op transposes or does nothing."""
+
+    def __init__(self, a: tuple[int, int], b: tuple[int, int], flip_a: bool, flip_b: bool) -> None:
+        self._flips = flip_a, flip_b
+        NumpyNode.__init__(self, "product", (a, b), (a[1] if flip_a else a[0], b[0] if flip_b else b[1]))
+
+    def compute(self, transposed: list[Array], result: Array) -> None:
+        """(op(A) op(B))^T = op(B)^T op(A)^T."""
+        a, b = transposed
+        np.matmul(b.T if self._flips[1] else b, a.T if self._flips[0] else a, out=result)
+
+
+class Tanh(NumpyNode):
+    """tanh of every entry."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        NumpyNode.__init__(self, "tanh", [shape], shape)
+
+    def compute(self, transposed: list[Array], result: Array) -> None:
+        """Entry by entry, vectorised."""
+        np.tanh(transposed[0], out=result)
+
+
+class NumpyGraph:
+    """A CasADi function of MX symbols whose dense products and tanh NumPy evaluates.
+
+    Args:
+        name: of the function.
+        inputs: MX symbols.
+        outputs: expressions of them, derivatives included.
+
+    Attributes:
+        function: the function; it lives as long as this object, which owns its nodes.
+    """
+
+    def __init__(self, name: str, inputs: Sequence[ca.MX], outputs: Sequence[ca.MX]) -> None:
+        self._nodes: list[NumpyNode] = []
+        with deferred():  # CasADi asks nodes for their shapes, and would swallow Ctrl-C there
+            self.function = ca.Function(name, list(inputs), self._rewritten(inputs, ca.cse(list(outputs))))
+        buffer: Any  # the stub of set_arg and set_res asks for a size, the method takes none
+        buffer, self._evaluate = self.function.buffer()
+        self._buffer = buffer
+
+    def __call__(self, *inputs: Array) -> list[Array]:
+        """Evaluate without copies: matrices come and go transposed, contiguous, and of the right size.
+
+        Large graphs need large scratch memory, which is kept from call to call.
+        """
+        for i, array in enumerate(inputs):
+            self._buffer.set_arg(i, array.data)
+        results = [np.empty(self.function.size_out(i)[::-1]) for i in range(self.function.n_out())]
+        for i, array in enumerate(results):
+            self._buffer.set_res(i, array.data)
+        with deferred():
+            self._evaluate()
+        return results
+
+    def _rewritten(self, inputs: Sequence[ca.MX], outputs: list[ca.MX]) -> list[ca.MX]:
+        """Cut the graph at its heavy nodes, then sew the pieces together with NumPy's nodes in between."""
+        plain = ca.Function("plain", list(inputs), outputs)
+        heavy = [
+            plain.instruction_MX(k)
+            for k in range(plain.n_instructions())
+            if plain.instruction_id(k) in (ca.OP_MTIMES, ca.OP_TANH)
+        ]
+        if not heavy:
+            return outputs
+        cuts = [ca.MX.sym("cut", *node.shape) for node in heavy]
+        operands = [[_untransposed(node.dep(i)) for i in range(node.n_dep())] for node in heavy]
+        pieces = iter(ca.graph_substitute([x for xs in operands for x, _ in xs] + outputs, heavy, cuts))
+        definitions = []
+        for node, xs in zip(heavy, operands, strict=True):
+            flips = [flipped for _, flipped in xs]
+            definitions.append(self._replacement(node, [next(pieces) for _ in xs], flips))
+        _, rewritten = ca.substitute_inplace(cuts, definitions, list(pieces))
+        return list(rewritten)
+
+    def _replacement(self, node: ca.MX, operands: list[ca.MX], flips: list[bool]) -> ca.MX:
+        """NumPy's node for a product z + x y (operands z, x, y) or for tanh."""
+        new: NumpyNode
+        if node.op() == ca.OP_TANH:
+            new = Tanh(node.shape)
+            arguments = [operands[0].T if flips[0] else operands[0]]
+        else:
+            new = Product(operands[1].shape, operands[2].shape, flips[1], flips[2])
+            arguments = operands[1:]
+        self._nodes.append(new)
+        result: ca.MX = new(*arguments)
+        if node.op() == ca.OP_MTIMES and not operands[0].is_zero():
+            result = (operands[0].T if flips[0] else operands[0]) + result
+        return result
+
+
+def _untransposed(operand: ca.MX) -> tuple[ca.MX, bool]:
+    """The operand without a transposition, and whether it had one."""
+    if operand.op() == ca.OP_TRANSPOSE:
+        return operand.dep(0), True
+    return operand, False

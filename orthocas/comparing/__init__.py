@@ -1,0 +1,3 @@
+"""Fits side by side."""
+
+__all__: list[str] = []

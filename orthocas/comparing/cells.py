@@ -1,0 +1,247 @@
+"""Fits side by side: a grid of parametrisations, solvers and seeds, judged on the same held-out samples."""
+
+import math
+import os
+import pickle
+import signal
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from orthocas.casadi_tools.batch import THREADS
+from orthocas.fitting.fit import fit
+from orthocas.fitting.loss import Weights
+from orthocas.minimising.solver import Solver, Status
+from orthocas.minimising.watch import Monitor, Progress, silent
+from orthocas.parametrisations import SEW, Given, Linear, Parametrisation
+from orthocas.problem import Problem
+from orthocas.quality import evaluate
+
+HELD_OUT_SEED = 2**31  #: seed of the held-out samples: no fit of a grid has it
+_DIED = "its process died: out of memory, or a script that calls compare outside `if __name__ == '__main__'`"
+_stops: list[Event] = []  # in processes of ours: set when the parent does not want results any more
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One fit of a grid: plain settings that can be sent to another process."""
+
+    problem: Problem
+    parametrisation: Parametrisation | SEW
+    solver: Solver
+    seed: int
+    weights: Weights
+    samples: int | None
+    held_out: int
+    chart_file: Path | None  #: where to save the chart
+
+    @property
+    def solver_name(self) -> str:
+        """Name of the solver; coordinates in closed form need none."""
+        return "closed form" if isinstance(self.parametrisation, Linear | Given | SEW) else self.solver.name
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """What one fit gave, or the error that stopped it; numbers of a failed one are NaN."""
+
+    problem: str
+    parametrisation: str
+    solver: str
+    seed: int
+    status: str
+    error: str = ""
+    seconds: float = float("nan")  #: of the fit
+    parameters: int = 0
+    samples: int = 0
+    iterations: int = 0
+    evaluations: int = 0
+    task_std_deg: float = float("nan")
+    mutual_std_deg: float = float("nan")
+    conditioning_min: float = float("nan")
+    conditioning_p01: float = float("nan")
+    conditioning_mean: float = float("nan")
+    folded_samples: int = 0
+    control_tick_us: float = float("nan")  #: of decoupled PD+ on the chart, as generated C, if it was measured
+    history: tuple[tuple[float, float], ...] = ()  #: seconds and training loss as the fit went on
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no chart."""
+        return bool(self.error)
+
+
+def run_cell(cell: Cell) -> CellResult:
+    """Fit and judge; an error becomes part of the result."""
+    history: list[tuple[float, float]] = []
+    start = time.perf_counter()
+
+    def record(progress: Progress) -> None:
+        if _cancelled():
+            raise KeyboardInterrupt
+        if math.isfinite(progress.value):
+            history.append((time.perf_counter() - start, progress.value))
+
+    if _cancelled():
+        return failure(cell, "cancelled")
+    try:
+        found = fit(
+            cell.problem,
+            cell.parametrisation,
+            cell.solver,
+            weights=cell.weights,
+            samples=cell.samples,
+            seed=cell.seed,
+            monitor=record,
+        )
+        if cell.chart_file is not None:
+            found.chart.save(cell.chart_file)
+        report = evaluate(found.chart, cell.held_out, HELD_OUT_SEED)
+    except Exception as error:
+        return failure(cell, f"{type(error).__name__}: {error}")
+    results = [stage.result for stage in found.stages]
+    return CellResult(
+        problem=cell.problem.name,
+        parametrisation=cell.parametrisation.label,
+        solver=cell.solver_name,
+        seed=cell.seed,
+        status=found.status.value,
+        seconds=found.seconds,
+        parameters=found.chart.coordinates.size,
+        samples=int(found.chart.notes["samples"]),
+        iterations=sum(result.iterations for result in results),
+        evaluations=sum(result.evaluations for result in results),
+        task_std_deg=report.task_angle.std,
+        mutual_std_deg=report.mutual_angle.std,
+        conditioning_min=report.conditioning.min,
+        conditioning_p01=report.conditioning.p01,
+        conditioning_mean=report.conditioning.mean,
+        folded_samples=report.folded_samples,
+        history=tuple(history),
+    )
+
+
+def failure(cell: Cell, error: str) -> CellResult:
+    """The result of a fit that did not come to its end."""
+    text = " ".join(error.split())
+    return CellResult(
+        cell.problem.name, cell.parametrisation.label, cell.solver_name, cell.seed, Status.FAILED.value, text
+    )
+
+
+def run_cells(
+    cells: Sequence[Cell], executor: Executor | None = None, jobs: int | None = None, monitor: Monitor = silent
+) -> Iterator[CellResult]:
+    """Results of cells as they come in; a failing cell, or one that kills its process, fails alone.
+
+    Args:
+        cells: what to run.
+        executor: where to run them; default processes of this machine with one thread each.
+        jobs: number of such processes, default one for each core this process may use.
+        monitor: called with the share of cells that are done.
+    """
+    results = _own_processes(cells, jobs) if executor is None else _submitted(cells, executor)
+    for done, result in enumerate(results, start=1):
+        detail = f"{result.parametrisation}, {result.solver}"
+        monitor(Progress("comparing", done / len(cells), f"{done} of {len(cells)}, {detail}"))
+        yield result
+
+
+def _submitted(cells: Sequence[Cell], executor: Executor) -> Iterator[CellResult]:
+    """All cells on a given executor."""
+    futures = {executor.submit(run_cell, cell): cell for cell in cells}
+    try:
+        for future in as_completed(futures):
+            yield _outcome(future, futures[future])
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _outcome(future: Future[CellResult], cell: Cell) -> CellResult:
+    error = future.exception()
+    if error is None:
+        return future.result()
+    died = isinstance(error, BrokenExecutor)
+    return failure(cell, _DIED if died else f"{type(error).__name__}: {error}")
+
+
+def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResult]:
+    """All cells in processes of our own. If one dies, all that were left are run again, each in a pool of its own.
+
+    Cells go through files: a pool whose process dies while a large argument is on its way hangs in Python 3.11.2.
+    """
+    with TemporaryDirectory(prefix="orthocas-") as folder:
+        files = {}
+        for k, cell in enumerate(cells):
+            try:
+                content = pickle.dumps(cell)
+            except (pickle.PicklingError, TypeError, AttributeError) as error:
+                yield failure(cell, f"{type(error).__name__}: {error}")
+                continue
+            files[cell] = Path(folder) / f"{k}.pickle"
+            files[cell].write_bytes(content)
+        yield from _in_pools(files, jobs)
+
+
+def _in_pools(files: Mapping[Cell, Path], jobs: int | None) -> Iterator[CellResult]:
+    """Cells that lie in files, in a pool, and one by one what a dying process left."""
+    left: list[Cell] = []
+    context = get_context("spawn")  # new interpreters: forked ones would inherit threads that no longer run
+    stop = context.Event()
+
+    def pool_of(size: int) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(size, mp_context=context, initializer=_begin, initargs=(stop,))
+
+    with single_threaded():
+        with pool_of(jobs or THREADS) as pool:
+            futures = {pool.submit(_run_stored, file): cell for cell, file in files.items()}
+            try:
+                for future in as_completed(futures):
+                    if isinstance(future.exception(), BrokenExecutor):
+                        left.append(futures[future])
+                    else:
+                        yield _outcome(future, futures[future])
+            except BaseException:  # Ctrl-C, or nobody wants the rest: fits that are running end at their next step
+                stop.set()
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+        for cell in left:
+            with pool_of(1) as pool:
+                yield _outcome(pool.submit(_run_stored, files[cell]), cell)
+
+
+def _run_stored(file: Path) -> CellResult:
+    """Run a cell that this program has written to a file."""
+    cell: Cell = pickle.loads(file.read_bytes())
+    return run_cell(cell)
+
+
+def _begin(stop: Event) -> None:
+    """In a new process: leave Ctrl-C to the parent, who says when to stop."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _stops.append(stop)
+
+
+def _cancelled() -> bool:
+    return any(stop.is_set() for stop in _stops)
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """Processes started meanwhile use one thread each, so that they do not fight for cores and seconds compare."""
+    before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = before

@@ -1,0 +1,141 @@
+"""Pictures of a comparison: the front of qualities, and the training loss over time."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from orthocas.comparing.cells import CellResult
+from orthocas.comparing.report import Comparison, Summary
+
+Colour = tuple[float, float, float, float]
+_HUES = {"linear": "Greys", "polynomial": "Blues", "fourier": "Greens", "mlp": "Oranges", "sew": "Purples"}
+_MARKERS = "osD^vPX*"
+_STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)))
+
+
+def front_figure(comparison: Comparison) -> Figure:
+    """Task angle against mutual angle of all fits: down and left is better.
+
+    Colour tells the parametrisation, marker the solver, size the number of parameters; labels beside the picture name
+    both with the seconds, lines lead to the medians over seeds. With one extra coordinate there is no mutual angle, and
+    the 1 % quantile of the conditioning takes its place.
+    """
+    summaries = [summary for summary in comparison.summaries() if summary.failed < summary.seeds]
+    figure = Figure(figsize=(9.6, max(4.6, 1.2 + 0.21 * len(summaries))), layout="constrained")
+    axes = figure.add_subplot()
+    good = [result for result in comparison.results if not result.failed]
+    single = all(math.isnan(result.mutual_std_deg) for result in good)
+    colours, markers = _colours(good), dict(zip(_names(good, "solver"), _MARKERS * 3, strict=False))
+    for result in good:
+        axes.scatter(
+            result.task_std_deg,
+            result.conditioning_p01 if single else result.mutual_std_deg,
+            s=_size(result.parameters),
+            color=colours[result.parametrisation],
+            marker=markers[result.solver],
+            alpha=0.8,
+            edgecolor="black",
+            linewidth=0.4,
+        )
+    axes.set_xlabel("task angle, standard deviation [deg]")
+    axes.set_ylabel("conditioning, 1 % quantile (1 is best)" if single else "mutual angle, standard deviation [deg]")
+    _scale(axes, [r.task_std_deg for r in good], [] if single else [r.mutual_std_deg for r in good])
+    _label(axes, summaries, single, colours)
+    handles = [Line2D([], [], marker=m, linestyle="", color="0.4", label=name) for name, m in markers.items()]
+    axes.legend(handles=handles, fontsize=8)
+    axes.set_title(f"{_problem(comparison)}: held-out quality; size is the number of parameters", fontsize=10)
+    axes.grid(alpha=0.3, which="both")
+    return figure
+
+
+def convergence_figure(comparison: Comparison) -> Figure:
+    """Training loss over time, one line a fit; jumps are new stages with other samples and more parameters."""
+    figure = Figure(figsize=(8.6, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    drawn = [result for result in comparison.results if result.history]
+    colours, styles = _colours(drawn), dict(zip(_names(drawn, "solver"), _STYLES * 3, strict=False))
+    for result in drawn:
+        seconds, loss = zip(*result.history, strict=True)
+        colour = colours[result.parametrisation]
+        axes.plot(seconds, loss, color=colour, linestyle=styles[result.solver], linewidth=1.4, alpha=0.8)
+        axes.plot(seconds[-1], loss[-1], ".", color=colour)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("training loss")
+    axes.set_title(f"{_problem(comparison)}: training loss over time", fontsize=10)
+    _legends(axes, colours, styles)
+    axes.grid(alpha=0.3, which="both")
+    return figure
+
+
+def _problem(comparison: Comparison) -> str:
+    return comparison.results[0].problem if comparison.results else ""
+
+
+def _names(results: Sequence[CellResult], attribute: str) -> list[str]:
+    return list(dict.fromkeys(str(getattr(result, attribute)) for result in results))
+
+
+def _colours(results: Sequence[CellResult]) -> dict[str, Colour]:
+    """One hue for every kind of parametrisation, darker for those later in the alphabet."""
+    kinds: dict[str, list[str]] = {}
+    for name in sorted(_names(results, "parametrisation")):
+        kinds.setdefault(name.partition(":")[0], []).append(name)
+    colours = {}
+    for kind, names in kinds.items():
+        for k, name in enumerate(names):
+            colours[name] = mpl.colormaps[_HUES.get(kind, "Reds")](0.35 + 0.6 * (k + 1) / len(names))
+    return colours
+
+
+def _size(parameters: int) -> float:
+    return 30 + 25 * math.log10(1 + parameters)
+
+
+def _label(axes: Axes, summaries: Sequence[Summary], single: bool, colours: Mapping[str, Colour]) -> None:
+    """Names and seconds in a column beside the axes, from top to bottom as the points lie, with lines to them."""
+    places = {(s.parametrisation, s.solver): s.conditioning_p01 if single else s.mutual_std_deg for s in summaries}
+    ordered = sorted(summaries, key=lambda s: (-places[s.parametrisation, s.solver], s.task_std_deg))
+    for k, summary in enumerate(ordered):
+        axes.annotate(
+            f"{summary.parametrisation}, {summary.solver}: {summary.seconds:.2g} s",
+            (summary.task_std_deg, places[summary.parametrisation, summary.solver]),
+            xytext=(1.04, 1 - (k + 0.5) / len(ordered)),
+            textcoords="axes fraction",
+            fontsize=7.5,
+            color=colours[summary.parametrisation],
+            verticalalignment="center",
+            arrowprops={
+                "arrowstyle": "-",
+                "relpos": (0, 0.5),
+                "shrinkA": 1,
+                "color": colours[summary.parametrisation],
+                "linewidth": 0.5,
+                "alpha": 0.6,
+            },
+        )
+
+
+def _scale(axes: Axes, *values: Sequence[float]) -> None:
+    """Logarithmic axes where values, none of them zero, spread over more than a factor of four."""
+    for name, numbers in zip(("x", "y"), values, strict=True):
+        if numbers and max(numbers) > 4 * min(numbers) > 1e-3 * max(numbers):
+            getattr(axes, f"set_{name}scale")("log")
+            axis = getattr(axes, f"{name}axis")
+            axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.set_minor_formatter(NullFormatter())
+
+
+def _legends(axes: Axes, colours: Mapping[str, Colour], styles: Mapping[str, Any]) -> None:
+    """One legend for parametrisations and solvers, beside the picture."""
+    handles = [Line2D([], [], color=colour, linewidth=3, label=name) for name, colour in colours.items()]
+    handles += [Line2D([], [], linestyle=style, color="0.3", label=name) for name, style in styles.items()]
+    axes.legend(handles=handles, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)

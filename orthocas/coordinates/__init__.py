@@ -1,0 +1,3 @@
+"""Coordinates xi(q) of a chart, and their inverse."""
+
+__all__: list[str] = []

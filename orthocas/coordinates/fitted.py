@@ -1,0 +1,146 @@
+"""The coordinates xi(q) of a chart: a fitted family on the active joints, and the idle joints as they are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from orthocas.casadi_tools.batch import Batched, dense_function, evaluate_columns
+from orthocas.casadi_tools.blas_graph import NumpyGraph
+from orthocas.casadi_tools.scalar_code import scalar_code
+from orthocas.checks import Array, frozen_array
+from orthocas.coordinates.point_functions import point_functions
+from orthocas.parametrisations import Family, JointSpace, Parametrisation
+from orthocas.parametrisations.family import Expression
+from orthocas.problem import Problem
+
+_COLUMNS = 256  # samples side by side in matrix-shaped graphs
+
+
+def joint_space(problem: Problem) -> JointSpace:
+    """The joints of a problem as parametrisations see them."""
+    robot, domain = problem.robot, problem.domain
+    return JointSpace(domain.centre, domain.half_width, robot.tree.prismatic, robot.joint_names)
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """xi(q) = [scale (family(q_active) - offset); q_idle - centre_idle], (r, 1).
+
+    Offset and scale make xi(centre) = 0 and the mean gradient length of each coordinate 1 over the domain; they
+    do not change the loss.
+    """
+
+    parametrisation: Parametrisation
+    space: JointSpace  #: all joints of the robot
+    idle: tuple[int, ...]  #: joints that are coordinates themselves, listed last
+    theta: Array  #: parameters of the family, (size,)
+    offset: Array  #: (r - idle,)
+    scale: Array  #: (r - idle,)
+
+    def __post_init__(self) -> None:
+        fitted = len(self.offset)
+        object.__setattr__(self, "theta", frozen_array("theta", self.theta, (self.family.size,)))
+        object.__setattr__(self, "offset", frozen_array("offset", self.offset, (fitted,)))
+        object.__setattr__(self, "scale", frozen_array("scale", self.scale, (fitted,)))
+
+    @property
+    def r(self) -> int:
+        """Number of coordinates."""
+        return len(self.offset) + len(self.idle)
+
+    @property
+    def label(self) -> str:
+        """Short name of the parametrisation."""
+        return self.parametrisation.label
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.theta.size
+
+    @property
+    def active(self) -> list[int]:
+        """Joints the fitted family depends on."""
+        return [i for i in range(self.space.n) if i not in self.idle]
+
+    @cached_property
+    def family(self) -> Family:
+        """The fitted family on the active joints."""
+        return self.parametrisation.family(self.space.restricted_to(self.active), len(self.offset))
+
+    def expression(self, q: Expression) -> Expression:
+        """xi(q), (r, N), for joint positions as columns (n, N)."""
+        columns = q.shape[1]
+        rows: list[Expression] = []
+        if len(self.offset):
+            theta = type(q)(ca.DM(self.theta))
+            fitted = self.family.expression(q[self.active, :], theta)
+            rows.append((fitted - _columns(self.offset, columns)) * _columns(self.scale, columns))
+        if self.idle:
+            rows.append(q[list(self.idle), :] - _columns(self.space.centre[list(self.idle)], columns))
+        return ca.vertcat(*rows)
+
+    def xi(self, points: Array) -> Array:
+        """Coordinates at points (N, n), (N, r)."""
+        if self.family.as_matrices:
+            return evaluate_columns(self._column_graphs["xi"].function, _COLUMNS, points)[0]
+        return self._batched["xi"](points)[0]
+
+    def jacobian(self, points: Array) -> Array:
+        """J_xi at points (N, n), (N, r, n)."""
+        if self.family.as_matrices:
+            flat = evaluate_columns(self._column_graphs["jacobian"].function, _COLUMNS, points)[0]
+            return flat.reshape(len(points), self.r, self.space.n)
+        return self._batched["jacobian"](points)[0].reshape(len(points), self.r, self.space.n)
+
+    @cached_property
+    def functions(self) -> dict[str, ca.Function]:
+        """Functions of one joint position: xi (r, 1), jacobian (r, n), and second_derivative of q, v, w (r, 1)."""
+        n, idle, active = self.space.n, list(self.idle), self.active
+        q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
+        unit = np.eye(n)
+        xi, J, second = [], [], []
+        if len(self.offset):
+            parts, scale = point_functions(self.family, self.theta, len(active)), ca.DM(self.scale)
+            xi.append((parts["xi"](q[active]) - ca.DM(self.offset)) * scale)
+            J_active = parts["jacobian"](q[active]) * ca.repmat(scale, 1, len(active))
+            J.append(J_active @ ca.DM(unit[active]) if idle else J_active)
+            second.append(parts["second_derivative"](q[active], v[active], w[active]) * scale)
+        if idle:
+            xi.append(q[idle] - ca.DM(self.space.centre[idle]))
+            J.append(ca.MX(ca.DM(unit[idle])))
+            second.append(ca.MX(len(idle), 1))
+        return {
+            "xi": dense_function("xi", [q], [ca.vertcat(*xi)]),
+            "jacobian": dense_function("J_xi", [q], [ca.vertcat(*J)]),
+            "second_derivative": dense_function("d2xi", [q, v, w], [ca.vertcat(*second)], ["q", "v", "w"]),
+        }
+
+    @cached_property
+    def _batched(self) -> dict[str, Batched]:
+        return {name: Batched(scalar_code(self.functions[name])) for name in ("xi", "jacobian")}
+
+    @cached_property
+    def _column_graphs(self) -> dict[str, NumpyGraph]:
+        """Functions xi and vec(J_xi^T) of many joint positions side by side: what dense products are fast at."""
+        q = ca.MX.sym("q", self.space.n, _COLUMNS)
+        J_xi = ca.vertcat(*self._gradients(q))
+        return {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}
+
+    def _gradients(self, q: ca.MX) -> list[ca.MX]:
+        """Gradients of all coordinates, r matrices (n, N), for joint positions as columns (n, N)."""
+        N = q.shape[1]
+        unit = np.eye(self.space.n)
+        gradients: list[ca.MX] = []
+        if len(self.offset):
+            own = self.family.jacobian(q[self.active, :], ca.MX(ca.DM(self.theta)))
+            spread = ca.DM(unit[:, self.active])
+            gradients += [spread @ gradient * scale for gradient, scale in zip(own, self.scale, strict=True)]
+        return gradients + [ca.MX(_columns(unit[k], N)) for k in self.idle]
+
+
+def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:
+    return ca.DM(np.repeat(np.asarray(values, dtype=float)[:, None], columns, axis=1))

@@ -1,0 +1,62 @@
+"""Families as CasADi functions of one joint position, in the form that makes small and fast C."""
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.casadi_tools.batch import dense_function
+from orthocas.checks import Array
+from orthocas.parametrisations.family import Family
+from orthocas.parametrisations.product_basis import LinearFamily
+
+
+def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Function]:
+    """Xi (r, 1) and its jacobian (r, n), functions of q (n, 1); second_derivative (r, 1), a function of q, v, w.
+
+    The last is d^2 xi(q)[v, w]. Bases are evaluated once, and their coefficients are a table that a loop multiplies
+    with: written out, a polynomial of degree 4 on seven joints is ten thousand operations.
+    """
+    if isinstance(family, LinearFamily):
+        return _from_basis(family, theta)
+    kind: Any = ca.MX if family.as_matrices else ca.SX
+    q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
+    parameters: Any = ca.DM(theta)  # numbers, so that slices and transposes of weights are not done at every call
+    xi = family.expression(q, parameters)
+    jacobian = ca.horzcat(*family.jacobian(q, parameters)).T
+    return _functions(xi, jacobian, second_derivative(xi, q, v, w), q, v, w)
+
+
+def second_derivative(values: Any, q: Any, v: Any, w: Any) -> Any:
+    """(d/ds) J(q + s v) w of an expression, SX or MX."""
+    return ca.jtimes(ca.jtimes(values, q, w), q, v)
+
+
+def _from_basis(family: LinearFamily, theta: Array) -> dict[str, ca.Function]:
+    """Derivatives of basis functions are sums of basis functions: d xi / d q_i = C_i psi' with few of them, psi'.
+
+    For a polynomial of degree d, psi' are those of degree d - 1, and J is one table times psi'.
+    """
+    n, r = family.space.n, family.outputs
+    tables = family.derivative_tables(theta)
+    places = np.flatnonzero(tables.any(axis=(0, 1)))
+    x, u = ca.SX.sym("q", n), ca.SX.sym("v", n)
+    psi = family.basis(x)
+    smaller = ca.vertcat(1, psi)[places.tolist()]
+    basis = ca.Function("basis", [x], [psi])
+    smaller_basis = ca.Function("smaller_basis", [x], [smaller])
+    change = ca.Function("smaller_basis_change", [x, u], [ca.densify(ca.jtimes(smaller, x, u))])
+    values = ca.MX(ca.DM(theta.reshape(r, family.width)))
+    slopes = ca.MX(ca.DM(tables[:, :, places].reshape(n * r, len(places))))
+    q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
+    jacobian = ca.reshape(slopes @ smaller_basis(q), r, n)
+    second = ca.reshape(slopes @ change(q, v), r, n) @ w
+    return _functions(values @ basis(q), jacobian, second, q, v, w)
+
+
+def _functions(xi: Any, jacobian: Any, second: Any, q: Any, v: Any, w: Any) -> dict[str, ca.Function]:
+    return {
+        "xi": dense_function("xi", [q], [xi]),
+        "jacobian": dense_function("J_xi", [q], [jacobian]),
+        "second_derivative": dense_function("d2xi", [q, v, w], [second], ["q", "v", "w"]),
+    }

@@ -1,0 +1,195 @@
+"""Closed expressions for grown coordinates: what controllers and generated C can use."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.blas_graph import NumpyGraph
+from orthocas.chart import Chart
+from orthocas.checks import Array, require_count, require_memory
+from orthocas.coordinates.fitted import Coordinates, joint_space
+from orthocas.domains import sample_evenly, sample_uniform
+from orthocas.errors import GrowError, InvalidValueError
+from orthocas.growing.grown import GrownCoordinates
+from orthocas.minimising.solver import Solver
+from orthocas.minimising.watch import Monitor, Progress, Watch, silent
+from orthocas.parametrisations import MLP, Family, GradedParametrisation, Parametrisation, Polynomial
+from orthocas.parametrisations.product_basis import LinearFamily
+from orthocas.quality import Report, evaluate
+from orthocas.solvers import LBFGS
+
+_PER_PARAMETER = 4  # samples for each parameter of a coordinate
+_LEAST, _MOST = 2000, 20_000  # samples
+_CHUNK = 500  # samples whose basis is held at once
+_HELD_OUT_SEED = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Distilled:
+    """A fitted chart that stands in for a grown one, and what was lost."""
+
+    chart: Chart
+    value_rms: Array  #: root mean square of xi - xi_grown over held-out samples, (r,)
+    gradient_rms: Array  #: of |dxi - dxi_grown| / |dxi_grown|, (r,)
+    grown: Report  #: quality of the grown chart
+    distilled: Report  #: quality of the new one; its task angle was 90 degrees exactly before
+    left_out: float  #: share of training samples where the grown chart has no value
+
+
+@dataclass(frozen=True, eq=False)
+class _Targets:
+    """Values and gradients of the grown chart."""
+
+    points: Array  #: (N, n)
+    xi: Array  #: (N, r)
+    gradients: Array  #: (N, r, n), times `weight`
+    weight: float  #: length that makes gradients comparable to values
+
+
+def distil(
+    chart: Chart,
+    parametrisation: Parametrisation | None = None,
+    solver: Solver | None = None,
+    samples: int | None = None,
+    seed: int = 0,
+    monitor: Monitor = silent,
+) -> Distilled:
+    """Fit a closed expression to the values and gradients of a grown chart, for controllers and generated C.
+
+    Minimises the mean of |xi - xi_grown|^2 + w^2 |J_xi - J_grown|^2 over samples of the domain, with w the mean
+    half-width of the domain: bases linear in their parameters by least squares, networks by a minimiser.
+
+    Args:
+        chart: a grown chart.
+        parametrisation: default Polynomial(degree=6).
+        solver: for networks, default LBFGS.
+        samples: number of samples; default four for each parameter of a coordinate, 2000 to 20,000.
+        seed: of samples and random starts.
+        monitor: called with progress.
+
+    Returns:
+        The chart, and what was lost: errors of values and gradients, and quality before and after.
+
+    Raises:
+        InvalidValueError: if the chart is not grown, or the parametrisation is none to fit.
+        GrowError: if the grown chart has no values on its domain.
+    """
+    parametrisation = Polynomial(degree=6) if parametrisation is None else parametrisation
+    if not isinstance(parametrisation, GradedParametrisation | MLP):
+        raise InvalidValueError("parametrisation", repr(parametrisation), "Polynomial, Fourier or MLP")
+    if not isinstance(chart, Chart):
+        raise InvalidValueError("chart", repr(chart), "a grown chart")
+    if solver is not None and not (isinstance(parametrisation, MLP) and isinstance(solver, Solver)):
+        raise InvalidValueError("solver", repr(solver), "a solver such as LBFGS(), and only for a network")
+    solver = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
+    watch = Watch(monitor, f"distil {parametrisation.label}")
+    if not isinstance(chart.coordinates, GrownCoordinates):
+        raise InvalidValueError("chart", f"a chart of kind {chart.coordinates.label}", "a grown chart")
+    space = joint_space(chart.problem)
+    family = parametrisation.family(space, chart.r)
+    if isinstance(family, LinearFamily):
+        needed = 8.0 * family.width * (3 * family.width + (chart.n + 1) * _CHUNK)
+        require_memory(f"least squares with {family.width} terms", needed)
+    wanted = int(np.clip(_PER_PARAMETER * family.size // chart.r, _LEAST, _MOST))
+    count = wanted if samples is None else require_count("samples", samples)
+    if count * (1 + chart.n) <= family.size / chart.r:
+        raise InvalidValueError("samples", count, f"enough for the {family.size // chart.r} numbers of a coordinate")
+    require_memory(f"distilling with {count} samples", 8.0 * count * chart.n * (chart.n + 4))
+    points = sample_evenly(chart.problem.domain, count, require_count("seed", seed, least=0))
+    targets = _targets(chart, points)
+    if isinstance(family, LinearFamily):
+        theta, offset = _least_squares(family, targets, watch)
+    else:
+        theta, offset = _minimised(family, targets, solver, seed, watch)
+    coordinates = Coordinates(parametrisation, space, (), theta, offset, np.ones(chart.r))
+    return _judged(
+        chart, Chart(chart.problem, coordinates, {"distilled from": chart.coordinates.label}), targets, count
+    )
+
+
+def _targets(chart: Chart, points: Array) -> _Targets:
+    """Grown values and gradients, where there are any."""
+    xi, gradients = chart.coordinates.xi(points), chart.coordinates.jacobian(points)
+    known = np.isfinite(xi).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
+    if not known.any():
+        raise GrowError(f"the grown chart has no value at any of {len(points)} samples of the domain")
+    weight = float(chart.problem.domain.half_width.mean())
+    return _Targets(points[known], xi[known], gradients[known] * weight, weight)
+
+
+def _judged(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
+    held_out = sample_uniform(chart.problem.domain, min(count, 5000), _HELD_OUT_SEED)
+    known = _targets(chart, held_out)
+    errors = distilled.coordinates.xi(known.points) - known.xi
+    gradients = known.gradients / known.weight
+    turned = np.linalg.norm(distilled.coordinates.jacobian(known.points) - gradients, axis=2)
+    relative = turned / np.linalg.norm(gradients, axis=2)
+    return Distilled(
+        chart=distilled,
+        value_rms=np.sqrt((errors**2).mean(axis=0)),
+        gradient_rms=np.sqrt((relative**2).mean(axis=0)),
+        grown=evaluate(chart, len(held_out), _HELD_OUT_SEED),
+        distilled=evaluate(distilled, len(held_out), _HELD_OUT_SEED),
+        left_out=1 - len(targets.points) / count,
+    )
+
+
+def _least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tuple[Array, Array]:
+    """Coefficients and offset of the best linear combination, by normal equations over chunks of samples."""
+    n, K = targets.points.shape[1], family.width
+    q = ca.SX.sym("q", n)
+    basis = family.basis(q)
+    both = Batched(dense_function("basis", [q], [basis, ca.jacobian(basis, q)]))
+    normal, right = np.zeros((K + 1, K + 1)), np.zeros((K + 1, family.outputs))
+    for start in range(0, len(targets.points), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        watch.monitor(Progress(watch.stage, start / len(targets.points), f"{start} samples"))
+        values, slopes = both(targets.points[part])
+        slopes = slopes.reshape(len(values), K, n).transpose(0, 2, 1).reshape(-1, K) * targets.weight
+        constant = np.r_[np.ones(len(values)), np.zeros(len(slopes))]
+        rows = np.column_stack([np.vstack([values, slopes]), constant])
+        wanted = np.vstack([targets.xi[part], targets.gradients[part].transpose(0, 2, 1).reshape(-1, family.outputs)])
+        normal += rows.T @ rows
+        right += rows.T @ wanted
+    solution: Array = np.asarray(np.linalg.lstsq(normal, right, rcond=1e-14)[0], dtype=float)
+    return solution[:-1].T.ravel(), -solution[-1]
+
+
+def _minimised(family: Family, targets: _Targets, solver: Solver, seed: int, watch: Watch) -> tuple[Array, Array]:
+    """Parameters by a minimiser; the output bias of a network takes up the offset, so that stays 0."""
+    result = solver.minimise(_Distance(family, targets), family.initial(seed), watch).raise_if_failed()
+    return result.theta, np.zeros(family.outputs)
+
+
+class _Distance:
+    """Mean squared distance of values and weighted gradients from the targets, samples side by side as columns."""
+
+    def __init__(self, family: Family, targets: _Targets) -> None:
+        N, n = targets.points.shape
+        r = family.outputs
+        theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", n, N)
+        values, slopes = ca.MX.sym("values", r, N), ca.MX.sym("slopes", r * n, N)
+        gradients = ca.vertcat(*family.jacobian(q, theta)) * targets.weight
+        distance = (ca.sumsqr(family.expression(q, theta) - values) + ca.sumsqr(gradients - slopes)) / N
+        inputs: list[Any] = [theta, q, values, slopes]
+        gradient = ca.jtimes(distance, theta, ca.MX(1), True)
+        self._value = NumpyGraph("distance", inputs, [distance])
+        self._both = NumpyGraph("distance_and_gradient", inputs, [distance, ca.densify(gradient)])
+        self._data = [np.ascontiguousarray(part) for part in (targets.points, targets.xi, targets.gradients)]
+        self._data[2] = self._data[2].reshape(N, r * n)
+
+    def value(self, theta: Array) -> float:
+        """Distance at theta."""
+        return float(self._run(self._value, theta)[0][0, 0])
+
+    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
+        """Distance and its gradient, (size,)."""
+        value, gradient = self._run(self._both, theta)
+        return float(value[0, 0]), gradient[0]
+
+    def _run(self, graph: Callable[..., list[Array]], theta: Array) -> list[Array]:
+        return graph(np.ascontiguousarray(theta), *self._data)

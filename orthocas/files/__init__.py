@@ -1,0 +1,3 @@
+"""Files: containers, charts."""
+
+__all__: list[str] = []

@@ -1,0 +1,3 @@
+"""Fitting coordinates to a problem."""
+
+__all__: list[str] = []

@@ -1,0 +1,160 @@
+"""Growing a chart: choose a base leaf, chart it, and carry its coordinates along the task gradients."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.chart import GrownChart
+from orthocas.checks import Array, as_float_array, frozen_array, require_count, require_known, require_shape
+from orthocas.domains import Box, Torus, sample_evenly
+from orthocas.errors import GrowError, InvalidValueError, NotInvolutiveError
+from orthocas.growing.circle_leaf import CircleLeaf, circle_leaf
+from orthocas.growing.disk_leaf import CELLS, disk_leaf
+from orthocas.growing.flow import TaskFlow
+from orthocas.growing.grown import GrownCoordinates
+from orthocas.growing.leaf import LeafChart, turning_joints
+from orthocas.growing.leaves import LEAVES
+from orthocas.growing.linear_leaf import linear_leaf
+from orthocas.involutivity import involutivity
+from orthocas.problem import Problem, check
+
+_PROBES = 1000  # samples of the domain that are pulled to see where a leaf has to reach
+_FEWEST_CELLS = 10  # along the longest edge of a region
+_MARGIN = 1.15  # of that region
+
+
+def grow(
+    problem: Problem,
+    level: ArrayLike | None = None,
+    leaf: str | None = None,
+    origin: ArrayLike | None = None,
+    region: Box | None = None,
+    cells: int | None = None,
+) -> GrownChart:
+    """Exact coordinates, J_x A^-1 J_xi^T = 0, carried from a base leaf along the task gradients ([AS2023] Sec. 5).
+
+    Args:
+        problem: with m = 1, or with a task whose gradients are involutive in the metric.
+        level: task value x0 of the base leaf, a number or (m,); default that of the origin.
+        leaf: how the base leaf is charted. "linear": xi0 = N^T (q - origin), any n. "circle": by arc length, scaled to
+            (-pi, pi], for a closed leaf with r = 1. "disk": by a harmonic map of a triangle mesh onto the unit disk,
+            for n = 3, m = 1. Default: "circle" for r = 1 on a torus, "disk" for n = 3 and m = 1, otherwise "linear".
+        origin: joint position (n,) whose end on the leaf is the origin of "linear" and "circle"; default the centre of
+            the domain, or, if the flow from there is singular, a point of the domain from where it is not.
+        region: only for "disk", the box whose part of the leaf is charted; default a box around all that the domain is
+            pulled to, and whole turns of joints that make them in the domain.
+        cells: only for "disk", number of mesh cells along the longest edge of the region, default 60.
+
+    Returns:
+        The chart. Values are NaN where a flow runs into a singularity or ends outside the chart of the leaf:
+        `chart.coordinates.pull(points).status` tells.
+
+    Raises:
+        NotInvolutiveError: if m >= 2 and the task gradients are not involutive, so that the result would depend on
+            the path.
+        NotADiskError: if that part of the leaf is no disk; says what it is.
+        GrowError: if the leaf cannot be reached, closed or charted.
+        MetricError: if the metric is not SPD on the domain.
+        InvalidValueError: if an argument has another type, or belongs to another kind of leaf.
+    """
+    if not isinstance(problem, Problem):
+        raise InvalidValueError("problem", repr(problem), "a Problem, such as problems.get('planar_2r')")
+    leaf = _default_leaf(problem) if leaf is None else leaf
+    if not isinstance(leaf, str):
+        raise InvalidValueError("leaf", repr(leaf), f"one of {', '.join(LEAVES)}")
+    require_known("leaf", leaf, LEAVES)
+    _require_fitting_options(leaf, region, cells)
+    check(problem)
+    require_involutive(problem)
+    origin = None if origin is None else frozen_array("origin", origin, (problem.n,))
+    x0 = _level(problem, level, origin)
+    coordinates = GrownCoordinates(problem, _leaf_chart(problem, leaf, x0, origin, region, cells or CELLS))
+    reached = np.isfinite(coordinates.xi(sample_evenly(problem.domain, _PROBES, 1))).all(axis=1)
+    if not reached.any():
+        raise GrowError(f"no sample of the domain reaches the charted part of the leaf h(q) = {x0.tolist()}")
+    notes: dict[str, str | float] = {
+        "level": ", ".join(f"{value:.6g}" for value in x0),
+        "share of the domain": float(reached.mean()),
+    }
+    if isinstance(coordinates.leaf, CircleLeaf):
+        notes["cut"] = ", ".join(f"{value:.6g}" for value in coordinates.leaf.cut)
+    return GrownChart(problem, coordinates, notes)
+
+
+def require_involutive(problem: Problem) -> None:
+    """Raise NotInvolutiveError unless the task gradients are involutive."""
+    if problem.m == 1:
+        return
+    found = involutivity(problem, samples=300)
+    if not found.exact:
+        raise NotInvolutiveError(
+            f"the gradients of task '{problem.task.name}' are not involutive (defect mean {found.mean:.3g}, "
+            f"max {found.max:.3g}): coordinates grown along them would depend on the path; fit them with orthocas.fit"
+        )
+
+
+def _default_leaf(problem: Problem) -> str:
+    if problem.r == 1 and isinstance(problem.domain, Torus):
+        return "circle"
+    return "disk" if (problem.n, problem.m) == (3, 1) else "linear"
+
+
+def _require_fitting_options(leaf: str, region: Box | None, cells: int | None) -> None:
+    """Refuse options that would be ignored, or mean nothing."""
+    if leaf != "disk" and (region is not None or cells is not None):
+        raise InvalidValueError("region or cells", f"given for a {leaf} leaf", "none, they belong to a disk")
+    if region is not None and not isinstance(region, Box):
+        raise InvalidValueError("region", repr(region), "a Box")
+    if cells is not None:
+        require_count("cells", cells, least=_FEWEST_CELLS)
+
+
+def _leaf_chart(
+    problem: Problem, leaf: str, x0: Array, origin: Array | None, region: Box | None, cells: int
+) -> LeafChart:
+    if leaf == "disk":
+        return disk_leaf(problem, x0, _region(problem, x0) if region is None else region, cells)
+    start = _start(problem, x0, origin)
+    if leaf == "linear":
+        if isinstance(problem.domain, Torus):
+            raise GrowError("a linear chart is not periodic: take a Box domain, or another leaf")
+        return linear_leaf(problem, start)
+    if problem.r != 1:
+        raise GrowError(f"a circle chart is for r = 1, got r = {problem.r}")
+    return circle_leaf(problem, x0, start)
+
+
+def _level(problem: Problem, level: ArrayLike | None, origin: Array | None) -> Array:
+    if level is None:
+        q = problem.domain.centre if origin is None else origin
+        return np.asarray(problem.task.batched(q[None])[0][0])
+    values = np.atleast_1d(as_float_array("level", level))
+    require_shape("level", values.shape, (problem.m,))
+    return frozen_array("level", values, (problem.m,))
+
+
+def _start(problem: Problem, x0: Array, origin: Array | None) -> Array:
+    """The point of the leaf that the origin is pulled to, (n,)."""
+    if origin is not None:
+        candidates = origin[None]
+    else:
+        candidates = np.vstack([problem.domain.centre, sample_evenly(problem.domain, _PROBES, 0)])
+    pulled = TaskFlow(problem).pull(candidates, x0, 1e-13)
+    reached = np.flatnonzero(pulled.reached)
+    if reached.size == 0:
+        where = "the origin" if origin is not None else "any sample of the domain"
+        raise GrowError(f"the leaf h(q) = {x0.tolist()} cannot be reached from {where}")
+    return np.asarray(pulled.points[reached[0]])
+
+
+def _region(problem: Problem, x0: Array) -> Box:
+    """A box that holds the part of the leaf that the domain is pulled to."""
+    domain = problem.domain
+    whole = (domain.half_width >= np.pi - 1e-9) & turning_joints(problem)
+    if whole.sum() > 1:  # the domain is cut open there, as in [AS2023] Sec. 5.2
+        return Box(domain.centre, domain.half_width)
+    pulled = TaskFlow(problem).pull(sample_evenly(domain, _PROBES, 0), x0)
+    if not pulled.reached.any():
+        raise InvalidValueError("level", x0.tolist(), "a task value that the flow from the domain reaches")
+    low, high = pulled.points[pulled.reached].min(axis=0), pulled.points[pulled.reached].max(axis=0)
+    centre = np.where(whole, domain.centre, (low + high) / 2)
+    return Box(centre, np.where(whole, np.pi, (high - low) / 2 * _MARGIN))

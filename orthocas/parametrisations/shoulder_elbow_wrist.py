@@ -1,0 +1,129 @@
+"""The shoulder-elbow-wrist (SEW) angle of a seven-joint arm: one number for where the elbow is."""
+
+import casadi as ca
+import numpy as np
+
+from orthocas.casadi_tools.batch import dense_function
+from orthocas.checks import require_known
+from orthocas.errors import RobotError
+from orthocas.robots import KinematicTree, Robot
+from orthocas.robots.kinematics import Pose, body_poses
+
+SEW_KINDS = ("conventional", "stereographic")
+
+# (e_t, e_r) in the world. The singular half-line e_t points down into the base; e_r = -x puts psi = 0, not the jump
+# at +-pi, where the arm reaches along +x with its elbow up.
+_DIRECTIONS = {
+    "conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)),
+}
+_MEETING = 1e-5  # axes this close meet [m]
+_PARALLEL = 1e-6  # axes at an angle this small are parallel [rad]
+
+
+def sew_angle(robot: Robot, kind: str) -> ca.Function:
+    """The SEW angle psi(q): how far the elbow is turned about the line from shoulder to wrist.
+
+    S is the point where axes 1, 2 and 3 meet, W the point where axes 5 and 6 meet, E the point of axis 4 nearest to
+    axis 3. With p_SE = E - S, p_SW = W - S and e_SW = p_SW / |p_SW|,
+
+        k_r = (e_SW - e_t) x e_r,  k_x = k_r x p_SW,  psi = atan2(e_SW . (k_x x p_SE), k_x . p_SE):
+
+    the angle about e_SW, right-handed, from the half-plane of k_x to the half-plane of E. Where axis 7 meets W too, a
+    motion that keeps the tip's pose turns E about a fixed line, and psi by as much; elsewhere W moves with the elbow.
+
+    - conventional: e_t = 0, e_r = z, so that k_x is e_r across e_SW: psi = 0 in the vertical plane of S and W with
+      the elbow up. Singular where W is straight above or straight below S: a line, which upright arms reach.
+    - stereographic: e_t = -z, e_r = -x, so that k_x is e_r turned along with e_SW from +z by the shortest way.
+      Singular where W is straight below S only: a half-line, inside the base of an arm that stands upright.
+
+    Both are undefined where S, E and W lie on one line, as in a stretched arm. Near a singularity the gradient grows
+    like 1 / distance; at it psi is arbitrary and its gradient huge or NaN. psi jumps between -pi and pi, its gradient
+    does not.
+
+    Args:
+        robot: a chain of seven revolute joints. Its z axis is the up direction above.
+        kind: one of `SEW_KINDS`.
+
+    Returns:
+        q (7, 1) [rad] -> psi (1, 1) [rad] in [-pi, pi], SX, dense.
+
+    Raises:
+        UnknownNameError: if there is no such kind.
+        RobotError: if the robot is not a chain of seven revolute joints, or its axes are parallel or do not meet in S
+            and W.
+
+    Source:
+        Both angles and where they are singular: [EW2024]. E as the foot of the common normal of axes 3 and 4, e_r = -x
+        and writing the conventional angle as e_t = 0 are our choices.
+    """
+    require_known("SEW angle", kind, SEW_KINDS)
+    _require_seven_revolute(robot.tree)
+    shoulder, elbow, wrist = _heights(robot.tree)
+    q = ca.SX.sym("q", robot.n)
+    poses = body_poses(robot.tree, q)
+    S, E, W = _on_axis(poses[0], shoulder), _on_axis(poses[3], elbow), _on_axis(poses[4], wrist)
+    e_t, e_r = (ca.SX(ca.DM(direction)) for direction in _DIRECTIONS[kind])
+    return dense_function("sew_angle", [q], [_angle(E - S, W - S, e_t, e_r)])
+
+
+def _angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.SX:
+    """Psi of columns (3, 1); atan2 needs no unit k_x."""
+    e_SW = p_SW / ca.norm_2(p_SW)
+    k_r = ca.cross(e_SW - e_t, e_r)
+    k_x = ca.cross(k_r, p_SW)
+    return ca.atan2(ca.dot(e_SW, ca.cross(k_x, p_SE)), ca.dot(k_x, p_SE))
+
+
+def _on_axis(pose: Pose, height: float) -> ca.SX:
+    """The point of a joint's axis (z of its body) at a height above the body's origin, (3, 1) in the world."""
+    R, p = pose
+    return p + R[:, 2] * height
+
+
+def _heights(tree: KinematicTree) -> tuple[float, float, float]:
+    """Heights [m] of S on axis 1, of E on axis 4 and of W on axis 5, above the origins of bodies 1, 4 and 5.
+
+    What neighbouring axes share does not depend on q, so that no posture is needed: S stays in the base and in bodies
+    1 to 3, E in bodies 3 and 4, W in bodies 4 to 6.
+    """
+    names = tree.joint_names
+    shoulder, on_2, gap_12 = _common_normal(tree, 0)
+    also_on_2, _, gap_23 = _common_normal(tree, 1)
+    _, elbow, _ = _common_normal(tree, 2)
+    wrist, _, gap_56 = _common_normal(tree, 4)
+    for first, gap in ((0, gap_12), (1, gap_23), (4, gap_56)):
+        if gap > _MEETING:
+            raise RobotError(
+                f"the axes of joints '{names[first]}' and '{names[first + 1]}' are {gap:.3g} m apart, "
+                f"expected axes that meet within {_MEETING:g} m"
+            )
+    if abs(on_2 - also_on_2) > _MEETING:
+        raise RobotError(
+            f"the axes of joints '{names[0]}' and '{names[2]}' meet that of '{names[1]}' in points "
+            f"{abs(on_2 - also_on_2):.3g} m apart, expected one point within {_MEETING:g} m"
+        )
+    return shoulder, elbow, wrist
+
+
+def _common_normal(tree: KinematicTree, i: int) -> tuple[float, float, float]:
+    """Ends of the common normal of axes i and i + 1, as heights on each, and its length [m]."""
+    origin, axis = tree.translations[i + 1], tree.rotations[i + 1][:, 2]  # of joint i + 1 in body i, whose axis is z
+    across = axis[:2]
+    if np.linalg.norm(across) < _PARALLEL:
+        names = tree.joint_names
+        raise RobotError(f"the axes of joints '{names[i]}' and '{names[i + 1]}' are parallel, expected an angle")
+    height = -float(origin[:2] @ across) / float(across @ across)
+    end = origin + height * axis
+    return float(end[2]), height, float(np.linalg.norm(end[:2]))
+
+
+def _require_seven_revolute(tree: KinematicTree) -> None:
+    """Raise RobotError unless the tree is a chain of seven revolute joints."""
+    if tree.n != 7:
+        raise RobotError(f"the robot has {tree.n} joints, expected 7 for a shoulder-elbow-wrist angle")
+    for i, name in enumerate(tree.joint_names):
+        if tree.joint_kinds[i] != "revolute":
+            raise RobotError(f"joint '{name}' is {tree.joint_kinds[i]}, expected 7 revolute joints")
+        if tree.parents[i] != i - 1:
+            raise RobotError(f"joint '{name}' does not follow joint '{tree.joint_names[i - 1]}', expected a chain")

@@ -1,0 +1,285 @@
+"""Grids of fits: every cell reported, failures apart, tables and pictures that hold what was measured."""
+
+import csv
+import json
+import math
+import multiprocessing
+import os
+import shutil
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas import solvers
+from orthocas.casadi_tools import batch
+from orthocas.comparing import cells
+from orthocas.comparing.cells import Cell, CellResult, run_cell, run_cells
+from orthocas.comparing.figures import convergence_figure, front_figure
+from orthocas.comparing.report import Comparison
+from orthocas.errors import ChartFileError, InvalidValueError
+from orthocas.fitting.loss import Weights
+from orthocas.minimising.watch import Progress
+
+QUICK: dict[str, Any] = {"samples": 150, "held_out": 500}
+
+
+class Kills:
+    """A parametrisation that ends its process, as running out of memory does."""
+
+    label = "kills"
+
+    def family(self, space: object, outputs: int) -> object:
+        os._exit(3)
+
+
+class Breaks:
+    """A parametrisation with a defect of its own."""
+
+    label = "breaks"
+
+    def family(self, space: object, outputs: int) -> object:
+        raise KeyError("a defect")
+
+
+class InThisThread(Executor):
+    """The smallest executor there is."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+@pytest.fixture(scope="module")
+def grid(planar_x: oc.Problem, tmp_path_factory: pytest.TempPathFactory) -> tuple[Comparison, Path]:
+    folder = tmp_path_factory.mktemp("charts")
+    found = oc.compare(
+        planar_x,
+        [oc.Linear(), oc.Polynomial(2), oc.MLP((4,))],
+        [solvers.GaussNewton(), solvers.LBFGS(max_iterations=20)],
+        seeds=2,
+        executor=InThisThread(),
+        charts=folder,
+        **QUICK,
+    )
+    return found, folder
+
+
+def test_grid_holds_every_cell_once_and_in_order(grid: tuple[Comparison, Path]) -> None:
+    found, _ = grid
+    cells = [(r.parametrisation, r.solver, r.seed) for r in found.results]
+    assert cells == [
+        ("linear", "closed form", 0),
+        *(("polynomial:2", name, seed) for name in ("gauss_newton", "lbfgs") for seed in (0, 1)),
+        *(("mlp:4", name, seed) for name in ("gauss_newton", "lbfgs") for seed in (0, 1)),
+    ]
+
+
+def test_failing_cells_are_reported_and_the_others_go_on(grid: tuple[Comparison, Path]) -> None:
+    found, _ = grid
+    failed = [r for r in found.results if r.failed]
+    assert {(r.parametrisation, r.solver) for r in failed} == {("mlp:4", "gauss_newton")}
+    assert all("expected lbfgs or adam" in r.error and math.isnan(r.task_std_deg) for r in failed)
+    assert not found.interrupted
+
+
+def test_results_are_those_of_the_saved_charts(grid: tuple[Comparison, Path]) -> None:
+    found, folder = grid
+    result = next(r for r in found.results if r.solver == "lbfgs" and r.seed == 1)
+    chart = oc.load(folder / "polynomial-2_lbfgs_1.orthocas")
+    report = oc.evaluate(chart, 500, cells.HELD_OUT_SEED)
+    assert result.task_std_deg == report.task_angle.std
+    assert result.mutual_std_deg == report.mutual_angle.std
+    assert result.conditioning_p01 == report.conditioning.p01
+    assert result.parameters == chart.coordinates.theta.size
+    assert len(list(folder.iterdir())) == 7
+
+
+def test_history_falls_and_ends_before_the_fit_does(grid: tuple[Comparison, Path]) -> None:
+    for result in grid[0].results:
+        if result.solver == "lbfgs":
+            seconds, losses = zip(*result.history, strict=True)
+            assert list(seconds) == sorted(seconds)
+            assert seconds[-1] <= result.seconds
+            assert list(losses) == sorted(losses, reverse=True)
+            assert len(losses) == result.iterations
+
+
+def test_summaries_are_medians_and_spreads_over_seeds(grid: tuple[Comparison, Path]) -> None:
+    found, _ = grid
+    first, *_, last = found.summaries()
+    own = [
+        r.task_std_deg for r in found.results if (r.parametrisation, r.solver) == (first.parametrisation, first.solver)
+    ]
+    assert first.task_std_deg == pytest.approx(np.median(own))
+    assert first.task_spread == pytest.approx((max(own) - min(own)) / np.median(own))
+    assert first.task_std_deg == min(s.task_std_deg for s in found.summaries() if not s.failed)
+    assert (last.failed, last.seeds) == (2, 2)
+    rows = found.rows()
+    assert rows[-1][2].startswith("failed: InvalidValueError")
+    assert "±" in rows[1][3]
+
+
+def test_control_ticks_are_measured_once_a_parametrisation(planar_x: oc.Problem, tmp_path: Path) -> None:
+    """Failed fits have none."""
+    lbfgs = solvers.LBFGS(max_iterations=5)
+    parametrisations = [oc.Linear(), oc.MLP((4,)), Breaks()]
+    places: dict[str, Any] = {"executor": InThisThread(), "charts": tmp_path, "control_ticks": True}
+    found = oc.compare(planar_x, parametrisations, [lbfgs], seeds=2, **places, **QUICK)
+    with pytest.raises(InvalidValueError, match="a folder for charts"):
+        oc.compare(planar_x, parametrisations, control_ticks=True)
+    ticks = {r.parametrisation: r.control_tick_us for r in found.results}
+    assert math.isnan(ticks.pop("breaks"))
+    if shutil.which("cc") is None:
+        assert all(math.isnan(tick) for tick in ticks.values())
+        pytest.skip("no C compiler")
+    assert all(tick > 0 for tick in ticks.values())
+    for result in found.results:
+        assert result.failed or result.control_tick_us == ticks[result.parametrisation]
+    table = found.rows()
+    assert table[0][-1] == "control tick"
+    assert [row[-1].endswith(" us") for row in table[1:]] == [True, True, False]
+
+
+def test_ticks_are_left_out_without_a_compiler(
+    planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    places: dict[str, Any] = {"executor": InThisThread(), "charts": tmp_path, "control_ticks": True}
+    found = oc.compare(planar_x, [oc.Linear()], **places, **QUICK)
+    assert math.isnan(found.results[0].control_tick_us)
+    assert found.rows()[1][-1] == "-"
+
+
+def test_files_hold_the_same_numbers(grid: tuple[Comparison, Path], tmp_path: Path) -> None:
+    found, _ = grid
+    found.write(tmp_path)
+    with (tmp_path / "comparison.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    data = json.loads((tmp_path / "comparison.json").read_text())
+    assert len(lines) == len(data["fits"]) == len(found.results)
+    for line, entry, result in zip(lines, data["fits"], found.results, strict=True):
+        assert line["solver"] == entry["solver"] == result.solver
+        if not result.failed:
+            assert float(line["task_std_deg"]) == entry["task_std_deg"] == result.task_std_deg
+        else:
+            assert entry["task_std_deg"] is None
+
+
+def test_pictures_show_every_good_fit(grid: tuple[Comparison, Path]) -> None:
+    found, _ = grid
+    (axes,) = front_figure(found).axes
+    drawn = np.array([collection.get_offsets()[0] for collection in axes.collections])
+    good = [(r.task_std_deg, r.mutual_std_deg) for r in found.results if not r.failed]
+    np.testing.assert_allclose(drawn, good)
+    (axes,) = convergence_figure(found).axes
+    curves = [line.get_xydata() for line in axes.lines if len(line.get_xydata()) > 1]
+    wanted = [r.history for r in found.results if len(r.history) > 1]
+    assert len(curves) == len(wanted)
+
+
+def test_front_of_one_coordinate_shows_the_conditioning(planar_xy: oc.Problem) -> None:
+    found = oc.compare(planar_xy, [oc.Linear(), oc.Polynomial(2)], executor=InThisThread(), **QUICK)
+    (axes,) = front_figure(found).axes
+    assert "conditioning" in axes.get_ylabel()
+    heights = [collection.get_offsets()[0][1] for collection in axes.collections]
+    np.testing.assert_allclose(heights, [r.conditioning_p01 for r in found.results])
+
+
+def test_process_that_dies_fails_alone(planar_x: oc.Problem) -> None:
+    told: list[Progress] = []
+    found = oc.compare(
+        planar_x, [oc.Polynomial(1), Kills(), Breaks(), oc.Polynomial(2)], jobs=2, monitor=told.append, **QUICK
+    )
+    by_label = {r.parametrisation: r for r in found.results}
+    assert by_label["kills"].error.startswith("its process died: out of memory, or")
+    assert by_label["breaks"].error == "KeyError: 'a defect'"
+    assert not by_label["polynomial:1"].failed
+    assert not by_label["polynomial:2"].failed
+    assert [round(p.fraction, 2) for p in told] == [0.25, 0.5, 0.75, 1.0]
+
+
+def test_processes_use_one_thread_each_and_leave_the_environment_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    with cells.single_threaded():
+        assert os.environ["OMP_NUM_THREADS"] == "1"
+        assert batch._threads() == 1
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    with cells.single_threaded():
+        pass
+    assert "OMP_NUM_THREADS" not in os.environ
+
+
+def test_any_executor_does(planar_x: oc.Problem) -> None:
+    with ThreadPoolExecutor(2) as pool:
+        found = oc.compare(planar_x, [oc.Polynomial(1), oc.Polynomial(2)], executor=pool, **QUICK)
+    assert [r.failed for r in found.results] == [False, False]
+
+
+def test_executor_that_loses_a_cell_is_reported(planar_x: oc.Problem) -> None:
+    class Loses(InThisThread):
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            future: Future[Any] = Future()
+            future.set_exception(ConnectionError("worker is gone"))
+            return future
+
+    (result,) = oc.compare(planar_x, [oc.Polynomial(1)], executor=Loses(), **QUICK).results
+    assert result.error == "ConnectionError: worker is gone"
+
+
+def test_ctrl_c_returns_what_is_done(planar_x: oc.Problem) -> None:
+    def press(progress: Progress) -> None:
+        if progress.fraction > 0.5:
+            raise KeyboardInterrupt
+
+    found = oc.compare(planar_x, [oc.Linear(), oc.Polynomial(1)], executor=InThisThread(), monitor=press, **QUICK)
+    assert found.interrupted
+    assert len(found.results) == 1
+
+
+def test_same_cell_same_result(planar_x: oc.Problem) -> None:
+    cell = Cell(planar_x, oc.Polynomial(2), solvers.GaussNewton(), 3, Weights(1000.0, 30.0), 150, 500, None)
+    first, second = (replace(r, seconds=0.0, history=()) for r in run_cells([cell, cell], InThisThread()))
+    assert first == second
+    assert isinstance(run_cell(cell), CellResult)
+
+
+def test_ctrl_c_stops_running_processes_too(planar_x: oc.Problem) -> None:
+    """Fits that would take minutes end at their next step, and none is started."""
+
+    def press(progress: Progress) -> None:
+        raise KeyboardInterrupt
+
+    slow = solvers.Adam(epochs=2000, steps=50)
+    start = time.monotonic()
+    networks = [oc.MLP((8, 8)), oc.MLP((9, 9)), oc.MLP((10, 10)), oc.MLP((11, 11))]
+    found = oc.compare(planar_x, [oc.Linear(), *networks], [slow], jobs=2, monitor=press, **QUICK)
+    assert found.interrupted
+    while multiprocessing.active_children() and time.monotonic() - start < 60:
+        time.sleep(0.1)
+    assert time.monotonic() - start < 60  # a single network would take longer
+
+
+def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
+    for grid, message in (
+        ({"parametrisations": []}, "parametrisations is empty"),
+        ({"parametrisations": ["polynomial:2"]}, "parametrisations is 'polynomial:2', expected objects such as"),
+        ({"parametrisations": [oc.Linear(), oc.Linear((0.6, 0.8, 0.8))]}, "two called 'linear'"),
+        ({"solvers": []}, "solvers is empty"),
+        ({"solvers": [solvers.LBFGS(), solvers.LBFGS(memory=5)]}, "two called 'lbfgs'"),
+    ):
+        with pytest.raises(InvalidValueError, match=message):
+            oc.compare(planar_x, **{"parametrisations": [oc.Linear()], **grid})
+    with pytest.raises(ChartFileError, match="folder missing does not exist"):
+        oc.compare(planar_x, [oc.Linear()], charts="missing")
+    for settings in ({"seeds": 0}, {"jobs": 0}, {"held_out": 0}, {"weights": (0.0, 1.0)}):
+        with pytest.raises(InvalidValueError):
+            oc.compare(planar_x, [oc.Linear()], **settings)
