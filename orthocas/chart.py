@@ -62,7 +62,7 @@ class Chart:
 
     def runnable(self, graph: ca.Function) -> ca.Function:
         """A graph of this chart's functions in the form that runs fast: scalar code, or as it is with networks."""
-        matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.family.as_matrices
+        matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.as_matrices
         return graph if matrices else scalar_code(graph)
 
     def xi(self, q: ArrayLike) -> Array:

@@ -10,6 +10,10 @@ class OrthocasError(Exception):
     """Base of every error raised on purpose."""
 
 
+class NotSavableWarning(UserWarning):
+    """Coordinates that are about to be fitted cannot be saved in a chart file."""
+
+
 class ShapeError(OrthocasError, ValueError):
     """An array has the wrong shape."""
 

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from orthocas.problems.iiwa import urdf_path
 from scipy.linalg import block_diag, sqrtm
 
 import orthocas as oc
@@ -32,6 +31,7 @@ from orthocas.errors import (
     UnknownNameError,
     UnreachableReferenceError,
 )
+from orthocas.problems.iiwa import urdf_path
 
 RNG = np.random.default_rng(21)
 

@@ -10,7 +10,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import robot_data
-from orthocas.problems.iiwa import urdf_path
 from scipy.integrate import solve_ivp
 from scipy.linalg import inv, sqrtm
 
@@ -21,6 +20,7 @@ from orthocas.checks import Array
 from orthocas.cli import main
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
+from orthocas.problems.iiwa import urdf_path
 
 BOX = oc.Box([0.6, 0.8, 0.8], 0.3)
 

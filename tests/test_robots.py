@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import ROBOTS, arm, pinocchio_position, robot_data
-from orthocas.problems.iiwa import robot as iiwa_robot
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, RobotError, ShapeError, UnknownNameError
+from orthocas.problems.iiwa import robot as iiwa_robot
 from orthocas.robots.planar import planar_model
 
 

@@ -4,11 +4,11 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from orthocas.problems.iiwa import robot as iiwa_robot
 
 import orthocas as oc
 from orthocas.casadi_tools.tape import from_tape, to_tape
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
+from orthocas.problems.iiwa import robot as iiwa_robot
 
 Q = np.array([0.3, 0.7, -0.4, -1.0, 0.5, 0.9, 0.2])
 

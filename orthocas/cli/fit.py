@@ -22,13 +22,13 @@ from orthocas.errors import ChartFileError, InvalidValueError
 from orthocas.files.atomic import require_writable
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
-from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers
+from orthocas.fitting.loss import DEFAULT_WEIGHTS, Weights
 from orthocas.minimising.solver import Status
 from orthocas.parametrisations import parse_parametrisation
 from orthocas.quality import Report, evaluate
 from orthocas.solvers import get as get_solver
 
-WEIGHTS_TEXT = ",".join(f"{value:g}" for value in DEFAULT_WEIGHTS)
+WEIGHTS_TEXT = f"{DEFAULT_WEIGHTS.task:g},{DEFAULT_WEIGHTS.mutual:g},{DEFAULT_WEIGHTS.regularity:g}"
 
 
 def fit(
@@ -97,16 +97,12 @@ def fit(
         raise typer.Exit(130)
 
 
-def parse_weights(text: str) -> WeightNumbers:
+def parse_weights(text: str) -> Weights:
     """Read "1000,30", "1000,30,150" or "1000,30,150,0.01"."""
-    match parse_numbers("--weights", text).tolist():
-        case [task, mutual]:
-            return task, mutual
-        case [task, mutual, regularity]:
-            return task, mutual, regularity
-        case [task, mutual, regularity, length]:
-            return task, mutual, regularity, length
-    raise InvalidValueError("--weights", repr(text), "two to four numbers")
+    numbers = parse_numbers("--weights", text).tolist()
+    if not 2 <= len(numbers) <= 4:
+        raise InvalidValueError("--weights", repr(text), "two to four numbers")
+    return Weights.of(numbers)
 
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:

@@ -12,18 +12,18 @@ from orthocas.comparing.report import Comparison
 from orthocas.comparing.ticks import with_control_ticks
 from orthocas.errors import ChartFileError, InvalidValueError
 from orthocas.files.atomic import require_writable
-from orthocas.fitting.fit import default_solver
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers, Weights
+from orthocas.fitting.settings import default_solver
 from orthocas.minimising.solver import Solver
 from orthocas.minimising.watch import Monitor, silent
-from orthocas.parametrisations import SEW, Given, Linear, Parametrisation
+from orthocas.parametrisations import Parametrisation, require_savable
 from orthocas.problem import Problem
 from orthocas.solvers import GaussNewton
 
 
 def compare(
     problem: Problem,
-    parametrisations: Sequence[Parametrisation | SEW],
+    parametrisations: Sequence[Parametrisation],
     solvers: Sequence[Solver] | None = None,
     *,
     seeds: int = 1,
@@ -70,6 +70,8 @@ def compare(
     folder = None if charts is None else Path(charts)
     if folder is not None:
         require_writable(folder / "chart", ChartFileError)
+        for parametrisation in parametrisations:
+            require_savable(parametrisation.for_problem(problem))
     elif control_ticks:
         raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
     cells = [
@@ -80,11 +82,14 @@ def compare(
 
 
 def _fits(
-    parametrisations: Sequence[Parametrisation | SEW], solvers: Sequence[Solver] | None, seeds: int, folder: Path | None
-) -> Iterator[tuple[Parametrisation | SEW, Solver, int, Path | None]]:
+    parametrisations: Sequence[Parametrisation],
+    solvers: Sequence[Solver] | None,
+    seeds: int,
+    folder: Path | None,
+) -> Iterator[tuple[Parametrisation, Solver, int, Path | None]]:
     """Parametrisation, solver, seed and chart file of every fit of a grid."""
     for parametrisation in parametrisations:
-        closed = isinstance(parametrisation, Linear | Given | SEW)
+        closed = parametrisation.closed_form is not None
         fitting = [default_solver(parametrisation)] if closed or solvers is None else solvers
         for solver, seed in product(fitting, range(1 if closed else seeds)):
             name = re.sub(r"[^\w.-]", "-", f"{parametrisation.label}_{solver.name}_{seed}.orthocas")
@@ -108,10 +113,10 @@ def _run_grid(
     return Comparison(tuple(results), interrupted)
 
 
-def _require_grid(parametrisations: Sequence[Parametrisation | SEW], solvers: Sequence[Solver] | None) -> None:
+def _require_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence[Solver] | None) -> None:
     """Refuse grids that are empty, hold something else, or whose results could not be told apart."""
     for name, members, kinds, example in (
-        ("parametrisations", parametrisations, Parametrisation | SEW, "Polynomial(degree=4)"),
+        ("parametrisations", parametrisations, Parametrisation, "Polynomial(degree=4)"),
         ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
     ):
         if not members:

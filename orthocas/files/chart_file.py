@@ -10,14 +10,14 @@ import numpy as np
 
 from orthocas.casadi_tools.tape import from_tape, to_tape
 from orthocas.checks import Array, require_count, require_known
-from orthocas.coordinates.fitted import Coordinates, joint_space
+from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.domains import Box, Domain, Torus
 from orthocas.errors import ChartFileError, OrthocasError
 from orthocas.files.archive import Kind, read_archive, write_archive
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
-from orthocas.parametrisations import parametrisation_from_data, parametrisation_to_data
+from orthocas.parametrisations import JointSpace, parametrisation_from_data, parametrisation_to_data
 from orthocas.problem import Problem
 from orthocas.robots import KinematicTree, Robot
 from orthocas.tasks import Task
@@ -91,7 +91,7 @@ def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str,
         return GrownCoordinates(problem, leaf_from_arrays(problem, data["leaf"], own))
     return Coordinates(
         parametrisation_from_data(data),
-        joint_space(problem),
+        JointSpace.of(problem),
         _idle(data["idle"], problem.n),
         arrays["theta"],
         arrays["offset"],
