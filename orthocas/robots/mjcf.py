@@ -16,6 +16,7 @@ from orthocas.robots.xml_files import MOST_LINKS
 from orthocas.robots.xml_values import Attributes
 
 _GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2] where <option> has none
+_LEAST_TOTAL = 1e-15  # [kg], MuJoCo's
 _SEEN = ("camera", "light")  # seen in pictures only
 _READ = ("inertial", "joint", "freejoint", "geom", "site", "body")
 
@@ -23,8 +24,9 @@ _READ = ("inertial", "joint", "freejoint", "geom", "site", "body")
 def model_from_mjcf(path: str | Path) -> pin.Model:
     """Read the kinematics, masses, armatures, joint limits and gravity of an MJCF file.
 
-    The model has one frame per body and one per named site; where they share a name, `frame_index` takes the body.
-    Bodies and joints without a name are called body<i> and joint<i>, with MuJoCo's indices i.
+    The model has a frame for every body, named site and joint; where they share a name, `frame_index` takes the body
+    before the site and the site before the joint. Bodies and joints without a name are called body<i> and joint<i>,
+    with MuJoCo's indices i.
 
     The mass matrix and the bias are MuJoCo's (qM and qfrc_bias). What MuJoCo adds to them as passive or constraint
     forces is not part of a `Robot`: springs, damping, friction, gravity compensation (gravcomp), fluids, actuators,
@@ -93,7 +95,7 @@ class _Builder:
             self._add_sites(parts, 0, pin.SE3.Identity(), "world")
             self._add_bodies(parts, 0, pin.SE3.Identity())
         total = sum(inertia.mass for _, _, inertia in self._masses)
-        scale = self._rules.total / total if self._rules.total > 0 and total > 0 else 1.0
+        scale = self._rules.total / max(total, _LEAST_TOTAL) if self._rules.total > 0 else 1.0
         for joint, placement, inertia in self._masses:
             scaled = pin.Inertia(scale * inertia.mass, inertia.lever, scale * inertia.inertia)
             self._model.appendBodyToJoint(joint, scaled, placement)
@@ -118,7 +120,8 @@ class _Builder:
                 joint, placement = self._add_joint(child, joint, placement, name)
         self._model.addFrame(pin.Frame(name, joint, placement, pin.FrameType.BODY))
         self._add_sites(parts, joint, placement, name)
-        self._masses.append((joint, placement, self._inertia(body, parts, name)))
+        if joint or self._rules.total > 0:  # what is fixed to the world weighs on no joint
+            self._masses.append((joint, placement, self._inertia(body, parts, name)))
         self._add_bodies(parts, joint, placement)
 
     def _parts(self, parent: Element, frame: pin.SE3, childclass: str, body: str) -> Iterator[_Part]:
@@ -154,6 +157,7 @@ class _Builder:
                 index = self._model.addJoint(parent, pin.JointModelSpherical(), placement * anchor, name)
             else:
                 index = self._add_axis(joint, kind, part.frame.rotation, parent, placement * anchor, name)
+        self._model.addJointFrame(index)
         first = self._model.joints[index].idx_v
         self._model.armature[first : first + self._model.joints[index].nv] = armature
         return index, anchor.inverse()

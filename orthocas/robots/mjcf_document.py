@@ -43,16 +43,14 @@ class Document:
     def settings(self, path: str) -> Attributes:
         """What a global element such as compiler or option/flag says, a later one over an earlier one."""
         found = self._root.findall(path)
-        values = {name: value for element in found for name, value in self._own(element).items()}
+        values = {name: value for element in found for name, value in _own(element, self.label(element)).items()}
         return Attributes(str(self._main), f"<{path.rsplit('/', maxsplit=1)[-1]}>", values)
 
     def label(self, element: Element, body: str | None = None) -> Attributes:
         """An element's own attributes, under the name that messages use."""
-        if "name" in element.attrib:
-            name = f"<{element.tag} name='{element.get('name')}'>"
-        else:
-            name = f"<{element.tag}>" + (f" of body '{body}'" if body else "")
-        return Attributes(self._files[element], name, element.attrib)
+        shown = [f" {key}='{element.attrib[key][:80]}'" for key in ("name", "class") if key in element.attrib]
+        inside = f" of body '{body[:80]}'" if body else ""
+        return Attributes(self._files[element], f"<{element.tag}{''.join(shown[:1])}>{inside}", element.attrib)
 
     def attributes(self, element: Element, childclass: str = MAIN, body: str | None = None) -> Attributes:
         """An element's attributes over those of its default class, which is the one it names or childclass.
@@ -62,7 +60,7 @@ class Document:
         """
         label = self.label(element, body)
         name = self.known_class(element.get("class", childclass), label)
-        values = _over(self._classes[name].get(element.tag, {}), self._own(element))
+        values = _over(self._classes[name].get(element.tag, {}), _own(element, label))
         return Attributes(label.file, label.element, values)
 
     def known_class(self, name: str, label: Attributes) -> str:
@@ -104,27 +102,28 @@ class Document:
         self._included.add(path.resolve())
         return self._read(path, None, depth + 1)
 
-    def _own(self, element: Element) -> dict[str, str]:
-        """An element's attributes, all of them known."""
-        for name in element.attrib:
-            if name not in KNOWN.get(element.tag, element.attrib):
-                raise self.label(element).error(f"has an attribute '{name}' that orthocas does not know")
-        if sum(name in element.attrib for name in ORIENTATIONS) > 1:
-            raise self.label(element).error(f"has several orientations, expected one of {', '.join(ORIENTATIONS)}")
-        return dict(element.attrib)
-
     def _define(self, section: Element, name: str, inherited: _Settings) -> None:
         """Take in a default class, then the classes inside it."""
         settings = {tag: dict(values) for tag, values in inherited.items()}
         for child in section:
             if child.tag != "default":
-                settings[child.tag] = _over(settings.get(child.tag, {}), self._own(child))
+                settings[child.tag] = _over(settings.get(child.tag, {}), _own(child, self.label(child)))
         self._classes[name] = settings
         for child in section.findall("default"):
             inner = self.label(child).text("class")
             if inner in self._classes:
                 raise self.label(child).error(f"defines class '{inner}' a second time")
             self._define(child, inner, settings)
+
+
+def _own(element: Element, label: Attributes) -> dict[str, str]:
+    """An element's attributes, all of them known."""
+    for name in element.attrib:
+        if name not in KNOWN.get(element.tag, element.attrib):
+            raise label.error(f"has an attribute '{name}' that orthocas does not know")
+    if sum(name in element.attrib for name in ORIENTATIONS) > 1:
+        raise label.error(f"has several orientations, expected one of {', '.join(ORIENTATIONS)}")
+    return dict(element.attrib)
 
 
 def _over(inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:

@@ -15,6 +15,7 @@ Placed = tuple[pin.SE3, Attributes]  # an element, and the pose in the body of t
 _SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
 _MASSLESS = ("plane", "hfield")
 _FROM_FILE = ("mesh", "sdf")
+_ROUNDING = 1e-10  # relative, of moments of inertia
 _DENSITY = 1000.0  # [kg/m^3] where a geom has neither mass nor density
 
 
@@ -78,9 +79,14 @@ def _given_inertia(element: Attributes, angles: Angles) -> pin.Inertia:
     if ("diaginertia" in element.values) == ("fullinertia" in element.values):
         raise element.error("needs either diaginertia or fullinertia")
     if "diaginertia" in element.values:
-        return placement.act(pin.Inertia(mass, np.zeros(3), np.diag(element.numbers("diaginertia", 3))))
-    xx, yy, zz, xy, xz, yz = element.numbers("fullinertia", 6)
-    return placement.act(pin.Inertia(mass, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])))
+        matrix = np.diag(element.numbers("diaginertia", 3))
+    else:
+        xx, yy, zz, xy, xz, yz = element.numbers("fullinertia", 6)
+        matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    moments = np.asarray(np.linalg.eigvalsh(matrix), dtype=np.float64)
+    if moments[0] < -_ROUNDING * moments[2]:
+        raise element.error(f"has principal moments of inertia {_listed(moments)}, expected numbers >= 0")
+    return placement.act(pin.Inertia(mass, np.zeros(3), matrix))
 
 
 def _geom_inertia(geom: Attributes, rules: MassRules, angles: Angles) -> pin.Inertia:
@@ -108,7 +114,7 @@ def _sizes(geom: Attributes, kind: str, half_length: float | None) -> Array:
     words = geom.text("size", "").split()
     wanted = _SIZES[kind] if half_length is None else 1
     if not wanted <= len(words) <= 3:
-        raise geom.error(f"has size '{' '.join(words)[:80]}', expected {wanted} to 3 numbers")
+        raise geom.error(f"has size '{' '.join(words)[:80]}', expected {wanted} numbers for a {kind}")
     sizes = geom.numbers("size", len(words))[:wanted]
     if half_length is not None:  # equal across, and as long as the two points are apart
         sizes = np.append(np.repeat(sizes, _SIZES[kind] - 1), half_length)
@@ -145,10 +151,7 @@ def _bounded(body: Attributes, inertia: pin.Inertia, rules: MassRules) -> pin.In
     """The inertia after the compiler's bounds; it must be one that a body can have."""
     moments, axes = np.linalg.eigh(inertia.inertia)
     bounded = np.maximum(moments, rules.least_inertia)
-    slack = 1e-10 * abs(bounded).max()
-    if bounded[0] < -slack:
-        raise body.error(f"has principal moments of inertia {_listed(bounded)}, expected numbers >= 0")
-    if bounded[0] + bounded[1] < bounded[2] - slack:
+    if bounded[0] + bounded[1] < (1 - _ROUNDING) * bounded[2]:
         if not rules.balance:
             raise body.error(
                 f"has principal moments of inertia {_listed(bounded)}, expected none above the sum of the others"

@@ -11,6 +11,8 @@ MOST_ELEMENTS = 200_000  #: elements of a file, and of a file with all that it i
 MOST_DEPTH = 200  #: elements inside one another
 MOST_LINKS = 1000  #: links (URDF) or bodies (MJCF) of a robot
 
+_ARTICLE = {"URDF": "a", "MJCF": "an"}
+
 
 def read_xml(path: str | Path, kind: str, tag: str | None = None) -> ElementTree.Element:
     """The root element of an XML file.
@@ -31,9 +33,11 @@ def read_xml(path: str | Path, kind: str, tag: str | None = None) -> ElementTree
     except OSError as error:
         raise RobotError(f"cannot read {kind} file {path}: {error.strerror}") from None
     except (ElementTree.ParseError, LookupError, ValueError) as error:  # LookupError: an unknown encoding
-        raise RobotError(f"{path} is not a {kind} file: {error}") from None
+        raise RobotError(f"{path} is not {_ARTICLE[kind]} {kind} file: {error}") from None
     if tag is not None and root.tag != tag:
-        raise RobotError(f"{path} is not a {kind} file: its root element is <{root.tag}>, expected <{tag}>")
+        raise RobotError(
+            f"{path} is not {_ARTICLE[kind]} {kind} file: its root element is <{root.tag}>, expected <{tag}>"
+        )
     return root
 
 

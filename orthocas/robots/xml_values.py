@@ -1,4 +1,4 @@
-"""Attributes of XML elements, read strictly: a vector has its length, a number is finite, a keyword is known."""
+"""Attributes of XML elements, read strictly: a vector has its length, a number is not absurd, a keyword is known."""
 
 import re
 from collections.abc import Collection, Mapping
@@ -10,6 +10,7 @@ from orthocas.checks import Array
 from orthocas.errors import RobotError
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_LARGEST = 1e20  # no length, mass or angle is larger, and no volume overflows
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class Attributes:
         return self.keyword(name, ("true", "false"), "true" if default else "false") == "true"
 
     def number(self, name: str, default: float | None = None) -> float:
-        """An attribute that is one finite number.
+        """An attribute that is one number.
 
         Raises:
             RobotError: if it is something else, or missing without a default.
@@ -59,7 +60,7 @@ class Attributes:
         return float(self.numbers(name, 1, None if default is None else [default])[0])
 
     def numbers(self, name: str, count: int, default: Collection[float] | None = None) -> Array:
-        """An attribute that is a vector of count finite numbers, (count,).
+        """An attribute that is a vector of count numbers, (count,).
 
         Raises:
             RobotError: if it is something else, or missing without a default.
@@ -71,8 +72,8 @@ class Attributes:
         if len(words) != count or not all(_NUMBER.fullmatch(word) for word in words):
             raise self._unfit(name, expected)
         values = np.array([float(word) for word in words])
-        if not np.isfinite(values).all():
-            raise self._unfit(name, f"{expected} in the range of floating-point numbers")
+        if not (abs(values) <= _LARGEST).all():
+            raise self._unfit(name, f"{expected} up to {_LARGEST:g}")
         return values
 
     def direction(self, name: str, default: Collection[float] | None = None) -> Array:
