@@ -1,11 +1,11 @@
 """An MJCF file as one tree: what it includes is put in place, and what its default classes say is filled in."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from orthocas.errors import RobotError
-from orthocas.robots.mjcf_schema import KNOWN, ORIENTATIONS
+from orthocas.robots.mjcf_schema import DEFAULTS, KNOWN, ORIENTATIONS, SECTIONS
 from orthocas.robots.xml_files import MOST_DEPTH, MOST_ELEMENTS, read_xml
 from orthocas.robots.xml_values import Attributes
 
@@ -30,6 +30,7 @@ class Document:
         self._included = {self._main.resolve()}
         self._classes: dict[str, _Settings] = {MAIN: {}}
         self._root = self._read(self._main, "mujoco", 1)
+        self._require_names(self._root, SECTIONS)
         for section in self.sections("default"):
             name = section.get("class", MAIN)
             if name != MAIN:
@@ -73,6 +74,11 @@ class Document:
             raise label.error(f"is of class '{name}', known: {', '.join(self._classes)}")
         return name
 
+    def _require_names(self, parent: Element, known: Collection[str]) -> None:
+        for element in parent:
+            if element.tag not in known:
+                raise self.label(element).error(f"is an element that orthocas does not know in <{parent.tag}>")
+
     def _read(self, path: Path, tag: str | None, depth: int) -> Element:
         root = read_xml(path, "MJCF", tag)
         self._files |= dict.fromkeys(root.iter(), str(path))
@@ -104,6 +110,7 @@ class Document:
 
     def _define(self, section: Element, name: str, inherited: _Settings) -> None:
         """Take in a default class, then the classes inside it."""
+        self._require_names(section, DEFAULTS)
         settings = {tag: dict(values) for tag, values in inherited.items()}
         for child in section:
             if child.tag != "default":

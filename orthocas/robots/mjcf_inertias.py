@@ -8,6 +8,7 @@ import pinocchio as pin
 
 from orthocas.checks import Array
 from orthocas.robots.mjcf_poses import Angles, pose, shape_pose
+from orthocas.robots.mjcf_schema import ORIENTATIONS
 from orthocas.robots.xml_values import Attributes
 
 Placed = tuple[pin.SE3, Attributes]  # an element, and the pose in the body of the frame around it
@@ -78,6 +79,8 @@ def _given_inertia(element: Attributes, angles: Angles) -> pin.Inertia:
     placement = pose(element, angles)
     if ("diaginertia" in element.values) == ("fullinertia" in element.values):
         raise element.error("needs either diaginertia or fullinertia")
+    if "fullinertia" in element.values and any(name in element.values for name in ORIENTATIONS):
+        raise element.error("has both fullinertia and an orientation, expected one of them")
     if "diaginertia" in element.values:
         matrix = np.diag(element.numbers("diaginertia", 3))
     else:

@@ -10,6 +10,18 @@ def _words(text: str) -> set[str]:
     return set(text.split())
 
 
+#: Elements right below the root.
+SECTIONS = _words(
+    """asset compiler contact custom default deformable equality actuator extension keyframe option sensor size
+    statistic tendon visual worldbody"""
+)
+
+#: Elements of a default class.
+DEFAULTS = _words(
+    """adhesion camera cylinder damper dcmotor default equality general geom intvelocity joint light material mesh motor
+    muscle orientation pair pid plugin position site skin tendon texture velocity"""
+)
+
 #: Attributes by element: those of MuJoCo 4.0 and a few older ones. Another is refused, so that a misspelt mass is seen.
 KNOWN = {
     "compiler": _words(
