@@ -1,60 +1,48 @@
-"""Reading URDF and MJCF files through Pinocchio, and locking joints."""
+"""Reading URDF and MJCF files into Pinocchio models, and locking joints."""
 
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
 from orthocas.checks import Array, require_known
 from orthocas.errors import InvalidValueError, RobotError
+from orthocas.robots.mjcf import model_from_mjcf
 from orthocas.robots.pinocchio_model import frame_index
-
-_SLIDE = """<mujoco><worldbody><body name="b"><joint name="s" type="slide" range="-1 1"/>
-<geom type="sphere" size="0.1" mass="1"/></body></worldbody></mujoco>"""  # a range of 1 m
+from orthocas.robots.urdf_checks import check_urdf
+from orthocas.robots.xml_files import read_xml
 
 
 def read_urdf(path: str | Path) -> pin.Model:
     """Read a URDF file; mimic joints stay visible so that they can be refused or locked.
 
     Raises:
-        RobotError: if the file is missing or is not a URDF model.
+        RobotError: if the file is missing or is not a URDF model, or a joint moves along no axis.
     """
-    return _read(Path(path), "robot", "URDF", lambda name: pin.buildModelFromUrdf(name, mimic=True))
-
-
-def read_mjcf(path: str | Path) -> pin.Model:
-    """Read a MuJoCo MJCF file.
-
-    Raises:
-        RobotError: if the file is missing or is not an MJCF model.
-    """
-    model = _read(Path(path), "mujoco", "MJCF", pin.buildModelFromMJCF)
-    compiler = ElementTree.parse(path).getroot().find("compiler")
-    if compiler is None or compiler.get("angle", "degree") == "degree":
-        _in_metres(model)
+    check_urdf(path, read_xml(path, "URDF", "robot"))
+    with _captured_stderr() as notes:
+        try:
+            model = pin.buildModelFromUrdf(str(path), mimic=True)
+        except (ValueError, RuntimeError) as error:
+            raise RobotError(f"{path} is not a usable URDF model: {_text(notes) or error}") from None
+        complaints = _text(notes)
+    if "Error:" in complaints:  # the parser goes on without what it could not read, a mass for example
+        raise RobotError(f"{path} is not a usable URDF model: {complaints}")
     return model
 
 
-def _in_metres(model: pin.Model) -> None:
-    """Undo what Pinocchio (4.1) does to ranges of slides in files with angles in degrees: it scales them like angles.
+def read_mjcf(path: str | Path) -> pin.Model:
+    """Read a MuJoCo MJCF file; see `model_from_mjcf`.
 
-    How much it scales is asked of it, so that a version that does it right stays untouched.
+    Raises:
+        RobotError: if the file is missing, is not an MJCF model, or holds what cannot be read right.
     """
-    slides = [joint.idx_q for joint in model.joints if joint.shortname().startswith("JointModelP") and joint.nq == 1]
-    if not slides:
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        probe = Path(folder) / "probe.xml"
-        probe.write_text(_SLIDE)
-        scale = pin.buildModelFromMJCF(str(probe)).upperPositionLimit[0]
-    for limits in (model.lowerPositionLimit, model.upperPositionLimit):
-        limits[slides] /= scale
+    return model_from_mjcf(path)
 
 
 def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
@@ -108,27 +96,6 @@ def default_tip(model: pin.Model) -> str:
     if len(leaves) != 1:
         raise RobotError(f"the robot ends in {len(leaves)} places, name the tip frame: {', '.join(last.values())}")
     return last[leaves[0]]
-
-
-def _read(path: Path, root: str, kind: str, build: Callable[[str], pin.Model]) -> pin.Model:
-    """Check that the file is XML of the right kind, then let Pinocchio build the model."""
-    try:
-        found = ElementTree.parse(path).getroot().tag
-    except OSError as error:
-        raise RobotError(f"cannot read {kind} file {path}: {error.strerror}") from None
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise RobotError(f"{path} is not a {kind} file: {error}") from None
-    if found != root:
-        raise RobotError(f"{path} is not a {kind} file: its root element is <{found}>, expected <{root}>")
-    with _captured_stderr() as notes:
-        try:
-            model = build(str(path))
-        except (ValueError, RuntimeError) as error:
-            raise RobotError(f"{path} is not a usable {kind} model: {_text(notes) or error}") from None
-        complaints = _text(notes)
-    if "Error:" in complaints:  # the parser goes on without what it could not read, a mass for example
-        raise RobotError(f"{path} is not a usable {kind} model: {complaints}")
-    return model
 
 
 @contextmanager

@@ -47,14 +47,15 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
 
 
 def frame_index(model: pin.Model, name: str) -> int:
-    """Index of a frame; where a link and a joint share a name, as URDF allows, the link's.
+    """Index of a frame; where a link, a site and a joint share a name, the link's before the site's before the joint's.
 
     Raises:
         UnknownNameError: if there is no such frame.
     """
     require_known("frame", name, [frame.name for frame in model.frames])
     found = [i for i, frame in enumerate(model.frames) if frame.name == name]
-    return min(found, key=lambda i: model.frames[i].type != pin.FrameType.BODY)
+    kinds = {i: model.frames[i].type for i in found}
+    return min(found, key=lambda i: (kinds[i] != pin.FrameType.BODY, kinds[i] == pin.FrameType.JOINT))
 
 
 def _joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
