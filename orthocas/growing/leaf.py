@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.checks import Array
+from orthocas.checks import Array, Indices
 from orthocas.domains import Box
 from orthocas.errors import InvalidValueError
 from orthocas.problem import Problem, task_jacobians
@@ -60,7 +60,7 @@ class LeafChart(Protocol):
         """
         ...
 
-    def to_arrays(self) -> Mapping[str, Array]:
+    def to_arrays(self) -> Mapping[str, Array | Indices]:
         """All numbers, for chart files."""
         ...
 

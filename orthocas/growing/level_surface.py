@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from skimage.measure import marching_cubes
 
-from orthocas.checks import Array, frozen_array, require_count, require_finite, require_shape
+from orthocas.checks import Array, Indices, frozen_array, require_count, require_finite, require_shape
 from orthocas.errors import InvalidValueError
 from orthocas.growing.mesh_improvement import flip_to_delaunay, steps_to_neighbours
-from orthocas.growing.triangle_mesh import Indices, TriangleMesh, require_disk
+from orthocas.growing.triangle_mesh import TriangleMesh, require_disk
 
 __all__ = ["TriangleMesh", "level_surface", "require_disk"]
 
