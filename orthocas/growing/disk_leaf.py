@@ -26,8 +26,8 @@ _SCALE_SAMPLES = 1000  # that tell the size of the gradient
 class DiskLeaf:
     """xi0(q): the harmonic map of a triangulated leaf onto the unit disk, linear on every triangle.
 
-    A point of the leaf belongs to the nearest point of the mesh. From triangle to triangle the gradient jumps by about
-    the size of a cell, and the value by about its third power.
+    A point of the leaf gets the coordinates of the nearest point of the mesh. From one triangle to the next, the jump
+    of the gradient is of the order of the cell size, and that of the value of its third power.
     """
 
     problem: Problem
@@ -61,7 +61,7 @@ class DiskLeaf:
 
     @property
     def region(self) -> Box:
-        """The part of joint space that holds the leaf."""
+        """The box whose part of the leaf is charted."""
         return Box(self.region_centre, self.region_half_width)
 
     @cached_property
@@ -80,7 +80,7 @@ class DiskLeaf:
     def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for others.
 
-        The point of the triangle is moved along the triangle's normal onto the leaf, so that `values` leads back.
+        The point of the triangle is moved along the triangle's normal onto the leaf, so that `values` returns xi.
         """
         inside = np.hypot(xi[:, 0], xi[:, 1]) <= 1
         found = self._in_disk.locate(np.where(inside[:, None], xi, 0.0))
@@ -99,7 +99,7 @@ class DiskLeaf:
         return np.where(known[:, None], feet + height * normals, np.nan)
 
     def to_arrays(self) -> Mapping[str, Array | Indices]:
-        """All numbers, for chart files."""
+        """All arrays, for chart files."""
         names = ("level", "region_centre", "region_half_width", "vertices", "faces", "disk")
         return {name: getattr(self, name) for name in names}
 
@@ -142,7 +142,7 @@ def disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -
 
     Raises:
         GrowError: if n or m differ.
-        NotADiskError: if that part of the leaf is not a disk; says what it is.
+        NotADiskError: if that part of the leaf is not a disk; the message says what it is.
     """
     if (problem.n, problem.m) != (3, 1):
         raise GrowError(f"a disk chart is for n = 3 joints and m = 1 task, got n = {problem.n} and m = {problem.m}")

@@ -12,9 +12,9 @@ from orthocas.growing.mesh_improvement import cotangents
 def harmonic_disk(mesh: TriangleMesh) -> Array:
     """One-to-one harmonic map of a mesh onto the unit disk.
 
-    Boundary vertices go to the unit circle by arc length, from angle 0 at the lowest index on; every inner vertex is
-    the mean of its neighbours with the weights cot(alpha) + cot(beta). Where these are >= 0 (a Delaunay mesh) the map
-    is one-to-one; whether it is, is checked for every mesh.
+    Boundary vertices are placed on the unit circle by arc length; the one with the lowest index gets angle 0. Every
+    inner vertex is the mean of its neighbours, weighted by cot(alpha) + cot(beta) with the angles opposite the edge. If
+    no weight is negative (a Delaunay mesh), the map is one-to-one. Every map is checked for folds.
 
     Args:
         mesh: a topological disk.
@@ -23,7 +23,7 @@ def harmonic_disk(mesh: TriangleMesh) -> Array:
         (V, 2); all triangles are counterclockwise.
 
     Raises:
-        NotADiskError: if the mesh is no disk.
+        NotADiskError: if the mesh is not a disk.
         InvalidValueError: if a triangle has no area.
         FoldedMapError: if the map turns triangles over.
 

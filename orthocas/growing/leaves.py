@@ -18,7 +18,7 @@ LEAVES: dict[str, type[LinearLeaf] | type[CircleLeaf] | type[DiskLeaf]] = {
 
 
 def leaf_from_arrays(problem: Problem, kind: str, arrays: Mapping[str, NDArray[Any]]) -> LeafChart:
-    """Build a leaf's chart from its numbers.
+    """Build a leaf's chart from its arrays.
 
     Raises:
         UnknownNameError: if there is no such kind.

@@ -24,8 +24,8 @@ def cotangents(vertices: Array, faces: Indices) -> Array:
 def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
     """Flip edges until the angles opposite every inner edge add up to at most half a turn.
 
-    Then all weights cot(alpha) + cot(beta) are >= 0. An edge stays if the edge across exists already, or if a new
-    triangle would turn away from the old ones.
+    Then all weights cot(alpha) + cot(beta) are >= 0. An edge is not flipped if the new edge exists already, or if a new
+    triangle would face away from the old ones.
 
     Args:
         vertices: (V, 3).
@@ -50,7 +50,7 @@ def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
 
 
 def steps_to_neighbours(points: Array, faces: Indices) -> Array:
-    """Steps that even out a mesh, (V, 3): from every vertex, all in triangles, to the mean of its neighbours."""
+    """Smoothing steps (V, 3) from each vertex to the mean of its neighbours; every vertex belongs to a triangle."""
     neighbours = igl.adjacency_matrix(faces)
     mean = (neighbours @ points) / np.diff(neighbours.indptr)[:, None]
     steps: Array = mean - points
@@ -67,7 +67,7 @@ def _inner_edges(faces: Indices, count: int) -> tuple[Indices, Indices, Indices]
 
 
 def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second: Indices) -> bool:
-    """Flip as many of the edges as do not share a triangle, in place; whether there were any."""
+    """Flip edges that do not share a triangle, in place; returns whether any was flipped."""
     quads = _quads(faces, first, second)
     allowed = _allowed(vertices, quads, keys)
     quads, face, other = quads[allowed], first[allowed] % len(faces), second[allowed] % len(faces)
@@ -86,7 +86,7 @@ def _quads(faces: Indices, first: Indices, second: Indices) -> Indices:
 
 
 def _allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bool_]:
-    """Whether the edge k - n is new and the triangles i n k and n j k look the way the old ones do."""
+    """Whether the edge k - n is new and the triangles i n k and n j k face the same way as the old ones."""
     wanted = edge_keys(quads[:, 2], quads[:, 3], len(vertices))
     place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     p, q, r, s = (vertices[quads[:, c]] for c in range(4))
@@ -98,7 +98,7 @@ def _allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bool_
 
 
 def _independent(quads: Indices, face: Indices, other: Indices, count: int) -> NDArray[np.bool_]:
-    """Flips, best first, that are the first at both of their triangles and at their new edge."""
+    """Which flips, given best first, come first at both of their triangles and at their new edge."""
     number = np.arange(len(face))
     _, at_face = np.unique(np.stack([face, other], axis=1), return_index=True)
     wins = np.bincount(at_face // 2, minlength=len(face)) == 2

@@ -47,9 +47,9 @@ class TriangleMesh:
 
     @cached_property
     def clashing_edges(self) -> int:
-        """Number of edges with three or more triangles, or with two that turn opposite ways.
+        """Number of edges with three or more triangles, or with two triangles of opposite orientation.
 
-        `igl.is_edge_manifold` does not see the latter.
+        Ours because `igl.is_edge_manifold` misses the latter.
         """
         start, end = half_edges(self.faces)
         keys, count = np.unique(start * len(self.vertices) + end, return_counts=True)
@@ -58,12 +58,12 @@ class TriangleMesh:
 
     @cached_property
     def components(self) -> int:
-        """Number of parts whose triangles are joined by edges."""
+        """Number of connected parts; triangles are connected by edges, not by vertices."""
         return int(igl.facet_components(self.faces)[0])
 
     @cached_property
     def boundary_loops(self) -> int:
-        """Number of separate curves of the boundary."""
+        """Number of separate boundary curves."""
         if not len(self.boundary_edges):
             return 0
         _, edges = np.unique(self.boundary_edges, return_inverse=True)
@@ -78,14 +78,14 @@ class TriangleMesh:
 def require_disk(mesh: TriangleMesh) -> Indices:
     """The boundary of a mesh that is a topological disk.
 
-    One part joined by edges, one boundary loop and V - E + F = 1 make a surface whose edges have at most two triangles
-    a disk; two corners that touch in a vertex lower V - E + F.
+    A surface with at most two triangles at each edge is a disk if it has one component, one boundary loop and
+    V - E + F = 1. Two corners that touch in a vertex lower V - E + F.
 
     Returns:
-        The boundary loop (B,), counterclockwise seen from the side of the normals, from its lowest index on.
+        The boundary loop (B,), counterclockwise seen from the side of the normals, starting at its lowest index.
 
     Raises:
-        NotADiskError: if it is no disk; says what was found.
+        NotADiskError: if the mesh is not a disk; the message says what it is.
 
     Source:
         Ours: docs/derivations.md#disk-chart.
@@ -103,5 +103,5 @@ def half_edges(faces: Indices) -> tuple[Indices, Indices]:
 
 
 def edge_keys(start: Indices, end: Indices, count: int) -> Indices:
-    """One number for each edge between two of `count` vertices, whatever its direction."""
+    """One number per edge, the same for both directions, in a mesh with `count` vertices."""
     return np.minimum(start, end) * count + np.maximum(start, end)
