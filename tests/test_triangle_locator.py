@@ -221,3 +221,6 @@ def test_bad_input_is_named(leaf: TriangleMesh) -> None:
         TriangleLocator(np.full((3, 3), np.nan), [[0, 1, 2]])
     with pytest.raises(ShapeError, match="points has shape"):
         TriangleLocator(leaf.vertices, leaf.faces).locate(np.zeros((5, 2)))
+    for bad, name in ((np.nan, "points"), (np.inf, "points"), (1e200, "squared distance")):
+        with pytest.raises(InvalidValueError, match=f"{name}.* expected a finite number"):
+            TriangleLocator(leaf.vertices, leaf.faces).locate(np.full((2, 3), bad))

@@ -6,7 +6,7 @@ import igl
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, Indices, frozen_array, frozen_indices, require_shape
+from orthocas.checks import Array, Indices, frozen_array, frozen_indices, require_finite, require_shape
 from orthocas.errors import InvalidValueError
 
 _CHUNK = 10_000  # points of one call of libigl, which Ctrl-C cannot interrupt; 0.1 s on 200,000 triangles
@@ -57,7 +57,13 @@ class TriangleLocator:
         return TriangleLocator, (self._vertices, self._faces)
 
     def locate(self, points: Array) -> Located:
-        """Closest points on the mesh to points (N, d), finite."""
+        """Closest points on the mesh to points (N, d).
+
+        Raises:
+            ShapeError: if the points have another dimension than the mesh.
+            InvalidValueError: if a point, or its squared distance, is not finite.
+        """
+        require_finite("points", points)
         require_shape("points", points.shape, (None, self._vertices.shape[1]))
         starts = range(0, max(len(points), 1), _CHUNK)
         parts = [self._locate(_in_space(points[start : start + _CHUNK])) for start in starts]
@@ -65,6 +71,7 @@ class TriangleLocator:
 
     def _locate(self, points: Array) -> Located:
         squares, face, closest = self._tree.squared_distance(self._points, self._faces, points)
+        require_finite("squared distance", squares)  # otherwise libigl has found no face
         return Located(face, _barycentric(closest, self._points[self._faces[face]]), np.sqrt(squares))
 
 
