@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.errors import InvalidValueError, MemoryNeedError, ShapeError, UnknownNameError
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 def require_shape(name: str, got: tuple[int, ...], want: tuple[int | None, ...]) -> None:
@@ -49,6 +50,25 @@ def frozen_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> 
     require_shape(name, array.shape, shape)
     require_finite(name, array)
     frozen = array.copy()
+    frozen.setflags(write=False)
+    return frozen
+
+
+def frozen_indices(name: str, value: ArrayLike, shape: tuple[int | None, ...], count: int) -> Indices:
+    """Copy to a read-only integer array of the given shape with entries from 0 to count - 1.
+
+    Whole numbers kept as floats are accepted: chart files of early versions hold such indices.
+
+    Raises:
+        ShapeError: if the shape differs.
+        InvalidValueError: if an entry is not a whole number, or not from 0 to count - 1.
+    """
+    numbers = as_float_array(name, value)  # exact up to 2^53
+    require_shape(name, numbers.shape, shape)
+    bad = ~((numbers >= 0) & (numbers < count) & (numbers == np.floor(numbers)))
+    if bad.any():
+        raise InvalidValueError(name, f"{numbers[bad][0]:g}", f"whole numbers from 0 to {count - 1}")
+    frozen = numbers.astype(np.int64)
     frozen.setflags(write=False)
     return frozen
 

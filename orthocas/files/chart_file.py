@@ -9,12 +9,12 @@ import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.tape import from_tape, to_tape
-from orthocas.checks import Array, require_count, require_known
+from orthocas.checks import require_count, require_known
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.domains import Box, Domain, Torus
 from orthocas.errors import ChartFileError, OrthocasError
-from orthocas.files.archive import Kind, read_archive, write_archive
+from orthocas.files.archive import Kind, Stored, read_archive, write_archive
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
 from orthocas.parametrisations import JointSpace, parametrisation_from_data, parametrisation_to_data
@@ -75,7 +75,7 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:
         raise ChartFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
 
 
-def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Array]]:
+def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Coordinates as plain data and arrays."""
     if isinstance(coordinates, GrownCoordinates):
         arrays = {f"{_LEAF}{name}": array for name, array in coordinates.leaf.to_arrays().items()}
@@ -85,7 +85,7 @@ def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], di
     return data, {"theta": coordinates.theta, "offset": coordinates.offset, "scale": coordinates.scale}
 
 
-def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Array]) -> CoordinateMap:
+def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> CoordinateMap:
     if "leaf" in data:
         own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
         return GrownCoordinates(problem, leaf_from_arrays(problem, data["leaf"], own))
@@ -112,7 +112,7 @@ def _idle(joints: list[int], n: int) -> tuple[int, ...]:
     return idle
 
 
-def _tree(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> KinematicTree:
+def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTree:
     numbers: dict[str, Any] = {
         name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
     }
@@ -120,7 +120,7 @@ def _tree(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> KinematicTree
     return KinematicTree(**texts, **numbers)
 
 
-def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Array]) -> Problem:
+def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
     require_known("domain", data["domain"], ("box", "torus"))
     box = Box(arrays["domain_centre"], arrays["domain_half_width"])
     domain: Domain = Torus(robot.n) if data["domain"] == "torus" else box

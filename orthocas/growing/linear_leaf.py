@@ -50,7 +50,7 @@ class LinearLeaf:
     def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf with coordinates xi (N, r), NaN where there is none.
 
-        Newton's method along the straight way from the coordinates of `near`, or of q0, to xi: one sheet is kept.
+        Newton's method along the straight line from the coordinates of `near`, or of q0, to xi: it stays on one sheet.
         """
         q = np.broadcast_to(self.centre, (len(xi), len(self.centre)))
         q = q if near is None else np.where(np.isfinite(near), near, q)
@@ -67,7 +67,7 @@ class LinearLeaf:
         return np.where(solved[:, None], q, np.nan)
 
     def to_arrays(self) -> Mapping[str, Array]:
-        """All numbers, for chart files."""
+        """All arrays, for chart files."""
         return {"level": self.level, "centre": self.centre, "normals": self.normals}
 
     def _residual(self, q: Array, xi: Array) -> Array:
