@@ -12,7 +12,7 @@ from orthocas.errors import DomainError, InvalidValueError, ShapeError
 
 
 def panda() -> oc.Robot:
-    return oc.Robot.chain_from_file(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+    return oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
 
 
 def test_samples_fill_the_box_uniformly_and_follow_the_seed() -> None:
@@ -61,7 +61,7 @@ def test_default_box_respects_joint_limits() -> None:
 
 
 def test_default_box_of_prismatic_joint_is_in_metres() -> None:
-    robot = oc.Robot.chain_from_file(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
+    robot = oc.Robot.from_urdf(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
     np.testing.assert_allclose(default_box(robot).half_width[0], 0.35 / 2)
 
 
@@ -85,7 +85,7 @@ def test_domain_outside_limits_names_the_joint() -> None:
 
 
 def test_torus_with_a_prismatic_joint_is_refused() -> None:
-    robot = oc.Robot.chain_from_file(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
+    robot = oc.Robot.from_urdf(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
     with pytest.raises(DomainError, match="torso_lift_joint.*prismatic"):
         require_within_limits(robot, oc.Torus(robot.n))
 

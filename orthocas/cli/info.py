@@ -17,7 +17,7 @@ from orthocas.robots import Robot
 def info(target: ProblemName, tip: TipName = None, json: AsJson = False) -> None:
     """Show a chart file, a named problem, or a robot file."""
     if is_robot_file(target):
-        data = _robot(Robot.chain_from_file(target, tip))
+        data = _robot(Robot.from_file(target, tip))
     elif target in problems.names():
         data = _problem(build_problem(target, ProblemOptions(tip=tip)))
     elif tip is not None:

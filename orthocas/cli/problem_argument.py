@@ -76,7 +76,7 @@ def parse_numbers(option: str, text: str) -> Array:
 
 
 def _from_file(path: Path, options: ProblemOptions) -> Problem:
-    robot = Robot.chain_from_file(path, options.tip)
+    robot = Robot.from_file(path, options.tip)
     centre = None if options.centre is None else parse_numbers("--centre", options.centre)
     domain = default_box(robot, centre, options.half_width)
     task = Task.named(robot, "position" if options.task is None else options.task, domain.centre)

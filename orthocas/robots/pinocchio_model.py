@@ -19,7 +19,7 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         RobotError: if a joint is not revolute, continuous or prismatic (named in the message).
     """
     frame = model.frames[frame_index(model, tip)]
-    axes = [_joint_axis(model, i) for i in range(1, model.njoints)]
+    axes = [joint_axis(model, i) for i in range(1, model.njoints)]
     turns = [np.eye(3)] + [_rotation_z_to(axis) for _, axis in axes]  # body frame -> frame with the axis along z
     bodies = range(1, model.njoints)
     carrier = frame.parentJoint
@@ -57,15 +57,20 @@ def frame_index(model: pin.Model, name: str) -> int:
     return min(found, key=lambda i: model.frames[i].type != pin.FrameType.BODY)
 
 
-def _joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
-    """Kind and axis of joint i, read off its motion subspace."""
+def joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
+    """Kind and axis of joint i, read off its motion subspace.
+
+    Raises:
+        RobotError: if the joint is not revolute, continuous or prismatic; the message tells which joint to lock.
+    """
     joint, name = model.joints[i], model.names[i]
-    if joint.shortname() == "JointModelMimic":
-        raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: lock the joint it follows")
+    if i in set(model.mimicking_joints):
+        leader = model.names[leader_of(model, i)]
+        raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: {remedy(leader)}")
     if joint.nv != 1:
         raise RobotError(
             f"joint '{name}' is of type {joint.shortname()} with {joint.nv} degrees of freedom, "
-            "expected revolute, continuous or prismatic joints"
+            f"expected revolute, continuous or prismatic joints: {remedy(name)}"
         )
     data = joint.createData()
     joint.calc(data, pin.neutral(model))
@@ -75,7 +80,17 @@ def _joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
         return "revolute", angular
     if not angular.any():
         return "prismatic", linear
-    raise RobotError(f"joint '{name}' is helical, expected revolute, continuous or prismatic joints")
+    raise RobotError(f"joint '{name}' is helical, expected revolute, continuous or prismatic joints: {remedy(name)}")
+
+
+def leader_of(model: pin.Model, mimic: int) -> int:
+    """The joint that a mimic joint follows."""
+    return int(model.mimicked_joints[list(model.mimicking_joints).index(mimic)])
+
+
+def remedy(joint: str) -> str:
+    """How to lock a joint, in Python and on the command line."""
+    return f"lock it with locked={{'{joint}': 0.0}} or --lock {joint}=0"
 
 
 def _rotation_z_to(axis: Array) -> Array:

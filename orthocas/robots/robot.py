@@ -31,10 +31,10 @@ class Robot:
 
     @classmethod
     def from_model(cls, model: pin.Model, tip: str, locked: Mapping[str, float] | None = None) -> Self:
-        """Build from a Pinocchio model.
+        """Build from a Pinocchio model, with all its joints.
 
         Args:
-            model: the model; joints may be revolute, continuous or prismatic.
+            model: the model; joints left free must be revolute, continuous or prismatic.
             tip: name of any frame of the model.
             locked: joints to fix, with their positions [rad] or [m].
 
@@ -46,26 +46,37 @@ class Robot:
         return cls(tree_from_model(files.lock_joints(model, locked or {}), tip))
 
     @classmethod
+    def from_file(cls, path: str | Path, tip: str | None = None, locked: Mapping[str, float] | None = None) -> Self:
+        """Build the chain that moves the tip from a robot file: MJCF if its name ends in .xml, else URDF.
+
+        Every joint that does not move the tip, of any type, is locked at zero, or at the limit next to zero.
+
+        Args:
+            path: the file.
+            tip: name of any frame; without it, the last frame of a robot with a single chain.
+            locked: joints to fix elsewhere, or on the way to the tip, with their positions [rad] or [m]. Joints that
+                mimic them follow. A floating, spherical or planar joint is fixed at its neutral position, by 0.
+
+        Raises:
+            RobotError: if the file cannot be read, the robot branches and has no tip, or a joint on the way to the tip
+                is not revolute, continuous or prismatic (the message tells which one to lock).
+            UnknownNameError: if the frame or a locked joint does not exist.
+        """
+        return (
+            cls.from_mjcf(path, tip, locked)
+            if Path(path).suffix.lower() == ".xml"
+            else cls.from_urdf(path, tip, locked)
+        )
+
+    @classmethod
     def from_urdf(cls, path: str | Path, tip: str | None = None, locked: Mapping[str, float] | None = None) -> Self:
-        """Build from a URDF file; see `from_model`. Without a tip, the last frame of a single chain."""
-        model = files.read_urdf(path)
-        return cls.from_model(model, tip or files.default_tip(model), locked)
+        """Build the chain that moves the tip from a URDF file; see `from_file`."""
+        return cls._chain(files.read_urdf(path), tip, locked)
 
     @classmethod
     def from_mjcf(cls, path: str | Path, tip: str | None = None, locked: Mapping[str, float] | None = None) -> Self:
-        """Build from a MuJoCo MJCF file; see `from_model`. Without a tip, the last frame of a single chain."""
-        model = files.read_mjcf(path)
-        return cls.from_model(model, tip or files.default_tip(model), locked)
-
-    @classmethod
-    def chain_from_file(cls, path: str | Path, tip: str | None = None) -> Self:
-        """Build the chain that moves the tip from a URDF or MJCF (.xml) file.
-
-        Every joint that does not move the tip, of any type, is locked at zero, or at the limit next to zero.
-        """
-        model = files.read_mjcf(path) if Path(path).suffix == ".xml" else files.read_urdf(path)
-        tip = tip or files.default_tip(model)
-        return cls.from_model(files.lock_off_chain(model, tip), tip)
+        """Build the chain that moves the tip from a MuJoCo MJCF file; see `from_file`."""
+        return cls._chain(files.read_mjcf(path), tip, locked)
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
@@ -83,6 +94,12 @@ class Robot:
             raise InvalidValueError("factor", factors.min(), "numbers > 0")
         masses, inertias = self.tree.masses * factors, self.tree.inertias * factors[:, None, None]
         return type(self)(replace(self.tree, masses=masses, inertias=inertias))
+
+    @classmethod
+    def _chain(cls, model: pin.Model, tip: str | None, locked: Mapping[str, float] | None) -> Self:
+        """The joints of a model that move the tip, less those the user locks."""
+        tip = tip or files.default_tip(model)
+        return cls.from_model(files.lock_off_chain(files.lock_joints(model, locked or {}), tip), tip)
 
     @property
     def n(self) -> int:
