@@ -22,7 +22,7 @@ class Problem:
 
     Args:
         robot: the robot.
-        task: a task of that robot, m < n.
+        task: a task of that robot, m < n. Where it lacks a reference orientation, that at the domain's centre is taken.
         metric: "euclidean", "inertia", a constant SPD matrix (n, n), a map q -> A(q) on SX, or a Metric.
         domain: Box or Torus inside the joint limits; default `default_box(robot)`.
         name: for reports.
@@ -54,6 +54,7 @@ class Problem:
         if not isinstance(domain, Domain):
             raise InvalidValueError("domain", repr(domain), "a Box or a Torus")
         require_within_limits(robot, domain)
+        task = task.with_reference_at(domain.centre)
         metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
         require_shape("metric", metric.function.size_out(0), (robot.n, robot.n))
         for key, value in (

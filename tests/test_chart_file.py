@@ -61,6 +61,28 @@ KINDS = {
 }
 
 
+@pytest.mark.parametrize("kind", ["orientation", "axis:x", "position+axis:z"])
+def test_tasks_with_a_reference_come_back_with_it(kind: str, iiwa: oc.Problem, tmp_path: Path) -> None:
+    problem = oc.Problem(iiwa.robot, oc.Task.named(iiwa.robot, kind), domain=iiwa.domain)
+    chart = oc.fit(problem, oc.Polynomial(1), samples=100).chart
+    chart.save(tmp_path / "turned")
+    again = oc.load(tmp_path / "turned").problem.task
+    q = iiwa.domain.centre + 0.1
+    np.testing.assert_array_equal(np.array(again.function(q)), np.array(problem.task.function(q)))
+    assert (again.name, again.labels, again.units) == (kind, problem.task.labels, problem.task.units)
+
+
+def test_units_of_a_custom_task_come_back_and_older_files_have_none(tmp_path: Path) -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    task = oc.Task.custom(robot, "t", lambda q: q[0] ** 2 + q[1], units=("rad^2",))
+    path = tmp_path / "c.orthocas"
+    oc.fit(oc.Problem(robot, task), oc.Polynomial(1)).chart.save(path)
+    assert oc.load(path).problem.task.units == ("rad^2",)
+    header = header_of(path)
+    del header["problem"]["task"]["units"]  # type: ignore[attr-defined]
+    assert oc.load(rewritten(path, {"header.json": json.dumps(header).encode()})).problem.task.units == ("",)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_chart_comes_back_the_same(kind: str, tmp_path: Path) -> None:
     robot = oc.Robot.planar([1.0, 0.9, 0.8], [3.0, 2.0, 1.0])

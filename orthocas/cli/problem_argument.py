@@ -17,7 +17,10 @@ from orthocas.tasks import Task
 
 ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem, or a URDF file.")]
 TipName = Annotated[str | None, typer.Option("--tip", help="Tip frame of a URDF file; default the end of its chain.")]
-TaskName = Annotated[str | None, typer.Option("--task", help="position, position:xy, polar, orientation or pose.")]
+TaskName = Annotated[
+    str | None,
+    typer.Option("--task", help="position, position:xy, polar, orientation, pose, axis:z or position+axis:z."),
+]
 MetricName = Annotated[str | None, typer.Option("--metric", help="euclidean or inertia.")]
 CentreText = Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')]
 HalfWidth = Annotated[

@@ -129,11 +129,9 @@ def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Array])
 
 def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
     if recipe["kind"] == "custom":
-        return Task.custom(robot, recipe["name"], lambda q: from_tape(recipe["tape"], q), recipe["labels"])
-    if recipe["kind"] in ("orientation", "pose"):
-        build = Task.pose if recipe["kind"] == "pose" else Task.orientation
-        return build(robot, recipe["reference"])
-    return Task.named(robot, recipe["kind"])
+        labels, units = recipe["labels"], recipe.get("units", ())  # older files have no units
+        return Task.custom(robot, recipe["name"], lambda q: from_tape(recipe["tape"], q), labels, units)
+    return Task.from_recipe(robot, recipe)
 
 
 def _metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:

@@ -5,9 +5,9 @@ import pinocchio as pin
 
 from orthocas.checks import Array, require_known
 from orthocas.errors import RobotError
+from orthocas.robots.spatial import rotation_z_to, snap
 from orthocas.robots.tree import JointKind, KinematicTree
 
-_ROUNDING = 1e-14  # rotation entries this close to 0 or +-1 come from rounding in rpy -> matrix
 _UNLIMITED = 1e10  # Pinocchio writes the largest double for "no limit"
 
 
@@ -20,7 +20,7 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
     """
     frame = model.frames[frame_index(model, tip)]
     axes = [joint_axis(model, i) for i in range(1, model.njoints)]
-    turns = [np.eye(3)] + [_rotation_z_to(axis) for _, axis in axes]  # body frame -> frame with the axis along z
+    turns = [np.eye(3)] + [rotation_z_to(axis) for _, axis in axes]  # body frame -> frame with the axis along z
     bodies = range(1, model.njoints)
     carrier = frame.parentJoint
     continuous = [model.joints[i].nq == 2 for i in bodies]
@@ -29,7 +29,7 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         joint_kinds=tuple(kind for kind, _ in axes),
         parents=tuple(model.parents[i] - 1 for i in bodies),
         rotations=np.array(
-            [_snap(turns[model.parents[i]].T @ model.jointPlacements[i].rotation @ turns[i]) for i in bodies]
+            [snap(turns[model.parents[i]].T @ model.jointPlacements[i].rotation @ turns[i]) for i in bodies]
         ),
         translations=np.array([turns[model.parents[i]].T @ model.jointPlacements[i].translation for i in bodies]),
         masses=np.array([model.inertias[i].mass for i in bodies]),
@@ -40,7 +40,7 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         upper=_limits(model, model.upperPositionLimit, continuous, np.inf),
         tip_name=tip,
         tip_parent=carrier - 1,
-        tip_rotation=_snap(turns[carrier].T @ frame.placement.rotation),
+        tip_rotation=snap(turns[carrier].T @ frame.placement.rotation),
         tip_translation=turns[carrier].T @ frame.placement.translation,
         gravity=np.array(model.gravity.linear),
     )
@@ -91,21 +91,6 @@ def leader_of(model: pin.Model, mimic: int) -> int:
 def remedy(joint: str) -> str:
     """How to lock a joint, in Python and on the command line."""
     return f"lock it with locked={{'{joint}': 0.0}} or --lock {joint}=0"
-
-
-def _rotation_z_to(axis: Array) -> Array:
-    """A rotation T with T z = axis; a signed permutation where axis is a coordinate axis, so that zeros stay zeros."""
-    z = _snap(axis / np.linalg.norm(axis))
-    helper = np.roll(np.eye(3)[int(np.argmax(np.abs(z)))], 1)
-    y = np.cross(z, helper)
-    y = _snap(y / np.linalg.norm(y))
-    return np.column_stack([np.cross(y, z), y, z])
-
-
-def _snap(values: Array) -> Array:
-    """Round entries that are 0 or +-1 up to rounding, so that CasADi drops the terms."""
-    rounded = np.round(values)
-    return np.where(np.abs(values - rounded) < _ROUNDING, rounded, values) + 0.0
 
 
 def _limits(model: pin.Model, limits: Array, continuous: list[bool], unlimited: float) -> Array:
