@@ -147,7 +147,7 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: float
         centre: another centre (n,).
         half_width: another half-width for all joints; not shortened, so that it fails where it leaves the limits.
     """
-    wanted = np.where(robot.tree.prismatic, PRISMATIC_HALF_WIDTH, REVOLUTE_HALF_WIDTH)
+    wanted = _wanted_half_width(robot)
     limited = np.isfinite(robot.lower) & np.isfinite(robot.upper)
     middle = np.clip(np.zeros(robot.n), robot.lower + wanted, robot.upper - wanted)
     middle[limited] = (robot.lower[limited] + robot.upper[limited]) / 2
@@ -155,10 +155,17 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: float
         middle = frozen_array("centre", centre, (robot.n,))
     if half_width is not None:
         return Box(middle, half_width)
-    room = np.minimum(middle - robot.lower, robot.upper - middle)
-    if room.min() <= 0:
-        _raise_outside(robot, int(np.argmin(room)), middle, middle)
-    return Box(middle, np.minimum(wanted, room))
+    widths = default_half_width(robot, middle)
+    if widths.min() <= 0:
+        _raise_outside(robot, int(np.argmin(widths)), middle, middle)
+    return Box(middle, widths)
+
+
+def default_half_width(robot: Robot, centre: Array) -> Array:
+    """Half-widths of default boxes about centres (n,) or (N, n), same shape; <= 0 at a joint limit and beyond."""
+    room = np.minimum(centre - robot.lower, robot.upper - centre)
+    widths: Array = np.minimum(_wanted_half_width(robot), room)
+    return widths
 
 
 def require_within_limits(robot: Robot, domain: Domain) -> None:
@@ -178,6 +185,10 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
     if outside.size:
         _raise_outside(robot, int(outside[0]), low, high)
+
+
+def _wanted_half_width(robot: Robot) -> Array:
+    return np.where(robot.tree.prismatic, PRISMATIC_HALF_WIDTH, REVOLUTE_HALF_WIDTH)
 
 
 def _require_seed(seed: int | tuple[int, ...]) -> None:

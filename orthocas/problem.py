@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 
 from orthocas.checks import Array, require_shape
-from orthocas.domains import Domain, default_box, require_within_limits, sample_uniform
+from orthocas.domains import Domain, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
 from orthocas.metrics import Metric, metric_matrices
+from orthocas.postures.regular_box import regular_box
 from orthocas.robots import Robot
 from orthocas.tasks import Task
 
@@ -24,7 +25,7 @@ class Problem:
         robot: the robot.
         task: a task of that robot, m < n. Where it lacks a reference orientation, that at the domain's centre is taken.
         metric: "euclidean", "inertia", a constant SPD matrix (n, n), a map q -> A(q) on SX, or a Metric.
-        domain: Box or Torus inside the joint limits; default `default_box(robot)`.
+        domain: Box or Torus inside the joint limits; default `regular_box(robot, task)`: away from singular postures.
         name: for reports.
 
     Raises:
@@ -50,7 +51,7 @@ class Problem:
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
         if task.m >= robot.n:
             raise NotRedundantError(task.m, robot.n)
-        domain = default_box(robot) if domain is None else domain
+        domain = regular_box(robot, task) if domain is None else domain
         if not isinstance(domain, Domain):
             raise InvalidValueError("domain", repr(domain), "a Box or a Torus")
         require_within_limits(robot, domain)

@@ -1,0 +1,1 @@
+"""Postures that suit a task: where a domain lies when none is given."""
