@@ -1,7 +1,7 @@
 """Regions of joint space that coordinates are fitted and judged on, with seeded uniform sampling."""
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,6 +34,10 @@ class Domain(Protocol):
         """Half edge lengths, (n,), > 0."""
         ...
 
+    def contains(self, q: ArrayLike) -> Any:
+        """Whether points (n,) or (N, n) lie in the domain: a bool, or (N,)."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class Box:
@@ -62,6 +66,30 @@ class Box:
         object.__setattr__(self, "centre", middle)
         object.__setattr__(self, "half_width", widths)
 
+    @classmethod
+    def from_limits(cls, lower: ArrayLike, upper: ArrayLike) -> Self:
+        """All q with lower_i <= q_i <= upper_i.
+
+        Args:
+            lower: (n,) [rad] or [m].
+            upper: (n,), above lower everywhere.
+
+        Raises:
+            ShapeError: if the two differ in length.
+            InvalidValueError: if a number is not finite, or lower_i >= upper_i.
+        """
+        low = frozen_array("lower", lower, (None,))
+        high = frozen_array("upper", upper, low.shape)
+        wrong = np.flatnonzero(low >= high)
+        if wrong.size:
+            i = int(wrong[0])
+            raise InvalidValueError(f"lower[{i}]", low[i], f"a number below upper[{i}] = {high[i]:g}")
+        return cls((low + high) / 2, (high - low) / 2)
+
+    def contains(self, q: ArrayLike) -> Any:
+        """Whether points (n,) or (N, n) lie in the box: a bool, or (N,)."""
+        return contains(self, q)
+
 
 @dataclass(frozen=True, eq=False)
 class Torus:
@@ -83,6 +111,10 @@ class Torus:
     def half_width(self) -> Array:
         """Pi for every joint, (n,)."""
         return np.full(self.n, np.pi)
+
+    def contains(self, q: ArrayLike) -> Any:
+        """Whether points (n,) or (N, n) lie on the torus, as all angles do: a bool, or (N,)."""
+        return contains(self, q)
 
 
 def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
@@ -136,7 +168,7 @@ def reach(domain: Domain) -> Array:
     return values
 
 
-def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: float | None = None) -> Box:
+def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: ArrayLike | None = None) -> Box:
     """A box inside the joint limits.
 
     The centre is the middle of the limits (0, or the value next to 0, where there are none). Half-widths are pi/4 for
@@ -145,7 +177,8 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: float
     Args:
         robot: the robot.
         centre: another centre (n,).
-        half_width: another half-width for all joints; not shortened, so that it fails where it leaves the limits.
+        half_width: another half-width (n,), or one for all joints; not shortened, so that it fails where it leaves the
+            limits.
     """
     wanted = _wanted_half_width(robot)
     limited = np.isfinite(robot.lower) & np.isfinite(robot.upper)
