@@ -13,7 +13,8 @@ from orthocas.casadi_tools.user_expression import expression_of
 from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots import Robot
-from orthocas.robots.tip_turn import TipTurn, frame_along, reference_rotation
+from orthocas.robots.spatial import rotation_matrix
+from orthocas.robots.tip_turn import TipTurn, frame_along
 
 TASK_KINDS = (
     "position",
@@ -213,7 +214,7 @@ class Task:
         if reference is None:
             base, extra = robot.tip_rotation(default_box(robot).centre), {}
         else:
-            base = reference_rotation(reference)
+            base = rotation_matrix("reference", reference)
             extra = {"reference": base.tolist()}
         across = ca.SX(ca.DM(base.T))
         return cls._of_tip(

@@ -116,6 +116,8 @@ def _tree(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> KinematicTree
     numbers: dict[str, Any] = {
         name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
     }
+    for name in ("effort_limits", "velocity_limits"):  # unknown to older files
+        numbers.setdefault(name, np.full(len(data["joint_names"]), np.inf))
     texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
     return KinematicTree(**texts, **numbers)
 

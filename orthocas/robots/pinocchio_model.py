@@ -38,6 +38,8 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         armatures=np.array([model.armature[model.joints[i].idx_v] for i in bodies]),
         lower=_limits(model, model.lowerPositionLimit, continuous, -np.inf),
         upper=_limits(model, model.upperPositionLimit, continuous, np.inf),
+        effort_limits=_largest(model, model.effortLimit),
+        velocity_limits=_largest(model, model.velocityLimit),
         tip_name=tip,
         tip_parent=carrier - 1,
         tip_rotation=snap(turns[carrier].T @ frame.placement.rotation),
@@ -97,3 +99,9 @@ def _limits(model: pin.Model, limits: Array, continuous: list[bool], unlimited: 
     """Position limits, one per joint; a continuous joint has none."""
     values = [unlimited if free else limits[model.joints[i + 1].idx_q] for i, free in enumerate(continuous)]
     return np.array([unlimited if abs(value) > _UNLIMITED else value for value in values])
+
+
+def _largest(model: pin.Model, limits: Array) -> Array:
+    """Limits of effort or velocity, one per joint; 0, which files write for want of a number, means none."""
+    values = np.array([limits[joint.idx_v] for joint in model.joints[1:]])
+    return np.where((values > 0) & (values < _UNLIMITED), values, np.inf)

@@ -2,8 +2,10 @@
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
-from orthocas.checks import Array
+from orthocas.checks import Array, frozen_array
+from orthocas.errors import InvalidValueError
 
 _ROUNDING = 1e-14  # rotation entries this close to 0 or +-1 come from rounding in rpy -> matrix
 
@@ -38,6 +40,18 @@ def tilt(R: ca.SX, axis: int) -> ca.SX:
 def constant(values: Array) -> ca.SX:
     """A constant with its zeros dropped from the structure, so that products with them vanish."""
     return ca.SX(ca.sparsify(ca.DM(values)))
+
+
+def rotation_matrix(name: str, value: ArrayLike) -> Array:
+    """A rotation (3, 3), checked and read-only.
+
+    Raises:
+        ShapeError, InvalidValueError: if it is not a rotation matrix.
+    """
+    rotation = frozen_array(name, value, (3, 3))
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
+        raise InvalidValueError(name, rotation.tolist(), "a rotation matrix")
+    return rotation
 
 
 def rotation_z_to(axis: Array) -> Array:

@@ -57,18 +57,6 @@ class TipTurn:
         return ca.vertcat(position, x) if self.with_position else x
 
 
-def reference_rotation(reference: ArrayLike) -> Array:
-    """A reference orientation (3, 3), checked.
-
-    Raises:
-        ShapeError, InvalidValueError: if it is not a rotation matrix.
-    """
-    rotation = frozen_array("reference", reference, (3, 3))
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
-        raise InvalidValueError("reference", rotation.tolist(), "a rotation matrix")
-    return rotation
-
-
 def frame_along(direction: ArrayLike, axis: str) -> Array:
     """A rotation (3, 3) that turns a coordinate axis to a direction (3,).
 
