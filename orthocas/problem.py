@@ -1,14 +1,13 @@
 """A problem: a robot, a task, a metric and a domain that fit together."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from orthocas.checks import Array, require_shape
 from orthocas.domains import Domain, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
-from orthocas.metrics import Metric, metric_matrices
+from orthocas.metrics import Metric, MetricSpec, metric_matrices
 from orthocas.postures.regular_box import regular_box
 from orthocas.robots import Robot
 from orthocas.tasks import Task
@@ -31,7 +30,8 @@ class Problem:
     Raises:
         NotRedundantError: if m >= n.
         DomainError: if the domain leaves the joint limits.
-        MetricError: if a constant metric is not SPD (q-dependent ones are checked by `check` and on every sample).
+        MetricError: if a constant metric is not SPD, or a joint moves no mass under "inertia" (metrics that depend on q
+            are checked by `check` and on every sample).
     """
 
     robot: Robot
@@ -41,7 +41,12 @@ class Problem:
     name: str
 
     def __init__(
-        self, robot: Robot, task: Task, metric: Any = "euclidean", domain: Domain | None = None, name: str = "custom"
+        self,
+        robot: Robot,
+        task: Task,
+        metric: Metric | MetricSpec = "euclidean",
+        domain: Domain | None = None,
+        name: str = "custom",
     ) -> None:
         if not isinstance(task, Task) or not isinstance(robot, Robot):
             raise InvalidValueError(

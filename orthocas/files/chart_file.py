@@ -138,5 +138,6 @@ def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
 
 def _metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:
     if recipe["kind"] == "custom":
-        return Metric.from_spec(robot, lambda q: from_tape(recipe["tape"], q))
+        name = recipe.get("name", "custom")  # older files have no name
+        return Metric.custom(robot, name, lambda q: from_tape(recipe["tape"], q))
     return Metric.from_spec(robot, recipe["matrix"] if recipe["kind"] == "constant" else recipe["kind"])
