@@ -123,7 +123,7 @@ def data_cases() -> Iterator[Case]:
         return
     for name, (relative, tip, centre) in DATA.items():
         (path,) = (entry.locate() for entry in entries if str(entry).endswith(f"robots/{relative}"))
-        robot = oc.Robot.chain_from_file(str(path), tip)
+        robot = oc.Robot.from_file(str(path), tip)
         for half_width in (0.1, 0.4):
             yield Case(f"{name}, xyz", oc.Problem(robot, oc.Task.position(robot), domain=oc.Box(centre, half_width)), 3)
 

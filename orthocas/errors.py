@@ -29,10 +29,12 @@ class InvalidValueError(OrthocasError, ValueError):
 
 
 class UnknownNameError(OrthocasError, ValueError):
-    """A name that does not exist, with those that do."""
+    """A name that does not exist, with those that do: similar ones first."""
 
     def __init__(self, what: str, got: str, known: Iterable[str]) -> None:
         names = list(known)
+        near = difflib.get_close_matches(got, names, 3)
+        names = [*near, *(name for name in names if name not in near)]
         if len(names) > _MOST_NAMES:
             close = difflib.get_close_matches(got, names, _MOST_NAMES, 0.0)
             names = [*close, f"and {len(names) - len(close)} more"]

@@ -1,14 +1,14 @@
 """A problem: a robot, a task, a metric and a domain that fit together."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from orthocas.checks import Array, require_shape
-from orthocas.domains import Domain, default_box, require_within_limits, sample_uniform
+from orthocas.domains import Domain, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
-from orthocas.metrics import Metric, metric_matrices
+from orthocas.metrics import Metric, MetricSpec, metric_matrices
+from orthocas.postures.regular_box import regular_box
 from orthocas.robots import Robot
 from orthocas.tasks import Task
 
@@ -22,15 +22,16 @@ class Problem:
 
     Args:
         robot: the robot.
-        task: a task of that robot, m < n.
+        task: a task of that robot, m < n. Where it lacks a reference orientation, that at the domain's centre is taken.
         metric: "euclidean", "inertia", a constant SPD matrix (n, n), a map q -> A(q) on SX, or a Metric.
-        domain: Box or Torus inside the joint limits; default `default_box(robot)`.
+        domain: Box or Torus inside the joint limits; default `regular_box(robot, task)`: away from singular postures.
         name: for reports.
 
     Raises:
         NotRedundantError: if m >= n.
         DomainError: if the domain leaves the joint limits.
-        MetricError: if a constant metric is not SPD (q-dependent ones are checked by `check` and on every sample).
+        MetricError: if a constant metric is not SPD, or a joint moves no mass under "inertia" (metrics that depend on q
+            are checked by `check` and on every sample).
     """
 
     robot: Robot
@@ -40,7 +41,12 @@ class Problem:
     name: str
 
     def __init__(
-        self, robot: Robot, task: Task, metric: Any = "euclidean", domain: Domain | None = None, name: str = "custom"
+        self,
+        robot: Robot,
+        task: Task,
+        metric: Metric | MetricSpec = "euclidean",
+        domain: Domain | None = None,
+        name: str = "custom",
     ) -> None:
         if not isinstance(task, Task) or not isinstance(robot, Robot):
             raise InvalidValueError(
@@ -50,10 +56,11 @@ class Problem:
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
         if task.m >= robot.n:
             raise NotRedundantError(task.m, robot.n)
-        domain = default_box(robot) if domain is None else domain
+        domain = regular_box(robot, task) if domain is None else domain
         if not isinstance(domain, Domain):
             raise InvalidValueError("domain", repr(domain), "a Box or a Torus")
         require_within_limits(robot, domain)
+        task = task.with_reference_at(domain.centre)
         metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
         require_shape("metric", metric.function.size_out(0), (robot.n, robot.n))
         for key, value in (

@@ -63,7 +63,7 @@ def test_one_task_component_is_always_involutive(name: str, metric) -> None:
     if name == "iiwa":
         robot = problems.get("iiwa").robot
     elif name == "panda":
-        robot = oc.Robot.chain_from_file(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+        robot = oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
     else:
         robot = arm(int(name[-2]))
     found = oc.involutivity(oc.Problem(robot, oc.Task.position(robot, "x"), metric), samples=200)

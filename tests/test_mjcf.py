@@ -62,7 +62,7 @@ def assert_agrees(path: Path, states: int = 5) -> None:
 def test_robot_has_the_mass_matrix_bias_and_tip_pose_of_mujoco(name: str) -> None:
     path, tip = DATA / f"{name}.xml", TIPS[name]
     assert_agrees(path)
-    robot, theirs = oc.Robot.from_mjcf(path, tip), mujoco.MjModel.from_xml_path(str(path))
+    robot, theirs = oc.Robot.from_model(model_from_mjcf(path), tip), mujoco.MjModel.from_xml_path(str(path))
     for q, dq in np.random.default_rng(3).uniform(-2, 2, (5, 2, robot.n)):
         state, M, bias = mujoco_dynamics(theirs, q, dq)
         there = state.body(tip) if name in ("joints", "corrected") else state.site(tip)
@@ -74,7 +74,7 @@ def test_robot_has_the_mass_matrix_bias_and_tip_pose_of_mujoco(name: str) -> Non
 
 def test_included_arm_beside_free_bodies_has_the_dynamics_of_mujoco() -> None:
     path = DATA / "scene.xml"
-    robot, theirs = oc.Robot.chain_from_file(path, "tool"), mujoco.MjModel.from_xml_path(str(path))
+    robot, theirs = oc.Robot.from_mjcf(path, "tool"), mujoco.MjModel.from_xml_path(str(path))
     assert robot.joint_names == ("shoulder_pan", "shoulder_lift", "elbow", "wrist1", "wrist2", "wrist3")
     np.testing.assert_allclose(robot.upper, [6.28319, 6.28319, 3.1415, 6.28319, 6.28319, 6.28319])
     for q, dq in np.random.default_rng(5).uniform(-2, 2, (5, 2, 6)):
@@ -84,7 +84,7 @@ def test_included_arm_beside_free_bodies_has_the_dynamics_of_mujoco() -> None:
         assert_close(robot.bias(q, dq), bias[:6])
         assert_close(robot.tip_position(q), state.site("tool").xpos)
     with pytest.raises(RobotError, match="box.*FreeFlyer"):
-        oc.Robot.from_mjcf(path, "tool")
+        oc.Robot.from_model(model_from_mjcf(path), "tool")
 
 
 def test_locked_joints_keep_armatures_and_masses_of_the_others() -> None:
@@ -269,10 +269,10 @@ def test_last_site_is_the_default_tip_and_wrong_tips_list_bodies_and_sites(tmp_p
 def test_ball_joints_are_refused_unless_they_can_be_locked_off_the_chain(tmp_path: Path) -> None:
     path = write(tmp_path, '<body name="c"><joint name="neck" type="ball"/><geom size="0.1"/></body>')
     with pytest.raises(RobotError, match="neck.*Spherical"):
-        oc.Robot.from_mjcf(path, "b")
-    assert oc.Robot.chain_from_file(path, "b").joint_names == ("j",)
-    with pytest.raises(RobotError, match="neck.*cannot be locked"):
-        lock_joints(model_from_mjcf(path), {"neck": 0.0})
+        oc.Robot.from_model(model_from_mjcf(path), "b")
+    assert oc.Robot.from_mjcf(path, "b").joint_names == ("j",)
+    with pytest.raises(RobotError, match="neck.*degrees of freedom"):
+        lock_joints(model_from_mjcf(path), {"neck": 0.5})
 
 
 BOMB = '<!DOCTYPE m [<!ENTITY a "ha">' + "".join(

@@ -191,7 +191,7 @@ def test_bad_labels_are_refused(label: str, error: type[Exception], message: str
 def test_fourier_refuses_a_prismatic_joint_by_name() -> None:
     with pytest.raises(InvalidValueError, match="joint 'b' of a Fourier basis is prismatic"):
         oc.Fourier(2).family(SLIDING, 1)
-    robot = oc.Robot.chain_from_file(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
+    robot = oc.Robot.from_urdf(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
     with pytest.raises(InvalidValueError, match="torso_lift_joint"):
         oc.fit(oc.Problem(robot, oc.Task.position(robot)), oc.Fourier(1))
 

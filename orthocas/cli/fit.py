@@ -9,11 +9,14 @@ from orthocas.cli.output import AsJson, note, number, print_json, print_rows, re
 from orthocas.cli.problem_argument import (
     CentreText,
     HalfWidth,
+    HomeName,
+    Locks,
     MetricName,
     ProblemName,
     ProblemOptions,
     TaskName,
     TipName,
+    ToolText,
     build_problem,
     parse_numbers,
 )
@@ -34,6 +37,8 @@ WEIGHTS_TEXT = f"{DEFAULT_WEIGHTS.task:g},{DEFAULT_WEIGHTS.mutual:g},{DEFAULT_WE
 def fit(
     problem: ProblemName,
     tip: TipName = None,
+    lock: Locks = None,
+    tool: ToolText = None,
     task: TaskName = None,
     metric: MetricName = None,
     param: Annotated[
@@ -44,6 +49,7 @@ def fit(
         typer.Option("--solver", help="gauss_newton, lbfgs, ipopt, adam or gradient_flow; default what suits."),
     ] = None,
     centre: CentreText = None,
+    home: HomeName = None,
     half_width: HalfWidth = None,
     samples: Annotated[
         int | None, typer.Option("--samples", parser=whole_number, help="Training samples; default by size.")
@@ -68,7 +74,8 @@ def fit(
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
-    built = build_problem(problem, ProblemOptions(tip, task, metric, centre, half_width))
+    words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width)
+    built = build_problem(problem, words)
     target = out or Path(f"{built.name}.orthocas")
     require_writable(target, ChartFileError)
     parametrisation = parse_parametrisation(param)

@@ -116,6 +116,8 @@ def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTre
     numbers: dict[str, Any] = {
         name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
     }
+    for name in ("effort_limits", "velocity_limits"):  # unknown to older files
+        numbers.setdefault(name, np.full(len(data["joint_names"]), np.inf))
     texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
     return KinematicTree(**texts, **numbers)
 
@@ -129,14 +131,13 @@ def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]
 
 def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
     if recipe["kind"] == "custom":
-        return Task.custom(robot, recipe["name"], lambda q: from_tape(recipe["tape"], q), recipe["labels"])
-    if recipe["kind"] in ("orientation", "pose"):
-        build = Task.pose if recipe["kind"] == "pose" else Task.orientation
-        return build(robot, recipe["reference"])
-    return Task.named(robot, recipe["kind"])
+        labels, units = recipe["labels"], recipe.get("units", ())  # older files have no units
+        return Task.custom(robot, recipe["name"], lambda q: from_tape(recipe["tape"], q), labels, units)
+    return Task.from_recipe(robot, recipe)
 
 
 def _metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:
     if recipe["kind"] == "custom":
-        return Metric.from_spec(robot, lambda q: from_tape(recipe["tape"], q))
+        name = recipe.get("name", "custom")  # older files have no name
+        return Metric.custom(robot, name, lambda q: from_tape(recipe["tape"], q))
     return Metric.from_spec(robot, recipe["matrix"] if recipe["kind"] == "constant" else recipe["kind"])

@@ -13,7 +13,7 @@ import pinocchio as pin
 from orthocas.checks import Array, require_known
 from orthocas.errors import InvalidValueError, RobotError
 from orthocas.robots.mjcf import model_from_mjcf
-from orthocas.robots.pinocchio_model import frame_index
+from orthocas.robots.pinocchio_model import frame_index, joint_axis, leader_of, remedy
 from orthocas.robots.urdf_checks import check_urdf
 from orthocas.robots.xml_files import read_xml
 
@@ -48,9 +48,12 @@ def read_mjcf(path: str | Path) -> pin.Model:
 def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
     """Fix joints at the given positions [rad] or [m]; joints that mimic a locked joint follow it.
 
+    A joint with several degrees of freedom (floating, spherical, planar) is fixed at its neutral position, which is 0.
+
     Raises:
         UnknownNameError: if there is no such joint.
         InvalidValueError: if a position is not finite.
+        RobotError: if the joint mimics another one, or has several degrees of freedom and a position other than 0.
     """
     if not isinstance(locked, Mapping):
         raise InvalidValueError("locked", locked, "a mapping from joint names to positions")
@@ -63,7 +66,7 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
             raise InvalidValueError(f"locked position of joint '{name}'", repr(value), "a finite number")
         ids.append(model.getJointId(name))
         _set_position(model, ids[-1], float(value), position)
-    ids += [i for i in _mimic_ids(model) if i not in ids and _is_led_by(model, i, ids)]
+    ids += [i for i in model.mimicking_joints if leader_of(model, i) in ids]
     return pin.buildReducedModel(model, ids, position) if ids else model
 
 
@@ -72,13 +75,16 @@ def lock_off_chain(model: pin.Model, tip: str) -> pin.Model:
 
     Raises:
         UnknownNameError: if there is no frame called tip.
+        RobotError: if a joint that moves the tip is not revolute, continuous or prismatic (named in the message).
     """
-    chain = set(model.supports[model.frames[frame_index(model, tip)].parentJoint])
+    chain = [i for i in model.supports[model.frames[frame_index(model, tip)].parentJoint] if i > 0]
+    for i in chain:
+        joint_axis(model, i)
     ids = [i for i in range(1, model.njoints) if i not in chain]
-    position = pin.neutral(model)
+    position, mimics = pin.neutral(model), set(model.mimicking_joints)
     for i in ids:
         joint = model.joints[i]
-        if joint.nq == joint.nv == 1 and i not in _mimic_ids(model):
+        if joint.nq == joint.nv == 1 and i not in mimics:
             limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
             position[joint.idx_q] = np.clip(0.0, *limits)
     return pin.buildReducedModel(model, ids, position) if ids else model
@@ -119,16 +125,15 @@ def _text(notes: IO[bytes]) -> str:
 
 def _set_position(model: pin.Model, i: int, value: float, position: Array) -> None:
     """Write a joint position into a configuration; Pinocchio keeps cos and sin of a continuous joint."""
-    joint = model.joints[i]
+    joint, name = model.joints[i], model.names[i]
+    if i in set(model.mimicking_joints):
+        leader = model.names[leader_of(model, i)]
+        raise RobotError(f"joint '{name}' mimics joint '{leader}', expected an independent joint: {remedy(leader)}")
     if joint.nv != 1:
-        raise RobotError(f"joint '{model.names[i]}' is of type {joint.shortname()} and cannot be locked at one number")
+        if value != 0:
+            raise RobotError(
+                f"locked position of joint '{name}' is {value:g}, expected 0: "
+                f"a joint with {joint.nv} degrees of freedom is locked at its neutral position only"
+            )
+        return
     position[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(value), np.sin(value)) if joint.nq == 2 else value
-
-
-def _mimic_ids(model: pin.Model) -> list[int]:
-    return [i for i in range(1, model.njoints) if model.joints[i].shortname() == "JointModelMimic"]
-
-
-def _is_led_by(model: pin.Model, mimic: int, ids: list[int]) -> bool:
-    """Whether a mimic joint takes its position from one of the joints ids (it shares its index in q)."""
-    return any(model.joints[i].idx_q == model.joints[mimic].idx_q for i in ids)

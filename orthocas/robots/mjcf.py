@@ -99,7 +99,16 @@ class _Builder:
         for joint, placement, inertia in self._masses:
             scaled = pin.Inertia(scale * inertia.mass, inertia.lever, scale * inertia.inertia)
             self._model.appendBodyToJoint(joint, scaled, placement)
+        self._add_keyframes()
         return self._model
+
+    def _add_keyframes(self) -> None:
+        """Named postures, as reference configurations; the numbers of free and ball joints stay in MuJoCo's order."""
+        for section in self._document.sections("keyframe"):
+            for key in section.findall("key"):
+                if "name" in key.attrib and "qpos" in key.attrib:
+                    position = self._document.label(key).numbers("qpos", self._model.nq, ())
+                    self._model.referenceConfigurations[key.attrib["name"]] = np.array(position)
 
     def _add_bodies(self, parts: list[_Part], joint: int, placement: pin.SE3) -> None:
         for part in parts:

@@ -32,6 +32,8 @@ class KinematicTree:
     armatures: Array  #: (n,) rotor inertia seen at the joint [kg m^2] or [kg]
     lower: Array  #: (n,) joint limits [rad] or [m], -inf where unlimited
     upper: Array  #: (n,)
+    effort_limits: Array  #: (n,) largest torque [N m] or force [N], inf where unknown
+    velocity_limits: Array  #: (n,) largest speed [rad/s] or [m/s], inf where unknown
     tip_name: str
     tip_parent: int  #: body that carries the tip, -1 for the base
     tip_rotation: Array  #: (3, 3) in that body's frame
@@ -55,7 +57,7 @@ class KinematicTree:
         }
         for name, shape in shapes.items():
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
-        for name in ("lower", "upper"):  # may be infinite
+        for name in ("lower", "upper", "effort_limits", "velocity_limits"):  # may be infinite
             limits = np.array(getattr(self, name), dtype=float)
             require_shape(name, limits.shape, (n,))
             limits.setflags(write=False)
@@ -74,6 +76,9 @@ class KinematicTree:
                 raise RobotError(
                     f"joint '{name}' has limits [{self.lower[i]:g}, {self.upper[i]:g}], expected lower <= upper"
                 )
+            for what, limit in (("effort", self.effort_limits[i]), ("velocity", self.velocity_limits[i])):
+                if not limit > 0:
+                    raise RobotError(f"joint '{name}' has the {what} limit {limit:g}, expected a number > 0")
             if self.masses[i] < 0:
                 raise RobotError(f"the body moved by joint '{name}' has mass {self.masses[i]:g} kg, expected >= 0")
         if not -1 <= self.tip_parent < self.n:
