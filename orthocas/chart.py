@@ -1,8 +1,7 @@
 """Charts phi(q) = [h(q); xi(q)]: task and extra coordinates together, with Jacobian and inverse map."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
@@ -11,6 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.checks import Array, as_point_set, require_known
@@ -39,6 +39,11 @@ class Chart:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
+
+    def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
+        """Pickled and copied as what it was made of, with notes as a plain mapping: a read-only one can be neither."""
+        parts = {part.name: getattr(self, part.name) for part in fields(self)}
+        return type(self), tuple((parts | {"notes": dict(self.notes)}).values())
 
     @property
     def n(self) -> int:

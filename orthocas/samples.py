@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
 from orthocas.metrics import metric_matrices

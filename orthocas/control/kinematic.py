@@ -1,12 +1,12 @@
 """Velocity control in the coordinates phi = [x; xi] ([AS2023] Sec. 9)."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar
 
 import casadi as ca
 from numpy.typing import ArrayLike
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.control.controller import Command, guarded_graph, named_inputs

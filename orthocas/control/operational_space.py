@@ -1,7 +1,6 @@
 """Impedance control and PD+ in the coordinates phi = [x; xi] ([AS2023] Sec. 7), coupled or decoupled."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar, Literal
 
 import casadi as ca
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_known
 from orthocas.control.controller import Command, guarded_graph, named_function, named_inputs

@@ -1,13 +1,13 @@
 """The state of the art to compare with: null-space projectors on torque and on velocity level."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.checks import Array, frozen_array
 from orthocas.control.controller import Command, guarded_graph, named_function, named_inputs

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from math import factorial
 from typing import Self
 
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_float_array, frozen_array, require_known, require_shape
 from orthocas.control.low_pass import low_pass_response
 from orthocas.errors import InvalidValueError

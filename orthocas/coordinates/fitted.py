@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import Batched, dense_function, evaluate_columns
 from orthocas.casadi_tools.blas_graph import NumpyGraph
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.checks import Array, frozen_array
 from orthocas.coordinates.point_functions import point_functions

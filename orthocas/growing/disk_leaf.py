@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, frozen_array, require_memory
 from orthocas.domains import Box, sample_uniform
 from orthocas.errors import GrowError, InvalidValueError

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, frozen_array
 from orthocas.errors import InvalidValueError
 from orthocas.growing.leaf import LeafValues, require_on_leaf

@@ -1,13 +1,13 @@
 """Triangles in space and their topology."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, frozen_array, require_shape
 from orthocas.errors import InvalidValueError, NotADiskError
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,6 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_known
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
