@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.casadi_tools.batch import evaluate_columns
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.scalar_code import scalar_code
@@ -179,9 +180,10 @@ class Chart:
         return ca.rootfinder("inverse", "newton", equations, options)
 
     def _solve(self, q_start: Array, phi: Array) -> Array:
+        """One solution, with scratch memory of its own: threads that call a rootfinder itself share one, and crash."""
         with deferred():  # Ctrl-C inside comes out as a RuntimeError, or not at all
             try:
-                return np.asarray(self._rootfinder(ca.DM(q_start), ca.DM(phi)).nonzeros())
+                return evaluate_columns(self._rootfinder, 1, q_start[None], phi[None])[0][0]
             except RuntimeError:  # a singular linear system on the way
                 return np.full(self.n, np.nan)
 
