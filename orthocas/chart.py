@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, Self, TypeVar, overload
 
 import casadi as ca
 import numpy as np
@@ -14,7 +14,7 @@ from orthocas.casadi_tools.batch import evaluate_columns
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.scalar_code import scalar_code
-from orthocas.checks import Array, as_point_set, require_known
+from orthocas.checks import Array, as_point_set, require_kind, require_known, require_shape
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap, InvertibleMap
 from orthocas.errors import InvalidValueError, InverseError, ShapeError
@@ -22,6 +22,7 @@ from orthocas.files.chart_file import read_chart, write_chart
 from orthocas.growing import GrownCoordinates
 from orthocas.problem import Problem, task_jacobians
 
+Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
 _SINGULAR = 1e-8  # ratio of singular values of J where the inverse map is given up
 
@@ -30,8 +31,9 @@ _SINGULAR = 1e-8  # ratio of singular values of J where the inverse map is given
 class Chart:
     """A problem with coordinates xi(q) found for it ([AS2023] eq. (27)), fitted or grown.
 
-    NumPy arguments are one joint position (n,) or a set (N, n), [rad] or [m]. Grown coordinates are NaN at points from
-    where their flow does not reach the charted part of the base leaf.
+    Joint positions are one (n,), a column (n, 1), or a set (N, n), [rad] or [m]; xi, task, phi and jacobian also take a
+    CasADi column (n, 1), SX or MX, and give an expression. Grown coordinates are NaN at points from where their flow
+    does not reach the charted part of the base leaf.
     """
 
     problem: Problem
@@ -39,6 +41,7 @@ class Chart:
     notes: Mapping[str, str | float] = field(default_factory=dict)  #: how it was made: solver, weights, seed, ...
 
     def __post_init__(self) -> None:
+        require_kind("problem", self.problem, Problem)
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
 
     def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
@@ -71,24 +74,48 @@ class Chart:
         matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.family.as_matrices
         return graph if matrices else scalar_code(graph)
 
-    def xi(self, q: ArrayLike) -> Array:
+    @overload
+    def xi(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def xi(self, q: ArrayLike) -> Array: ...
+    def xi(self, q: Any) -> Any:
         """Extra coordinates, (r,) or (N, r)."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("xi", q)
         points, single = as_point_set("q", q, self.n)
         values = self.coordinates.xi(points)
         return values[0] if single else values
 
-    def task(self, q: ArrayLike) -> Array:
+    @overload
+    def task(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def task(self, q: ArrayLike) -> Array: ...
+    def task(self, q: Any) -> Any:
         """Task values x = h(q), (m,) or (N, m)."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("task", q)
         points, single = as_point_set("q", q, self.n)
         values = self.problem.task.batched(points)[0]
         return values[0] if single else values
 
-    def phi(self, q: ArrayLike) -> Array:
+    @overload
+    def phi(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def phi(self, q: ArrayLike) -> Array: ...
+    def phi(self, q: Any) -> Any:
         """Task values and extra coordinates stacked, (n,) or (N, n)."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("phi", q)
         return np.concatenate([self.task(q), self.xi(q)], axis=-1)
 
-    def jacobian(self, q: ArrayLike) -> Array:
+    @overload
+    def jacobian(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def jacobian(self, q: ArrayLike) -> Array: ...
+    def jacobian(self, q: Any) -> Any:
         """J = dphi/dq, (n, n) or (N, n, n); task rows first."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("jacobian", q)
         points, single = as_point_set("q", q, self.n)
         J = np.concatenate([task_jacobians(self.problem, points), self.coordinates.jacobian(points)], axis=1)
         return J[0] if single else J
@@ -134,6 +161,11 @@ class Chart:
         if name == "task":
             return self.problem.task.function
         return self.problem.task.jacobian_function if name == "task_jacobian" else self._functions[name]
+
+    def _expression(self, name: str, q: Any) -> Any:
+        """A function at a CasADi column (n, 1)."""
+        require_shape("q", q.shape, (self.n, 1))
+        return self.function(name)(q)
 
     def save(self, path: str | Path) -> None:
         """Write a self-contained chart file.
@@ -183,7 +215,8 @@ class Chart:
         """One solution, with scratch memory of its own: threads that call a rootfinder itself share one, and crash."""
         with deferred():  # Ctrl-C inside comes out as a RuntimeError, or not at all
             try:
-                return evaluate_columns(self._rootfinder, 1, q_start[None], phi[None])[0][0]
+                solution: Array = evaluate_columns(self._rootfinder, 1, q_start[None], phi[None])[0][0]
+                return solution
             except RuntimeError:  # a singular linear system on the way
                 return np.full(self.n, np.nan)
 

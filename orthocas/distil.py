@@ -10,7 +10,7 @@ import numpy as np
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.blas_graph import NumpyGraph
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_count, require_memory
+from orthocas.checks import Array, require_count, require_kind, require_memory
 from orthocas.coordinates.fitted import Coordinates, joint_space
 from orthocas.domains import sample_evenly, sample_uniform
 from orthocas.errors import GrowError, InvalidValueError
@@ -81,8 +81,7 @@ def distil(
     parametrisation = Polynomial(degree=6) if parametrisation is None else parametrisation
     if not isinstance(parametrisation, GradedParametrisation | MLP):
         raise InvalidValueError("parametrisation", repr(parametrisation), "Polynomial, Fourier or MLP")
-    if not isinstance(chart, Chart):
-        raise InvalidValueError("chart", repr(chart), "a grown chart")
+    require_kind("chart", chart, Chart)
     if solver is not None and not (isinstance(parametrisation, MLP) and isinstance(solver, Solver)):
         raise InvalidValueError("solver", repr(solver), "a solver such as LBFGS(), and only for a network")
     solver = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver

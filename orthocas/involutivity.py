@@ -7,9 +7,9 @@ import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.checks import Array, require_count, require_memory, require_shape
+from orthocas.checks import Array, require_count, require_kind, require_memory, require_shape
 from orthocas.domains import sample_uniform
-from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.errors import SingularTaskError
 from orthocas.problem import NEAR_SINGULAR, Problem, check, relative_singular_values
 
 _ROUNDING = 1e-7  # defects below this share of the terms they are differences of are zero
@@ -76,9 +76,8 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
         Theorem: [AS2023] Sec. 3. Defect, and expected angle: ours, docs/derivations.md#involutivity.
     """
     samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
+    require_kind("problem", problem, Problem)
     require_memory(f"{samples} samples of the defect", 32.0 * samples * problem.n * problem.m**2)
-    if not isinstance(problem, Problem):
-        raise InvalidValueError("problem", repr(problem), "a Problem, such as problems.get('iiwa')")
     points = _regular_points(problem, samples, seed)
     brackets = TaskBrackets.of(problem)
     across, size, basis = Batched(brackets.tensor_function())(points)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.checks import Array, require_shape
+from orthocas.checks import Array, require_kind, require_shape
 from orthocas.domains import Domain, default_box, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
 from orthocas.metrics import Metric, metric_matrices
@@ -105,6 +105,7 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
         MetricError: if A is not symmetric positive definite at a sample.
         SingularTaskError: if J_x loses rank at every sample, or is not finite at one.
     """
+    require_kind("problem", problem, Problem)
     points = sample_uniform(problem.domain, samples, seed)
     metric_matrices(problem.metric, points)
     smallest = relative_singular_values(problem, points)

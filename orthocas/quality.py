@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_count, require_memory
+from orthocas.checks import Array, require_count, require_kind, require_memory
 from orthocas.domains import sample_uniform
 from orthocas.errors import SingularTaskError
 from orthocas.files.json import plain
@@ -106,6 +106,7 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
         samples: number of samples N.
         seed: seed of the samples.
     """
+    require_kind("chart", chart, Chart)
     samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
     require_memory(f"evaluating {samples} samples", 8.0 * samples * chart.n * (chart.n + 4))
     points = sample_uniform(chart.problem.domain, samples, seed)

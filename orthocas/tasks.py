@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.user_expression import expression_of
-from orthocas.checks import frozen_array
+from orthocas.checks import frozen_array, require_kind
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots import Robot
 
@@ -78,6 +78,7 @@ class Task:
         Raises:
             ShapeError: if x is not a column.
         """
+        require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
         x = expression_of(f"task '{name}'", function, q)
         if x.shape[1] != 1 or x.shape[0] == 0:
@@ -159,6 +160,7 @@ class Task:
         extra: dict[str, Any] | None = None,
     ) -> Self:
         """A task that is a function of the tip's rotation and position."""
+        require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
         x = components(robot.function("tip_rotation")(q), robot.function("tip_position")(q))
         return cls(robot, name, labels, dense_function("h", [q], [x]), {"kind": name, **(extra or {})})

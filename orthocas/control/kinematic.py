@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.checks import Array, require_kind
 from orthocas.control.controller import Command, guarded_graph, named_inputs
 from orthocas.control.gains import command_limit, non_negative_gains
 from orthocas.control.inertia import block_inertia, median_volume
@@ -43,6 +43,7 @@ class Kinematic:
     energy: ClassVar[None] = None
 
     def __init__(self, chart: Chart, feedback: ArrayLike = 0.0, limit: ArrayLike | None = None) -> None:
+        require_kind("chart", chart, Chart)
         chart.function("xi")  # refuses grown charts
         object.__setattr__(self, "chart", chart)
         object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))

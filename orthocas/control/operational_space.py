@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.batch import Batched
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_known
+from orthocas.checks import Array, require_kind, require_known
 from orthocas.control.controller import Command, guarded_graph, named_function, named_inputs
 from orthocas.control.damping import DAMPING_DESIGNS, DampingDesign, damping_matrix
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
@@ -74,6 +74,7 @@ class _OperationalSpace:
     ) -> None:
         require_known("coupling", coupling, COUPLINGS)
         require_known("damping", damping, DAMPING_DESIGNS)
+        require_kind("chart", chart, Chart)
         chart.function("xi")  # refuses grown charts
         n = chart.n
         for name, value in {

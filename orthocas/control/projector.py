@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
-from orthocas.checks import Array, frozen_array
+from orthocas.checks import Array, frozen_array, require_kind
 from orthocas.control.controller import Command, guarded_graph, named_function, named_inputs
 from orthocas.control.damping import damping_matrix
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
@@ -54,6 +54,7 @@ class Projector:
         damping_ratio: ArrayLike = 0.7,
         limit: ArrayLike | None = None,
     ) -> None:
+        require_kind("problem", problem, Problem)
         n, m = problem.n, problem.m
         task = positive_gains("stiffness", stiffness, m)
         posture = positive_gains("posture_stiffness", posture_stiffness, n)
@@ -159,6 +160,7 @@ class KinematicProjector:
         posture_feedback: ArrayLike = 0.0,
         limit: ArrayLike | None = None,
     ) -> None:
+        require_kind("problem", problem, Problem)
         task = non_negative_gains("feedback", feedback, problem.m)
         posture = non_negative_gains("posture_feedback", posture_feedback, problem.n)
         object.__setattr__(self, "problem", problem)

@@ -6,7 +6,7 @@ import casadi as ca
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.checks import Array, require_kind
 from orthocas.errors import InvalidValueError
 from orthocas.simulation.trajectory import Trajectory
 
@@ -39,6 +39,8 @@ def task_acceleration_breakdown(chart: Chart, trajectory: Trajectory) -> Breakdo
     """
     if trajectory.kind != "torque":
         raise InvalidValueError("trajectory", f"one of '{trajectory.controller}'", "one of a torque controller")
+    require_kind("chart", chart, Chart)
+    require_kind("trajectory", trajectory, Trajectory)
     parts = Batched(_parts(chart))(trajectory.q, trajectory.dq, trajectory.command)
     return Breakdown(chart.problem.task.labels, *parts)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.checks import Array, require_kind
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError
 from orthocas.simulation.trajectory import Trajectory
@@ -42,6 +42,9 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
     Source:
         ours
     """
+    require_kind("chart", chart, Chart)
+    require_kind("reference", reference, Reference)
+    require_kind("trajectory", trajectory, Trajectory)
     if reference.labels != chart.labels:
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
     away = np.abs(chart.phi(trajectory.q) - reference.sample(np.minimum(trajectory.times, reference.duration))[0])

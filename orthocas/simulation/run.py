@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched
-from orthocas.checks import Array, as_float_array, frozen_array
-from orthocas.control.controller import Controller
+from orthocas.checks import Array, as_float_array, as_point, require_kind
+from orthocas.control.controller import Controller, require_controller
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, SimulationError
 from orthocas.minimising.watch import Monitor, Progress, silent
@@ -64,6 +64,7 @@ def simulate(
         UnreachableReferenceError: if the reference leaves the domain.
         ShapeError, InvalidValueError: for what does not fit.
     """
+    _require_kinds(controller, reference, plant, pushes, friction, noise)
     loop = ClosedLoop(controller, plant or controller.problem.robot, friction or Friction())
     for name, value in (
         ("step", step),
@@ -97,17 +98,36 @@ def simulate(
         return _trajectory(loop, reference, start, pieces, Outcome.INTERRUPTED)
 
 
+def _require_kinds(
+    controller: Controller,
+    reference: Reference,
+    plant: Robot | None,
+    pushes: Sequence[Push],
+    friction: Friction | None,
+    noise: Noise | None,
+) -> None:
+    """Refuse objects of another class."""
+    require_controller(controller)
+    require_kind("reference", reference, Reference)
+    for name, value, kind in (("plant", plant, Robot), ("friction", friction, Friction), ("noise", noise, Noise)):
+        if value is not None:
+            require_kind(name, value, kind)
+    require_kind("pushes", pushes, Sequence)
+    for push in pushes:
+        require_kind("an entry of pushes", push, Push)
+
+
 def _progress(name: str, time: float, duration: float) -> Progress:
     return Progress(f"simulate {name}", time / duration, f"{time:.1f} s")
 
 
 def _start_state(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | None) -> Array:
-    q = frozen_array("q_start", q_start, (loop.n,))
+    q = as_point("q_start", q_start, loop.n)
     if not loop.torque:
         if dq_start is not None:
             raise InvalidValueError("dq_start", dq_start, "nothing: velocity controllers have no velocity as a state")
         return q
-    return np.concatenate([q, np.zeros(loop.n) if dq_start is None else frozen_array("dq_start", dq_start, (loop.n,))])
+    return np.concatenate([q, np.zeros(loop.n) if dq_start is None else as_point("dq_start", dq_start, loop.n)])
 
 
 def _require_fitting(
