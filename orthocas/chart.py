@@ -21,14 +21,15 @@ from orthocas.errors import InvalidValueError, InverseError, ShapeError
 from orthocas.files.chart_file import read_chart, write_chart
 from orthocas.growing import GrownCoordinates
 from orthocas.problem import Problem, task_jacobians
+from orthocas.showing import Shown, listed
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
 _SINGULAR = 1e-8  # ratio of singular values of J where the inverse map is given up
 
 
-@dataclass(frozen=True, eq=False)
-class Chart:
+@dataclass(frozen=True, eq=False, repr=False)
+class Chart(Shown):
     """A problem with coordinates xi(q) found for it ([AS2023] eq. (27)), fitted or grown.
 
     Joint positions are one (n,), a column (n, 1), or a set (N, n), [rad] or [m]; xi, task, phi and jacobian also take a
@@ -63,6 +64,21 @@ class Chart:
     def r(self) -> int:
         """Number of extra coordinates."""
         return self.problem.r
+
+    def facts(self) -> dict[str, str]:
+        """Coordinates, problem, and how it was made."""
+        problem = self.problem.facts()
+        made = listed(
+            f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"
+            for name, value in self.notes.items()
+        )
+        return {
+            "chart": f"{self.coordinates.label} coordinates of {self.problem.heading}",
+            "phi": listed(self.labels),
+            "parameters": str(self.coordinates.size),
+            **{name: problem[name] for name in ("task", "metric", "domain")},
+            **({"made by": made} if made else {}),
+        }
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -241,7 +257,7 @@ class Chart:
             raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}, q is not unique there")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GrownChart(Chart):
     """A chart with grown coordinates, apart from `function` with the interface of fitted ones.
 

@@ -20,6 +20,7 @@ from orthocas.minimising.watch import Monitor, Progress, Watch, silent
 from orthocas.parametrisations import MLP, Family, GradedParametrisation, Parametrisation, Polynomial
 from orthocas.parametrisations.product_basis import LinearFamily
 from orthocas.quality import Report, evaluate
+from orthocas.showing import Shown, number_list
 from orthocas.solvers import LBFGS
 
 _PER_PARAMETER = 4  # samples for each parameter of a coordinate
@@ -28,8 +29,8 @@ _CHUNK = 500  # samples whose basis is held at once
 _HELD_OUT_SEED = 1
 
 
-@dataclass(frozen=True, eq=False)
-class Distilled:
+@dataclass(frozen=True, eq=False, repr=False)
+class Distilled(Shown):
     """A fitted chart that stands in for a grown one, and what was lost."""
 
     chart: Chart
@@ -38,6 +39,18 @@ class Distilled:
     grown: Report  #: quality of the grown chart
     distilled: Report  #: quality of the new one; its task angle was 90 degrees exactly before
     left_out: float  #: share of training samples where the grown chart has no value
+
+    def facts(self) -> dict[str, str]:
+        """What was lost."""
+        before, after = self.grown.task_angle, self.distilled.task_angle
+        return {
+            "distilled": f"{self.chart.coordinates.label} for {self.chart.notes['distilled from']} coordinates",
+            "problem": self.chart.problem.heading,
+            "error of xi": f"{number_list(self.value_rms)} (root mean square)",
+            "of gradients": f"{number_list(self.gradient_rms)} (relative)",
+            "task angle": f"std {after.std:.3g} deg, before {before.std:.3g} deg",
+            "left out": f"{self.left_out:.3%} of the samples",
+        }
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,14 +10,15 @@ from orthocas.domains import Domain, default_box, require_within_limits, sample_
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
 from orthocas.metrics import Metric, metric_matrices
 from orthocas.robots import Robot
+from orthocas.showing import Shown, number_list
 from orthocas.tasks import Task
 
 NEAR_SINGULAR = 0.01  #: smallest relative singular value of J_x below which a sample counts as singular
 _RANK_LOST = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
+@dataclass(frozen=True, eq=False, repr=False)
+class Problem(Shown):
     """Find r = n - m coordinates xi(q) with J_x A^-1 J_xi^T = 0 on a domain ([AS2023] eq. (5)).
 
     Args:
@@ -79,6 +80,18 @@ class Problem:
     def r(self) -> int:
         """Degree of redundancy n - m."""
         return self.n - self.m
+
+    def facts(self) -> dict[str, str]:
+        """Sizes, task, metric, domain and robot."""
+        domain = self.domain
+        return {
+            "problem": f"{self.name}, n = {self.n} joints, m = {self.m} task, r = {self.r} extra",
+            "task": self.task.heading,
+            "metric": self.metric.name,
+            "domain": f"{domain.name}, half-width {number_list(domain.half_width)}",
+            "centre": number_list(domain.centre),
+            "robot": self.robot.heading,
+        }
 
 
 @dataclass(frozen=True)

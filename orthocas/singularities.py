@@ -1,6 +1,6 @@
 """Where grown coordinates must break: singular points of a task, and what xi does there."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -30,7 +30,7 @@ class SingularPoint:
     kind: str  #: maximum, minimum or saddle
     task_value: float
     curvatures: Array  #: eigenvalues of A^-1 d^2h/dq^2, rising, (n,)
-    directions: Array  #: their eigenvectors as columns, A-orthonormal, (n, n)
+    directions: Array = field(repr=False)  #: their eigenvectors as columns, A-orthonormal, (n, n)
 
 
 @dataclass(frozen=True)

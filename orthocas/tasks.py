@@ -1,7 +1,7 @@
 """Tasks x = h(q): what the robot is to do, with m < n numbers."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Self
 
 import casadi as ca
@@ -14,19 +14,20 @@ from orthocas.casadi_tools.user_expression import expression_of
 from orthocas.checks import frozen_array, require_kind
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots import Robot
+from orthocas.showing import Shown, listed
 
 TASK_KINDS = ("position", "position:AXES", "polar", "orientation", "pose")
 
 
-@dataclass(frozen=True, eq=False)
-class Task:
+@dataclass(frozen=True, eq=False, repr=False)
+class Task(Shown):
     """A task map h of a robot. Use the class methods to build one."""
 
     robot: Robot
     name: str
     labels: tuple[str, ...]  #: names of the components of x
     function: ca.Function  #: q (n, 1) -> x (m, 1), dense, SX
-    recipe: dict[str, Any] = field(repr=False)  #: plain data that `from_recipe` turns into the same task
+    recipe: dict[str, Any]  #: plain data that `from_recipe` turns into the same task
 
     @classmethod
     def position(cls, robot: Robot, axes: str = "xyz") -> Self:
@@ -111,6 +112,10 @@ class Task:
     def m(self) -> int:
         """Number of task components."""
         return len(self.labels)
+
+    def facts(self) -> dict[str, str]:
+        """Name, components and robot."""
+        return {"task": f"{self.name}, m = {self.m} ({listed(self.labels)})", "robot": self.robot.heading}
 
     @cached_property
     def jacobian_function(self) -> ca.Function:

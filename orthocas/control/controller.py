@@ -10,6 +10,7 @@ from orthocas.control.status import guard
 from orthocas.domains import Domain
 from orthocas.errors import InvalidValueError
 from orthocas.problem import Problem
+from orthocas.showing import listed, number_list
 
 Command = Literal["torque", "velocity"]
 
@@ -65,6 +66,17 @@ class Controller(Protocol):
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError, with time and place, if the reference leaves what the law can follow."""
         ...
+
+
+def law_facts(controller: Controller, **settings: str) -> dict[str, str]:
+    """What a controller shows: quantities, gains, other settings and problem."""
+    return {
+        "law": f"{controller.name}, commands {controller.command} of {controller.problem.n} joints",
+        "quantities": listed(controller.labels),
+        **{name: number_list(gain) for name, gain in controller.gains.items()},
+        **settings,
+        "problem": controller.problem.heading,
+    }
 
 
 def require_controller(controller: Controller) -> None:

@@ -9,16 +9,17 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind
-from orthocas.control.controller import Command, guarded_graph, named_inputs
+from orthocas.control.controller import Command, guarded_graph, law_facts, named_inputs
 from orthocas.control.gains import command_limit, non_negative_gains
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
 from orthocas.problem import Problem
+from orthocas.showing import Shown
 
 
-@dataclass(frozen=True, eq=False)
-class Kinematic:
+@dataclass(frozen=True, eq=False, repr=False)
+class Kinematic(Shown):
     """Joint velocity dq = J^-1 (d_phi_d + Lambda (phi_d - phi)).
 
     Args:
@@ -53,6 +54,10 @@ class Kinematic:
     def problem(self) -> Problem:
         """Robot, task, metric and domain of the chart."""
         return self.chart.problem
+
+    def facts(self) -> dict[str, str]:
+        """Quantities, gains and problem."""
+        return law_facts(self)
 
     @property
     def labels(self) -> tuple[str, ...]:

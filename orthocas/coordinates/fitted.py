@@ -1,7 +1,7 @@
 """The coordinates xi(q) of a chart: a fitted family on the active joints, and the idle joints as they are."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -34,11 +34,11 @@ class Coordinates:
     """
 
     parametrisation: Parametrisation
-    space: JointSpace  #: all joints of the robot
+    space: JointSpace = field(repr=False)  #: all joints of the robot
     idle: tuple[int, ...]  #: joints that are coordinates themselves, listed last
-    theta: Array  #: parameters of the family, (size,)
-    offset: Array  #: (r - idle,)
-    scale: Array  #: (r - idle,)
+    theta: Array = field(repr=False)  #: parameters of the family, (size,)
+    offset: Array = field(repr=False)  #: (r - idle,)
+    scale: Array = field(repr=False)  #: (r - idle,)
 
     def __post_init__(self) -> None:
         fitted = len(self.offset)

@@ -1,7 +1,7 @@
 """A base leaf with the topology of a disk, three joints and one task, charted by a harmonic map ([AS2023] Sec. 5.2)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,13 +30,13 @@ class DiskLeaf:
     the size of a cell, and the value by about its third power.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     level: Array  #: x0, (1,)
     region_centre: Array  #: (3,)
     region_half_width: Array  #: (3,)
-    vertices: Array  #: (V, 3), on the leaf
-    faces: Array  #: (F, 3), whole numbers
-    disk: Array  #: images of the vertices, (V, 2)
+    vertices: Array = field(repr=False)  #: (V, 3), on the leaf
+    faces: Array = field(repr=False)  #: (F, 3), whole numbers
+    disk: Array = field(repr=False)  #: images of the vertices, (V, 2)
     kind = "disk"
     turn = 0.0
     periodic = True

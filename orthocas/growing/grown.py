@@ -1,6 +1,6 @@
 """Coordinates grown from a base leaf: exact ones, evaluated by following a flow ([AS2023] Sec. 5)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -25,7 +25,7 @@ class GrownCoordinates:
     chart of the leaf; `pull` tells which.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     leaf: LeafChart
 
     @property

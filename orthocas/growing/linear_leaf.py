@@ -1,7 +1,7 @@
 """Linear coordinates on the base leaf: the chart that exists for any number of joints."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,10 +26,10 @@ class LinearLeaf:
     the leaf folds over, the Jacobian of the grown chart loses rank, and `evaluate` shows it.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     level: Array  #: x0 = h(q0), (m,)
     centre: Array  #: q0, (n,)
-    normals: Array  #: N, (n, r), unit columns with J_x(q0) A^-1(q0) N = 0
+    normals: Array = field(repr=False)  #: N, (n, r), unit columns with J_x(q0) A^-1(q0) N = 0
     kind = "linear"
     turn = 0.0
     periodic = False

@@ -17,9 +17,10 @@ from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
 from orthocas.robots.pinocchio_model import frame_index, tree_from_model
 from orthocas.robots.tree import KinematicTree
+from orthocas.showing import Shown, listed, number_list
 
 
-class Robot:
+class Robot(Shown):
     """A fixed-base robot with n revolute or prismatic joints and one tip frame.
 
     Methods take CasADi columns (n, 1), SX or MX, and return the same kind; or NumPy, one state (n,) or a set
@@ -103,6 +104,18 @@ class Robot:
     def upper(self) -> Array:
         """Upper joint limits (n,) [rad] or [m], inf where unlimited."""
         return self.tree.upper
+
+    def facts(self) -> dict[str, str]:
+        """Joints, limits, tip and mass."""
+        tree = self.tree
+        sliding = [name for name, slides in zip(tree.joint_names, tree.prismatic, strict=True) if slides]
+        return {
+            "robot": f"{self.n} joints, tip {tree.tip_name}, {tree.masses.sum():.4g} kg",
+            "joints": listed(tree.joint_names),
+            **({"prismatic": listed(sliding)} if sliding else {}),
+            "lower": number_list(self.lower),
+            "upper": number_list(self.upper),
+        }
 
     def mass_matrix(self, q: Any) -> Any:
         """M(q), (n, n), symmetric positive definite."""

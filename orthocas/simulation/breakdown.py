@@ -1,6 +1,6 @@
 """Where unwanted task acceleration comes from ([AS2023] Fig. 25b)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 
@@ -16,10 +16,10 @@ class Breakdown:
     """Parts of the task acceleration dd_x along a run, each (N, m). They add up to dd_x."""
 
     labels: tuple[str, ...]  #: of x
-    own: Array  #: J_x M^-1 J_x^T f_x: what the force in the task does
-    error: Array  #: J_x M^-1 J_xi^T f_xi, [AS2023] eq. (38): 0 where (5) holds with A = M
-    curvature: Array  #: dJ_x/dt dq
-    coriolis: Array  #: -J_x M^-1 C dq
+    own: Array = field(repr=False)  #: J_x M^-1 J_x^T f_x: what the force in the task does
+    error: Array = field(repr=False)  #: J_x M^-1 J_xi^T f_xi, [AS2023] eq. (38): 0 where (5) holds with A = M
+    curvature: Array = field(repr=False)  #: dJ_x/dt dq
+    coriolis: Array = field(repr=False)  #: -J_x M^-1 C dq
 
     @property
     def total(self) -> Array:
