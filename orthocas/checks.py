@@ -96,7 +96,7 @@ def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
     points = array[None, :] if single else array
     if points.ndim != 2 or points.shape[1] != n:
         raise ShapeError(name, array.shape, (n,) if single else (None, n))
-    require_finite(name, points)
+    require_finite(name, points[0] if single else points)
     return points, single
 
 
@@ -115,7 +115,8 @@ def as_point(name: str, value: ArrayLike, n: int) -> Array:
 def require_kind(name: str, value: object, kind: type) -> None:
     """Raise InvalidValueError unless value is an instance of the class."""
     if not isinstance(value, kind):
-        raise InvalidValueError(name, f"of type {type(value).__name__}", f"a {kind.__name__}")
+        plain = isinstance(value, str | int | float | None)
+        raise InvalidValueError(name, repr(value)[:80] if plain else f"a {type(value).__name__}", f"a {kind.__name__}")
 
 
 def require_at_least(name: str, value: float, least: float) -> None:

@@ -82,7 +82,7 @@ def law_facts(controller: Controller, **settings: str) -> dict[str, str]:
 def require_controller(controller: Controller) -> None:
     """Raise InvalidValueError for what has not the attributes of a controller; none of its functions is built."""
     if not all(hasattr(controller, name) for name in ("name", "problem", "command", "labels", "gains")):
-        raise InvalidValueError("controller", f"of type {type(controller).__name__}", "a controller, such as PDPlus")
+        raise InvalidValueError("controller", f"a {type(controller).__name__}", "a controller, such as PDPlus")
 
 
 def named_inputs(n: int, gains: dict[str, Array], k: int) -> dict[str, ca.MX]:

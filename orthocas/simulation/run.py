@@ -12,7 +12,7 @@ from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, SimulationError
 from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.robots import Robot
-from orthocas.simulation.closed_loop import ClosedLoop
+from orthocas.simulation.closed_loop import ClosedLoop, Piece
 from orthocas.simulation.continuous import integrate
 from orthocas.simulation.disturbances import Friction, Noise, Push
 from orthocas.simulation.sampled import run_ticks
@@ -77,7 +77,8 @@ def simulate(
     start = _start_state(loop, q_start, dq_start)
     if must_be_reachable:
         controller.require_reachable(reference, start[: loop.n])
-    loads, pieces = tuple(pushes), []
+    loads = tuple(pushes)
+    pieces: list[Piece] = []
     outcome = Outcome.COMPLETE
     running = (
         integrate(loop, reference, loads, start, step, tolerance)
@@ -87,7 +88,7 @@ def simulate(
     try:
         for piece in running:
             pieces.append(piece)
-            monitor(_progress(controller.name, piece[0][-1], reference.duration))
+            monitor(_progress(controller.name, piece.times[-1], reference.duration))
     except KeyboardInterrupt:
         outcome = Outcome.INTERRUPTED
     except SimulationError:
@@ -158,20 +159,21 @@ def _require_fitting(
 
 
 def _trajectory(
-    loop: ClosedLoop, reference: Reference, start: Array, pieces: Sequence[tuple[Array, ...]], outcome: Outcome
+    loop: ClosedLoop, reference: Reference, start: Array, pieces: Sequence[Piece], outcome: Outcome
 ) -> Trajectory:
     """Put the pieces in a row, and add what follows from states and reference."""
     controller, n = loop.controller, loop.n
-    times = np.concatenate([[0.0], *(piece[0] for piece in pieces)])
-    states = np.vstack([start, *(piece[1] for piece in pieces)])
+    times = np.concatenate([[0.0], *(piece.times for piece in pieces)])
+    states = np.vstack([start, *(piece.states for piece in pieces)])
     q = states[:, :n]
     wanted = reference.sample(np.minimum(times, reference.duration))
     dq = states[:, n:] if loop.torque else np.zeros_like(q)
     arguments = [q, dq, *wanted, *(np.tile(gain, (len(times), 1)) for gain in controller.gains.values())]
     command, status = Batched(controller.function)(*arguments)
-    if pieces and len(pieces[0]) > 2:  # commands were held from noisy measurements: take those that were sent
-        command = np.vstack([*(piece[2] for piece in pieces), pieces[-1][2][-1:]])
-        status = np.concatenate([*(piece[3] for piece in pieces), pieces[-1][3][-1:]])[:, None]
+    held = [piece.held for piece in pieces if piece.held is not None]
+    if held:  # commands come from noisy measurements: take those that were sent, the last one also for the end
+        command = np.vstack([*(sent for sent, _ in held), held[-1][0][-1:]])
+        status = np.concatenate([*(known for _, known in held), held[-1][1][-1:]])[:, None]
     unknown = [np.full((len(times), 1), np.nan)] * 2
     storage, power = unknown if controller.energy is None else Batched(controller.energy)(*arguments)
     return Trajectory(
