@@ -10,7 +10,7 @@ import numpy as np
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.blas_graph import NumpyGraph
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_count, require_memory
+from orthocas.checks import Array, require_count, require_kind, require_memory
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import sample_evenly, sample_uniform
 from orthocas.errors import GrowError, InvalidValueError
@@ -19,6 +19,7 @@ from orthocas.minimising.solver import Solver
 from orthocas.minimising.watch import Monitor, Progress, Watch, silent
 from orthocas.parametrisations import Family, JointSpace, LinearFamily, Parametrisation, Polynomial
 from orthocas.quality import Report, evaluate
+from orthocas.showing import Shown, number_list
 from orthocas.solvers import LBFGS
 
 _PER_PARAMETER = 4  # samples for each parameter of a coordinate
@@ -27,8 +28,8 @@ _CHUNK = 500  # samples whose basis is held at once
 _HELD_OUT_SEED = 1
 
 
-@dataclass(frozen=True, eq=False)
-class Distilled:
+@dataclass(frozen=True, eq=False, repr=False)
+class Distilled(Shown):
     """A fitted chart that stands in for a grown one, and what was lost."""
 
     chart: Chart
@@ -37,6 +38,18 @@ class Distilled:
     grown: Report  #: quality of the grown chart
     distilled: Report  #: quality of the new one; its task angle was 90 degrees exactly before
     left_out: float  #: share of training samples where the grown chart has no value
+
+    def facts(self) -> dict[str, str]:
+        """What was lost."""
+        before, after = self.grown.task_angle, self.distilled.task_angle
+        return {
+            "distilled": f"{self.chart.coordinates.label} for {self.chart.notes['distilled from']} coordinates",
+            "problem": self.chart.problem.heading,
+            "error of xi": f"{number_list(self.value_rms)} (root mean square)",
+            "of gradients": f"{number_list(self.gradient_rms)} (relative)",
+            "task angle": f"std {after.std:.3g} deg, before {before.std:.3g} deg",
+            "left out": f"{self.left_out:.3%} of the samples",
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +93,7 @@ def distil(
     parametrisation = Polynomial(degree=6) if parametrisation is None else parametrisation
     if not isinstance(parametrisation, Parametrisation) or parametrisation.closed_form is not None:
         raise InvalidValueError("parametrisation", repr(parametrisation), "one that is fitted, such as Polynomial(6)")
-    if not isinstance(chart, Chart):
-        raise InvalidValueError("chart", repr(chart), "a grown chart")
+    require_kind("chart", chart, Chart)
     watch = Watch(monitor, f"distil {parametrisation.label}")
     if not isinstance(chart.coordinates, GrownCoordinates):
         raise InvalidValueError("chart", f"a chart of kind {chart.coordinates.label}", "a grown chart")

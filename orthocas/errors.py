@@ -25,7 +25,7 @@ class InvalidValueError(OrthocasError, ValueError):
     """A value is outside what the argument allows."""
 
     def __init__(self, name: str, got: object, want: str) -> None:
-        super().__init__(f"{name} is {got}, expected {want}")
+        super().__init__(f"{name} is {' '.join(str(got).split())}, expected {want}")
 
 
 class UnknownNameError(OrthocasError, ValueError):

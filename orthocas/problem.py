@@ -4,20 +4,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocas.checks import Array, require_shape
+from orthocas.checks import Array, require_kind, require_shape
 from orthocas.domains import Domain, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
 from orthocas.metrics import Metric, MetricSpec, metric_matrices
 from orthocas.postures.regular_box import regular_box
 from orthocas.robots import Robot
+from orthocas.showing import Shown, number_list
 from orthocas.tasks import Task
 
 NEAR_SINGULAR = 0.01  #: smallest relative singular value of J_x below which a sample counts as singular
 _RANK_LOST = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
+@dataclass(frozen=True, eq=False, repr=False)
+class Problem(Shown):
     """Find r = n - m coordinates xi(q) with J_x A^-1 J_xi^T = 0 on a domain ([AS2023] eq. (5)).
 
     Args:
@@ -87,6 +88,18 @@ class Problem:
         """Degree of redundancy n - m."""
         return self.n - self.m
 
+    def facts(self) -> dict[str, str]:
+        """Sizes, task, metric, domain and robot."""
+        domain = self.domain
+        return {
+            "problem": f"{self.name}, n = {self.n} joints, m = {self.m} task, r = {self.r} extra",
+            "task": self.task.heading,
+            "metric": self.metric.name,
+            "domain": f"{domain.name}, half-width {number_list(domain.half_width)}",
+            "centre": number_list(domain.centre),
+            "robot": self.robot.heading,
+        }
+
 
 @dataclass(frozen=True)
 class ProblemCheck:
@@ -112,6 +125,7 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
         MetricError: if A is not symmetric positive definite at a sample.
         SingularTaskError: if J_x loses rank at every sample, or is not finite at one.
     """
+    require_kind("problem", problem, Problem)
     points = sample_uniform(problem.domain, samples, seed)
     metric_matrices(problem.metric, points)
     smallest = relative_singular_values(problem, points)

@@ -2,25 +2,29 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
 from orthocas.metrics import metric_matrices
 from orthocas.problem import Problem, task_jacobians
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Samples:
     """N joint positions with their task gradients and metrics; samples with a vanishing gradient are left out."""
 
     points: Array  #: q, (N, n)
     task_jacobian: Array  #: J_x, (N, m, n)
     metric_inverse: Array | None  #: A^-1, (N, n, n); None for the identity
+
+    def __repr__(self) -> str:
+        N, m, n = self.task_jacobian.shape
+        return f"Samples({N} joint positions, n = {n}, m = {m})"
 
     def __len__(self) -> int:
         return len(self.points)

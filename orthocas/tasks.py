@@ -1,20 +1,22 @@
 """Tasks x = h(q): what the robot is to do, with m < n numbers."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any, Self
 
 import casadi as ca
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.user_expression import expression_of
+from orthocas.checks import require_kind
 from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots import Robot
 from orthocas.robots.spatial import rotation_matrix
 from orthocas.robots.tip_turn import TipTurn, frame_along
+from orthocas.showing import Shown, listed
 
 TASK_KINDS = (
     "position",
@@ -29,8 +31,8 @@ TASK_KINDS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Task:
+@dataclass(frozen=True, eq=False, repr=False)
+class Task(Shown):
     """A task map h of a robot. Use the class methods to build one.
 
     Orientation, pose and axis tasks compare the tip with a reference. Where none is given, `Problem` takes the tip's
@@ -42,7 +44,7 @@ class Task:
     labels: tuple[str, ...]  #: names of the components of x
     units: tuple[str, ...]  #: of the components: "m", "rad", or "" where it is unknown
     function: ca.Function  #: q (n, 1) -> x (m, 1), dense, SX
-    recipe: dict[str, Any] = field(repr=False)  #: plain data that `from_recipe` turns into the same task
+    recipe: dict[str, Any]  #: plain data that `from_recipe` turns into the same task
 
     @classmethod
     def position(cls, robot: Robot, axes: str = "xyz") -> Self:
@@ -126,6 +128,7 @@ class Task:
         Raises:
             ShapeError: if x is not a column, or labels or units do not have one entry per component.
         """
+        require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
         x = expression_of(f"task '{name}'", function, q)
         if x.shape[1] != 1 or x.shape[0] == 0:
@@ -174,6 +177,10 @@ class Task:
     def m(self) -> int:
         """Number of task components."""
         return len(self.labels)
+
+    def facts(self) -> dict[str, str]:
+        """Name, components and robot."""
+        return {"task": f"{self.name}, m = {self.m} ({listed(self.labels)})", "robot": self.robot.heading}
 
     @cached_property
     def jacobian_function(self) -> ca.Function:
@@ -232,6 +239,7 @@ class Task:
         extra: Mapping[str, Any] | None = None,
     ) -> Self:
         """A task that is a function of the tip's rotation and position."""
+        require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
         x = components(robot.function("tip_rotation")(q), robot.function("tip_position")(q))
         return cls(robot, name, labels, units, dense_function("h", [q], [x]), {"kind": name, **(extra or {})})

@@ -4,10 +4,11 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from orthocas import problems
-from orthocas.checks import Array, as_float_array
+from orthocas.checks import Array
 from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, UnknownNameError
 from orthocas.postures.regular_box import regular_box
@@ -104,7 +105,11 @@ def build_problem(name: str, options: ProblemOptions) -> Problem:
 
 def parse_numbers(option: str, text: str) -> Array:
     """Read "0,0.5,..."."""
-    return as_float_array(option, [part.strip() for part in text.split(",")])
+    words = [part.strip() for part in text.split(",")]
+    try:
+        return np.array([float(word) for word in words])
+    except ValueError:
+        raise InvalidValueError(option, words, "an array of numbers") from None
 
 
 def _from_file(name: str, options: ProblemOptions) -> Problem:

@@ -6,7 +6,7 @@ from concurrent.futures import Executor
 from itertools import product
 from pathlib import Path
 
-from orthocas.checks import require_count
+from orthocas.checks import require_count, require_kind
 from orthocas.comparing.cells import Cell, CellResult, run_cells
 from orthocas.comparing.report import Comparison
 from orthocas.comparing.ticks import with_control_ticks
@@ -63,6 +63,7 @@ def compare(
         InvalidValueError: if the grid is empty, or two of its parametrisations or solvers have the same name.
         ChartFileError: if the folder for charts cannot be written.
     """
+    require_kind("problem", problem, Problem)
     count, loss = require_count("seeds", seeds), Weights.of(weights)
     jobs = None if jobs is None else require_count("jobs", jobs)
     held_out = require_count("held_out", held_out)

@@ -1,14 +1,14 @@
 """The coordinates xi(q) of a chart: a fitted family on the active joints, and the idle joints as they are."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import Batched, dense_function, evaluate_columns
 from orthocas.casadi_tools.blas_graph import NumpyGraph
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.checks import Array, frozen_array
 from orthocas.coordinates.point_functions import point_functions
@@ -27,11 +27,11 @@ class Coordinates:
     """
 
     parametrisation: Parametrisation
-    space: JointSpace  #: all joints of the robot
+    space: JointSpace = field(repr=False)  #: all joints of the robot
     idle: tuple[int, ...]  #: joints that are coordinates themselves, listed last
-    theta: Array  #: parameters of the family, (size,)
-    offset: Array  #: (r - idle,)
-    scale: Array  #: (r - idle,)
+    theta: Array = field(repr=False)  #: parameters of the family, (size,)
+    offset: Array = field(repr=False)  #: (r - idle,)
+    scale: Array = field(repr=False)  #: (r - idle,)
 
     def __post_init__(self) -> None:
         fitted = len(self.offset)

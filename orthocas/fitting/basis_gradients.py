@@ -1,11 +1,10 @@
 """Gradients of basis functions at samples: of any linear family, without the zeros."""
 
-from functools import cached_property
-
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.columns import ColumnFunction, blocked
 from orthocas.checks import Array
 from orthocas.parametrisations import LinearFamily

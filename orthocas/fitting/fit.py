@@ -20,12 +20,13 @@ from orthocas.minimising.watch import Monitor, silent
 from orthocas.parametrisations import JointSpace, Parametrisation, Polynomial, warn_unless_savable
 from orthocas.problem import Problem, ProblemCheck, check
 from orthocas.samples import Samples, sample_problem
+from orthocas.showing import Shown, listed
 
 _FIRST_SAMPLES = 1000  # tag of the samples that scale coordinates, apart from those of the stages
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
+@dataclass(frozen=True, eq=False, repr=False)
+class Fit(Shown):
     """A fitted chart and how it came about."""
 
     chart: Chart
@@ -38,6 +39,18 @@ class Fit:
     def status(self) -> Status:
         """How the last stage ended; CONVERGED if there was nothing to minimise."""
         return self.stages[-1].result.status if self.stages else Status.CONVERGED
+
+    def facts(self) -> dict[str, str]:
+        """Status, time, stages and the chart."""
+        stages = [f"{stage.label} {stage.result.value:.4g}" for stage in self.stages]
+        return {
+            "fit": f"{self.chart.coordinates.label}, {self.status.value} after {self.seconds:.3g} s",
+            "problem": self.chart.problem.heading,
+            "loss": listed(stages) or "nothing to minimise",
+            "samples": str(self.chart.notes.get("samples", "")),
+            "idle joints": listed(self.idle_joints) or "none",
+            "near singular": f"{self.problem_check.singular_share:.3%} of the domain",
+        }
 
 
 def fit(

@@ -1,14 +1,14 @@
 """A closed base leaf of dimension one, charted by its arc length ([AS2023] Sec. 5.1)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array, frozen_array
 from orthocas.errors import GrowError, InvalidValueError
@@ -32,9 +32,9 @@ class CircleLeaf:
     The point opposite to the first sample is the cut: a circle has no single smooth coordinate.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     level: Array  #: x0, (m,)
-    curve: Array  #: samples at equal arc lengths, (K + 1, n); the last is the first one, up to whole turns
+    curve: Array = field(repr=False)  #: samples at equal arc lengths, (K + 1, n); the last is the first, up to turns
     length: Array  #: L, (1,)
     kind = "circle"
     turn = 2 * np.pi

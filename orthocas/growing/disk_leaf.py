@@ -1,11 +1,11 @@
 """A base leaf with the topology of a disk, three joints and one task, charted by a harmonic map ([AS2023] Sec. 5.2)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, Indices, frozen_array, frozen_indices, require_memory
 from orthocas.domains import Box, sample_uniform
 from orthocas.errors import GrowError, InvalidValueError
@@ -30,13 +30,13 @@ class DiskLeaf:
     of the gradient is of the order of the cell size, and that of the value of its third power.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     level: Array  #: x0, (1,)
     region_centre: Array  #: (3,)
     region_half_width: Array  #: (3,)
-    vertices: Array  #: (V, 3), on the leaf
-    faces: Indices  #: (F, 3), indices of vertices
-    disk: Array  #: images of the vertices, (V, 2)
+    vertices: Array = field(repr=False)  #: (V, 3), on the leaf
+    faces: Indices = field(repr=False)  #: (F, 3), indices of vertices
+    disk: Array = field(repr=False)  #: images of the vertices, (V, 2)
     kind = "disk"
     turn = 0.0
     periodic = True

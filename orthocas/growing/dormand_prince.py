@@ -5,7 +5,6 @@ step of all trajectories is an operation on columns of samples, which leaves lit
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.columns import ColumnFunction, blocked, by_sample
 from orthocas.checks import Array
 

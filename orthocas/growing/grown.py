@@ -1,12 +1,12 @@
 """Coordinates grown from a base leaf: exact ones, evaluated by following a flow ([AS2023] Sec. 5)."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_point_set
 from orthocas.errors import NoExpressionError
 from orthocas.growing.flow import TOLERANCE, Arrival, Moved, TaskFlow
@@ -25,7 +25,7 @@ class GrownCoordinates:
     chart of the leaf; `pull` tells which.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     leaf: LeafChart
 
     @property

@@ -1,11 +1,11 @@
 """Linear coordinates on the base leaf: the chart that exists for any number of joints."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, frozen_array
 from orthocas.errors import InvalidValueError
 from orthocas.growing.leaf import LeafValues, require_on_leaf
@@ -26,10 +26,10 @@ class LinearLeaf:
     the leaf folds over, the Jacobian of the grown chart loses rank, and `evaluate` shows it.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     level: Array  #: x0 = h(q0), (m,)
     centre: Array  #: q0, (n,)
-    normals: Array  #: N, (n, r), unit columns with J_x(q0) A^-1(q0) N = 0
+    normals: Array = field(repr=False)  #: N, (n, r), unit columns with J_x(q0) A^-1(q0) N = 0
     kind = "linear"
     turn = 0.0
     periodic = False

@@ -4,13 +4,13 @@
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.errors import GrowError
 from orthocas.growing.flow import Arrival, Moved, TaskFlow

@@ -1,11 +1,11 @@
 """Triangles in space and their topology."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import igl
 import numpy as np
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, Indices, frozen_array, frozen_indices
 from orthocas.errors import NotADiskError
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, require_shape
 from orthocas.parametrisations.family import Expression, JointSpace, component_gradients
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,6 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_known
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
@@ -19,12 +19,13 @@ from orthocas.robots.homes import model_states, postures, srdf_states
 from orthocas.robots.pinocchio_model import frame_index, tree_from_model
 from orthocas.robots.tool import with_tool
 from orthocas.robots.tree import KinematicTree
+from orthocas.showing import Shown, listed, number_list
 
 Locked = Mapping[str, float] | None  #: joint -> position where it stays [rad] or [m]
 Tool = ArrayLike | None
 
 
-class Robot:
+class Robot(Shown):
     """A fixed-base robot with n revolute or prismatic joints and one tip frame.
 
     Methods take CasADi columns (n, 1), SX or MX, and return the same kind; or NumPy, one state (n,) or a set
@@ -160,6 +161,18 @@ class Robot:
     def velocity_limits(self) -> Array:
         """Largest joint speeds [rad/s] or [m/s], (n,), inf where the file has none, or 0."""
         return self.tree.velocity_limits
+
+    def facts(self) -> dict[str, str]:
+        """Joints, limits, tip and mass."""
+        tree = self.tree
+        sliding = [name for name, slides in zip(tree.joint_names, tree.prismatic, strict=True) if slides]
+        return {
+            "robot": f"{self.n} joints, tip {tree.tip_name}, {tree.masses.sum():.4g} kg",
+            "joints": listed(tree.joint_names),
+            **({"prismatic": listed(sliding)} if sliding else {}),
+            "lower": number_list(self.lower),
+            "upper": number_list(self.upper),
+        }
 
     def mass_matrix(self, q: Any) -> Any:
         """M(q), (n, n), symmetric positive definite."""

@@ -2,10 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 
 import casadi as ca
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.columns import ColumnFunction
 from orthocas.fitting.loss.registry import term_of
 from orthocas.fitting.loss.term import SAMPLE_DATA, LossTerm, Sizes
