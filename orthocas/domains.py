@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_count
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
 from orthocas.robots import Robot
+from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
 
-REVOLUTE_HALF_WIDTH = np.pi / 4  #: default half-width [rad], the hyper-cube of [AS2023] Sec. 9
-PRISMATIC_HALF_WIDTH = 0.25  #: default half-width [m] of an unlimited prismatic joint
 _WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes and overflow later
 
 
@@ -180,12 +179,7 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: Array
         half_width: another half-width (n,), or one for all joints; not shortened, so that it fails where it leaves the
             limits.
     """
-    wanted = _wanted_half_width(robot)
-    limited = np.isfinite(robot.lower) & np.isfinite(robot.upper)
-    middle = np.clip(np.zeros(robot.n), robot.lower + wanted, robot.upper - wanted)
-    middle[limited] = (robot.lower[limited] + robot.upper[limited]) / 2
-    if centre is not None:
-        middle = frozen_array("centre", centre, (robot.n,))
+    middle = robot.tree.middle if centre is None else frozen_array("centre", centre, (robot.n,))
     if half_width is not None:
         return Box(middle, half_width)
     widths = default_half_width(robot, middle)
@@ -221,7 +215,7 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
 
 
 def _wanted_half_width(robot: Robot) -> Array:
-    return np.where(robot.tree.prismatic, PRISMATIC_HALF_WIDTH, REVOLUTE_HALF_WIDTH)
+    return np.where(robot.tree.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
 
 
 def _require_seed(seed: int | tuple[int, ...]) -> None:

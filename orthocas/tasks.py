@@ -11,7 +11,6 @@ from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.user_expression import expression_of
 from orthocas.checks import require_kind
-from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots import Robot
 from orthocas.robots.spatial import rotation_matrix
@@ -36,7 +35,7 @@ class Task(Shown):
     """A task map h of a robot. Use the class methods to build one.
 
     Orientation, pose and axis tasks compare the tip with a reference. Where none is given, `Problem` takes the tip's
-    orientation at the centre of its domain; the task alone takes the one at the centre of `default_box(robot)`.
+    orientation at the centre of its domain; the task alone takes the one in the middle of the joint limits.
     """
 
     robot: Robot
@@ -219,7 +218,7 @@ class Task(Shown):
     def _turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None) -> Self:
         """A task of the tip's turn away from a reference rotation (3, 3), or from the default if there is none."""
         if reference is None:
-            base, extra = robot.tip_rotation(default_box(robot).centre), {}
+            base, extra = robot.tip_rotation(robot.tree.middle), {}
         else:
             base = rotation_matrix("reference", reference)
             extra = {"reference": base.tolist()}

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, Self, TypeVar, runtime_checkable
 
 import casadi as ca
 
 from orthocas.checks import Array
-from orthocas.problem import Problem
+
+if TYPE_CHECKING:
+    from orthocas.problem import Problem
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)
 
@@ -22,7 +24,7 @@ class JointSpace:
     joint_names: tuple[str, ...]
 
     @classmethod
-    def of(cls, problem: Problem) -> "JointSpace":
+    def of(cls, problem: "Problem") -> "JointSpace":
         """All joints of a problem."""
         robot, domain = problem.robot, problem.domain
         return cls(domain.centre, domain.half_width, robot.tree.prismatic, robot.joint_names)
@@ -141,11 +143,11 @@ class Parametrisation(Protocol):
         ...
 
     @property
-    def closed_form(self) -> Callable[[Problem], ClosedForm] | None:
+    def closed_form(self) -> "Callable[[Problem], ClosedForm] | None":
         """What finds the parameters without a fit; None if they are fitted."""
         ...
 
-    def for_problem(self, problem: Problem) -> "Parametrisation":
+    def for_problem(self, problem: "Problem") -> "Parametrisation":
         """The same with everything it has to know of the problem; itself, if that is nothing."""
         ...
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import comb, sqrt
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -11,7 +11,9 @@ from orthocas.checks import Array, require_count
 from orthocas.errors import InvalidValueError
 from orthocas.parametrisations.family import JointSpace
 from orthocas.parametrisations.product_basis import ProductFamily, product_family, terms_up_to
-from orthocas.problem import Problem
+
+if TYPE_CHECKING:
+    from orthocas.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Fourier:
         """'fourier:DEGREE'."""
         return f"fourier:{self.degree}"
 
-    def for_problem(self, problem: Problem) -> "Fourier":
+    def for_problem(self, problem: "Problem") -> "Fourier":
         """Itself."""
         return self
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -13,7 +13,9 @@ from orthocas.casadi_tools.tape import Tape, replay, to_tape
 from orthocas.casadi_tools.user_expression import expression_of
 from orthocas.checks import Array, require_shape
 from orthocas.parametrisations.family import ClosedForm, Expression, JointSpace, component_gradients
-from orthocas.problem import Problem
+
+if TYPE_CHECKING:
+    from orthocas.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +45,11 @@ class Given:
         require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
         return cls(name, n, to_tape(dense_function("xi", [q], [xi])))
 
-    def for_problem(self, problem: Problem) -> "Given":
+    def for_problem(self, problem: "Problem") -> "Given":
         """Itself."""
         return self
 
-    def closed_form(self, problem: Problem) -> ClosedForm:
+    def closed_form(self, problem: "Problem") -> ClosedForm:
         """No parameters."""
         return ClosedForm(np.zeros(0))
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from orthocas.checks import Array, frozen_array, require_known
 from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.metrics import metric_matrices
 from orthocas.parametrisations.family import ClosedForm, JointSpace
 from orthocas.parametrisations.product_basis import ProductFamily, product_family
-from orthocas.problem import Problem
-from orthocas.samples import samples_at
+from orthocas.problem import Problem, task_jacobians
 
 Normals = Literal["orthonormal", "paper"]
 
@@ -52,10 +52,10 @@ class Linear:
             InvalidValueError, SingularTaskError: if the task is singular there.
         """
         base = frozen_array("base", problem.domain.centre if self.base is None else self.base, (problem.n,))
-        at_base = samples_at(problem, base[None, :])
-        if len(at_base) == 0:
+        J, A = task_jacobians(problem, base[None])[0], metric_matrices(problem.metric, base[None])[0]
+        if not (J**2).sum(axis=1).all():
             raise InvalidValueError("base", base.tolist(), "a joint position where no task gradient vanishes")
-        theta = self.normal_vectors(at_base.raised(at_base.task_jacobian)[0]).ravel()
+        theta = self.normal_vectors(np.linalg.solve(A, J.T).T).ravel()
         return ClosedForm(theta, base, scaled=False)
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -11,7 +11,9 @@ import numpy as np
 from orthocas.checks import Array, require_count
 from orthocas.errors import InvalidValueError
 from orthocas.parametrisations.family import Expression, JointSpace
-from orthocas.problem import Problem
+
+if TYPE_CHECKING:
+    from orthocas.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class MLP:
         """'mlp:WIDTHxWIDTH'."""
         return "mlp:" + "x".join(map(str, self.hidden))
 
-    def for_problem(self, problem: Problem) -> "MLP":
+    def for_problem(self, problem: "Problem") -> "MLP":
         """Itself."""
         return self
 

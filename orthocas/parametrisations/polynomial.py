@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import comb, sqrt
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -10,7 +10,9 @@ import numpy as np
 from orthocas.checks import Array, require_count
 from orthocas.parametrisations.family import JointSpace
 from orthocas.parametrisations.product_basis import ProductFamily, product_family, terms_up_to
-from orthocas.problem import Problem
+
+if TYPE_CHECKING:
+    from orthocas.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Polynomial:
         """'polynomial:DEGREE'."""
         return f"polynomial:{self.degree}"
 
-    def for_problem(self, problem: Problem) -> "Polynomial":
+    def for_problem(self, problem: "Problem") -> "Polynomial":
         """Itself."""
         return self
 

@@ -9,6 +9,8 @@ from orthocas.checks import Array, frozen_array, require_known, require_shape
 from orthocas.errors import InvalidValueError, RobotError
 
 JointKind = Literal["revolute", "prismatic"]
+REVOLUTE_ROOM = np.pi / 4  #: [rad] either side of a default posture, the hyper-cube of [AS2023] Sec. 9
+PRISMATIC_ROOM = 0.25  #: [m]
 JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "prismatic")
 
 
@@ -88,6 +90,18 @@ class KinematicTree:
     def n(self) -> int:
         """Number of joints."""
         return len(self.joint_names)
+
+    @property
+    def middle(self) -> Array:
+        """A posture away from the joint limits, (n,) [rad] or [m].
+
+        Their middle; where there is one limit or none, the value next to 0 that leaves pi/4 rad (0.25 m) of room.
+        """
+        room = np.where(self.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
+        posture = np.clip(np.zeros(self.n), self.lower + room, self.upper - room)
+        limited = np.isfinite(self.lower) & np.isfinite(self.upper)
+        posture[limited] = (self.lower[limited] + self.upper[limited]) / 2
+        return np.asarray(posture)
 
     @property
     def prismatic(self) -> tuple[bool, ...]:
