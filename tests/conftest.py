@@ -1,4 +1,9 @@
-"""Shared problems, charts and real robot descriptions."""
+"""Shared problems, charts and real robot descriptions; one thread for linear algebra."""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: threads of BLAS that spin take other processes' cores
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from importlib import metadata
 from pathlib import Path
