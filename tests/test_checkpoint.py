@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import python
 
 import orthocas as oc
 from orthocas import solvers
@@ -156,5 +157,4 @@ def test_killed_process_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None
     header, arrays = checkpoint.read_archive(file, checkpoint.CHECKPOINT)
     assert header["running"] == "mlp:8x8"
     assert 0 < arrays["state_iterations"] < 150
-    again = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert again.stdout.split() == ["150", str(1 + 150 * 21)]  # one start, 20 steps and one judgement an epoch
+    assert python(code).split() == ["150", str(1 + 150 * 21)]  # one start, 20 steps and one judgement an epoch

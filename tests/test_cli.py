@@ -10,25 +10,10 @@ from pathlib import Path
 
 import pytest
 from conftest import robot_data
+from programs import Run, output_of
 
 import orthocas as oc
-from orthocas.cli import main
 from orthocas.fitting.fit import Fit
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> object:
-    """Run a command in an empty folder; exit code, standard output, standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["orthocas", *words])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        out, err = capsys.readouterr()
-        return int(stop.value.code or 0), out, err
-
-    return call
 
 
 @pytest.fixture
@@ -38,7 +23,7 @@ def saved(iiwa_fit: Fit, tmp_path: Path) -> str:
     return str(path)
 
 
-def test_fit_writes_a_chart_and_prints_its_quality(run, tmp_path: Path) -> None:
+def test_fit_writes_a_chart_and_prints_its_quality(run: Run, tmp_path: Path) -> None:
     code, out, err = run("fit", "planar_3r_x", "--param", "polynomial:3", "--out", "a.orthocas")
     assert (code, err) == (0, "")
     assert "task angle" in out
@@ -46,7 +31,7 @@ def test_fit_writes_a_chart_and_prints_its_quality(run, tmp_path: Path) -> None:
     assert oc.load(tmp_path / "a.orthocas").r == 2
 
 
-def test_fit_json_is_one_object(run) -> None:
+def test_fit_json_is_one_object(run: Run) -> None:
     code, out, err = run("fit", "planar_3r_xy", "--param", "linear", "--json")
     data = json.loads(out)
     assert (code, err) == (0, "")
@@ -55,7 +40,7 @@ def test_fit_json_is_one_object(run) -> None:
     assert data["task_angle_deg"]["std"] > 0
 
 
-def test_evaluate_json_has_the_promised_keys(run, saved: str) -> None:
+def test_evaluate_json_has_the_promised_keys(run: Run, saved: str) -> None:
     code, out, err = run("evaluate", saved, "--samples", "500", "--seed", "3", "--json")
     data = json.loads(out)
     assert (code, err) == (0, "")
@@ -69,7 +54,7 @@ def test_evaluate_json_has_the_promised_keys(run, saved: str) -> None:
     assert data == json.loads(json.dumps(want))
 
 
-def test_info_shows_charts_problems_and_robots(run, saved: str) -> None:
+def test_info_shows_charts_problems_and_robots(run: Run, saved: str) -> None:
     assert "polynomial:3" in run("info", saved)[1]
     assert json.loads(run("info", "planar_2r", "--json")[1])["domain"] == "torus"
     path = str(robot_data("panda_description/urdf/panda.urdf"))
@@ -78,7 +63,7 @@ def test_info_shows_charts_problems_and_robots(run, saved: str) -> None:
     assert json.loads(out)["joints"][0] == "panda_joint1"
 
 
-def test_urdf_with_every_option(run) -> None:
+def test_urdf_with_every_option(run: Run) -> None:
     path = str(robot_data("ur_description/urdf/ur5_robot.urdf"))
     words = ["--tip", "tool0", "--task", "orientation", "--metric", "inertia", "--param", "fourier:1"]
     words += [
@@ -104,7 +89,7 @@ def test_urdf_with_every_option(run) -> None:
     assert info["notes"]["lambda3"] == 0
 
 
-def test_named_problem_with_overrides(run) -> None:
+def test_named_problem_with_overrides(run: Run) -> None:
     code, out, _ = run("fit", "iiwa", "--param", "linear", "--metric", "inertia", "--task", "position:xy", "--json")
     assert code == 0
     assert (json.loads(out)["m"], json.loads(out)["metric"]) == (2, "inertia")
@@ -159,7 +144,7 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["info", "nothing.orthocas"], "does not exist"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_two(run, tmp_path: Path, words: list[str], message: str) -> None:
+def test_bad_input_is_one_line_and_exit_code_two(run: Run, tmp_path: Path, words: list[str], message: str) -> None:
     code, out, err = run(*words)
     assert code == 2
     assert message in err
@@ -168,20 +153,18 @@ def test_bad_input_is_one_line_and_exit_code_two(run, tmp_path: Path, words: lis
     assert list(tmp_path.iterdir()) == []
 
 
-def test_no_words_show_help(run) -> None:
+def test_no_words_show_help(run: Run) -> None:
     _, out, err = run()
     assert "fit" in out + err
 
 
 def test_help_names_the_commands() -> None:
-    result = subprocess.run(
-        [sys.executable, "-m", "orthocas", "--help"], capture_output=True, text=True, check=True, cwd="/"
-    )
+    shown = output_of(sys.executable, "-m", "orthocas", "--help", folder=Path("/"))
     for command in ("fit", "evaluate", "info"):
-        assert command in result.stdout
+        assert command in shown
 
 
-def test_output_folder_is_checked_before_the_long_work(run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_output_folder_is_checked_before_the_long_work(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def never(*args: object) -> None:
         raise AssertionError("the fit was started")
 
@@ -220,7 +203,7 @@ def test_ctrl_c_saves_the_best_chart_so_far(tmp_path: Path) -> None:
     assert chart.notes["status"] == "interrupted"
 
 
-def test_fit_under_a_bound_on_mutual_angles(run) -> None:
+def test_fit_under_a_bound_on_mutual_angles(run: Run) -> None:
     code, out, err = run(
         "fit", "planar_3r_x", "--param", "polynomial:2", "--samples", "300", "--max-mutual-deg", "2.0", "--json"
     )
@@ -234,7 +217,7 @@ def test_fit_under_a_bound_on_mutual_angles(run) -> None:
     assert err.count("\n") == 1
 
 
-def test_fit_goes_on_from_its_checkpoint(run, tmp_path: Path) -> None:
+def test_fit_goes_on_from_its_checkpoint(run: Run, tmp_path: Path) -> None:
     words = ("fit", "planar_3r_x", "--param", "polynomial:2", "--samples", "100", "--checkpoint", "run.checkpoint")
     assert run(*words)[0] == 0
     first = (tmp_path / "planar_3r_x.orthocas").read_bytes()
@@ -245,7 +228,7 @@ def test_fit_goes_on_from_its_checkpoint(run, tmp_path: Path) -> None:
     assert "another fit: its seed is 0, expected 4" in err
 
 
-def test_compare_writes_tables_pictures_and_charts(run, tmp_path: Path) -> None:
+def test_compare_writes_tables_pictures_and_charts(run: Run, tmp_path: Path) -> None:
     words = ("compare", "planar_3r_x", "--samples", "100", "--held-out", "300", "--param", "linear")
     code, out, err = run(
         *words, "--param", "mlp:3", "--solver", "gauss_newton", "--solver", "lbfgs", "--jobs", "1", "--out", "grid"
@@ -271,7 +254,7 @@ def test_compare_writes_tables_pictures_and_charts(run, tmp_path: Path) -> None:
         (("compare", "iiwa", "--out", "file"), "--out is file, expected a folder"),
     ],
 )
-def test_bad_grids_are_refused_before_any_work(run, tmp_path: Path, words: tuple[str, ...], message: str) -> None:
+def test_bad_grids_are_refused_before_any_work(run: Run, tmp_path: Path, words: tuple[str, ...], message: str) -> None:
     (tmp_path / "file").write_text("in the way")
     code, out, err = run(*words)
     assert (code, out) == (2, "")

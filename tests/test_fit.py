@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from charts import with_metric
 from conftest import robot_data
 
 import orthocas as oc
@@ -141,7 +142,7 @@ def test_joint_that_the_metric_depends_on_is_not_split_off() -> None:
 
 
 def test_inertia_couples_joints_so_none_is_idle(iiwa: oc.Problem) -> None:
-    problem = oc.Problem(iiwa.robot, iiwa.task, "inertia", iiwa.domain)
+    problem = with_metric(iiwa, "inertia")
     assert oc.fit(problem, oc.Polynomial(1), samples=300).idle_joints == ()
 
 

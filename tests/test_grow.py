@@ -6,6 +6,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from charts import planar_2r
 
 import orthocas as oc
 from orthocas import problems
@@ -28,11 +29,6 @@ from orthocas.metrics import metric_matrices
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
 CELL = oc.Box([np.pi / 2, 0, 0], [np.pi / 2, np.pi, np.pi])
 ON_LEAF = [np.pi / 3, 0.0]  # x = 1 of planar_2r
-
-
-def planar_2r(metric: str) -> oc.Problem:
-    known = problems.get("planar_2r")
-    return oc.Problem(known.robot, known.task, metric, known.domain)
 
 
 def planar_3r(metric: str) -> oc.Problem:

@@ -62,7 +62,7 @@ def compare(
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers = [get_solver(name) for name in solver] if solver else None
     loss = parse_weights(weights)
-    charts = made_folder("--out", out / "charts")
+    charts = made_folder("--out", made_folder("--out", out) / "charts")
     with terminal_monitor() as monitor:
         found = compare_fits(
             built,
