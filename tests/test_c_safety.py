@@ -18,7 +18,7 @@ from orthocas.codegen.library import STRICT, compilers
 from orthocas.control import Controller, ControlStatus, PDPlus
 from orthocas.errors import CompileError
 
-pytestmark = needs_c
+pytestmark = [needs_c, pytest.mark.slow]
 
 Generated = tuple[GeneratedC, Controller]
 PROGRAMS = Path(__file__).parent / "c"

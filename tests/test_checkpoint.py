@@ -137,6 +137,7 @@ def test_without_a_path_nothing_is_written(tmp_path: Path, monkeypatch: pytest.M
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_killed_process_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None:
     """The real thing: a process killed by the system, and a new one."""
     file = tmp_path / "run.checkpoint"

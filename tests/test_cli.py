@@ -63,6 +63,7 @@ def test_info_shows_charts_problems_and_robots(run: Run, saved: str) -> None:
     assert json.loads(out)["joints"][0] == "panda_joint1"
 
 
+@pytest.mark.slow
 def test_urdf_with_every_option(run: Run) -> None:
     path = str(robot_data("ur_description/urdf/ur5_robot.urdf"))
     words = ["--tip", "tool0", "--task", "orientation", "--metric", "inertia", "--param", "fourier:1"]
@@ -89,6 +90,7 @@ def test_urdf_with_every_option(run: Run) -> None:
     assert info["notes"]["lambda3"] == 0
 
 
+@pytest.mark.slow
 def test_named_problem_with_overrides(run: Run) -> None:
     code, out, _ = run("fit", "iiwa", "--param", "linear", "--metric", "inertia", "--task", "position:xy", "--json")
     assert code == 0
@@ -158,6 +160,7 @@ def test_no_words_show_help(run: Run) -> None:
     assert "fit" in out + err
 
 
+@pytest.mark.slow
 def test_help_names_the_commands() -> None:
     shown = output_of(sys.executable, "-m", "orthocas", "--help", folder=Path("/"))
     for command in ("fit", "evaluate", "info"):
@@ -182,6 +185,7 @@ def _read_terminal(descriptor: int) -> bytes:
         return b""
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_the_best_chart_so_far(tmp_path: Path) -> None:
     """The signal is sent when the progress bar, on a pseudo-terminal, shows the third degree of six."""
     command = [sys.executable, "-m", "orthocas", "fit", "iiwa", "--param", "polynomial:6", "--out", "c.orthocas"]
@@ -203,6 +207,7 @@ def test_ctrl_c_saves_the_best_chart_so_far(tmp_path: Path) -> None:
     assert chart.notes["status"] == "interrupted"
 
 
+@pytest.mark.slow
 def test_fit_under_a_bound_on_mutual_angles(run: Run) -> None:
     code, out, err = run(
         "fit", "planar_3r_x", "--param", "polynomial:2", "--samples", "300", "--max-mutual-deg", "2.0", "--json"
@@ -217,6 +222,7 @@ def test_fit_under_a_bound_on_mutual_angles(run: Run) -> None:
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_fit_goes_on_from_its_checkpoint(run: Run, tmp_path: Path) -> None:
     words = ("fit", "planar_3r_x", "--param", "polynomial:2", "--samples", "100", "--checkpoint", "run.checkpoint")
     assert run(*words)[0] == 0
@@ -228,6 +234,7 @@ def test_fit_goes_on_from_its_checkpoint(run: Run, tmp_path: Path) -> None:
     assert "another fit: its seed is 0, expected 4" in err
 
 
+@pytest.mark.slow
 def test_compare_writes_tables_pictures_and_charts(run: Run, tmp_path: Path) -> None:
     words = ("compare", "planar_3r_x", "--samples", "100", "--held-out", "300", "--param", "linear")
     code, out, err = run(

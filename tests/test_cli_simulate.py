@@ -64,6 +64,7 @@ def report_of(run: Run, *words: str, **more: str) -> dict[str, Any]:
     return report
 
 
+@pytest.mark.slow
 def test_example_of_the_docs_end_to_end(run: Run, chart: oc.Chart) -> None:
     code, out, err = run("pd_plus", "--json", steps=str(EXAMPLES / "steps_planar_3r_x.json"))
     assert (code, err) == (0, "")
@@ -142,6 +143,7 @@ def test_gains_and_limits_are_those_given(run: Run, chart: oc.Chart) -> None:
     assert build_controller("kinematic", chart, all_of_them, None).gains["feedback"].tolist() == [5, 5, 5]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank")
 def test_a_wrong_model_friction_and_noise_cost_accuracy(run: Run) -> None:
     exact = report_of(run, "pd_plus")["tracking_error"]["x"]

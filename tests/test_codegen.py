@@ -38,6 +38,7 @@ def laws(chart: oc.Chart) -> list[Controller]:
     ]
 
 
+@pytest.mark.slow
 def test_every_controller_equals_its_python(planar_chart: oc.Chart, tmp_path: Path) -> None:
     """Also NaN, infinities and huge numbers: same status, same fallback."""
     for law in (*laws(planar_chart), None):
@@ -56,6 +57,7 @@ def test_every_family_equals_its_python(planar_xy: oc.Problem, parametrisation: 
     assert check_c(oc.generate_c(chart, tmp_path, law), chart, law, states=200).differences["control"] < 1e-10
 
 
+@pytest.mark.slow
 def test_seven_joints_with_an_idle_one(iiwa: oc.Problem, tmp_path: Path) -> None:
     chart = oc.fit(iiwa, oc.Polynomial(2)).chart
     law = PDPlus(chart, 50.0, coupling="decoupled")
@@ -87,6 +89,7 @@ int main(void) {
 """
 
 
+@pytest.mark.slow
 @needs_cmake
 def test_installed_libraries_are_found_and_linked(pd_plus: Generated, tmp_path: Path) -> None:
     """By CMake and pkg-config, from a folder with a space, after it has been moved."""
@@ -112,6 +115,7 @@ def test_installed_libraries_are_found_and_linked(pd_plus: Generated, tmp_path: 
     output_of(program)
 
 
+@pytest.mark.slow
 @needs_cmake
 def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: Generated, tmp_path: Path) -> None:
     (tmp_path / "main.c").write_text(_MAIN)
@@ -124,6 +128,7 @@ def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: Generated, t
     assert not list((tmp_path / "installed").rglob("*arm*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -156,6 +161,7 @@ def test_check_compares_with_the_gains_of_the_controller(planar_chart: oc.Chart,
         check_c(generated, planar_chart, Impedance(planar_chart, 51.0, limit=90.0), states=50)
 
 
+@pytest.mark.slow
 def test_coordinates_without_a_value_everywhere(planar_x: oc.Problem, tmp_path: Path) -> None:
     """NaN in Python is a status and zeros in C; branches with infinities are code like any other."""
     for k, expression in enumerate((lambda q: ca.sqrt(q[1] - 0.4), lambda q: ca.if_else(q[1] > 0.4, q[1], ca.inf))):
@@ -181,6 +187,7 @@ def test_words_of_others_do_not_become_code(tmp_path: Path) -> None:
     assert re.fullmatch(r"[a-z]\w*", oc.generate_c(chart, tmp_path / "unnamed").name, flags=re.ASCII)
 
 
+@pytest.mark.slow
 def test_check_is_fair_near_singularities(tmp_path: Path) -> None:
     """A good fit whose box holds postures where commands amplify rounding by a million, and its coupled laws."""
     robot = oc.Robot.planar([1, 1, 1], [1, 1, 1])
@@ -245,6 +252,7 @@ def test_what_cannot_be_generated_is_refused(planar_x: oc.Problem, planar_chart:
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_command_writes_checks_and_refuses(planar_fit: Fit, run: Run) -> None:
     planar_fit.chart.save("arm.orthocas")
     code, out, err = run("codegen", "arm.orthocas", "--controller", "kinematic", "--out", "c", "--check", "--json")
@@ -268,6 +276,7 @@ def test_command_writes_checks_and_refuses(planar_fit: Fit, run: Run) -> None:
         assert not Path("other").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_compiled_kinematics_and_dynamics_match_pinocchio(name: str, tmp_path: Path) -> None:
     """Nothing of ours between the compiled library and Pinocchio's numbers."""

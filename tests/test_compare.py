@@ -127,6 +127,7 @@ def test_summaries_are_medians_and_spreads_over_seeds(grid: tuple[Comparison, Pa
     assert "±" in rows[1][3]
 
 
+@pytest.mark.slow
 def test_control_ticks_are_measured_once_a_parametrisation(planar_x: oc.Problem, tmp_path: Path) -> None:
     """Failed fits have none."""
     lbfgs = solvers.LBFGS(max_iterations=5)
@@ -193,6 +194,7 @@ def test_front_of_one_coordinate_shows_the_conditioning(planar_xy: oc.Problem) -
     np.testing.assert_allclose(heights, [r.conditioning_p01 for r in found.results])
 
 
+@pytest.mark.slow
 def test_process_that_dies_fails_alone(planar_x: oc.Problem) -> None:
     told: list[Progress] = []
     found = oc.compare(
@@ -252,6 +254,7 @@ def test_same_cell_same_result(planar_x: oc.Problem) -> None:
     assert isinstance(run_cell(cell), CellResult)
 
 
+@pytest.mark.slow
 def test_ctrl_c_stops_running_processes_too(planar_x: oc.Problem) -> None:
     """Fits that would take minutes end at their next step, and none is started."""
 

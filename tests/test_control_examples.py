@@ -7,7 +7,10 @@ import control_tick
 import controllers
 import lengths
 import panda_elbow
+import pytest
 from programs import needs_c
+
+pytestmark = pytest.mark.slow
 
 
 def test_panda_moves_its_elbow_and_not_its_hand(tmp_path: Path) -> None:

@@ -124,6 +124,7 @@ def test_laws_equal_the_paper_written_out(arm_chart: oc.Chart, model: pin.Model,
         np.testing.assert_allclose(called(controller, s), want, rtol=2e-7, atol=1e-6 * np.abs(want).max())
 
 
+@pytest.mark.slow
 def test_coupled_pd_plus_gives_the_wanted_acceleration(arm_chart: oc.Chart, model: pin.Model) -> None:
     """On the reference (no error) dd_phi = dd_phi_d whatever the chart: forward dynamics by Pinocchio."""
     for _ in range(5):

@@ -24,12 +24,14 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_python_quickstart_runs(checkout: Path) -> None:
     code = blocks("python")[0]
     assert float(python(code, checkout).split()[0]) < 2.06
     assert (checkout / "arm.orthocas").exists()
 
 
+@pytest.mark.slow
 def test_python_block_of_exact_coordinates_runs(checkout: Path) -> None:
     code = blocks("python")[1]
     verdict, numbers = python(code, checkout).splitlines()
@@ -38,6 +40,7 @@ def test_python_block_of_exact_coordinates_runs(checkout: Path) -> None:
     assert exact < 1e-9 < distilled < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("checkout")
 def test_shell_quickstart_runs(run: Run) -> None:
     commands = [shlex.split(line) for line in blocks("sh")[1].splitlines()]
@@ -48,6 +51,7 @@ def test_shell_quickstart_runs(run: Run) -> None:
         assert (code, err) == (0, "")
 
 
+@pytest.mark.slow
 def test_python_block_of_the_page_on_control_runs(tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "control.md").read_text(), flags=re.DOTALL)
     first, coupling = python(code, tmp_path).splitlines()
@@ -56,6 +60,7 @@ def test_python_block_of_the_page_on_control_runs(tmp_path: Path) -> None:
     assert (tmp_path / "run.npz").exists()
 
 
+@pytest.mark.slow
 @needs_c
 @needs_cmake
 @pytest.mark.usefixtures("checkout")

@@ -2,7 +2,10 @@
 
 from pathlib import Path
 
+import pytest
 from programs import python
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent
 USE = (

@@ -315,6 +315,7 @@ def test_bad_sample_numbers_are_refused(planar_xy: oc.Problem) -> None:
         oc.involutivity(planar_xy, seed=-1)
 
 
+@pytest.mark.slow
 def test_info_shows_defect_and_verdict(run: Run, planar_xy: oc.Problem) -> None:
     def printed(*words: str) -> str:
         code, out, _ = run(*words)

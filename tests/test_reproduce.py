@@ -82,6 +82,7 @@ def test_every_figure_has_a_check() -> None:
     assert {*CHECKS, *(name for module in elsewhere for name in module.NAMES)} == set(FIGURES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHECKS)
 def test_numbers_of_figure(name: str) -> None:
     drawing = FIGURES[name].draw(True)

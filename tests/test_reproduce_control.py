@@ -27,6 +27,8 @@ from orthocas.reproduce.planar_loop import (
     task_angle_std,
 )
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("fig22", "fig23", "fig24", "fig25", "fig26", "fig30")
 Numbers = dict[str, float]
 

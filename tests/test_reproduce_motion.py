@@ -8,6 +8,8 @@ from orthocas.errors import SolveError
 from orthocas.reproduce import Drawing
 from orthocas.reproduce.hidden_spring import HiddenSpring
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("fig02", "fig21", "fig28")
 
 

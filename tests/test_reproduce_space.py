@@ -8,6 +8,8 @@ from orthocas.reproduce.charted_surface import add_with_edges, add_with_lines, p
 from orthocas.reproduce.painting import Isolines
 from orthocas.reproduce.section import curves_inside, section
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("fig01", "fig10", "fig15", "fig19")
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), np.array([[0, 1, 2], [1, 3, 2]])
 

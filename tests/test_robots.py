@@ -14,6 +14,7 @@ from orthocas.errors import InvalidValueError, RobotError, ShapeError, UnknownNa
 from orthocas.robots.planar import planar_model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_dynamics_and_kinematics_match_pinocchio_on_random_states(name: str) -> None:
     model, tip = arm(name)

@@ -80,6 +80,7 @@ def test_run_agrees_with_another_integrator_on_pinocchios_dynamics(
     assert np.abs(run.q[-1] - q0).max() > 0.02
 
 
+@pytest.mark.slow
 def test_accelerations_along_a_run_are_pinocchios() -> None:
     """7-DoF arm: the plant's forward dynamics at every instant of a run, to 1e-8 of the largest acceleration."""
     base = oc.problems.get("iiwa")
