@@ -250,7 +250,7 @@ def test_ctrl_c_returns_what_is_done(planar_x: oc.Problem) -> None:
 def test_same_cell_same_result(planar_x: oc.Problem) -> None:
     cell = Cell(planar_x, oc.Polynomial(2), solvers.GaussNewton(), 3, Weights(1000.0, 30.0), 150, 500, None)
     first, second = (replace(r, seconds=0.0, history=()) for r in run_cells([cell, cell], InThisThread()))
-    assert first == second
+    assert repr(first) == repr(second)  # NaN where nothing was measured, which equals nothing
     assert isinstance(run_cell(cell), CellResult)
 
 
