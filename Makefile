@@ -3,14 +3,18 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
-.PHONY: demo test lint types wheel-check bench clean
+.PHONY: demo test check lint types wheel-check bench clean
 
 demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and picture in out/
 	$(BIN)/python examples/iiwa_demo.py --out out
 
 test: $(INSTALLED)  ## the whole test suite
-	$(BIN)/python -m pytest
+	$(PYTEST)
+
+check: lint  ## while working: lint and the fast tests, with the slowest of them named
+	$(PYTEST) -m "not slow" --durations 5
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -20,7 +20,7 @@ def row(weights: tuple[float, ...], quick: bool) -> str:
     """Train once, judge on held-out samples."""
     network = oc.MLP((16, 8)) if quick else oc.MLP((1024, 512))
     solver = solvers.Adam(epochs=2) if quick else solvers.Adam()
-    fit = oc.fit(problems.get("iiwa"), network, solver, weights)  # type: ignore[arg-type]
+    fit = oc.fit(problems.get("iiwa"), network, solver, weights=weights)  # type: ignore[arg-type]
     report = oc.evaluate(fit.chart, 2_000 if quick else 100_000)
     quality = report.conditioning
     return (

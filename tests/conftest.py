@@ -1,15 +1,26 @@
-"""Shared problems, charts and real robot descriptions."""
+"""Shared problems, charts and real robot descriptions; one thread for linear algebra."""
 
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: threads of BLAS that spin take other processes' cores
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import sys
 from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from programs import Run
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.cli import main
+from orthocas.codegen import GeneratedC
+from orthocas.control import PDPlus
 from orthocas.fitting.fit import Fit
+from orthocas.reproduce import FIGURES, Drawing
 from orthocas.robots import files
 
 ROBOTS = {
@@ -78,3 +89,31 @@ def planar_fit(planar_x: oc.Problem) -> Fit:
 def planar_chart(planar_x: oc.Problem) -> oc.Chart:
     """Task x, A = M, orthogonal to 0.2 degrees, with gradients of even lengths: for controllers."""
     return oc.fit(planar_x, oc.Polynomial(degree=8), weights=(1000, 30, 150, 0.1)).chart
+
+
+@pytest.fixture(scope="session")
+def pd_plus(planar_fit: Fit, tmp_path_factory: pytest.TempPathFactory) -> tuple[GeneratedC, PDPlus]:
+    """A law on a box of the planar arm, and its C."""
+    law = PDPlus(planar_fit.chart, np.linspace(20, 80, 3), 0.6, "decoupled", limit=90.0)
+    return oc.generate_c(law.chart, tmp_path_factory.mktemp("pd_plus"), law, "arm"), law
+
+
+@pytest.fixture(scope="module")
+def drawings(request: pytest.FixtureRequest) -> dict[str, Drawing]:
+    """The figures of the paper that a test file names, in quick mode."""
+    return {name: FIGURES[name].draw(True) for name in request.module.NAMES}
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command of orthocas in an empty folder, in this process."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["orthocas", *words])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        out, err = capsys.readouterr()
+        return int(stop.value.code or 0), out, err
+
+    return call

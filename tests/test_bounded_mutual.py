@@ -55,6 +55,7 @@ def test_gauge_makes_the_mean_squared_gradient_length_one(bounded: BoundedMutual
     np.testing.assert_allclose((J**2).sum(axis=2).mean(axis=0), 1.0, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_bound_is_met_and_trades_against_the_task(iiwa: oc.Problem) -> None:
     fits = [oc.fit(iiwa, oc.Polynomial(2), samples=800, max_mutual_deg=bound) for bound in (1.0, 3.0)]
     reports = [oc.evaluate(fit.chart, 20_000) for fit in fits]
@@ -63,6 +64,7 @@ def test_bound_is_met_and_trades_against_the_task(iiwa: oc.Problem) -> None:
     assert reports[0].task_angle.std > reports[1].task_angle.std
 
 
+@pytest.mark.slow
 def test_point_of_the_weighted_front_is_found_again(planar_x: oc.Problem) -> None:
     weighted = oc.evaluate(oc.fit(planar_x, oc.Polynomial(3), solvers.Ipopt()).chart, 20_000)
     deviation = np.hypot(weighted.mutual_angle.std, weighted.mutual_angle.mean - 90)  # root mean square

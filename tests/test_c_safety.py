@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from charts import linear_on_the_torus, with_metric
+from programs import needs_c
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
@@ -16,27 +18,31 @@ from orthocas.codegen.library import STRICT, compilers
 from orthocas.control import Controller, ControlStatus, PDPlus
 from orthocas.errors import CompileError
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None and shutil.which("gcc") is None, reason="no C compiler")
+pytestmark = [needs_c, pytest.mark.slow]
 
 Generated = tuple[GeneratedC, Controller]
 PROGRAMS = Path(__file__).parent / "c"
-LIMIT = 90.0
-
-
-@pytest.fixture(scope="module")
-def pd_plus(planar_chart: oc.Chart, tmp_path_factory: pytest.TempPathFactory) -> Generated:
-    law = PDPlus(planar_chart, np.linspace(20, 80, 3), 0.6, "decoupled", limit=LIMIT)
-    return oc.generate_c(planar_chart, tmp_path_factory.mktemp("box"), law, "arm"), law
 
 
 @pytest.fixture(scope="module")
 def on_the_torus(tmp_path_factory: pytest.TempPathFactory) -> Generated:
-    """Linear coordinates on all joint positions: the stretched arm (0, 0, 0) is singular, and there is no outside."""
-    robot = oc.Robot.planar([1, 1, 1], [3, 3, 3])
-    problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Torus(3))
-    chart = oc.fit(problem, oc.Linear(base=(0.6, 0.8, 0.8))).chart
-    law = PDPlus(chart, 50.0, limit=LIMIT)
-    return oc.generate_c(chart, tmp_path_factory.mktemp("torus"), law, "arm"), law
+    law = PDPlus(linear_on_the_torus(), 50.0, limit=90.0)
+    return oc.generate_c(law.chart, tmp_path_factory.mktemp("torus"), law, "arm"), law
+
+
+@pytest.fixture
+def clang(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Clang on the path: the machine's own, or the one that the package ziglang carries."""
+    cache = tmp_path_factory.getbasetemp() / "zig"
+    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(cache))
+    monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(cache))
+    if shutil.which("clang") is None:
+        script = tmp_path / "bin" / "clang"
+        script.parent.mkdir()
+        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang cc -Wno-unused-command-line-argument "$@"\n')
+        script.chmod(0o755)
+        monkeypatch.setenv("PATH", str(script.parent), prepend=":")
+    return str(shutil.which("clang"))
 
 
 def built(generated: GeneratedC, program: str, out: Path, *flags: str, compiler: str | None = None) -> Path:
@@ -61,8 +67,10 @@ def built(generated: GeneratedC, program: str, out: Path, *flags: str, compiler:
     return target
 
 
-def random_ticks(generated: GeneratedC, ticks: int, out: Path, *flags: str) -> Path:
-    return built(generated, "random_ticks.c", out, f"-DTICKS={ticks}L", f"-DLIMIT={LIMIT}", "-DSINGULAR=0,0,0", *flags)
+def random_ticks(case: Generated, ticks: int, out: Path, *flags: str) -> Path:
+    generated, law = case
+    limit = law.gains["limit"].max()
+    return built(generated, "random_ticks.c", out, f"-DTICKS={ticks}L", f"-DLIMIT={limit}", "-DSINGULAR=0,0,0", *flags)
 
 
 @pytest.mark.parametrize("case", ["pd_plus", "on_the_torus"])
@@ -71,7 +79,7 @@ def test_a_million_random_ticks_under_sanitizers_never_trap(
 ) -> None:
     """Address and undefined-behaviour sanitizers; the program itself checks statuses, finiteness and the limit."""
     flags = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    program = random_ticks(request.getfixturevalue(case)[0], 1_000_000, tmp_path, *flags)
+    program = random_ticks(request.getfixturevalue(case), 1_000_000, tmp_path, *flags)
     done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{done.returncode}: {done.stderr}"
     well, outside, singular, not_finite = (int(word) for word in done.stdout.split())
@@ -119,7 +127,7 @@ def test_speeds_that_overflow_give_zeros(tmp_path: Path) -> None:
 def test_valgrind_finds_nothing(pd_plus: Generated, tmp_path: Path) -> None:
     if shutil.which("valgrind") is None:
         pytest.skip("no valgrind")
-    program = random_ticks(pd_plus[0], 20_000, tmp_path)
+    program = random_ticks(pd_plus, 5_000, tmp_path)
     command = ["valgrind", "--error-exitcode=9", "--leak-check=full", str(program)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -127,7 +135,7 @@ def test_valgrind_finds_nothing(pd_plus: Generated, tmp_path: Path) -> None:
 
 def test_calls_take_no_more_stack_than_the_header_says(iiwa: oc.Problem, clang: str, tmp_path: Path) -> None:
     """Measured on a painted stack, for what needs most, by two compilers, with and without optimisation."""
-    problem = oc.Problem(iiwa.robot, iiwa.task, "inertia", iiwa.domain)
+    problem = with_metric(iiwa, "inertia")
     polynomial = oc.fit(problem, oc.Polynomial(2)).chart
     network = oc.fit(problem, oc.MLP((40, 30)), samples=300, solver=oc.solvers.LBFGS(max_iterations=3)).chart
     for law in (PDPlus(polynomial, 50.0), PDPlus(polynomial, 50.0, damping="double_diagonal"), PDPlus(network, 50.0)):
@@ -180,20 +188,6 @@ def test_two_threads_get_what_one_gets(pd_plus: Generated, tmp_path: Path) -> No
         for (command, status), (want, want_status) in zip(results, alone, strict=True):
             assert status == want_status
             np.testing.assert_array_equal(command, want)
-
-
-@pytest.fixture
-def clang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Clang on the path: the machine's own, or the one that the package ziglang carries."""
-    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(tmp_path / "zig"))
-    monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(tmp_path / "zig"))
-    if shutil.which("clang") is None:
-        script = tmp_path / "bin" / "clang"
-        script.parent.mkdir()
-        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m ziglang cc -Wno-unused-command-line-argument "$@"\n')
-        script.chmod(0o755)
-        monkeypatch.setenv("PATH", str(script.parent), prepend=":")
-    return str(shutil.which("clang"))
 
 
 def test_clang_accepts_it_and_computes_the_same(planar_chart: oc.Chart, clang: str, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import python
 
 import orthocas as oc
 from orthocas import solvers
@@ -136,6 +137,7 @@ def test_without_a_path_nothing_is_written(tmp_path: Path, monkeypatch: pytest.M
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_killed_process_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None:
     """The real thing: a process killed by the system, and a new one."""
     file = tmp_path / "run.checkpoint"
@@ -156,5 +158,4 @@ def test_killed_process_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None
     header, arrays = checkpoint.read_archive(file, checkpoint.CHECKPOINT)
     assert header["running"] == "mlp:8x8"
     assert 0 < arrays["state_iterations"] < 150
-    again = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert again.stdout.split() == ["150", str(1 + 150 * 21)]  # one start, 20 steps and one judgement an epoch
+    assert python(code).split() == ["150", str(1 + 150 * 21)]  # one start, 20 steps and one judgement an epoch

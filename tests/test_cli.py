@@ -11,26 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import robot_data
+from programs import Run, output_of
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.cli import main
 from orthocas.fitting.fit import Fit
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> object:
-    """Run a command in an empty folder; exit code, standard output, standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["orthocas", *words])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        out, err = capsys.readouterr()
-        return int(stop.value.code or 0), out, err
-
-    return call
 
 
 @pytest.fixture
@@ -40,7 +25,7 @@ def saved(iiwa_fit: Fit, tmp_path: Path) -> str:
     return str(path)
 
 
-def test_fit_writes_a_chart_and_prints_its_quality(run, tmp_path: Path) -> None:
+def test_fit_writes_a_chart_and_prints_its_quality(run: Run, tmp_path: Path) -> None:
     code, out, err = run("fit", "planar_3r_x", "--param", "polynomial:3", "--out", "a.orthocas")
     assert (code, err) == (0, "")
     assert "task angle" in out
@@ -48,7 +33,7 @@ def test_fit_writes_a_chart_and_prints_its_quality(run, tmp_path: Path) -> None:
     assert oc.load(tmp_path / "a.orthocas").r == 2
 
 
-def test_fit_json_is_one_object(run) -> None:
+def test_fit_json_is_one_object(run: Run) -> None:
     code, out, err = run("fit", "planar_3r_xy", "--param", "linear", "--json")
     data = json.loads(out)
     assert (code, err) == (0, "")
@@ -57,7 +42,7 @@ def test_fit_json_is_one_object(run) -> None:
     assert data["task_angle_deg"]["std"] > 0
 
 
-def test_evaluate_json_has_the_promised_keys(run, saved: str) -> None:
+def test_evaluate_json_has_the_promised_keys(run: Run, saved: str) -> None:
     code, out, err = run("evaluate", saved, "--samples", "500", "--seed", "3", "--json")
     data = json.loads(out)
     assert (code, err) == (0, "")
@@ -71,7 +56,7 @@ def test_evaluate_json_has_the_promised_keys(run, saved: str) -> None:
     assert data == json.loads(json.dumps(want))
 
 
-def test_info_shows_charts_problems_and_robots(run, saved: str) -> None:
+def test_info_shows_charts_problems_and_robots(run: Run, saved: str) -> None:
     assert "polynomial:3" in run("info", saved)[1]
     assert json.loads(run("info", "planar_2r", "--json")[1])["domain"] == "torus"
     path = str(robot_data("panda_description/urdf/panda.urdf"))
@@ -80,7 +65,8 @@ def test_info_shows_charts_problems_and_robots(run, saved: str) -> None:
     assert json.loads(out)["joints"][0] == "panda_joint1"
 
 
-def test_urdf_with_every_option(run) -> None:
+@pytest.mark.slow
+def test_urdf_with_every_option(run: Run) -> None:
     path = str(robot_data("ur_description/urdf/ur5_robot.urdf"))
     words = ["--tip", "tool0", "--task", "orientation", "--metric", "inertia", "--param", "fourier:1"]
     words += [
@@ -106,7 +92,7 @@ def test_urdf_with_every_option(run) -> None:
     assert info["notes"]["lambda3"] == 0
 
 
-def test_urdf_with_locked_joint_tool_home_and_half_widths(run) -> None:
+def test_urdf_with_locked_joint_tool_home_and_half_widths(run: Run) -> None:
     path = str(robot_data("panda_description/urdf/panda.urdf"))
     words = [
         "--tip",
@@ -133,7 +119,7 @@ def test_urdf_with_locked_joint_tool_home_and_half_widths(run) -> None:
     np.testing.assert_allclose(problem.robot.tip_position(q), want, atol=1e-12)
 
 
-def test_info_tells_limits_and_homes_of_a_robot_file(run) -> None:
+def test_info_tells_limits_and_homes_of_a_robot_file(run: Run) -> None:
     path = str(robot_data("panda_description/urdf/panda.urdf"))
     code, out, _ = run("info", path, "--tip", "panda_rightfinger", "--lock", "panda_finger_joint1=0.02", "--json")
     data = json.loads(out)
@@ -141,7 +127,7 @@ def test_info_tells_limits_and_homes_of_a_robot_file(run) -> None:
     assert (len(data["joints"]), data["homes"], data["effort_limits"][6]) == (7, ["default"], 12)
 
 
-def test_urdf_of_a_stretched_arm_fits_about_a_bent_posture(run) -> None:
+def test_urdf_of_a_stretched_arm_fits_about_a_bent_posture(run: Run) -> None:
     """A command of the README: about the middle of the limits 9 % of the samples fold."""
     path = str(Path(problems.__file__).parent / "data" / "iiwa7_r800.urdf")
     words = [
@@ -162,7 +148,8 @@ def test_urdf_of_a_stretched_arm_fits_about_a_bent_posture(run) -> None:
     assert "folded" not in out
 
 
-def test_named_problem_with_overrides(run) -> None:
+@pytest.mark.slow
+def test_named_problem_with_overrides(run: Run) -> None:
     code, out, _ = run("fit", "iiwa", "--param", "linear", "--metric", "inertia", "--task", "position:xy", "--json")
     assert code == 0
     assert (json.loads(out)["m"], json.loads(out)["metric"]) == (2, "inertia")
@@ -240,7 +227,7 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["info", "nothing.orthocas"], "does not exist"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_two(run, tmp_path: Path, words: list[str], message: str) -> None:
+def test_bad_input_is_one_line_and_exit_code_two(run: Run, tmp_path: Path, words: list[str], message: str) -> None:
     code, out, err = run(*words)
     assert code == 2
     assert message in err
@@ -249,20 +236,19 @@ def test_bad_input_is_one_line_and_exit_code_two(run, tmp_path: Path, words: lis
     assert list(tmp_path.iterdir()) == []
 
 
-def test_no_words_show_help(run) -> None:
+def test_no_words_show_help(run: Run) -> None:
     _, out, err = run()
     assert "fit" in out + err
 
 
+@pytest.mark.slow
 def test_help_names_the_commands() -> None:
-    result = subprocess.run(
-        [sys.executable, "-m", "orthocas", "--help"], capture_output=True, text=True, check=True, cwd="/"
-    )
+    shown = output_of(sys.executable, "-m", "orthocas", "--help", folder=Path("/"))
     for command in ("fit", "evaluate", "info"):
-        assert command in result.stdout
+        assert command in shown
 
 
-def test_output_folder_is_checked_before_the_long_work(run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_output_folder_is_checked_before_the_long_work(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def never(*args: object) -> None:
         raise AssertionError("the fit was started")
 
@@ -280,6 +266,7 @@ def _read_terminal(descriptor: int) -> bytes:
         return b""
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_the_best_chart_so_far(tmp_path: Path) -> None:
     """The signal is sent when the progress bar, on a pseudo-terminal, shows the third degree of six."""
     command = [sys.executable, "-m", "orthocas", "fit", "iiwa", "--param", "polynomial:6", "--out", "c.orthocas"]
@@ -301,7 +288,8 @@ def test_ctrl_c_saves_the_best_chart_so_far(tmp_path: Path) -> None:
     assert chart.notes["status"] == "interrupted"
 
 
-def test_fit_under_a_bound_on_mutual_angles(run) -> None:
+@pytest.mark.slow
+def test_fit_under_a_bound_on_mutual_angles(run: Run) -> None:
     code, out, err = run(
         "fit", "planar_3r_x", "--param", "polynomial:2", "--samples", "300", "--max-mutual-deg", "2.0", "--json"
     )
@@ -315,7 +303,8 @@ def test_fit_under_a_bound_on_mutual_angles(run) -> None:
     assert err.count("\n") == 1
 
 
-def test_fit_goes_on_from_its_checkpoint(run, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_fit_goes_on_from_its_checkpoint(run: Run, tmp_path: Path) -> None:
     words = ("fit", "planar_3r_x", "--param", "polynomial:2", "--samples", "100", "--checkpoint", "run.checkpoint")
     assert run(*words)[0] == 0
     first = (tmp_path / "planar_3r_x.orthocas").read_bytes()
@@ -326,7 +315,8 @@ def test_fit_goes_on_from_its_checkpoint(run, tmp_path: Path) -> None:
     assert "another fit: its seed is 0, expected 4" in err
 
 
-def test_compare_writes_tables_pictures_and_charts(run, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_compare_writes_tables_pictures_and_charts(run: Run, tmp_path: Path) -> None:
     words = ("compare", "planar_3r_x", "--samples", "100", "--held-out", "300", "--param", "linear")
     code, out, err = run(
         *words, "--param", "mlp:3", "--solver", "gauss_newton", "--solver", "lbfgs", "--jobs", "1", "--out", "grid"
@@ -352,7 +342,7 @@ def test_compare_writes_tables_pictures_and_charts(run, tmp_path: Path) -> None:
         (("compare", "iiwa", "--out", "file"), "--out is file, expected a folder"),
     ],
 )
-def test_bad_grids_are_refused_before_any_work(run, tmp_path: Path, words: tuple[str, ...], message: str) -> None:
+def test_bad_grids_are_refused_before_any_work(run: Run, tmp_path: Path, words: tuple[str, ...], message: str) -> None:
     (tmp_path / "file").write_text("in the way")
     code, out, err = run(*words)
     assert (code, out) == (2, "")

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from charts import with_metric
 from matplotlib.figure import Figure
 from PIL import Image
+from programs import Run
 
 import orthocas as oc
-from orthocas.cli import main
 from orthocas.cli import simulate as command
 from orthocas.cli.controller_argument import ControllerOptions, build_controller
 from orthocas.domains import sample_uniform
@@ -26,7 +26,6 @@ from orthocas.simulation import Trajectory
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SHORT = {"duration": 1, "steps": [{"time": 0.1, "move": {"x": 0.1}}, {"time": 0.6, "to": {"xi1": 0.05}}]}
 FILES = {"trajectory.npz", "coordinates.png", "report.json"}
-Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
@@ -35,21 +34,15 @@ def chart(planar_fit: Fit) -> oc.Chart:
 
 
 @pytest.fixture
-def run(chart: oc.Chart, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Simulate in a folder with a.orthocas and short.json; exit code, standard output, standard error."""
-    monkeypatch.chdir(tmp_path)
+def run(run: Run, chart: oc.Chart) -> Run:
+    """Simulate in a folder with a.orthocas and short.json."""
     chart.save("a.orthocas")
     Path("short.json").write_text(json.dumps(SHORT))
 
     def call(
         controller: str, *words: str, steps: str = "short.json", chart: str = "a.orthocas"
     ) -> tuple[int, str, str]:
-        line = [chart, "--controller", controller, "--steps", steps, "--out", "out", *words]
-        monkeypatch.setattr(sys, "argv", ["orthocas", "simulate", *line])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        out, err = capsys.readouterr()
-        return int(stop.value.code or 0), out, err
+        return run("simulate", chart, "--controller", controller, "--steps", steps, "--out", "out", *words)
 
     return call
 
@@ -71,6 +64,7 @@ def report_of(run: Run, *words: str, **more: str) -> dict[str, Any]:
     return report
 
 
+@pytest.mark.slow
 def test_example_of_the_docs_end_to_end(run: Run, chart: oc.Chart) -> None:
     code, out, err = run("pd_plus", "--json", steps=str(EXAMPLES / "steps_planar_3r_x.json"))
     assert (code, err) == (0, "")
@@ -149,6 +143,7 @@ def test_gains_and_limits_are_those_given(run: Run, chart: oc.Chart) -> None:
     assert build_controller("kinematic", chart, all_of_them, None).gains["feedback"].tolist() == [5, 5, 5]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank")
 def test_a_wrong_model_friction_and_noise_cost_accuracy(run: Run) -> None:
     exact = report_of(run, "pd_plus")["tracking_error"]["x"]
@@ -322,7 +317,7 @@ def test_a_fallback_is_said_with_time_and_reason(run: Run) -> None:
 
 @pytest.mark.usefixtures("blank")
 def test_a_metric_other_than_inertia_is_noted(run: Run, planar_x: oc.Problem) -> None:
-    problem = oc.Problem(planar_x.robot, planar_x.task, "euclidean", planar_x.domain)
+    problem = with_metric(planar_x, "euclidean")
     oc.fit(problem, oc.Linear()).chart.save("plain.orthocas")
     Path("still.json").write_text('{"duration": 0.1, "steps": []}')
     code, _, err = run("impedance", "--animation", "none", chart="plain.orthocas", steps="still.json")

@@ -4,8 +4,6 @@ import json
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +11,18 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
+from charts import linear_on_the_torus
 from conftest import ROBOTS, arm, pinocchio_position
+from programs import Run, needs_c, needs_cmake, output_of
 
 import orthocas as oc
-from orthocas.cli import main
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared
 from orthocas.codegen.library import compilers
 from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector
 from orthocas.errors import CompileError, InvalidValueError, NoExpressionError, ProofError
+from orthocas.fitting.fit import Fit
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None and shutil.which("gcc") is None, reason="no C compiler")
+pytestmark = needs_c
 
 Generated = tuple[GeneratedC, Controller]
 
@@ -38,12 +38,7 @@ def laws(chart: oc.Chart) -> list[Controller]:
     ]
 
 
-@pytest.fixture(scope="module")
-def pd_plus(planar_chart: oc.Chart, tmp_path_factory: pytest.TempPathFactory) -> Generated:
-    law = laws(planar_chart)[1]
-    return oc.generate_c(planar_chart, tmp_path_factory.mktemp("c"), law, "arm"), law
-
-
+@pytest.mark.slow
 def test_every_controller_equals_its_python(planar_chart: oc.Chart, tmp_path: Path) -> None:
     """Also NaN, infinities and huge numbers: same status, same fallback."""
     for law in (*laws(planar_chart), None):
@@ -62,6 +57,7 @@ def test_every_family_equals_its_python(planar_xy: oc.Problem, parametrisation: 
     assert check_c(oc.generate_c(chart, tmp_path, law), chart, law, states=200).differences["control"] < 1e-10
 
 
+@pytest.mark.slow
 def test_seven_joints_with_an_idle_one(iiwa: oc.Problem, tmp_path: Path) -> None:
     chart = oc.fit(iiwa, oc.Polynomial(2)).chart
     law = PDPlus(chart, 50.0, coupling="decoupled")
@@ -69,9 +65,7 @@ def test_seven_joints_with_an_idle_one(iiwa: oc.Problem, tmp_path: Path) -> None
 
 
 def test_chart_on_the_torus_has_no_outside(tmp_path: Path) -> None:
-    robot = oc.Robot.planar([1, 1, 1], [3, 3, 3])
-    problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Torus(3))
-    chart = oc.fit(problem, oc.Linear(base=(0.6, 0.8, 0.8))).chart
+    chart = linear_on_the_torus()
     generated = oc.generate_c(chart, tmp_path, None, "free_arm")
     check_c(generated, chart, None, states=200)
     library = CompiledLibrary(compile_shared(generated, tmp_path), "free_arm", 3)
@@ -95,49 +89,46 @@ int main(void) {
 """
 
 
-def run(*command: str | Path) -> str:
-    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-@pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
+@pytest.mark.slow
+@needs_cmake
 def test_installed_libraries_are_found_and_linked(pd_plus: Generated, tmp_path: Path) -> None:
     """By CMake and pkg-config, from a folder with a space, after it has been moved."""
     first, place, project = tmp_path / "first place", tmp_path / "second place", tmp_path / "consumer"
-    run("cmake", "-S", pd_plus[0].folder, "-B", tmp_path / "build")
-    run("cmake", "--build", tmp_path / "build")
-    run("cmake", "--install", tmp_path / "build", "--prefix", first)
+    output_of("cmake", "-S", pd_plus[0].folder, "-B", tmp_path / "build")
+    output_of("cmake", "--build", tmp_path / "build")
+    output_of("cmake", "--install", tmp_path / "build", "--prefix", first)
     first.rename(place)
     assert len(list(place.rglob("libarm.a"))) == 1
     assert (place / "include" / "arm.h").exists()
     project.mkdir()
     (project / "CMakeLists.txt").write_text(_CONSUMER)
     (project / "main.c").write_text(_MAIN)
-    run("cmake", "-S", project, "-B", project / "build", f"-DCMAKE_PREFIX_PATH={place}")
-    run("cmake", "--build", project / "build")
-    run(project / "build" / "consumer")
+    output_of("cmake", "-S", project, "-B", project / "build", f"-DCMAKE_PREFIX_PATH={place}")
+    output_of("cmake", "--build", project / "build")
+    output_of(project / "build" / "consumer")
     if shutil.which("pkg-config") is None:
         return
     (package,) = place.rglob("arm.pc")
-    flags = run("env", f"PKG_CONFIG_PATH={package.parent}", "pkg-config", "--cflags", "--libs", "arm")
+    flags = output_of("env", f"PKG_CONFIG_PATH={package.parent}", "pkg-config", "--cflags", "--libs", "arm")
     program, library = project / "by_package", package.parent.parent
-    run(compilers()[0], project / "main.c", "-o", program, *shlex.split(flags), f"-Wl,-rpath,{library}")
-    run(program)
+    output_of(compilers()[0], project / "main.c", "-o", program, *shlex.split(flags), f"-Wl,-rpath,{library}")
+    output_of(program)
 
 
-@pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
+@pytest.mark.slow
+@needs_cmake
 def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: Generated, tmp_path: Path) -> None:
     (tmp_path / "main.c").write_text(_MAIN)
     text = _CONSUMER.replace("find_package(arm 0.1 REQUIRED)", f'add_subdirectory("{pd_plus[0].folder}" arm)')
     (tmp_path / "CMakeLists.txt").write_text(text.replace("arm::shared", "arm::static"))
-    run("cmake", "-S", tmp_path, "-B", tmp_path / "build")
-    run("cmake", "--build", tmp_path / "build")
-    run(tmp_path / "build" / "consumer")
-    run("cmake", "--install", tmp_path / "build", "--prefix", tmp_path / "installed")
+    output_of("cmake", "-S", tmp_path, "-B", tmp_path / "build")
+    output_of("cmake", "--build", tmp_path / "build")
+    output_of(tmp_path / "build" / "consumer")
+    output_of("cmake", "--install", tmp_path / "build", "--prefix", tmp_path / "installed")
     assert not list((tmp_path / "installed").rglob("*arm*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -170,6 +161,7 @@ def test_check_compares_with_the_gains_of_the_controller(planar_chart: oc.Chart,
         check_c(generated, planar_chart, Impedance(planar_chart, 51.0, limit=90.0), states=50)
 
 
+@pytest.mark.slow
 def test_coordinates_without_a_value_everywhere(planar_x: oc.Problem, tmp_path: Path) -> None:
     """NaN in Python is a status and zeros in C; branches with infinities are code like any other."""
     for k, expression in enumerate((lambda q: ca.sqrt(q[1] - 0.4), lambda q: ca.if_else(q[1] > 0.4, q[1], ca.inf))):
@@ -191,12 +183,11 @@ def test_words_of_others_do_not_become_code(tmp_path: Path) -> None:
     chart = oc.fit(problem, oc.Linear()).chart
     generated = oc.generate_c(chart, tmp_path, None, "arm")
     check_c(generated, chart, None, states=100)
-    assert "evil" not in subprocess.run(
-        [compilers()[0], "-E", "-P", str(tmp_path / "arm.c")], capture_output=True, text=True, check=True
-    ).stdout.replace("evil_", "")
+    assert "evil" not in output_of(compilers()[0], "-E", "-P", tmp_path / "arm.c").replace("evil_", "")
     assert re.fullmatch(r"[a-z]\w*", oc.generate_c(chart, tmp_path / "unnamed").name, flags=re.ASCII)
 
 
+@pytest.mark.slow
 def test_check_is_fair_near_singularities(tmp_path: Path) -> None:
     """A good fit whose box holds postures where commands amplify rounding by a million, and its coupled laws."""
     robot = oc.Robot.planar([1, 1, 1], [1, 1, 1])
@@ -227,9 +218,7 @@ def test_files_of_the_user_stay(planar_chart: oc.Chart, tmp_path: Path) -> None:
         oc.generate_c(planar_chart, tmp_path, None, "leg")
 
 
-def test_header_and_readme_tell_what_a_user_needs(
-    pd_plus: Generated, planar_chart: oc.Chart, planar_x: oc.Problem
-) -> None:
+def test_header_and_readme_tell_what_a_user_needs(pd_plus: Generated, planar_x: oc.Problem) -> None:
     generated, law = pd_plus
     header = (generated.folder / "arm.h").read_text()
     for name in planar_x.robot.joint_names:
@@ -245,7 +234,7 @@ def test_header_and_readme_tell_what_a_user_needs(
     assert "| `stiffness` | 20.0, 50.0, 80.0 |" in readme
     assert law.name in readme
     q, phi = (np.array(json.loads(f"[{row}]")) for row in re.findall(r"    (?:q  |phi) = {(.*)}", readme))
-    np.testing.assert_array_equal(planar_chart.phi(q), phi)
+    np.testing.assert_array_equal(law.chart.phi(q), phi)
 
 
 def test_what_cannot_be_generated_is_refused(planar_x: oc.Problem, planar_chart: oc.Chart, tmp_path: Path) -> None:
@@ -263,24 +252,16 @@ def test_what_cannot_be_generated_is_refused(planar_x: oc.Problem, planar_chart:
     assert not (tmp_path / "new").exists()
 
 
-def test_command_writes_checks_and_refuses(
-    planar_chart: oc.Chart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    planar_chart.save(tmp_path / "arm.orthocas")
-
-    def run(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["orthocas", "codegen", str(tmp_path / "arm.orthocas"), *words])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        return int(stopped.value.code or 0), *capsys.readouterr()
-
-    code, out, err = run("--controller", "kinematic", "--out", str(tmp_path / "c"), "--check", "--json")
+@pytest.mark.slow
+def test_command_writes_checks_and_refuses(planar_fit: Fit, run: Run) -> None:
+    planar_fit.chart.save("arm.orthocas")
+    code, out, err = run("codegen", "arm.orthocas", "--controller", "kinematic", "--out", "c", "--check", "--json")
     assert (code, err) == (0, "")
     report = json.loads(out)
     assert report["checked_states"] == 1009
     assert max(report["relative_differences"].values()) < 1e-10
     assert Path(report["source"]).exists()
-    code, out, _ = run("--controller", "none", "--out", str(tmp_path / "d"), "--name", "arm")
+    code, out, _ = run("codegen", "arm.orthocas", "--controller", "none", "--out", "d", "--name", "arm")
     assert code == 0
     assert "lines of C99" in out
     for words, message in (
@@ -289,12 +270,13 @@ def test_command_writes_checks_and_refuses(
         (["--controller", "spring"], "unknown controller 'spring'"),
         (["--controller", "pd_plus", "--name", "a b"], "a C identifier"),
     ):
-        code, _, err = run(*words, "--out", str(tmp_path / "other"))
+        code, _, err = run("codegen", "arm.orthocas", *words, "--out", "other")
         assert code == 2
         assert message in err
-        assert not (tmp_path / "other").exists()
+        assert not Path("other").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_compiled_kinematics_and_dynamics_match_pinocchio(name: str, tmp_path: Path) -> None:
     """Nothing of ours between the compiled library and Pinocchio's numbers."""

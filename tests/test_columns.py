@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from orthocas.casadi_tools import columns
 from orthocas.casadi_tools.columns import COLUMNS, ColumnFunction, blocked, by_sample, shares
 
 
@@ -12,8 +13,10 @@ def example() -> ca.Function:
     return ca.Function("f", [A, b], [A @ b, ca.sin(A.T) * b[1] + 2, ca.fmax(b, 0)])
 
 
+@pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("N", [1, 7, COLUMNS, COLUMNS + 1, 3 * COLUMNS - 5])
-def test_columns_agree_with_single_samples(N: int) -> None:
+def test_columns_agree_with_single_samples(monkeypatch: pytest.MonkeyPatch, N: int, threads: int) -> None:
+    monkeypatch.setattr(columns, "THREADS", threads)
     rng = np.random.default_rng(3)
     A, b = rng.normal(size=(N, 2, 3)), rng.normal(size=(N, 3))
     f = example()

@@ -142,6 +142,7 @@ def test_summaries_are_medians_and_spreads_over_seeds(grid: tuple[Comparison, Pa
     assert "±" in rows[1][3]
 
 
+@pytest.mark.slow
 def test_control_ticks_are_measured_once_a_parametrisation(planar_x: oc.Problem, tmp_path: Path) -> None:
     """Failed fits have none."""
     lbfgs = solvers.LBFGS(max_iterations=5)
@@ -208,6 +209,7 @@ def test_front_of_one_coordinate_shows_the_conditioning(planar_xy: oc.Problem) -
     np.testing.assert_allclose(heights, [r.conditioning_p01 for r in found.results])
 
 
+@pytest.mark.slow
 def test_process_that_dies_fails_alone(planar_x: oc.Problem) -> None:
     told: list[Progress] = []
     found = oc.compare(
@@ -263,10 +265,11 @@ def test_ctrl_c_returns_what_is_done(planar_x: oc.Problem) -> None:
 def test_same_cell_same_result(planar_x: oc.Problem) -> None:
     cell = Cell(planar_x, oc.Polynomial(2), solvers.GaussNewton(), 3, Weights.of((1000.0, 30.0)), 150, 500, None)
     first, second = (replace(r, seconds=0.0, history=()) for r in run_cells([cell, cell], InThisThread()))
-    assert first == second
+    assert repr(first) == repr(second)  # NaN where nothing was measured, which equals nothing
     assert isinstance(run_cell(cell), CellResult)
 
 
+@pytest.mark.slow
 def test_ctrl_c_stops_running_processes_too(planar_x: oc.Problem) -> None:
     """Fits that would take minutes end at their next step, and none is started."""
 

@@ -96,6 +96,7 @@ def test_equation_29_can_be_indefinite_where_double_diagonal_is_not() -> None:
         assert np.linalg.eigvalsh(damping("double_diagonal", M, K, ratios))[0] > -1e-12
 
 
+@pytest.mark.slow
 def test_damping_generates_to_c_that_agrees(tmp_path: Path) -> None:
     """Compiled with warnings as errors, on 100 inertias; both designs share the square root."""
     compiler = shutil.which("gcc") or shutil.which("cc")

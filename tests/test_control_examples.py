@@ -1,6 +1,5 @@
 """Examples and the benchmark of closed loops, in quick mode."""
 
-import shutil
 from pathlib import Path
 
 import closed_loop
@@ -9,6 +8,9 @@ import controllers
 import lengths
 import panda_elbow
 import pytest
+from programs import needs_c
+
+pytestmark = pytest.mark.slow
 
 
 def test_panda_moves_its_elbow_and_not_its_hand(tmp_path: Path) -> None:
@@ -37,9 +39,8 @@ def test_closed_loop_benchmark_agrees_with_its_peer() -> None:
     assert 1e-6 < found["planar_3r_x sampled at 1 kHz error"] < 1e-3  # half a tick late
 
 
+@needs_c
 def test_ticks_of_generated_c_are_measured() -> None:
-    if shutil.which("cc") is None and shutil.which("gcc") is None:
-        pytest.skip("no C compiler")
     found = control_tick.main(quick=True)
     assert {"PD+ decoupled, polynomial:2", "projector, A = M"} <= set(found)
     for row in found.values():

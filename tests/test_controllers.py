@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from charts import linear_on_the_torus, with_metric
 from scipy.linalg import block_diag, sqrtm
 
 import orthocas as oc
@@ -40,7 +41,7 @@ RNG = np.random.default_rng(21)
 def arm_chart() -> oc.Chart:
     """The 7-DoF arm with A = M, roughly fitted: laws have to be right for any regular chart."""
     problem = oc.problems.get("iiwa")
-    inertial = oc.Problem(problem.robot, problem.task, "inertia", problem.domain)
+    inertial = with_metric(problem, "inertia")
     return oc.fit(inertial, oc.Polynomial(2)).chart
 
 
@@ -123,6 +124,7 @@ def test_laws_equal_the_paper_written_out(arm_chart: oc.Chart, model: pin.Model,
         np.testing.assert_allclose(called(controller, s), want, rtol=2e-7, atol=1e-6 * np.abs(want).max())
 
 
+@pytest.mark.slow
 def test_coupled_pd_plus_gives_the_wanted_acceleration(arm_chart: oc.Chart, model: pin.Model) -> None:
     """On the reference (no error) dd_phi = dd_phi_d whatever the chart: forward dynamics by Pinocchio."""
     for _ in range(5):
@@ -180,7 +182,7 @@ def test_kinematic_control_inverts_the_jacobian(arm_chart: oc.Chart, model: pin.
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
 def test_projector_equals_equations_2_and_3(model: pin.Model, metric: str) -> None:
     base = oc.problems.get("iiwa")
-    problem = oc.Problem(base.robot, base.task, metric, base.domain)
+    problem = with_metric(base, metric)
     controller = Projector(problem, 300.0, np.linspace(5, 20, 7), 0.6)
     chart = oc.Chart(problem, oc.fit(base, oc.Polynomial(2)).chart.coordinates)
     s = State.random(chart, model)
@@ -283,13 +285,11 @@ class TestGuard:
             assert np.isfinite(command).all()
 
     def test_singular_chart_is_told(self) -> None:
-        robot = oc.Robot.planar([1, 1, 1], [3, 3, 3])
-        problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Torus(3))
-        chart = oc.fit(problem, oc.Linear(base=(0.6, 0.8, 0.8))).chart
+        chart = linear_on_the_torus()
         for law in (Impedance(chart, 50.0), PDPlus(chart, 50.0), Kinematic(chart)):
             command, status = self.run(law, [0.0, 0.0, 0.0], 1.0)
             assert status == ControlStatus.SINGULAR
-            want = robot.gravity(np.zeros(3)) if law.command == "torque" else np.zeros(3)
+            want = chart.problem.robot.gravity(np.zeros(3)) if law.command == "torque" else np.zeros(3)
             np.testing.assert_allclose(command, want, atol=1e-12)
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])

@@ -16,6 +16,7 @@ def grown(metric: str = "euclidean", leaf: str = "linear", half_width: float = n
     return oc.grow(oc.Problem(ARM, oc.Task.position(ARM, "x"), metric, box), leaf=leaf)
 
 
+@pytest.mark.slow
 def test_polynomials_keep_nearly_everything() -> None:
     chart = grown()
     lost = {degree: oc.distil(chart, oc.Polynomial(degree)) for degree in (2, 4, 6)}
@@ -34,6 +35,7 @@ def test_the_result_is_an_expression() -> None:
     assert chart.notes["distilled from"] == "grown:linear"
 
 
+@pytest.mark.slow
 def test_inertia_metric_and_meshes_distil_too() -> None:
     assert oc.distil(grown("inertia", half_width=0.1), oc.Polynomial(5)).distilled.task_angle.std < 0.2
     on_mesh = oc.distil(grown(leaf="disk"), oc.Polynomial(5))

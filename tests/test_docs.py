@@ -3,11 +3,10 @@
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from programs import Run, needs_c, needs_cmake, output_of, python
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -25,58 +24,60 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_python_quickstart_runs(checkout: Path) -> None:
     code = blocks("python")[0]
-    done = subprocess.run([sys.executable, "-c", code], cwd=checkout, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert float(done.stdout.split()[0]) < 2.06
+    assert float(python(code, checkout).split()[0]) < 2.06
     assert (checkout / "arm.orthocas").exists()
 
 
+@pytest.mark.slow
 def test_python_block_of_exact_coordinates_runs(checkout: Path) -> None:
     code = blocks("python")[1]
-    done = subprocess.run([sys.executable, "-c", code], cwd=checkout, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    verdict, numbers = done.stdout.splitlines()
+    verdict, numbers = python(code, checkout).splitlines()
     assert "orthogonal" in verdict
     exact, distilled = map(float, numbers.split())
     assert exact < 1e-9 < distilled < 0.1
 
 
-def test_shell_quickstart_runs(checkout: Path) -> None:
+@pytest.mark.slow
+@pytest.mark.usefixtures("checkout")
+def test_shell_quickstart_runs(run: Run) -> None:
     commands = [shlex.split(line) for line in blocks("sh")[1].splitlines()]
     assert len(commands) == 10
     for words in commands:
         assert words[0] == "orthocas"
-        done = subprocess.run([sys.executable, "-m", *words], cwd=checkout, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        assert done.stderr == ""
+        code, _, err = run(*words[1:])
+        assert (code, err) == (0, "")
 
 
+@pytest.mark.slow
 def test_python_block_of_the_page_on_control_runs(tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "control.md").read_text(), flags=re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    first, coupling = done.stdout.splitlines()
+    first, coupling = python(code, tmp_path).splitlines()
     assert first.endswith("] 0")  # no status but OK
     assert float(coupling) < 0.005
     assert (tmp_path / "run.npz").exists()
 
 
-def test_ten_minutes_to_a_controller_in_c_run(checkout: Path) -> None:
+@pytest.mark.slow
+@needs_c
+@needs_cmake
+@pytest.mark.usefixtures("checkout")
+def test_ten_minutes_to_a_controller_in_c_run(run: Run) -> None:
     """Every command of docs/c_controller.md, in order."""
-    if shutil.which("cmake") is None or shutil.which("cc") is None:
-        pytest.skip("no C compiler, or no cmake")
     page = (ROOT / "docs" / "c_controller.md").read_text()
     lines = [line for block in re.findall(r"```sh\n(.*?)```", page, flags=re.DOTALL) for line in block.splitlines()]
     assert len(lines) == 7
     for line in lines:
-        words = shlex.split(line)
-        command = [sys.executable, "-m", *words] if words[0] == "orthocas" else words
-        done = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, f"{line}: {done.stderr}"
-    assert "statuses: 2000 ok, 0 outside" in done.stdout
-    assert float(done.stdout.split()[-1]) < 1e-4  # the task stays while the arm moves
+        program, *words = shlex.split(line)
+        if program == "orthocas":
+            code, printed, err = run(*words)
+            assert code == 0, f"{line}: {err}"
+        else:
+            printed = output_of(program, *words)
+    assert "statuses: 2000 ok, 0 outside" in printed
+    assert float(printed.split()[-1]) < 1e-4  # the task stays while the arm moves
 
 
 def test_make_targets_of_the_readme_exist() -> None:

@@ -25,6 +25,7 @@ import orthocas as oc
 from orthocas.reproduce.registry import FIGURES
 
 
+@pytest.mark.slow
 def test_demo_saves_chart_and_pictures(tmp_path: Path) -> None:
     found = iiwa_demo.main(tmp_path, quick=True)
     assert found["task_std_deg"] < 2.4
@@ -53,6 +54,7 @@ def test_compiled_timing_harness_times_calls() -> None:
     assert times["f"] > 1
 
 
+@pytest.mark.slow
 def test_front_shows_the_trade_and_the_trap(tmp_path: Path) -> None:
     found = front.main(tmp_path, quick=True)
     assert found["task_std_small_lambda2"] < found["task_std_large_lambda2"]
@@ -62,6 +64,7 @@ def test_front_shows_the_trade_and_the_trap(tmp_path: Path) -> None:
     assert (tmp_path / "front.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_involutivity_defect_tells_the_angles_of_fits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = involutivity.main(tmp_path, quick=True)
     assert found["rank_correlation"] > 0.95
@@ -73,6 +76,7 @@ def test_involutivity_defect_tells_the_angles_of_fits(tmp_path: Path, capsys: py
     assert (tmp_path / "involutivity.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_comparison_example_draws_and_returns_the_best(tmp_path: Path) -> None:
     best = compare_parametrisations.main(tmp_path, quick=True)
     assert 5 < best["planar_3r_xy"] < 8
@@ -86,6 +90,7 @@ def test_comparison_example_knows_every_problem() -> None:
     assert (problem.m, problem.r) == (6, 1)
 
 
+@pytest.mark.slow
 def test_distillation_keeps_more_with_the_degree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = distillation.main(tmp_path, quick=True)
     assert found["euclidean polynomial:4"] < 0.2 < found["euclidean polynomial:2"] < 2
@@ -94,6 +99,7 @@ def test_distillation_keeps_more_with_the_degree(tmp_path: Path, capsys: pytest.
     assert oc.evaluate(oc.load(tmp_path / "distilled_euclidean.orthocas"), 1000).task_angle.std < 0.2
 
 
+@pytest.mark.slow
 def test_gallery_shrinks_pictures(tmp_path: Path) -> None:
     assert set(gallery.main(tmp_path, "fig11", quick=True)) == {"fig11"}
     with Image.open(tmp_path / "fig11.png") as picture:
@@ -117,6 +123,7 @@ def test_gallery_page_shows_every_figure() -> None:
     assert page.count("- Agrees: ") == page.count("- Differs: ") == len(shown)
 
 
+@pytest.mark.slow
 def test_growing_benchmark_compares_equal_results(capsys: pytest.CaptureFixture[str]) -> None:
     found = growing_queries.main(quick=True)
     assert found["euclidean ours error"] < 1e-9
@@ -126,6 +133,7 @@ def test_growing_benchmark_compares_equal_results(capsys: pytest.CaptureFixture[
     assert "| ours |" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[str]) -> None:
     found = ipopt_front.main(quick=True)
     assert found["iiwa_domination"] < 0.02
@@ -133,6 +141,7 @@ def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().out.count("\n") == 4
 
 
+@pytest.mark.slow
 def test_benchmarks_of_networks_and_starts_print_rows(capsys: pytest.CaptureFixture[str]) -> None:
     assert len([paper_network.row((1000.0, 30.0), quick=True)]) == 1
     starts.main(quick=True)

@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from charts import with_metric
 from conftest import robot_data
 
 import orthocas as oc
@@ -14,6 +15,7 @@ from orthocas.minimising.solver import SolveResult, Status
 from orthocas.minimising.watch import UNWATCHED, Progress, Watch
 
 
+@pytest.mark.slow
 def test_default_fit_of_the_iiwa_beats_the_papers_network(iiwa: oc.Problem) -> None:
     """The paper's 535e3-parameter network: task 2.06, mutual 3.44 degrees on its own samples."""
     fit = oc.fit(iiwa)
@@ -54,12 +56,14 @@ def test_degree_continuation_goes_through_every_degree(iiwa_fit: Fit) -> None:
     assert iiwa_fit.stages[1].result.value < iiwa_fit.stages[0].result.value
 
 
+@pytest.mark.slow
 def test_exact_coordinates_of_an_involutive_task_are_found(planar_x: oc.Problem) -> None:
     coarse, fine = (oc.evaluate(oc.fit(planar_x, oc.Polynomial(d)).chart, 5000) for d in (4, 8))
     assert fine.task_angle.std <= 0.1 < coarse.task_angle.std
     assert fine.conditioning.p01 > 0.9
 
 
+@pytest.mark.slow
 def test_length_term_keeps_gradients_even(planar_x: oc.Problem) -> None:
     """Held out: angles leave lengths free by a factor of thousands, and a controller's gains with them."""
     plain, even = (
@@ -104,6 +108,7 @@ def test_every_sensible_pair_fits_and_beats_linear_coordinates(
     assert np.isnan(report.mutual_angle.std)
 
 
+@pytest.mark.slow
 def test_panda_and_ur10_fit_without_tuning_straight_from_their_urdfs() -> None:
     for file, tip, idle in (
         ("panda_description/urdf/panda.urdf", "panda_hand", "panda_joint7"),
@@ -141,7 +146,7 @@ def test_joint_that_the_metric_depends_on_is_not_split_off() -> None:
 
 
 def test_inertia_couples_joints_so_none_is_idle(iiwa: oc.Problem) -> None:
-    problem = oc.Problem(iiwa.robot, iiwa.task, "inertia", iiwa.domain)
+    problem = with_metric(iiwa, "inertia")
     assert oc.fit(problem, oc.Polynomial(1), samples=300).idle_joints == ()
 
 

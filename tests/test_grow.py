@@ -6,6 +6,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from charts import planar_2r
 
 import orthocas as oc
 from orthocas import problems
@@ -30,11 +31,6 @@ from orthocas.metrics import metric_matrices
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
 CELL = oc.Box([np.pi / 2, 0, 0], [np.pi / 2, np.pi, np.pi])
 ON_LEAF = [np.pi / 3, 0.0]  # x = 1 of planar_2r
-
-
-def planar_2r(metric: str) -> oc.Problem:
-    known = problems.get("planar_2r")
-    return oc.Problem(known.robot, known.task, metric, known.domain)
 
 
 def planar_3r(metric: str) -> oc.Problem:
@@ -68,6 +64,7 @@ def known_points(chart: oc.Chart, count: int = 100, seed: int = 7) -> np.ndarray
     return points[gradients > 1e-3][:count]  # NaN counts as false
 
 
+@pytest.mark.slow
 def test_coordinates_do_not_change_along_flow_lines(chart: oc.Chart) -> None:
     points = known_points(chart)
     for dx in (0.02, -0.02):
@@ -168,6 +165,7 @@ def test_there_is_no_expression_but_a_pointer(chart: oc.Chart) -> None:
     assert chart.function("task").size_out(0) == (chart.m, 1)
 
 
+@pytest.mark.slow
 def test_evaluate_counts_what_lies_too_near_to_a_separatrix_as_folded() -> None:
     report = oc.evaluate(CHARTS["circle_M"](), 20_000)
     assert 0 < report.folded_samples < 200
@@ -224,6 +222,7 @@ def test_leaves_that_are_no_disk_say_what_they_are() -> None:
         oc.grow(whole, 0.0, cells=20)
 
 
+@pytest.mark.slow
 def test_bad_arguments_name_what_came() -> None:
     problem = planar_2r("euclidean")
     with pytest.raises(UnknownNameError, match="unknown leaf 'sphere'"):
@@ -276,6 +275,7 @@ def test_the_two_ends_of_a_circle_are_one_point() -> None:
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-6, 1e5])
 @pytest.mark.parametrize("leaf", ["disk", "linear"])
 def test_units_of_the_task_do_not_matter(leaf: str, scale: float) -> None:
@@ -299,6 +299,7 @@ def test_a_start_elsewhere_is_no_obstacle_for_a_linear_leaf() -> None:
     np.testing.assert_allclose(chart.inverse(chart.phi(points), points), points, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_prismatic_joints_grow(tmp_path: Path) -> None:
     """A slide that carries a planar arm: x = q1 + cos q2 + cos(q2 + q3)."""
     kinds = [("prismatic", 0, "1 0 0"), ("revolute", 0, "0 0 1"), ("revolute", 1, "0 0 1")]

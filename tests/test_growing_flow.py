@@ -43,6 +43,7 @@ def test_batched_flow_stops_where_the_solution_ends() -> None:
     np.testing.assert_allclose(ends[0], 2.0, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", ["euclidean", "inertia", STIFFNESS], ids=["I", "M", "custom"])
 def test_pull_ends_where_the_paper_s_gradient_flow_ends(metric: object) -> None:
     """Equation (23) by SciPy, run until h has converged to 1e-9, against the task-parametrised flow."""
@@ -60,6 +61,7 @@ def test_pull_ends_where_the_paper_s_gradient_flow_ends(metric: object) -> None:
         np.testing.assert_allclose(end, solved, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", ["euclidean", "inertia", STIFFNESS], ids=["I", "M", "custom"])
 def test_all_flows_agree(metric: object) -> None:
     problem = planar(metric)
@@ -96,6 +98,7 @@ def test_move_changes_two_task_values_by_what_was_asked() -> None:
     np.testing.assert_allclose(change, dx, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
 def test_seven_joints_flow(metric: str) -> None:
     arm = problems.get("iiwa")

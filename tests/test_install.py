@@ -1,8 +1,11 @@
 """`orthocas` imports in every situation a person gets into; the wheel itself is checked by check_wheel.py."""
 
-import subprocess
-import sys
 from pathlib import Path
+
+import pytest
+from programs import python
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent
 USE = (
@@ -11,27 +14,24 @@ USE = (
 )
 
 
-def python(code: str, folder: Path) -> str:
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], cwd=folder, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+def strictly(code: str, folder: Path) -> str:
+    """What it prints in a new Python, where a warning is an error."""
+    return python(code, folder, "-W", "error").strip()
 
 
 def test_works_anywhere(tmp_path: Path) -> None:
-    assert python(USE, tmp_path) == "2 lbfgs"
+    assert strictly(USE, tmp_path) == "2 lbfgs"
 
 
 def test_works_in_the_checkout_root() -> None:
-    assert python(USE, ROOT) == "2 lbfgs"
+    assert strictly(USE, ROOT) == "2 lbfgs"
 
 
 def test_users_own_modules_of_the_same_names_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "solvers.py").write_text("mine = 'solvers'")
     (tmp_path / "problems.py").write_text("mine = 'problems'")
     assert (
-        python(USE + "; import solvers, problems; print(solvers.mine, problems.mine)", tmp_path)
+        strictly(USE + "; import solvers, problems; print(solvers.mine, problems.mine)", tmp_path)
         == "2 lbfgs\nsolvers problems"
     )
 
@@ -41,4 +41,4 @@ def test_import_is_silent_and_leaves_random_state_alone(tmp_path: Path) -> None:
         "import numpy as np, casadi as ca; a = np.random.get_state()[1].copy(); m = ca.GlobalOptions.getNumpyMode();"
         "import orthocas; assert (np.random.get_state()[1] == a).all(); assert ca.GlobalOptions.getNumpyMode() == m"
     )
-    assert python(code, tmp_path) == ""
+    assert strictly(code, tmp_path) == ""

@@ -28,6 +28,7 @@ def press_after(seconds: float) -> threading.Timer:
     return timer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.15, 0.31, 0.57])
 @pytest.mark.parametrize("name", FITS)
 def test_ctrl_c_at_any_moment(planar_x: oc.Problem, name: str, seconds: float) -> None:

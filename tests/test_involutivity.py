@@ -1,15 +1,15 @@
 """The involutivity defect is zero exactly where exact coordinates exist, and does not depend on task coordinates."""
 
 import json
-import sys
 from itertools import combinations
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
+from charts import with_metric
 from conftest import robot_data
+from programs import Run
 from scipy.integrate import solve_ivp
 from scipy.linalg import inv, sqrtm
 
@@ -17,7 +17,6 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array
-from orthocas.cli import main
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.problems.iiwa import urdf_path
@@ -223,7 +222,7 @@ def test_defect_of_iiwa_matches_finite_differences_of_pinocchio(iiwa: oc.Problem
 
     points = sample_uniform(iiwa.domain, 5, 7)
     for metric, matrix in (("inertia", mass), ("euclidean", lambda q: np.eye(7))):
-        problem = oc.Problem(iiwa.robot, iiwa.task, metric, iiwa.domain)
+        problem = with_metric(iiwa, metric)
         expected = [defect_by_differences(jacobian, matrix, q) for q in points]
         np.testing.assert_allclose(defects(problem, points), expected, rtol=1e-6)
 
@@ -316,23 +315,22 @@ def test_bad_sample_numbers_are_refused(planar_xy: oc.Problem) -> None:
         oc.involutivity(planar_xy, seed=-1)
 
 
-def test_info_shows_defect_and_verdict(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], planar_xy: oc.Problem
-) -> None:
-    def run(*words: str) -> str:
-        monkeypatch.setattr(sys, "argv", ["orthocas", *words])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        assert not stop.value.code
-        return capsys.readouterr().out
+@pytest.mark.slow
+def test_info_shows_defect_and_verdict(run: Run, planar_xy: oc.Problem) -> None:
+    def printed(*words: str) -> str:
+        code, out, _ = run(*words)
+        assert code == 0
+        return out
 
     found = oc.involutivity(planar_xy)
-    data = json.loads(run("info", "planar_3r_xy", "--json"))
+    data = json.loads(printed("info", "planar_3r_xy", "--json"))
     assert data["involutivity_defect"] == {"mean": found.mean, "max": found.max}
     assert data["expected_angle_deg"] == found.expected_angle_deg
     assert data["verdict"] == found.verdict
-    assert f"involutivity_defect  mean {found.mean:.4g}, max {found.max:.4g}" in run("info", "planar_3r_xy")
-    assert "exact orthogonal coordinates exist" in run("info", "planar_3r_x")
-    chart = str(tmp_path / "straight.orthocas")
-    run("fit", "planar_3r_xy", "--param", "linear", "--centre", "0.6,0,0.003", "--half-width", "0.001", "--out", chart)
-    assert "unknown whether exact coordinates exist" in run("info", chart)
+    assert f"involutivity_defect  mean {found.mean:.4g}, max {found.max:.4g}" in printed("info", "planar_3r_xy")
+    assert "exact orthogonal coordinates exist" in printed("info", "planar_3r_x")
+    chart = "straight.orthocas"
+    printed(
+        "fit", "planar_3r_xy", "--param", "linear", "--centre", "0.6,0,0.003", "--half-width", "0.001", "--out", chart
+    )
+    assert "unknown whether exact coordinates exist" in printed("info", chart)

@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from charts import planar_2r
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
@@ -121,7 +122,14 @@ def test_linear_leaf_points_solve_both_conditions() -> None:
     np.testing.assert_allclose(leaf.values(points).xi, xi, atol=1e-10)
     np.testing.assert_allclose(problem.task.batched(points)[0], leaf.level[None].repeat(20, 0), atol=1e-10)
     np.testing.assert_allclose(np.linalg.norm(leaf.normals, axis=0), 1.0)
-    assert np.isnan(leaf.points(np.full((1, 6), 50.0))).all()
+
+
+def test_where_a_linear_leaf_has_no_point_there_is_nan() -> None:
+    """At q = (0.5, -0.5) the gradient of x has no second part, so +-xi = q2 + 0.5; and x <= 2 |cos(q2 / 2)|."""
+    leaf = linear_leaf(planar_2r("euclidean"), np.array([0.5, -0.5]))
+    xi = np.array([[np.pi], [0.1], [-np.pi]])
+    assert 2 * np.cos((np.pi - 0.5) / 2) < leaf.level[0]
+    assert np.isnan(leaf.points(xi)).all(axis=1).tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize("cells", [20, 60])

@@ -81,6 +81,7 @@ def test_gradients_of_both_objectives_agree(problem: oc.Problem) -> None:
     np.testing.assert_allclose(linear.normal_equations(theta)[1], graph.value_and_gradient(theta)[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_hessian_is_the_derivative_of_the_gradient(problem: oc.Problem) -> None:
     linear, _, _ = objectives(problem, oc.Polynomial(2), REGULAR)
     theta = linear.family.initial(3)
@@ -100,6 +101,7 @@ def test_weights_split_the_loss_into_its_terms(problem: oc.Problem) -> None:
     assert task < regular
 
 
+@pytest.mark.slow
 def test_fresh_batches_are_new_samples_of_the_same_loss(problem: oc.Problem) -> None:
     for objective in objectives(problem, oc.Polynomial(2), REGULAR)[:2]:
         theta = oc.Polynomial(2).family(JointSpace.of(problem), problem.r).initial(3)

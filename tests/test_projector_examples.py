@@ -13,6 +13,8 @@ import orthocas as oc
 from orthocas.casadi_tools.batch import Batched
 from orthocas.control import Impedance
 
+pytestmark = pytest.mark.slow
+
 IMPEDANCE = ("impedance, coupled", "impedance, decoupled")
 PROJECTORS = ("projector, A = I", "projector, A = M")
 

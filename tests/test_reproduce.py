@@ -1,7 +1,6 @@
 """Figures of the paper: their numbers, the files, the scene they are drawn in, and the command."""
 
 import json
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest.mock import patch
@@ -16,9 +15,9 @@ import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from programs import Run
 
 from orthocas import problems
-from orthocas.cli import main
 from orthocas.errors import InvalidValueError, SolveError, UnknownNameError
 from orthocas.minimising.watch import Progress
 from orthocas.reproduce import FIGURES, Drawing, Recipe, Scene, registry, reproduce, save, solids
@@ -84,6 +83,7 @@ def test_every_figure_has_a_check() -> None:
     assert {*CHECKS, *(name for module in elsewhere for name in module.NAMES)} == set(FIGURES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHECKS)
 def test_numbers_of_figure(name: str) -> None:
     drawing = FIGURES[name].draw(True)
@@ -107,20 +107,6 @@ def two_figures() -> Iterator[list[tuple[str, bool]]]:
     recipes = {name: recipe(name) for name in ("fig06", "fig11")}
     with patch.dict(registry.FIGURES, recipes, clear=True):  # unlike monkeypatch, it restores the order too
         yield drawn
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> object:
-    monkeypatch.chdir(tmp_path)
-
-    def call(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["orthocas", "reproduce", *words])
-        with pytest.raises(SystemExit) as stop:
-            main()
-        out, err = capsys.readouterr()
-        return int(stop.value.code or 0), out, err
-
-    return call
 
 
 def test_save_writes_pictures_meshes_and_numbers(tmp_path: Path) -> None:
@@ -196,8 +182,8 @@ def test_unwritable_folder_is_refused(tmp_path: Path) -> None:
         reproduce("fig06", tmp_path / "file", True)
 
 
-def test_command_prints_rows_or_json(run, two_figures: list[tuple[str, bool]], tmp_path: Path) -> None:
-    code, out, err = run("all", "--out", "new")
+def test_command_prints_rows_or_json(run: Run, two_figures: list[tuple[str, bool]], tmp_path: Path) -> None:
+    code, out, err = run("reproduce", "all", "--out", "new")
     assert (code, err) == (0, "")
     assert out.splitlines() == [
         "fig06: title of fig06",
@@ -206,7 +192,7 @@ def test_command_prints_rows_or_json(run, two_figures: list[tuple[str, bool]], t
         "  name  11",
         "files  new",
     ]
-    code, out, err = run("6", "--out", "new", "--quick", "--json")
+    code, out, err = run("reproduce", "6", "--out", "new", "--quick", "--json")
     assert (code, json.loads(out), err) == (0, {"fig06": {"name": 6.0}}, "")
     assert two_figures == [("fig06", False), ("fig11", False), ("fig06", True)]
 
@@ -221,10 +207,10 @@ def test_command_prints_rows_or_json(run, two_figures: list[tuple[str, bool]], t
     ],
 )
 def test_command_refuses_before_any_work(
-    run, two_figures: list[tuple[str, bool]], tmp_path: Path, words: tuple[str, ...], message: str
+    run: Run, two_figures: list[tuple[str, bool]], tmp_path: Path, words: tuple[str, ...], message: str
 ) -> None:
     (tmp_path / "file").write_text("in the way")
-    code, out, err = run(*words)
+    code, out, err = run("reproduce", *words)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert message in err
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

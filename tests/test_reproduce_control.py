@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from orthocas.chart import Chart
 from orthocas.domains import Box
-from orthocas.reproduce import FIGURES, Drawing
+from orthocas.reproduce import Drawing
 from orthocas.reproduce.closed_loop_picture import draw_coordinates, draw_plane, moved
 from orthocas.reproduce.fig24 import largest_curvature
 from orthocas.reproduce.joint_space_path import coordinate_grid
@@ -27,13 +27,10 @@ from orthocas.reproduce.planar_loop import (
     task_angle_std,
 )
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("fig22", "fig23", "fig24", "fig25", "fig26", "fig30")
 Numbers = dict[str, float]
-
-
-@pytest.fixture(scope="module")
-def drawings() -> dict[str, Drawing]:
-    return {name: FIGURES[name].draw(True) for name in NAMES}
 
 
 @pytest.fixture(scope="module")

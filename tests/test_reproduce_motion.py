@@ -5,15 +5,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from orthocas.errors import SolveError
-from orthocas.reproduce import FIGURES, Drawing
+from orthocas.reproduce import Drawing
 from orthocas.reproduce.hidden_spring import HiddenSpring
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("fig02", "fig21", "fig28")
-
-
-@pytest.fixture(scope="module")
-def drawings() -> dict[str, Drawing]:
-    return {name: FIGURES[name].draw(True) for name in NAMES}
 
 
 @pytest.fixture(scope="module")

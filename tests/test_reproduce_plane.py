@@ -4,15 +4,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from orthocas.reproduce import FIGURES, Drawing
+from orthocas.reproduce import Drawing
 from orthocas.reproduce.planar_flow import cosines_by_differences, deviations, flow_lines, grown_chart, planar_problem
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("fig09", "fig12", "fig13", "fig14", "fig17", "fig18", "fig20")
-
-
-@pytest.fixture(scope="module")
-def drawings() -> dict[str, Drawing]:
-    return {name: FIGURES[name].draw(True) for name in NAMES}
 
 
 @pytest.fixture

@@ -3,18 +3,15 @@
 import numpy as np
 import pytest
 
-from orthocas.reproduce import FIGURES, Drawing, Scene
+from orthocas.reproduce import Drawing, Scene
 from orthocas.reproduce.charted_surface import add_with_edges, add_with_lines, part_below
 from orthocas.reproduce.painting import Isolines
 from orthocas.reproduce.section import curves_inside, section
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("fig01", "fig10", "fig15", "fig19")
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), np.array([[0, 1, 2], [1, 3, 2]])
-
-
-@pytest.fixture(scope="module")
-def drawings() -> dict[str, Drawing]:
-    return {name: FIGURES[name].draw(True) for name in NAMES}
 
 
 def test_every_picture_has_axes(drawings: dict[str, Drawing]) -> None:

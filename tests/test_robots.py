@@ -16,6 +16,7 @@ from orthocas.robots import files
 from orthocas.robots.planar import planar_model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_dynamics_and_kinematics_match_pinocchio_on_random_states(name: str) -> None:
     model, tip = arm(name)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from charts import with_metric
 from scipy.integrate import solve_ivp
 
 import orthocas as oc
@@ -79,10 +80,11 @@ def test_run_agrees_with_another_integrator_on_pinocchios_dynamics(
     assert np.abs(run.q[-1] - q0).max() > 0.02
 
 
+@pytest.mark.slow
 def test_accelerations_along_a_run_are_pinocchios() -> None:
     """7-DoF arm: the plant's forward dynamics at every instant of a run, to 1e-8 of the largest acceleration."""
     base = oc.problems.get("iiwa")
-    chart = oc.fit(oc.Problem(base.robot, base.task, "inertia", base.domain), oc.Polynomial(2)).chart
+    chart = oc.fit(with_metric(base, "inertia"), oc.Polynomial(2)).chart
     q0 = base.domain.centre
     reference = Reference.steps(chart.labels, chart.phi(q0), [(0.0, {"x": chart.phi(q0)[0] + 0.05, "xi1": 0.03})], 1.0)
     run = simulate(PDPlus(chart, 50.0), reference, q0)

@@ -197,6 +197,7 @@ def test_formats_that_cannot_be_made_are_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.gif", "a.mp4"])
 def test_interrupted_animation_leaves_nothing_and_keeps_the_old_one(
     planar_run: Trajectory, planar_fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
@@ -214,6 +215,7 @@ def test_interrupted_animation_leaves_nothing_and_keeps_the_old_one(
     assert {path.name for path in tmp_path.iterdir()} == {"bin", name}
 
 
+@pytest.mark.slow
 def test_a_run_of_one_instant_can_be_drawn(planar_run: Trajectory, planar_fit: Fit, tmp_path: Path) -> None:
     arrays = {name: value[:1] for name, value in vars(planar_run).items() if isinstance(value, np.ndarray)}
     instant = replace(planar_run, outcome=Outcome.DIVERGED, **arrays)

@@ -3,16 +3,12 @@
 import casadi as ca
 import numpy as np
 import pytest
+from charts import planar_2r
 
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import GrowError
 from orthocas.singularities import jumps, singular_points
-
-
-def planar_2r(metric: str) -> oc.Problem:
-    known = problems.get("planar_2r")
-    return oc.Problem(known.robot, known.task, metric, known.domain)
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])

@@ -287,6 +287,7 @@ PAIRS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parametrisation", "solver"), PAIRS, ids=lambda value: getattr(value, "label", getattr(value, "name", ""))
 )

@@ -95,6 +95,7 @@ def test_points_of_the_disk_lie_in_their_triangles(leaf: TriangleMesh) -> None:
     assert found.distance.max() < ROUNDING
 
 
+@pytest.mark.slow
 def test_distance_to_a_disk_from_outside(leaf: TriangleMesh) -> None:
     disk = harmonic_disk(leaf)
     points = 3 * np.random.default_rng(7).normal(size=(200, 2))

@@ -1,4 +1,4 @@
-"""Reading URDF and MJCF files into Pinocchio models, and locking joints."""
+"""Reading URDF files into Pinocchio models, and locking joints of any model."""
 
 import os
 import tempfile
@@ -12,7 +12,6 @@ import pinocchio as pin
 
 from orthocas.checks import Array, require_known
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.robots.mjcf import model_from_mjcf
 from orthocas.robots.pinocchio_model import frame_index, joint_axis, leader_of, remedy
 from orthocas.robots.urdf_checks import check_urdf
 from orthocas.robots.xml_files import read_xml
@@ -34,15 +33,6 @@ def read_urdf(path: str | Path) -> pin.Model:
     if "Error:" in complaints:  # the parser goes on without what it could not read, a mass for example
         raise RobotError(f"{path} is not a usable URDF model: {complaints}")
     return model
-
-
-def read_mjcf(path: str | Path) -> pin.Model:
-    """Read a MuJoCo MJCF file; see `model_from_mjcf`.
-
-    Raises:
-        RobotError: if the file is missing, is not an MJCF model, or holds what cannot be read right.
-    """
-    return model_from_mjcf(path)
 
 
 def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:

@@ -16,6 +16,7 @@ from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, r
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
 from orthocas.robots.homes import model_states, postures, srdf_states
+from orthocas.robots.mjcf import model_from_mjcf
 from orthocas.robots.pinocchio_model import frame_index, tree_from_model
 from orthocas.robots.tool import with_tool
 from orthocas.robots.tree import KinematicTree
@@ -85,7 +86,7 @@ class Robot(Shown):
     @classmethod
     def from_mjcf(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
         """Build the chain that moves the tip from a MuJoCo MJCF file; see `from_file`."""
-        return cls._chain(files.read_mjcf(path), tip, locked, tool)
+        return cls._chain(model_from_mjcf(path), tip, locked, tool)
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:

@@ -1,0 +1,20 @@
+"""Problems and charts that several test files use."""
+
+import orthocas as oc
+from orthocas import problems
+
+
+def with_metric(problem: oc.Problem, metric: str) -> oc.Problem:
+    """The same robot, task and domain under another metric."""
+    return oc.Problem(problem.robot, problem.task, metric, problem.domain)
+
+
+def planar_2r(metric: str) -> oc.Problem:
+    return with_metric(problems.get("planar_2r"), metric)
+
+
+def linear_on_the_torus() -> oc.Chart:
+    """Linear coordinates on all joint positions: the stretched arm (0, 0, 0) is singular, and there is no outside."""
+    robot = oc.Robot.planar([1, 1, 1], [3, 3, 3])
+    problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Torus(3))
+    return oc.fit(problem, oc.Linear(base=(0.6, 0.8, 0.8))).chart

@@ -1,0 +1,26 @@
+"""Programs that tests start, and which of them a machine has."""
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+Run = Callable[..., tuple[int, str, str]]  #: words of a command line to exit code, standard output, standard error
+
+needs_c = pytest.mark.skipif(shutil.which("cc") is None and shutil.which("gcc") is None, reason="no C compiler")
+needs_cmake = pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
+
+
+def output_of(*words: str | Path, folder: Path | None = None) -> str:
+    """What a program prints; it has to end well."""
+    done = subprocess.run([str(word) for word in words], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{words}: exit code {done.returncode}\n{done.stdout}{done.stderr}"
+    return done.stdout
+
+
+def python(code: str, folder: Path | None = None, *options: str) -> str:
+    """What a new Python prints for some code."""
+    return output_of(sys.executable, *options, "-c", code, folder=folder)
