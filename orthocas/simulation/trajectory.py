@@ -6,6 +6,7 @@ import zlib
 from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, Self
 
 import numpy as np
@@ -17,7 +18,7 @@ from orthocas.files.atomic import published, require_writable
 
 _VERSION = 1
 _WRONG_CONTENT = (ValueError, KeyError, TypeError, AttributeError)
-_DAMAGE = (*_WRONG_CONTENT, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+_DAMAGE = (*_WRONG_CONTENT, OSError, EOFError, RuntimeError, TokenError, zipfile.BadZipFile, zlib.error)
 _ARRAYS = {  #: array fields and their units
     "times": "s",
     "q": "rad or m",
