@@ -8,11 +8,11 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from statistics import median
 
-from orthocas.solvers import GaussNewton
 from torch_peer import PeerSettings, train
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.solvers import GaussNewton
 
 TASK, MUTUAL = 2.06, 3.44
 WEIGHTS, SAMPLES = (1000.0, 30.0), 3000

@@ -8,18 +8,19 @@ import numpy as np
 from c_timing import nanoseconds_per_call
 
 from orthocas.casadi_tools.columns import COLUMNS
-from orthocas.fitting.loss import LossShape, Weights, loss_columns
+from orthocas.fitting.loss import Loss, Sizes, Weights
+from orthocas.fitting.loss.residuals import loss_columns
 
 BLOCKS = 16
 
 
 def main(rounds: int = 9) -> dict[str, float]:
     """Nanoseconds a sample of both."""
-    shape = LossShape(7, 3, 4, True, Weights(1000.0, 30.0))
-    J, data = ca.SX.sym("J", shape.r, shape.n), shape.symbols()
-    loss = ca.sumsqr(shape.residuals(J, data)) / 2
-    compiled = ca.Function("loss", [J, *data], ca.cse([loss, ca.densify(ca.gradient(loss, J))]))
-    columns, rng = loss_columns(shape), np.random.default_rng(0)
+    loss = Loss.of(Sizes(n=7, m=3, r=4, identity_metric=True), Weights.of((1000.0, 30.0)).by_name)
+    J, data = loss.arguments()
+    value = ca.sumsqr(loss.residuals(J, data)) / 2
+    compiled = ca.Function("loss", [J, *data], ca.cse([value, ca.densify(ca.gradient(value, J))]))
+    columns, rng = loss_columns(loss), np.random.default_rng(0)
     inputs = [rng.normal(size=(BLOCKS, compiled.numel_in(i), COLUMNS)) for i in range(compiled.n_in())]
     columns(*inputs)
     times = []

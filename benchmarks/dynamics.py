@@ -10,9 +10,9 @@ import numpy as np
 import pinocchio as pin
 from adam.casadi import KinDynComputations
 from c_timing import nanoseconds_per_call
-from orthocas.problems import iiwa
 
 import orthocas as oc
+from orthocas.problems import iiwa
 
 
 def main() -> dict[str, float]:

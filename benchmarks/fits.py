@@ -34,7 +34,7 @@ def build(name: str) -> oc.Problem:
         return problems.get(name)
     file, tip = ROBOTS[name]
     path = next(Path(str(f.locate())).resolve() for f in files("example-robot-data") or [] if str(f).endswith(file))
-    robot = oc.Robot.chain_from_file(path, tip)
+    robot = oc.Robot.from_file(path, tip)
     return oc.Problem(robot, oc.Task.position(robot), name=name)
 
 

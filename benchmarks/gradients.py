@@ -14,11 +14,10 @@ from torch_loss import WEIGHTS, Step, basis_step, network_step
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.coordinates.fitted import joint_space
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.graph_objective import GraphObjective
 from orthocas.fitting.loss import Weights
-from orthocas.parametrisations import LinearFamily
+from orthocas.parametrisations import JointSpace, LinearFamily
 from orthocas.samples import sample_problem
 
 HEADER = (
@@ -39,9 +38,9 @@ def main(quick: bool = False) -> list[str]:
 def network_row(hidden: tuple[int, ...], samples: int, rounds: int) -> str:
     """One network."""
     problem = problems.get("iiwa")
-    family = oc.MLP(hidden).family(joint_space(problem), problem.r)
+    family = oc.MLP(hidden).family(JointSpace.of(problem), problem.r)
     drawn, theta = sample_problem(problem, samples, 0), family.initial(0)
-    ours = GraphObjective(family, drawn, Weights(*WEIGHTS), theta, lambda count, seed: drawn)
+    ours = GraphObjective(family, drawn, Weights.of(WEIGHTS), theta, lambda count, seed: drawn)
     peers = {
         f"{mode} {dtype}": network_step(hidden, theta, drawn.points, drawn.unit_task_gradients, problem.r, dtype, mode)
         for dtype in (torch.float64, torch.float32)
@@ -59,10 +58,10 @@ def network_row(hidden: tuple[int, ...], samples: int, rounds: int) -> str:
 def basis_row(parametrisation: oc.Polynomial | oc.Fourier, samples: int, rounds: int) -> str:
     """One basis, its gradients sampled before the clock starts for both."""
     problem = problems.get("iiwa")
-    family = parametrisation.family(joint_space(problem), problem.r)
+    family = parametrisation.family(JointSpace.of(problem), problem.r)
     assert isinstance(family, LinearFamily)
     drawn, theta = sample_problem(problem, samples, 0), family.initial(0)
-    ours = BasisObjective(family, drawn, Weights(*WEIGHTS), theta, lambda count, seed: drawn)
+    ours = BasisObjective(family, drawn, Weights.of(WEIGHTS), theta, lambda count, seed: drawn)
     C, G = theta.reshape(problem.r, -1), family.dense_gradients(ours.G, samples)
     peers = {str(dtype): basis_step(C, G, drawn.unit_task_gradients, dtype) for dtype in (torch.float64, torch.float32)}
     times = _times({"ours": lambda: ours.value_and_gradient(theta), **peers}, rounds)

@@ -1,15 +1,14 @@
-"""Seconds for a disk chart of a planar 3R leaf: surface, harmonic map, closest points; libigl beside them."""
+"""Seconds for a disk chart of a planar 3R leaf: surface, harmonic map, closest points; bare calls of libigl beside."""
 
 import argparse
 import time
 from collections.abc import Callable
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
+import igl
 import numpy as np
 
-from orthocas.growing.harmonic import circle_by_arc_length, harmonic_disk
+from orthocas.growing.harmonic import harmonic_disk
 from orthocas.growing.level_surface import TriangleMesh, level_surface, require_disk
 from orthocas.growing.triangle_locator import TriangleLocator
 
@@ -18,7 +17,6 @@ HEADER = (
     "| libigl: closest points [s] |\n| --- | --- | --- | --- | --- | --- |"
 )
 OFF_SURFACE = 0.01  # [rad], standard deviation of the queries around the mesh
-IGL: Any = import_module("igl") if find_spec("igl") else None
 
 
 def leaf(cells: int) -> TriangleMesh:
@@ -47,17 +45,15 @@ def row(cells: int, queries: int = 100_000) -> str:
     points = np.einsum("nc,ncd->nd", rng.dirichlet([1, 1, 1], queries), corners)
     points += OFF_SURFACE * rng.normal(size=points.shape)
     locate_time, found = seconds(lambda: TriangleLocator(mesh.vertices, mesh.faces).locate(points))
-    peers = "- | -"
-    if IGL is not None:
-        loop = require_disk(mesh)
-        circle = circle_by_arc_length(mesh.vertices[loop])
-        igl_map_time, igl_disk = seconds(lambda: IGL.harmonic(mesh.vertices, mesh.faces, loop, circle, 1))
-        igl_locate_time, (squares, _, _) = seconds(
-            lambda: IGL.point_mesh_squared_distance(points, mesh.vertices, mesh.faces)
-        )
-        assert np.abs(igl_disk - disk).max() < 1e-8
-        assert np.abs(np.sqrt(squares) - found.distance).max() < 1e-12
-        peers = f"{igl_map_time:.2f} | {igl_locate_time:.2f}"
+    loop = require_disk(mesh)
+    circle = igl.map_vertices_to_circle(mesh.vertices, loop)
+    bare_map_time, bare_disk = seconds(lambda: igl.harmonic(mesh.vertices, mesh.faces, loop, circle, 1))
+    bare_locate_time, (squares, _, _) = seconds(
+        lambda: igl.point_mesh_squared_distance(points, mesh.vertices, mesh.faces)
+    )
+    assert np.abs(bare_disk - disk).max() < 1e-8
+    assert np.abs(np.sqrt(squares) - found.distance).max() < 1e-12
+    peers = f"{bare_map_time:.2f} | {bare_locate_time:.2f}"
     return f"| {len(mesh.faces)} | {surface_time:.2f} | {map_time:.2f} | {locate_time:.2f} | {peers} |"
 
 

@@ -171,7 +171,8 @@ def mutual_over_xi(done: Run) -> float:
 def named_problem(quick: bool) -> float:
     """Coupling index x <- xi1 of planar_3r_x with the settings of the figures, for steps of 0.1 from its centre."""
     problem = problems.get("planar_3r_x")
-    fitted = oc.fit(problem, oc.Polynomial(8), samples=2000 if quick else None).chart
+    even = oc.Weights(length=0.1)  # gradients of even length: a step of 0.1 means as much for every coordinate
+    fitted = oc.fit(problem, oc.Polynomial(8), weights=even, samples=2000 if quick else None).chart
     moves: Moves = ({"x": 0.1}, {"xi1": 0.1}, {"x": 0.0}, {"xi1": 0.0})
     return from_xi(follow(fitted, problem.domain.centre, moves))
 

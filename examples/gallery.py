@@ -7,8 +7,7 @@ from PIL import Image
 
 from orthocas.reproduce import reproduce
 
-WIDTH = 1300  #: pixels, enough for a page
-COLOURS = 192
+WIDTH = 1100  #: pixels, enough for a page
 
 
 def main(out: Path, name: str = "all", quick: bool = False) -> dict[str, dict[str, float]]:
@@ -30,11 +29,11 @@ def main(out: Path, name: str = "all", quick: bool = False) -> dict[str, dict[st
 
 
 def shrink(path: Path) -> None:
-    """Make a picture at most WIDTH pixels wide, with a palette."""
+    """Make a picture at most WIDTH pixels wide, with all its colours."""
     with Image.open(path) as picture:
         small = picture.convert("RGB")
     small.thumbnail((WIDTH, 10 * WIDTH))
-    small.quantize(COLOURS, Image.Quantize.MEDIANCUT).save(path, optimize=True)
+    small.save(path, optimize=True)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from scipy.stats import spearmanr
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.fitting.loss import DEFAULT_WEIGHTS
+from orthocas.fitting.loss import DEFAULT_WEIGHTS, Weights
 from orthocas.samples import sample_problem
 
 METRICS = {"euclidean": "I", "inertia": "M"}
@@ -123,12 +123,12 @@ def data_cases() -> Iterator[Case]:
         return
     for name, (relative, tip, centre) in DATA.items():
         (path,) = (entry.locate() for entry in entries if str(entry).endswith(f"robots/{relative}"))
-        robot = oc.Robot.chain_from_file(str(path), tip)
+        robot = oc.Robot.from_file(str(path), tip)
         for half_width in (0.1, 0.4):
             yield Case(f"{name}, xyz", oc.Problem(robot, oc.Task.position(robot), domain=oc.Box(centre, half_width)), 3)
 
 
-def measured(case: Case, weights: tuple[float, float, float] = DEFAULT_WEIGHTS, samples: int = 10_000) -> Row:
+def measured(case: Case, weights: Weights = DEFAULT_WEIGHTS, samples: int = 10_000) -> Row:
     """Defect and fit of a case."""
     chart = oc.fit(case.problem, oc.Polynomial(case.degree), weights=weights).chart
     task_std = oc.evaluate(chart, samples).task_angle.std

@@ -1,22 +1,30 @@
 """orthocas: joint-space coordinates that a redundant robot's task does not disturb, with CasADi."""
 
+from importlib import import_module as _import_module
 from pathlib import Path as _Path
+from typing import TYPE_CHECKING
 
 # In a checkout, problems/ and solvers/ lie beside this folder, not inside it. Looking one level up keeps
 # `orthocas.problems` importable there, whether or not an installed copy exists; a wheel does not take this line.
 if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
-from orthocas import control, problems, simulation, solvers
+from orthocas import control, errors, parametrisations, problems, simulation, solvers
 from orthocas.chart import Chart, GrownChart, load
 from orthocas.codegen import generate_c
 from orthocas.comparing.compare import compare
+from orthocas.comparing.report import Comparison
 from orthocas.distil import distil
-from orthocas.domains import Box, Torus, contains
-from orthocas.fitting.fit import fit
+from orthocas.domains import Box, Torus, contains, default_box
+from orthocas.fitting.fit import Fit, fit
+from orthocas.fitting.loss import Weights
+from orthocas.fitting.loss import register as register_loss_term
+from orthocas.fitting.symbolic_loss import loss
 from orthocas.grow import grow
 from orthocas.involutivity import Involutivity, involutivity, lie_bracket
+from orthocas.metrics import Metric
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial
+from orthocas.parametrisations import register as register_parametrisation
 from orthocas.problem import Problem, check
 from orthocas.quality import Report, evaluate
 from orthocas.robots import Robot
@@ -25,28 +33,37 @@ from orthocas.singularities import jumps, singular_points
 from orthocas.tasks import Task
 from orthocas.version import VERSION as _VERSION
 
+if TYPE_CHECKING:
+    from orthocas import plotting
+
 __version__ = _VERSION
 __all__ = [
     "MLP",
     "SEW",
     "Box",
     "Chart",
+    "Comparison",
+    "Fit",
     "Fourier",
     "Given",
     "GrownChart",
     "Involutivity",
     "Linear",
+    "Metric",
     "Polynomial",
     "Problem",
     "Report",
     "Robot",
     "Task",
     "Torus",
+    "Weights",
     "check",
     "compare",
     "contains",
     "control",
+    "default_box",
     "distil",
+    "errors",
     "evaluate",
     "fit",
     "generate_c",
@@ -55,9 +72,26 @@ __all__ = [
     "jumps",
     "lie_bracket",
     "load",
+    "loss",
+    "parametrisations",
+    "plotting",
     "problems",
+    "register_loss_term",
+    "register_parametrisation",
     "simulate",
     "simulation",
     "singular_points",
     "solvers",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Load figures when they are wanted: they need matplotlib, which takes half a second to import."""
+    if name == "plotting":
+        return _import_module("orthocas.plotting")
+    raise AttributeError(f"module 'orthocas' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    """What users use; modules of the machinery are found by their full names."""
+    return [*__all__, "__version__"]

@@ -1,36 +1,40 @@
 """Charts phi(q) = [h(q); xi(q)]: task and extra coordinates together, with Jacobian and inverse map."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, Self, TypeVar, overload
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.casadi_tools.batch import evaluate_columns
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.scalar_code import scalar_code
-from orthocas.checks import Array, as_point_set, require_known
+from orthocas.checks import Array, as_point_set, require_kind, require_known, require_shape
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap, InvertibleMap
 from orthocas.errors import InvalidValueError, InverseError, ShapeError
 from orthocas.files.chart_file import read_chart, write_chart
 from orthocas.growing import GrownCoordinates
 from orthocas.problem import Problem, task_jacobians
+from orthocas.showing import Shown, listed
 
+Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
 _SINGULAR = 1e-8  # ratio of singular values of J where the inverse map is given up
 
 
-@dataclass(frozen=True, eq=False)
-class Chart:
+@dataclass(frozen=True, eq=False, repr=False)
+class Chart(Shown):
     """A problem with coordinates xi(q) found for it ([AS2023] eq. (27)), fitted or grown.
 
-    NumPy arguments are one joint position (n,) or a set (N, n), [rad] or [m]. Grown coordinates are NaN at points from
-    where their flow does not reach the charted part of the base leaf.
+    Joint positions are one (n,), a column (n, 1), or a set (N, n), [rad] or [m]; xi, task, phi and jacobian also take a
+    CasADi column (n, 1), SX or MX, and give an expression. Grown coordinates are NaN at points from where their flow
+    does not reach the charted part of the base leaf.
     """
 
     problem: Problem
@@ -38,7 +42,13 @@ class Chart:
     notes: Mapping[str, str | float] = field(default_factory=dict)  #: how it was made: solver, weights, seed, ...
 
     def __post_init__(self) -> None:
+        require_kind("problem", self.problem, Problem)
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
+
+    def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
+        """Pickled and copied as what it was made of, with notes as a plain mapping: a read-only one can be neither."""
+        parts = {part.name: getattr(self, part.name) for part in fields(self)}
+        return type(self), tuple((parts | {"notes": dict(self.notes)}).values())
 
     @property
     def n(self) -> int:
@@ -55,6 +65,21 @@ class Chart:
         """Number of extra coordinates."""
         return self.problem.r
 
+    def facts(self) -> dict[str, str]:
+        """Coordinates, problem, and how it was made."""
+        problem = self.problem.facts()
+        made = listed(
+            f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"
+            for name, value in self.notes.items()
+        )
+        return {
+            "chart": f"{self.coordinates.label} coordinates of {self.problem.heading}",
+            "phi": listed(self.labels),
+            "parameters": str(self.coordinates.size),
+            **{name: problem[name] for name in ("task", "metric", "domain")},
+            **({"made by": made} if made else {}),
+        }
+
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of the components of phi: those of the task, then xi1, xi2, ..."""
@@ -62,27 +87,51 @@ class Chart:
 
     def runnable(self, graph: ca.Function) -> ca.Function:
         """A graph of this chart's functions in the form that runs fast: scalar code, or as it is with networks."""
-        matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.family.as_matrices
+        matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.as_matrices
         return graph if matrices else scalar_code(graph)
 
-    def xi(self, q: ArrayLike) -> Array:
+    @overload
+    def xi(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def xi(self, q: ArrayLike) -> Array: ...
+    def xi(self, q: Any) -> Any:
         """Extra coordinates, (r,) or (N, r)."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("xi", q)
         points, single = as_point_set("q", q, self.n)
         values = self.coordinates.xi(points)
         return values[0] if single else values
 
-    def task(self, q: ArrayLike) -> Array:
+    @overload
+    def task(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def task(self, q: ArrayLike) -> Array: ...
+    def task(self, q: Any) -> Any:
         """Task values x = h(q), (m,) or (N, m)."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("task", q)
         points, single = as_point_set("q", q, self.n)
         values = self.problem.task.batched(points)[0]
         return values[0] if single else values
 
-    def phi(self, q: ArrayLike) -> Array:
+    @overload
+    def phi(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def phi(self, q: ArrayLike) -> Array: ...
+    def phi(self, q: Any) -> Any:
         """Task values and extra coordinates stacked, (n,) or (N, n)."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("phi", q)
         return np.concatenate([self.task(q), self.xi(q)], axis=-1)
 
-    def jacobian(self, q: ArrayLike) -> Array:
+    @overload
+    def jacobian(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def jacobian(self, q: ArrayLike) -> Array: ...
+    def jacobian(self, q: Any) -> Any:
         """J = dphi/dq, (n, n) or (N, n, n); task rows first."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("jacobian", q)
         points, single = as_point_set("q", q, self.n)
         J = np.concatenate([task_jacobians(self.problem, points), self.coordinates.jacobian(points)], axis=1)
         return J[0] if single else J
@@ -129,6 +178,11 @@ class Chart:
             return self.problem.task.function
         return self.problem.task.jacobian_function if name == "task_jacobian" else self._functions[name]
 
+    def _expression(self, name: str, q: Any) -> Any:
+        """A function at a CasADi column (n, 1)."""
+        require_shape("q", q.shape, (self.n, 1))
+        return self.function(name)(q)
+
     def save(self, path: str | Path) -> None:
         """Write a self-contained chart file.
 
@@ -174,9 +228,11 @@ class Chart:
         return ca.rootfinder("inverse", "newton", equations, options)
 
     def _solve(self, q_start: Array, phi: Array) -> Array:
+        """One solution, with scratch memory of its own: threads that call a rootfinder itself share one, and crash."""
         with deferred():  # Ctrl-C inside comes out as a RuntimeError, or not at all
             try:
-                return np.asarray(self._rootfinder(ca.DM(q_start), ca.DM(phi)).nonzeros())
+                solution: Array = evaluate_columns(self._rootfinder, 1, q_start[None], phi[None])[0][0]
+                return solution
             except RuntimeError:  # a singular linear system on the way
                 return np.full(self.n, np.nan)
 
@@ -201,7 +257,7 @@ class Chart:
             raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}, q is not unique there")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GrownChart(Chart):
     """A chart with grown coordinates, apart from `function` with the interface of fitted ones.
 

@@ -10,6 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.errors import InvalidValueError, MemoryNeedError, ShapeError, UnknownNameError
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_REAL = "biuf"  # kinds of NumPy's numbers
+_NO_NUMBER = (str, bytes, complex, type(None))  # though NumPy converts them
 
 
 def require_shape(name: str, got: tuple[int, ...], want: tuple[int | None, ...]) -> None:
@@ -53,12 +57,39 @@ def frozen_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> 
     return frozen
 
 
+def frozen_indices(name: str, value: ArrayLike, shape: tuple[int | None, ...], count: int) -> Indices:
+    """Copy to a read-only integer array of the given shape with entries from 0 to count - 1.
+
+    Whole numbers kept as floats are accepted: chart files of early versions hold such indices.
+
+    Raises:
+        ShapeError: if the shape differs.
+        InvalidValueError: if an entry is not a whole number, or not from 0 to count - 1.
+    """
+    numbers = as_float_array(name, value)  # exact up to 2^53
+    require_shape(name, numbers.shape, shape)
+    bad = ~((numbers >= 0) & (numbers < count) & (numbers == np.floor(numbers)))
+    if bad.any():
+        raise InvalidValueError(name, f"{numbers[bad][0]:g}", f"whole numbers from 0 to {count - 1}")
+    frozen = numbers.astype(np.int64)
+    frozen.setflags(write=False)
+    return frozen
+
+
 def as_float_array(name: str, value: Any) -> Array:
-    """Convert to a float array, with an error that names the argument."""
+    """Convert to a float array.
+
+    Raises:
+        InvalidValueError: for anything but real numbers: text (also "1.0"), complex numbers, None, expressions.
+    """
     try:
-        return np.asarray(value, dtype=float)
+        array = np.asarray(value)
+        mixed = array.dtype.kind == "O" and not any(isinstance(entry, _NO_NUMBER) for entry in array.flat)
+        if mixed or array.dtype.kind in _REAL:
+            return np.asarray(array, dtype=float)
     except (TypeError, ValueError):
-        raise InvalidValueError(name, repr(value)[:80], "an array of numbers") from None
+        pass
+    raise InvalidValueError(name, repr(value)[:80], "an array of numbers")
 
 
 def require_finite(name: str, array: Array) -> None:
@@ -70,19 +101,42 @@ def require_finite(name: str, array: Array) -> None:
 
 
 def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
-    """One point (n,) or a set (N, n) as a set (N, n), and whether it was one point.
+    """One point or a set (N, n) as a set (N, n), and whether it was one point.
+
+    A point is (n,), or a column (n, 1), such as a `casadi.DM`; for n = 1 a column is a set.
 
     Raises:
         ShapeError: if the last axis does not have n entries.
         InvalidValueError: if an entry is not finite.
     """
     array = as_float_array(name, value)
+    if n > 1 and array.shape == (n, 1):
+        array = array[:, 0]
     single = array.ndim == 1
     points = array[None, :] if single else array
     if points.ndim != 2 or points.shape[1] != n:
         raise ShapeError(name, array.shape, (n,) if single else (None, n))
-    require_finite(name, points)
+    require_finite(name, points[0] if single else points)
     return points, single
+
+
+def as_point(name: str, value: ArrayLike, n: int) -> Array:
+    """One point, (n,) or a column (n, 1), as a read-only copy (n,).
+
+    Raises:
+        ShapeError, InvalidValueError: as `as_point_set`, and for a set.
+    """
+    points, single = as_point_set(name, value, n)
+    if not single:
+        raise ShapeError(name, points.shape, (n,))
+    return frozen_array(name, points[0], (n,))
+
+
+def require_kind(name: str, value: object, kind: type) -> None:
+    """Raise InvalidValueError unless value is an instance of the class."""
+    if not isinstance(value, kind):
+        plain = isinstance(value, str | int | float | None)
+        raise InvalidValueError(name, repr(value)[:80] if plain else f"a {type(value).__name__}", f"a {kind.__name__}")
 
 
 def require_at_least(name: str, value: float, least: float) -> None:

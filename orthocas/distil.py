@@ -10,16 +10,16 @@ import numpy as np
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.blas_graph import NumpyGraph
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_count, require_memory
-from orthocas.coordinates.fitted import Coordinates, joint_space
+from orthocas.checks import Array, require_count, require_kind, require_memory
+from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import sample_evenly, sample_uniform
 from orthocas.errors import GrowError, InvalidValueError
 from orthocas.growing.grown import GrownCoordinates
 from orthocas.minimising.solver import Solver
 from orthocas.minimising.watch import Monitor, Progress, Watch, silent
-from orthocas.parametrisations import MLP, Family, GradedParametrisation, Parametrisation, Polynomial
-from orthocas.parametrisations.product_basis import LinearFamily
+from orthocas.parametrisations import Family, JointSpace, LinearFamily, Parametrisation, Polynomial
 from orthocas.quality import Report, evaluate
+from orthocas.showing import Shown, number_list
 from orthocas.solvers import LBFGS
 
 _PER_PARAMETER = 4  # samples for each parameter of a coordinate
@@ -28,8 +28,8 @@ _CHUNK = 500  # samples whose basis is held at once
 _HELD_OUT_SEED = 1
 
 
-@dataclass(frozen=True, eq=False)
-class Distilled:
+@dataclass(frozen=True, eq=False, repr=False)
+class Distilled(Shown):
     """A fitted chart that stands in for a grown one, and what was lost."""
 
     chart: Chart
@@ -38,6 +38,18 @@ class Distilled:
     grown: Report  #: quality of the grown chart
     distilled: Report  #: quality of the new one; its task angle was 90 degrees exactly before
     left_out: float  #: share of training samples where the grown chart has no value
+
+    def facts(self) -> dict[str, str]:
+        """What was lost."""
+        before, after = self.grown.task_angle, self.distilled.task_angle
+        return {
+            "distilled": f"{self.chart.coordinates.label} for {self.chart.notes['distilled from']} coordinates",
+            "problem": self.chart.problem.heading,
+            "error of xi": f"{number_list(self.value_rms)} (root mean square)",
+            "of gradients": f"{number_list(self.gradient_rms)} (relative)",
+            "task angle": f"std {after.std:.3g} deg, before {before.std:.3g} deg",
+            "left out": f"{self.left_out:.3%} of the samples",
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,19 +91,17 @@ def distil(
         GrowError: if the grown chart has no values on its domain.
     """
     parametrisation = Polynomial(degree=6) if parametrisation is None else parametrisation
-    if not isinstance(parametrisation, GradedParametrisation | MLP):
-        raise InvalidValueError("parametrisation", repr(parametrisation), "Polynomial, Fourier or MLP")
-    if not isinstance(chart, Chart):
-        raise InvalidValueError("chart", repr(chart), "a grown chart")
-    if solver is not None and not (isinstance(parametrisation, MLP) and isinstance(solver, Solver)):
-        raise InvalidValueError("solver", repr(solver), "a solver such as LBFGS(), and only for a network")
-    solver = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
+    if not isinstance(parametrisation, Parametrisation) or parametrisation.closed_form is not None:
+        raise InvalidValueError("parametrisation", repr(parametrisation), "one that is fitted, such as Polynomial(6)")
+    require_kind("chart", chart, Chart)
     watch = Watch(monitor, f"distil {parametrisation.label}")
     if not isinstance(chart.coordinates, GrownCoordinates):
         raise InvalidValueError("chart", f"a chart of kind {chart.coordinates.label}", "a grown chart")
-    space = joint_space(chart.problem)
+    space = JointSpace.of(chart.problem)
     family = parametrisation.family(space, chart.r)
     if isinstance(family, LinearFamily):
+        if solver is not None:
+            raise InvalidValueError("solver", repr(solver), "none: bases are fitted by least squares")
         needed = 8.0 * family.width * (3 * family.width + (chart.n + 1) * _CHUNK)
         require_memory(f"least squares with {family.width} terms", needed)
     wanted = int(np.clip(_PER_PARAMETER * family.size // chart.r, _LEAST, _MOST))
@@ -104,7 +114,8 @@ def distil(
     if isinstance(family, LinearFamily):
         theta, offset = _least_squares(family, targets, watch)
     else:
-        theta, offset = _minimised(family, targets, solver, seed, watch)
+        minimiser = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
+        theta, offset = _minimised(family, targets, minimiser, seed, watch)
     coordinates = Coordinates(parametrisation, space, (), theta, offset, np.ones(chart.r))
     return _judged(
         chart, Chart(chart.problem, coordinates, {"distilled from": chart.coordinates.label}), targets, count

@@ -1,7 +1,7 @@
 """Regions of joint space that coordinates are fitted and judged on, with seeded uniform sampling."""
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_count
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
 from orthocas.robots import Robot
+from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
 
-REVOLUTE_HALF_WIDTH = np.pi / 4  #: default half-width [rad], the hyper-cube of [AS2023] Sec. 9
-PRISMATIC_HALF_WIDTH = 0.25  #: default half-width [m] of an unlimited prismatic joint
 _WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes and overflow later
 
 
@@ -32,6 +31,10 @@ class Domain(Protocol):
     @property
     def half_width(self) -> Array:
         """Half edge lengths, (n,), > 0."""
+        ...
+
+    def contains(self, q: ArrayLike) -> Any:
+        """Whether points (n,) or (N, n) lie in the domain: a bool, or (N,)."""
         ...
 
 
@@ -62,6 +65,30 @@ class Box:
         object.__setattr__(self, "centre", middle)
         object.__setattr__(self, "half_width", widths)
 
+    @classmethod
+    def from_limits(cls, lower: ArrayLike, upper: ArrayLike) -> Self:
+        """All q with lower_i <= q_i <= upper_i.
+
+        Args:
+            lower: (n,) [rad] or [m].
+            upper: (n,), above lower everywhere.
+
+        Raises:
+            ShapeError: if the two differ in length.
+            InvalidValueError: if a number is not finite, or lower_i >= upper_i.
+        """
+        low = frozen_array("lower", lower, (None,))
+        high = frozen_array("upper", upper, low.shape)
+        wrong = np.flatnonzero(low >= high)
+        if wrong.size:
+            i = int(wrong[0])
+            raise InvalidValueError(f"lower[{i}]", low[i], f"a number below upper[{i}] = {high[i]:g}")
+        return cls((low + high) / 2, (high - low) / 2)
+
+    def contains(self, q: ArrayLike) -> Any:
+        """Whether points (n,) or (N, n) lie in the box: a bool, or (N,)."""
+        return contains(self, q)
+
 
 @dataclass(frozen=True, eq=False)
 class Torus:
@@ -83,6 +110,10 @@ class Torus:
     def half_width(self) -> Array:
         """Pi for every joint, (n,)."""
         return np.full(self.n, np.pi)
+
+    def contains(self, q: ArrayLike) -> Any:
+        """Whether points (n,) or (N, n) lie on the torus, as all angles do: a bool, or (N,)."""
+        return contains(self, q)
 
 
 def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
@@ -136,7 +167,7 @@ def reach(domain: Domain) -> Array:
     return values
 
 
-def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: float | None = None) -> Box:
+def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: ArrayLike | None = None) -> Box:
     """A box inside the joint limits.
 
     The centre is the middle of the limits (0, or the value next to 0, where there are none). Half-widths are pi/4 for
@@ -145,20 +176,23 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: float
     Args:
         robot: the robot.
         centre: another centre (n,).
-        half_width: another half-width for all joints; not shortened, so that it fails where it leaves the limits.
+        half_width: another half-width (n,), or one for all joints; not shortened, so that it fails where it leaves the
+            limits.
     """
-    wanted = np.where(robot.tree.prismatic, PRISMATIC_HALF_WIDTH, REVOLUTE_HALF_WIDTH)
-    limited = np.isfinite(robot.lower) & np.isfinite(robot.upper)
-    middle = np.clip(np.zeros(robot.n), robot.lower + wanted, robot.upper - wanted)
-    middle[limited] = (robot.lower[limited] + robot.upper[limited]) / 2
-    if centre is not None:
-        middle = frozen_array("centre", centre, (robot.n,))
+    middle = robot.tree.middle if centre is None else frozen_array("centre", centre, (robot.n,))
     if half_width is not None:
         return Box(middle, half_width)
-    room = np.minimum(middle - robot.lower, robot.upper - middle)
-    if room.min() <= 0:
-        _raise_outside(robot, int(np.argmin(room)), middle, middle)
-    return Box(middle, np.minimum(wanted, room))
+    widths = default_half_width(robot, middle)
+    if widths.min() <= 0:
+        _raise_outside(robot, int(np.argmin(widths)), middle, middle)
+    return Box(middle, widths)
+
+
+def default_half_width(robot: Robot, centre: Array) -> Array:
+    """Half-widths of default boxes about centres (n,) or (N, n), same shape; <= 0 at a joint limit and beyond."""
+    room = np.minimum(centre - robot.lower, robot.upper - centre)
+    widths: Array = np.minimum(_wanted_half_width(robot), room)
+    return widths
 
 
 def require_within_limits(robot: Robot, domain: Domain) -> None:
@@ -178,6 +212,10 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
     if outside.size:
         _raise_outside(robot, int(outside[0]), low, high)
+
+
+def _wanted_half_width(robot: Robot) -> Array:
+    return np.where(robot.tree.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
 
 
 def _require_seed(seed: int | tuple[int, ...]) -> None:

@@ -10,6 +10,10 @@ class OrthocasError(Exception):
     """Base of every error raised on purpose."""
 
 
+class NotSavableWarning(UserWarning):
+    """Coordinates that are about to be fitted cannot be saved in a chart file."""
+
+
 class ShapeError(OrthocasError, ValueError):
     """An array has the wrong shape."""
 
@@ -21,14 +25,16 @@ class InvalidValueError(OrthocasError, ValueError):
     """A value is outside what the argument allows."""
 
     def __init__(self, name: str, got: object, want: str) -> None:
-        super().__init__(f"{name} is {got}, expected {want}")
+        super().__init__(f"{name} is {' '.join(str(got).split())}, expected {want}")
 
 
 class UnknownNameError(OrthocasError, ValueError):
-    """A name that does not exist, with those that do."""
+    """A name that does not exist, with those that do: similar ones first."""
 
     def __init__(self, what: str, got: str, known: Iterable[str]) -> None:
         names = list(known)
+        near = difflib.get_close_matches(got, names, 3)
+        names = [*near, *(name for name in names if name not in near)]
         if len(names) > _MOST_NAMES:
             close = difflib.get_close_matches(got, names, _MOST_NAMES, 0.0)
             names = [*close, f"and {len(names) - len(close)} more"]

@@ -4,7 +4,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.chart import GrownChart
-from orthocas.checks import Array, as_float_array, frozen_array, require_count, require_known, require_shape
+from orthocas.checks import (
+    Array,
+    as_float_array,
+    as_point,
+    frozen_array,
+    require_count,
+    require_kind,
+    require_known,
+    require_shape,
+)
 from orthocas.domains import Box, Torus, sample_evenly
 from orthocas.errors import GrowError, InvalidValueError, NotInvolutiveError
 from orthocas.growing.circle_leaf import CircleLeaf, circle_leaf
@@ -56,8 +65,7 @@ def grow(
         MetricError: if the metric is not SPD on the domain.
         InvalidValueError: if an argument has another type, or belongs to another kind of leaf.
     """
-    if not isinstance(problem, Problem):
-        raise InvalidValueError("problem", repr(problem), "a Problem, such as problems.get('planar_2r')")
+    require_kind("problem", problem, Problem)
     leaf = _default_leaf(problem) if leaf is None else leaf
     if not isinstance(leaf, str):
         raise InvalidValueError("leaf", repr(leaf), f"one of {', '.join(LEAVES)}")
@@ -65,7 +73,7 @@ def grow(
     _require_fitting_options(leaf, region, cells)
     check(problem)
     require_involutive(problem)
-    origin = None if origin is None else frozen_array("origin", origin, (problem.n,))
+    origin = None if origin is None else as_point("origin", origin, problem.n)
     x0 = _level(problem, level, origin)
     coordinates = GrownCoordinates(problem, _leaf_chart(problem, leaf, x0, origin, region, cells or CELLS))
     reached = np.isfinite(coordinates.xi(sample_evenly(problem.domain, _PROBES, 1))).all(axis=1)

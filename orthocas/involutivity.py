@@ -1,27 +1,28 @@
 """Whether exact orthogonal coordinates exist for a task, and how far it is from having them."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.checks import Array, require_count, require_memory, require_shape
+from orthocas.checks import Array, require_count, require_kind, require_memory, require_shape
 from orthocas.domains import sample_uniform
-from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.errors import SingularTaskError
 from orthocas.problem import NEAR_SINGULAR, Problem, check, relative_singular_values
+from orthocas.showing import Shown, number_list
 
 _ROUNDING = 1e-7  # defects below this share of the terms they are differences of are zero
 _STRAIGHT = 1e-12  # [rad]; task gradients that turn less than this over the domain do not turn
 _LARGE = 20.0  # [deg]; expected angles beyond this are not predicted by the first order
 
 
-@dataclass(frozen=True, eq=False)
-class Involutivity:
+@dataclass(frozen=True, eq=False, repr=False)
+class Involutivity(Shown):
     """Involutivity defect d(q) of a task on uniform samples of its domain; see `involutivity`."""
 
-    function: ca.Function = field(repr=False)  #: q (n, 1) -> d (1, 1); NaN where J_x loses rank
+    function: ca.Function  #: q (n, 1) -> d (1, 1); NaN where J_x loses rank
     mean: float
     std: float
     p99: float  #: 99 % quantile
@@ -43,6 +44,17 @@ class Involutivity:
             f"coordinates can only be as orthogonal as possible: mean involutivity defect {self.mean:.3g}, "
             f"expect task angles {angle} degrees off 90 in the metric on this domain"
         )
+
+    def facts(self) -> dict[str, str]:
+        """The verdict and the numbers behind it."""
+        return {
+            "involutivity": "exact coordinates exist" if self.exact else "no exact coordinates",
+            "verdict": self.verdict,
+            "defect": f"mean {self.mean:.3g}, std {self.std:.3g}, 99 % {self.p99:.3g}, max {self.max:.3g}",
+            "worst at": number_list(self.worst_point),
+            "expected angle": f"{self.expected_angle_deg:.3g} deg off 90",
+            "samples": f"{self.samples}, seed {self.seed}, {self.singular_samples} left out",
+        }
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, without the function."""
@@ -76,9 +88,8 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
         Theorem: [AS2023] Sec. 3. Defect, and expected angle: ours, docs/derivations.md#involutivity.
     """
     samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
+    require_kind("problem", problem, Problem)
     require_memory(f"{samples} samples of the defect", 32.0 * samples * problem.n * problem.m**2)
-    if not isinstance(problem, Problem):
-        raise InvalidValueError("problem", repr(problem), "a Problem, such as problems.get('iiwa')")
     points = _regular_points(problem, samples, seed)
     brackets = TaskBrackets.of(problem)
     across, size, basis = Batched(brackets.tensor_function())(points)

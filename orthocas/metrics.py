@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Self
 
 import casadi as ca
@@ -10,42 +9,44 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.user_expression import expression_of
 from orthocas.checks import Array, frozen_array, require_known
 from orthocas.errors import MetricError, ShapeError
 from orthocas.robots import Robot
+from orthocas.robots.pinocchio_model import remedy
 
 METRIC_KINDS = ("euclidean", "inertia")
-MetricLike = str | ArrayLike | Callable[[ca.SX], ca.SX]
+MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` makes a metric of
+_SINGULAR = 1e-12  # eigenvalue, relative to the largest entry, that counts as none
 
 
 @dataclass(frozen=True, eq=False)
 class Metric:
-    """A symmetric positive definite A(q), (n, n). Use `from_spec` to build one."""
+    """A symmetric positive definite A(q), (n, n). Use `from_spec` or `custom` to build one."""
 
-    name: str  #: euclidean, inertia, constant or custom
+    name: str  #: euclidean, inertia, constant, custom, or the name of a custom one
     function: ca.Function  #: q (n, 1) -> A (n, n), dense, SX
     recipe: dict[str, Any] = field(repr=False)  #: plain data for chart files
 
     @classmethod
-    def from_spec(cls, robot: Robot, spec: Any) -> Self:
+    def from_spec(cls, robot: Robot, spec: MetricSpec) -> Self:
         """Build from "euclidean", "inertia", a constant matrix (n, n), or a map q -> A(q) on SX.
 
         Raises:
             UnknownNameError: if a name is unknown.
             ShapeError: if A is not (n, n).
-            MetricError: if a constant A is not symmetric positive definite.
+            MetricError: if a constant A is not symmetric positive definite, or M(q) never is (a joint is named).
         """
         q = ca.SX.sym("q", robot.n)
         if isinstance(spec, str):
             require_known("metric", spec, METRIC_KINDS)
+            if spec == "inertia":
+                _require_mass(robot)
             A = robot.function("mass_matrix")(q) if spec == "inertia" else ca.SX.eye(robot.n)
             return cls(spec, dense_function("metric", [q], [A]), {"kind": spec})
         if callable(spec):
-            A = expression_of("metric", spec, q)
-            if A.shape != (robot.n, robot.n):
-                raise ShapeError("metric", A.shape, (robot.n, robot.n))
-            return cls("custom", dense_function("metric", [q], [A]), {"kind": "custom"})
+            return cls.custom(robot, "custom", spec)
         matrix = frozen_array("metric", spec, (robot.n, robot.n))
         require_spd(matrix[None], np.zeros((1, robot.n)))
         return cls(
@@ -53,6 +54,24 @@ class Metric:
             dense_function("metric", [q], [ca.SX(ca.DM(matrix))]),
             {"kind": "constant", "matrix": matrix.tolist()},
         )
+
+    @classmethod
+    def custom(cls, robot: Robot, name: str, function: Callable[[ca.SX], ca.SX] | ca.Function) -> Self:
+        """Any metric of elementary operations that CasADi can express.
+
+        Args:
+            robot: the robot.
+            name: a name for reports.
+            function: maps an SX column q (n, 1) to a symmetric positive definite A (n, n).
+
+        Raises:
+            ShapeError: if A is not (n, n).
+        """
+        q = ca.SX.sym("q", robot.n)
+        A = expression_of("metric", function, q)
+        if A.shape != (robot.n, robot.n):
+            raise ShapeError("metric", A.shape, (robot.n, robot.n))
+        return cls(str(name), dense_function("metric", [q], [A]), {"kind": "custom", "name": str(name)})
 
     @cached_property
     def batched(self) -> Batched:
@@ -62,7 +81,7 @@ class Metric:
     @property
     def is_identity(self) -> bool:
         """Whether A = I everywhere."""
-        return self.name == "euclidean"
+        return bool(self.recipe["kind"] == "euclidean")
 
 
 def metric_matrices(metric: Metric, points: Array) -> Array:
@@ -91,9 +110,21 @@ def require_spd(matrices: Array, points: Array) -> None:
             f"(difference {asymmetry[worst]:.3g}), expected symmetric positive definite"
         )
     smallest = np.linalg.eigvalsh(matrices)[:, 0]
-    worst = int(np.argmin(smallest - 1e-12 * size))
-    if smallest[worst] <= 1e-12 * size[worst]:
+    worst = int(np.argmin(smallest - _SINGULAR * size))
+    if smallest[worst] <= _SINGULAR * size[worst]:
         raise MetricError(
             f"metric has eigenvalue {smallest[worst]:.3g} at q = {np.round(points[worst], 4).tolist()}, "
             "expected symmetric positive definite"
+        )
+
+
+def _require_mass(robot: Robot) -> None:
+    """Raise MetricError, with the joint to blame, if M(q) is singular at each of a few postures."""
+    M = robot.mass_matrix(np.random.default_rng(0).uniform(-1, 1, (4, robot.n)))
+    values, vectors = np.linalg.eigh(M)
+    if np.all(values[:, 0] <= _SINGULAR * np.abs(M).max(axis=(1, 2))):
+        joint = robot.joint_names[int(np.argmax(np.abs(vectors[0, :, 0])))]
+        raise MetricError(
+            f"joint '{joint}' moves no mass and M(q) is singular, expected mass or armature for the metric inertia: "
+            f"give the joint's link a mass in the robot file, or {remedy(joint)}"
         )

@@ -1,36 +1,38 @@
 """A problem: a robot, a task, a metric and a domain that fit together."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from orthocas.checks import Array, require_shape
-from orthocas.domains import Domain, default_box, require_within_limits, sample_uniform
+from orthocas.checks import Array, require_kind, require_shape
+from orthocas.domains import Domain, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
-from orthocas.metrics import Metric, metric_matrices
+from orthocas.metrics import Metric, MetricSpec, metric_matrices
+from orthocas.postures.regular_box import regular_box
 from orthocas.robots import Robot
+from orthocas.showing import Shown, number_list
 from orthocas.tasks import Task
 
 NEAR_SINGULAR = 0.01  #: smallest relative singular value of J_x below which a sample counts as singular
 _RANK_LOST = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
+@dataclass(frozen=True, eq=False, repr=False)
+class Problem(Shown):
     """Find r = n - m coordinates xi(q) with J_x A^-1 J_xi^T = 0 on a domain ([AS2023] eq. (5)).
 
     Args:
         robot: the robot.
-        task: a task of that robot, m < n.
+        task: a task of that robot, m < n. Where it lacks a reference orientation, that at the domain's centre is taken.
         metric: "euclidean", "inertia", a constant SPD matrix (n, n), a map q -> A(q) on SX, or a Metric.
-        domain: Box or Torus inside the joint limits; default `default_box(robot)`.
+        domain: Box or Torus inside the joint limits; default `regular_box(robot, task)`: away from singular postures.
         name: for reports.
 
     Raises:
         NotRedundantError: if m >= n.
         DomainError: if the domain leaves the joint limits.
-        MetricError: if a constant metric is not SPD (q-dependent ones are checked by `check` and on every sample).
+        MetricError: if a constant metric is not SPD, or a joint moves no mass under "inertia" (metrics that depend on q
+            are checked by `check` and on every sample).
     """
 
     robot: Robot
@@ -40,7 +42,12 @@ class Problem:
     name: str
 
     def __init__(
-        self, robot: Robot, task: Task, metric: Any = "euclidean", domain: Domain | None = None, name: str = "custom"
+        self,
+        robot: Robot,
+        task: Task,
+        metric: Metric | MetricSpec = "euclidean",
+        domain: Domain | None = None,
+        name: str = "custom",
     ) -> None:
         if not isinstance(task, Task) or not isinstance(robot, Robot):
             raise InvalidValueError(
@@ -50,10 +57,11 @@ class Problem:
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
         if task.m >= robot.n:
             raise NotRedundantError(task.m, robot.n)
-        domain = default_box(robot) if domain is None else domain
+        domain = regular_box(robot, task) if domain is None else domain
         if not isinstance(domain, Domain):
             raise InvalidValueError("domain", repr(domain), "a Box or a Torus")
         require_within_limits(robot, domain)
+        task = task.with_reference_at(domain.centre)
         metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
         require_shape("metric", metric.function.size_out(0), (robot.n, robot.n))
         for key, value in (
@@ -80,6 +88,18 @@ class Problem:
         """Degree of redundancy n - m."""
         return self.n - self.m
 
+    def facts(self) -> dict[str, str]:
+        """Sizes, task, metric, domain and robot."""
+        domain = self.domain
+        return {
+            "problem": f"{self.name}, n = {self.n} joints, m = {self.m} task, r = {self.r} extra",
+            "task": self.task.heading,
+            "metric": self.metric.name,
+            "domain": f"{domain.name}, half-width {number_list(domain.half_width)}",
+            "centre": number_list(domain.centre),
+            "robot": self.robot.heading,
+        }
+
 
 @dataclass(frozen=True)
 class ProblemCheck:
@@ -105,6 +125,7 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
         MetricError: if A is not symmetric positive definite at a sample.
         SingularTaskError: if J_x loses rank at every sample, or is not finite at one.
     """
+    require_kind("problem", problem, Problem)
     points = sample_uniform(problem.domain, samples, seed)
     metric_matrices(problem.metric, points)
     smallest = relative_singular_values(problem, points)

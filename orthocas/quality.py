@@ -1,17 +1,18 @@
 """How good a chart is: angles and conditioning on held-out samples ([AS2023] Figs. 20 and 27, and ours)."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_count, require_memory
+from orthocas.checks import Array, require_count, require_kind, require_memory
 from orthocas.domains import sample_uniform
 from orthocas.errors import SingularTaskError
 from orthocas.files.json import plain
 from orthocas.fitting.loss import pairs
 from orthocas.samples import Samples, samples_at
+from orthocas.showing import Shown
 
 DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
 _CHUNK = 5000
@@ -25,7 +26,7 @@ class AngleStatistics:
     mean: float
     std: float
     max: float  #: largest deviation from 90 degrees
-    histogram: Array  #: counts in bins of 0.1 degree, centred at 0.0, 0.1, ..., 180.0
+    histogram: Array = field(repr=False)  #: counts in bins of 0.1 degree, centred at 0.0, 0.1, ..., 180.0
 
     @classmethod
     def of_cosines(cls, cosines: Array) -> "AngleStatistics":
@@ -46,8 +47,8 @@ class Conditioning:
     mean: float
 
 
-@dataclass(frozen=True, eq=False)
-class Report:
+@dataclass(frozen=True, eq=False, repr=False)
+class Report(Shown):
     """Quality of a chart on uniform samples of its domain."""
 
     n: int
@@ -68,6 +69,35 @@ class Report:
     def degenerate(self) -> bool:
         """Whether coordinates are nearly parallel, or lean into the task, on more than 1 % of the domain."""
         return self.conditioning.p01 < DEGENERATE
+
+    def facts(self) -> dict[str, str]:
+        """Angles, conditioning and lengths, and what is wrong with the chart, if anything is."""
+        task, mutual, values = self.task_angle, self.mutual_angle, self.conditioning
+        facts = {
+            "problem": f"n = {self.n} joints, m = {self.m} task, r = {self.r} extra, metric {self.metric}",
+            "task angle": f"mean {task.mean:.2f}, std {task.std:.2f}, largest deviation {task.max:.1f} deg",
+            "mutual angle": f"mean {mutual.mean:.2f}, std {mutual.std:.2f}, largest deviation {mutual.max:.1f} deg",
+            "conditioning": f"mean {values.mean:.3f}, 1 % quantile {values.p01:.3f}, min {values.min:.3g}",
+            "lengths": f"of gradients differ by a factor of {self.length_ratio:.3g} (99 % to 1 % quantile)",
+            "samples": f"{self.samples} held out, seed {self.seed}",
+        }
+        if self.r == 1:
+            facts["mutual angle"] = "none, r = 1"
+        return facts | self._faults()
+
+    def _faults(self) -> dict[str, str]:
+        faults = {}
+        if self.folded_samples:
+            at = ", ".join(f"{value:.2f}" for value in self.worst_point)
+            share = self.folded_samples / self.samples
+            faults["folded"] = f"{share:.3%} of the domain, where det J changes sign; conditioning worst at q = ({at})"
+        if self.singular_samples:
+            share = self.singular_samples / self.samples
+            faults["left out"] = f"{share:.3%} of the domain: singular, or without a value"
+        if self.degenerate:
+            advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
+            faults["DEGENERATE"] = f"coordinates are nearly parallel or lean into the task: {advice}"
+        return faults
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON; NaN becomes None."""
@@ -106,6 +136,7 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
         samples: number of samples N.
         seed: seed of the samples.
     """
+    require_kind("chart", chart, Chart)
     samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
     require_memory(f"evaluating {samples} samples", 8.0 * samples * chart.n * (chart.n + 4))
     points = sample_uniform(chart.problem.domain, samples, seed)

@@ -1,26 +1,30 @@
 """Sample sets of a problem: everything the loss needs that does not depend on the coordinates."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
 from orthocas.metrics import metric_matrices
 from orthocas.problem import Problem, task_jacobians
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Samples:
     """N joint positions with their task gradients and metrics; samples with a vanishing gradient are left out."""
 
     points: Array  #: q, (N, n)
     task_jacobian: Array  #: J_x, (N, m, n)
     metric_inverse: Array | None  #: A^-1, (N, n, n); None for the identity
+
+    def __repr__(self) -> str:
+        N, m, n = self.task_jacobian.shape
+        return f"Samples({N} joint positions, n = {n}, m = {m})"
 
     def __len__(self) -> int:
         return len(self.points)
@@ -75,20 +79,20 @@ class Samples:
         """Sign +1 or -1, at most samples, of the volume that gradients J_xi, (N, r, n), span across the task."""
         return 1.0 if np.median(np.linalg.det(coordinate_jacobians @ self.null_basis)) >= 0 else -1.0
 
-    def loss_data(self, orientation: float | None) -> list[Array]:
-        """What the residuals need of every sample; see `orthocas.fitting.loss.LossShape.symbols`.
+    def described(self, names: Iterable[str], orientation: float | None) -> list[Array]:
+        """What a loss needs to know of every sample: properties by name, (N, rows, columns) or (N, rows) each.
 
         Args:
+            names: see `orthocas.fitting.loss.term.SAMPLE_DATA`.
             orientation: of the coordinates, as `orientation` gives it for those a fit starts from: the null basis is
-                turned like them, so that the volume of their gradients is positive. None without a regularity residual.
+                turned like them, so that the volume of their gradients is positive.
         """
-        data = [self.unit_task_gradients]
-        data += [] if self.metric_inverse is None else [self.metric_inverse]
-        if orientation is not None:
-            Z = self.null_basis.copy()
-            Z[:, :, -1] *= orientation
-            data.append(Z)
-        return data
+        found: dict[str, Array] = {name: getattr(self, name) for name in names}
+        if "null_basis" in found:
+            turned = found["null_basis"].copy()
+            turned[:, :, -1] *= orientation or 1.0
+            found["null_basis"] = turned
+        return list(found.values())
 
 
 Draw = Callable[[int, tuple[int, ...]], Samples]  #: a number of fresh samples of a problem, by seed

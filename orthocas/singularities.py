@@ -1,6 +1,6 @@
 """Where grown coordinates must break: singular points of a task, and what xi does there."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.checks import Array, require_kind
 from orthocas.domains import contains, sample_evenly
 from orthocas.errors import GrowError
 from orthocas.growing.grown import GrownCoordinates
@@ -30,7 +30,7 @@ class SingularPoint:
     kind: str  #: maximum, minimum or saddle
     task_value: float
     curvatures: Array  #: eigenvalues of A^-1 d^2h/dq^2, rising, (n,)
-    directions: Array  #: their eigenvectors as columns, A-orthonormal, (n, n)
+    directions: Array = field(repr=False)  #: their eigenvectors as columns, A-orthonormal, (n, n)
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...
     Raises:
         GrowError: if m > 1.
     """
+    require_kind("problem", problem, Problem)
     if problem.m != 1:
         raise GrowError(f"singular points are found for m = 1 tasks, got m = {problem.m}")
     hessian = _hessian(problem)
@@ -83,6 +84,7 @@ def jumps(chart: Chart, radius: float = 0.02) -> tuple[Jump, ...]:
     Raises:
         GrowError: if the chart is not grown from a circle for n = 2.
     """
+    require_kind("chart", chart, Chart)
     grown = chart.coordinates
     if not isinstance(grown, GrownCoordinates) or grown.leaf.kind != "circle" or chart.n != 2:
         raise GrowError("jumps are found for charts with n = 2 that are grown from a circle")

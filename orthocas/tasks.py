@@ -1,32 +1,49 @@
 """Tasks x = h(q): what the robot is to do, with m < n numbers."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Self
 
 import casadi as ca
-import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.user_expression import expression_of
-from orthocas.checks import frozen_array
+from orthocas.checks import require_kind
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots import Robot
+from orthocas.robots.spatial import rotation_matrix
+from orthocas.robots.tip_turn import TipTurn, frame_along
+from orthocas.showing import Shown, listed
 
-TASK_KINDS = ("position", "position:AXES", "polar", "orientation", "pose")
+TASK_KINDS = (
+    "position",
+    "position:AXES",
+    "polar",
+    "orientation",
+    "pose",
+    "axis",
+    "axis:AXIS",
+    "position+axis",
+    "position+axis:AXIS",
+)
 
 
-@dataclass(frozen=True, eq=False)
-class Task:
-    """A task map h of a robot. Use the class methods to build one."""
+@dataclass(frozen=True, eq=False, repr=False)
+class Task(Shown):
+    """A task map h of a robot. Use the class methods to build one.
+
+    Orientation, pose and axis tasks compare the tip with a reference. Where none is given, `Problem` takes the tip's
+    orientation at the centre of its domain; the task alone takes the one in the middle of the joint limits.
+    """
 
     robot: Robot
     name: str
     labels: tuple[str, ...]  #: names of the components of x
+    units: tuple[str, ...]  #: of the components: "m", "rad", or "" where it is unknown
     function: ca.Function  #: q (n, 1) -> x (m, 1), dense, SX
-    recipe: dict[str, Any] = field(repr=False)  #: plain data that `from_recipe` turns into the same task
+    recipe: dict[str, Any]  #: plain data that `from_recipe` turns into the same task
 
     @classmethod
     def position(cls, robot: Robot, axes: str = "xyz") -> Self:
@@ -34,7 +51,7 @@ class Task:
         if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
             raise InvalidValueError("axes", repr(axes), "different letters out of 'xyz'")
         rows = ["xyz".index(a) for a in axes]
-        return cls._of_tip(robot, f"position:{axes}", tuple(axes), lambda R, p: p[rows])
+        return cls._of_tip(robot, f"position:{axes}", tuple(axes), ("m",) * len(rows), lambda R, p: p[rows])
 
     @classmethod
     def polar(cls, robot: Robot) -> Self:
@@ -43,6 +60,7 @@ class Task:
             robot,
             "polar",
             ("radius", "angle"),
+            ("m", "rad"),
             lambda R, p: ca.vertcat(ca.sqrt(p[0] ** 2 + p[1] ** 2), ca.atan2(p[1], p[0])),
         )
 
@@ -54,18 +72,48 @@ class Task:
 
         Args:
             robot: the robot.
-            reference: reference rotation (3, 3) in the world, default the identity.
+            reference: reference rotation (3, 3) in the world; default the tip's at the centre of the problem's domain.
         """
-        return cls._relative_to(robot, "orientation", reference)
+        return cls._turned(robot, TipTurn(False, None), reference)
 
     @classmethod
     def pose(cls, robot: Robot, reference: ArrayLike | None = None) -> Self:
         """Position [m] and orientation of the tip, (6,); see `position` and `orientation`."""
-        return cls._relative_to(robot, "pose", reference)
+        return cls._turned(robot, TipTurn(True, None), reference)
+
+    @classmethod
+    def axis(cls, robot: Robot, axis: str = "z", reference: ArrayLike | None = None) -> Self:
+        """Direction of one axis of the tip, (2,): where it points, whatever the turn about it.
+
+        With d the axis in a frame whose own axis is the reference direction, x = (d_i, d_j) sqrt(2 / (1 + d_axis)) has
+        the length 2 sin(angle / 2) of the angle between the two: [rad] near the reference, smooth except half a turn
+        away. The frame is the tip's at the centre of the problem's domain, or any about the direction that is given.
+
+        Args:
+            robot: the robot.
+            axis: "x", "y" or "z" of the tip frame.
+            reference: direction (3,) in the world, of any length; default the axis at the centre of the domain.
+
+        Source:
+            Lambert's azimuthal equal-area map of the sphere of directions.
+        """
+        turn = TipTurn(False, axis)
+        return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis))
+
+    @classmethod
+    def position_and_axis(cls, robot: Robot, axis: str = "z", reference: ArrayLike | None = None) -> Self:
+        """Position [m] and direction of one axis of the tip, (5,); see `position` and `axis`."""
+        turn = TipTurn(True, axis)
+        return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis))
 
     @classmethod
     def custom(
-        cls, robot: Robot, name: str, function: Callable[[ca.SX], ca.SX] | ca.Function, labels: Sequence[str] = ()
+        cls,
+        robot: Robot,
+        name: str,
+        function: Callable[[ca.SX], ca.SX] | ca.Function,
+        labels: Sequence[str] = (),
+        units: Sequence[str] = (),
     ) -> Self:
         """Any task of elementary operations that CasADi can express.
 
@@ -74,42 +122,64 @@ class Task:
             name: a name for reports.
             function: maps an SX column q (n, 1) to x (m, 1).
             labels: names of the components.
+            units: of the components, for pictures and reports, for example "m" or "rad"; default unknown.
 
         Raises:
-            ShapeError: if x is not a column.
+            ShapeError: if x is not a column, or labels or units do not have one entry per component.
         """
+        require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
         x = expression_of(f"task '{name}'", function, q)
         if x.shape[1] != 1 or x.shape[0] == 0:
             raise ShapeError(f"task '{name}'", x.shape, (None, 1))
         labels = tuple(str(label) for label in labels) or tuple(f"{name}[{i}]" for i in range(x.shape[0]))
-        if len(labels) != x.shape[0]:
-            raise ShapeError("labels", (len(labels),), (x.shape[0],))
-        h = dense_function("h", [q], [x])
-        return cls(robot, str(name), labels, h, {"kind": "custom", "name": str(name), "labels": labels})
+        units = tuple(str(unit) for unit in units) or ("",) * x.shape[0]
+        for argument, texts in (("labels", labels), ("units", units)):
+            if len(texts) != x.shape[0]:
+                raise ShapeError(argument, (len(texts),), (x.shape[0],))
+        recipe = {"kind": "custom", "name": str(name), "labels": labels, "units": units}
+        return cls(robot, str(name), labels, units, dense_function("h", [q], [x]), recipe)
 
     @classmethod
     def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> Self:
-        """A task from its short name: position, position:xy, polar, orientation, pose.
+        """A task from its short name: position, position:xy, polar, orientation, pose, axis, axis:x, position+axis.
 
         Args:
             robot: the robot.
             kind: the short name.
-            q_reference: posture (n,) whose tip orientation is the reference of orientation and pose.
+            q_reference: posture (n,) whose tip orientation is the reference of orientation, pose and axis tasks.
         """
         if kind == "position" or kind.startswith("position:"):
             return cls.position(robot, kind.partition(":")[2] or "xyz")
         if kind == "polar":
             return cls.polar(robot)
-        if kind in ("orientation", "pose"):
-            reference = None if q_reference is None else robot.tip_rotation(q_reference)
-            return cls.pose(robot, reference) if kind == "pose" else cls.orientation(robot, reference)
+        if (turn := TipTurn.of_kind(kind)) is not None:
+            return cls._turned(robot, turn, None if q_reference is None else robot.tip_rotation(q_reference))
         raise UnknownNameError("task", kind, TASK_KINDS)
+
+    @classmethod
+    def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> Self:
+        """The task of a robot that `recipe` describes; for every task but a custom one."""
+        turn = TipTurn.of_kind(recipe["kind"])
+        return cls.named(robot, recipe["kind"]) if turn is None else cls._turned(robot, turn, recipe["reference"])
+
+    @property
+    def lacks_reference(self) -> bool:
+        """Whether the task compares the tip's orientation with a reference that was not given."""
+        return TipTurn.of_kind(self.recipe["kind"]) is not None and "reference" not in self.recipe
+
+    def with_reference_at(self, q: ArrayLike) -> Self:
+        """The task with the tip's orientation at q (n,) as its reference; the same task if it lacks none."""
+        return self.named(self.robot, self.recipe["kind"], q) if self.lacks_reference else self
 
     @property
     def m(self) -> int:
         """Number of task components."""
         return len(self.labels)
+
+    def facts(self) -> dict[str, str]:
+        """Name, components and robot."""
+        return {"task": f"{self.name}, m = {self.m} ({listed(self.labels)})", "robot": self.robot.heading}
 
     @cached_property
     def jacobian_function(self) -> ca.Function:
@@ -125,6 +195,16 @@ class Task:
         return dense_function("task_second_derivative", [q, v, w], [second], ["q", "v", "w"])
 
     @cached_property
+    def centred_jacobian_function(self) -> ca.Function:
+        """Q, centre (n, 1) -> J_x at q (m, n), with a reference that nobody gave taken at the centre."""
+        q, centre = (ca.SX.sym(name, self.robot.n) for name in ("q", "centre"))
+        x, turn = self.function(q), TipTurn.of_kind(self.recipe["kind"])
+        if turn is not None and self.lacks_reference:
+            rotation, position = self.robot.function("tip_rotation"), self.robot.function("tip_position")
+            x = turn.components(rotation(centre).T @ rotation(q), position(q))
+        return dense_function("centred_jacobian", [q, centre], [ca.jacobian(x, q)], ["q", "centre"])
+
+    @cached_property
     def batched(self) -> Batched:
         """H at many points."""
         return Batched(self.function)
@@ -135,19 +215,17 @@ class Task:
         return Batched(self.jacobian_function)
 
     @classmethod
-    def _relative_to(cls, robot: Robot, kind: str, reference: ArrayLike | None) -> Self:
-        """Orientation or pose relative to a reference rotation."""
-        base = frozen_array("reference", np.eye(3) if reference is None else reference, (3, 3))
-        if not np.allclose(base @ base.T, np.eye(3), atol=1e-9) or np.linalg.det(base) < 0:
-            raise InvalidValueError("reference", base.tolist(), "a rotation matrix")
-        angles = ("rx", "ry", "rz")
-
-        def components(R: ca.SX, p: ca.SX) -> ca.SX:
-            turned = _half_angle_vector(ca.SX(ca.DM(base.T)) @ R)
-            return ca.vertcat(p, turned) if kind == "pose" else turned
-
-        labels = ("x", "y", "z", *angles) if kind == "pose" else angles
-        return cls._of_tip(robot, kind, labels, components, {"reference": base.tolist()})
+    def _turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None) -> Self:
+        """A task of the tip's turn away from a reference rotation (3, 3), or from the default if there is none."""
+        if reference is None:
+            base, extra = robot.tip_rotation(robot.tree.middle), {}
+        else:
+            base = rotation_matrix("reference", reference)
+            extra = {"reference": base.tolist()}
+        across = ca.SX(ca.DM(base.T))
+        return cls._of_tip(
+            robot, turn.kind, turn.labels, turn.units, lambda R, p: turn.components(across @ R, p), extra
+        )
 
     @classmethod
     def _of_tip(
@@ -155,16 +233,12 @@ class Task:
         robot: Robot,
         name: str,
         labels: tuple[str, ...],
+        units: tuple[str, ...],
         components: Callable[[ca.SX, ca.SX], ca.SX],
-        extra: dict[str, Any] | None = None,
+        extra: Mapping[str, Any] | None = None,
     ) -> Self:
         """A task that is a function of the tip's rotation and position."""
+        require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
         x = components(robot.function("tip_rotation")(q), robot.function("tip_position")(q))
-        return cls(robot, name, labels, dense_function("h", [q], [x]), {"kind": name, **(extra or {})})
-
-
-def _half_angle_vector(R: ca.SX) -> ca.SX:
-    """2 sin(angle / 2) axis of a rotation matrix, (3, 1): vee(R - R^T) / sqrt(1 + trace R)."""
-    vee = ca.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
-    return vee / ca.sqrt(1 + ca.trace(R))
+        return cls(robot, name, labels, units, dense_function("h", [q], [x]), {"kind": name, **(extra or {})})

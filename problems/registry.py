@@ -2,10 +2,9 @@
 
 from collections.abc import Callable
 
-from orthocas.problems import iiwa, planar
-
 from orthocas.checks import require_known
 from orthocas.problem import Problem
+from orthocas.problems import iiwa, planar
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "planar_2r": planar.planar_2r,

@@ -1,13 +1,12 @@
 """Minimisers behind one protocol (`orthocas.minimising.objective.Solver`)."""
 
+from orthocas.checks import require_known
+from orthocas.minimising.solver import Solver
 from orthocas.solvers.adam import Adam
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.gradient_flow import GradientFlow
 from orthocas.solvers.ipopt import Ipopt
 from orthocas.solvers.lbfgs import LBFGS
-
-from orthocas.checks import require_known
-from orthocas.minimising.solver import Solver
 
 __all__ = ["LBFGS", "SOLVERS", "Adam", "GaussNewton", "GradientFlow", "Ipopt", "get"]
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from orthocas.solvers.array_node import ArrayNode
 
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array, require_at_least, require_count
@@ -13,6 +12,7 @@ from orthocas.minimising.best_point import BestPoint
 from orthocas.minimising.objective import LeastSquaresObjective, Objective
 from orthocas.minimising.solver import SolveResult, Status
 from orthocas.minimising.watch import UNWATCHED, Watch
+from orthocas.solvers.array_node import ArrayNode
 
 _DIFFERENCE = 1e-7  # step of finite differences, relative to theta
 _FIRST = 1e-3  # first stretch of time, in units of |theta0| / |grad L|

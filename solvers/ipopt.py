@@ -5,7 +5,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from orthocas.solvers.array_node import ArrayNode
 
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array, require_at_least, require_count
@@ -13,6 +12,7 @@ from orthocas.minimising.best_point import BestPoint
 from orthocas.minimising.objective import ConstrainedObjective, Objective, SmoothObjective
 from orthocas.minimising.solver import SolveResult, Status
 from orthocas.minimising.watch import UNWATCHED, Watch
+from orthocas.solvers.array_node import ArrayNode
 
 _EXACT = 1500  # largest number of parameters for exact, dense Hessians
 _BARRIER = 1e-4  # starts are good: a stronger barrier would push away from them, into worse minima

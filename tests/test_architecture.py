@@ -30,7 +30,7 @@ def tree(path: Path) -> ast.Module:
 def imports_of(path: Path) -> set[str]:
     """Modules of this package that a file takes names from; names that a package hands on count where they are made."""
     found = set()
-    for node in ast.walk(tree(path)):
+    for node in tree(path).body:  # imports for types alone stand in a block of their own
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             found |= {home(node.module or "", alias.name) for alias in node.names}

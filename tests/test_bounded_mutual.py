@@ -5,20 +5,20 @@ import pytest
 
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.coordinates.fitted import joint_space
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.bounded_mutual import BoundedMutual
 from orthocas.fitting.loss import Weights
-from orthocas.fitting.stages import StageRunner
+from orthocas.fitting.stages import missed_bound
 from orthocas.minimising.solver import SolveResult, Status
+from orthocas.parametrisations import JointSpace
 from orthocas.samples import sample_problem
 
 
 @pytest.fixture(scope="module")
 def bounded() -> BoundedMutual:
     problem = problems.get("planar_3r_x")
-    family = oc.Polynomial(2).family(joint_space(problem), problem.r)
+    family = oc.Polynomial(2).family(JointSpace.of(problem), problem.r)
     samples = sample_problem(problem, 60, 3)
     weights = Weights(1000.0, 30.0, 100.0)
     return BoundedMutual(BasisObjective(family, samples, weights, family.initial(0), lambda n, s: samples), 0.05)
@@ -82,14 +82,12 @@ def test_bound_out_of_reach_is_reported_with_the_closest_value(planar_x: oc.Prob
 
 
 def test_status_decides_between_infeasible_and_not_found(bounded: BoundedMutual) -> None:
-    runner = object.__new__(StageRunner)
-    object.__setattr__(runner, "max_mutual", 0.05)
     for status, error, words in (
         (Status.INFEASIBLE, InfeasibleError, "there are no"),
         (Status.ITERATION_LIMIT, SolveError, "found in 7 iterations"),
     ):
         result = SolveResult(theta_of(bounded), np.inf, status, 7, 7, 0.0)
-        found = runner._missed("polynomial:2", bounded, result)
+        found = missed_bound("polynomial:2", 0.05, bounded, result)
         assert type(found) is error
         assert words in str(found)
         assert "within 2.865 deg" in str(found)

@@ -8,11 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import robot_data
 from programs import Run, output_of
 
 import orthocas as oc
+from orthocas import problems
 from orthocas.fitting.fit import Fit
 
 
@@ -90,6 +92,62 @@ def test_urdf_with_every_option(run: Run) -> None:
     assert info["notes"]["lambda3"] == 0
 
 
+def test_urdf_with_locked_joint_tool_home_and_half_widths(run: Run) -> None:
+    path = str(robot_data("panda_description/urdf/panda.urdf"))
+    words = [
+        "--tip",
+        "panda_hand",
+        "--lock",
+        "panda_joint3=0.1",
+        "--lock",
+        "panda_joint1=0",
+        "--tool",
+        "0,0,0.1,0,0,0.5",
+    ]
+    words += ["--home", "default", "--half-width", "0.4,0.1,0.2,0.3,0.4", "--task", "axis:z", "--param", "linear"]
+    code, _, err = run("fit", path, *words, "--out", "x.orthocas")
+    assert (code, err) == (0, "")
+    problem = oc.load("x.orthocas").problem
+    assert problem.robot.joint_names == tuple(f"panda_joint{k}" for k in (2, 4, 5, 6, 7))
+    np.testing.assert_allclose(problem.domain.centre, [-0.785398, -2.35619, 0, 1.5707, 0.785398])
+    np.testing.assert_array_equal(problem.domain.half_width, [0.4, 0.1, 0.2, 0.3, 0.4])
+    assert (problem.task.name, problem.task.m) == ("axis:z", 2)
+    np.testing.assert_allclose(np.array(problem.task.function(problem.domain.centre)), 0, atol=1e-12)
+    q = problem.domain.centre
+    hand = oc.Robot.from_urdf(path, "panda_hand", {"panda_joint3": 0.1, "panda_joint1": 0.0})
+    want = hand.tip_position(q) + 0.1 * hand.tip_rotation(q)[:, 2]
+    np.testing.assert_allclose(problem.robot.tip_position(q), want, atol=1e-12)
+
+
+def test_info_tells_limits_and_homes_of_a_robot_file(run: Run) -> None:
+    path = str(robot_data("panda_description/urdf/panda.urdf"))
+    code, out, _ = run("info", path, "--tip", "panda_rightfinger", "--lock", "panda_finger_joint1=0.02", "--json")
+    data = json.loads(out)
+    assert code == 0
+    assert (len(data["joints"]), data["homes"], data["effort_limits"][6]) == (7, ["default"], 12)
+
+
+def test_urdf_of_a_stretched_arm_fits_about_a_bent_posture(run: Run) -> None:
+    """A command of the README: about the middle of the limits 9 % of the samples fold."""
+    path = str(Path(problems.__file__).parent / "data" / "iiwa7_r800.urdf")
+    words = [
+        "--tip",
+        "link_ee",
+        "--task",
+        "pose",
+        "--metric",
+        "inertia",
+        "--param",
+        "polynomial:2",
+        "--out",
+        "p.orthocas",
+    ]
+    code, out, err = run("fit", path, *words)
+    assert (code, err) == (0, "")
+    assert "DEGENERATE" not in out
+    assert "folded" not in out
+
+
 @pytest.mark.slow
 def test_named_problem_with_overrides(run: Run) -> None:
     code, out, _ = run("fit", "iiwa", "--param", "linear", "--metric", "inertia", "--task", "position:xy", "--json")
@@ -130,7 +188,30 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["info", PANDA, "--tip", "panda"], "panda_hand"),
         (["fit", "iiwa", "--samples", "0"], "samples is 0"),
         (["fit", "iiwa", "--samples", "many"], "'many' came, expected a whole number"),
-        (["fit", "iiwa", "--half-width", "wide"], "'wide' came, expected a number"),
+        (["fit", "iiwa", "--half-width", "wide"], "--half-width is ['wide'], expected an array of numbers"),
+        (["fit", "iiwa", "--half-width", "0.4,0.1"], "half_width has shape (2,), expected (7,)"),
+        (["fit", "iiwa", "--lock", "joint_3=0"], "--lock is joint_3=0, expected no lock for the named problem 'iiwa'"),
+        (["info", "planar_2r", "--tool", "0,0,1"], "--tool is 0,0,1, expected no tool for the named problem"),
+        (["fit", "iiwa", "--home", "up"], "unknown home 'up', known: none, the robot's files name no posture"),
+        (["fit", PANDA, "--tip", "panda_hand", "--home", "ready"], "unknown home 'ready', known: default"),
+        (
+            ["fit", PANDA, "--tip", "panda_hand", "--home", "default", "--centre", "0,0"],
+            "--home is default, expected either",
+        ),
+        (
+            ["fit", PANDA, "--tip", "panda_hand", "--lock", "panda_joint3"],
+            "--lock is panda_joint3, expected JOINT=VALUE",
+        ),
+        (["fit", PANDA, "--tip", "panda_hand", "--lock", "panda_joint3=x"], "--lock panda_joint3 is ['x']"),
+        (
+            ["fit", PANDA, "--tip", "panda_hand", "--lock", "panda_joint=0"],
+            "unknown joint 'panda_joint', known: panda_joint",
+        ),
+        (["info", PANDA, "--tip", "panda_rightfinger"], "or --lock panda_finger_joint1=0"),
+        (
+            ["info", PANDA, "--tip", "panda_hand", "--tool", "0,1"],
+            "shape of tool is (2,), expected (3,), (6,) or (4, 4)",
+        ),
         (["fit", "iiwa", "--seed", "-1"], "seed is -1, expected a whole number >= 0"),
         (["fit", "iiwa", "--weights", "1000,nan"], "lambda2 is nan"),
         (["fit", "iiwa", "--weights", "1000"], "two to four numbers"),

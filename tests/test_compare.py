@@ -9,9 +9,9 @@ import shutil
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytest
@@ -26,6 +26,7 @@ from orthocas.comparing.report import Comparison
 from orthocas.errors import ChartFileError, InvalidValueError
 from orthocas.fitting.loss import Weights
 from orthocas.minimising.watch import Progress
+from orthocas.parametrisations import register
 
 QUICK: dict[str, Any] = {"samples": 150, "held_out": 500}
 
@@ -34,18 +35,32 @@ class Kills:
     """A parametrisation that ends its process, as running out of memory does."""
 
     label = "kills"
+    linear = True
+    closed_form = None
+
+    def for_problem(self, problem: oc.Problem) -> Self:
+        return self
 
     def family(self, space: object, outputs: int) -> object:
         os._exit(3)
 
 
+@dataclass(frozen=True)
 class Breaks:
     """A parametrisation with a defect of its own."""
 
-    label = "breaks"
+    label: ClassVar[str] = "breaks"
+    linear: ClassVar[bool] = True
+    closed_form: ClassVar[None] = None
+
+    def for_problem(self, problem: oc.Problem) -> Self:
+        return self
 
     def family(self, space: object, outputs: int) -> object:
         raise KeyError("a defect")
+
+
+register("breaks", Breaks)
 
 
 class InThisThread(Executor):
@@ -248,7 +263,7 @@ def test_ctrl_c_returns_what_is_done(planar_x: oc.Problem) -> None:
 
 
 def test_same_cell_same_result(planar_x: oc.Problem) -> None:
-    cell = Cell(planar_x, oc.Polynomial(2), solvers.GaussNewton(), 3, Weights(1000.0, 30.0), 150, 500, None)
+    cell = Cell(planar_x, oc.Polynomial(2), solvers.GaussNewton(), 3, Weights.of((1000.0, 30.0)), 150, 500, None)
     first, second = (replace(r, seconds=0.0, history=()) for r in run_cells([cell, cell], InThisThread()))
     assert repr(first) == repr(second)  # NaN where nothing was measured, which equals nothing
     assert isinstance(run_cell(cell), CellResult)

@@ -7,7 +7,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from charts import linear_on_the_torus, with_metric
-from orthocas.problems.iiwa import urdf_path
 from scipy.linalg import block_diag, sqrtm
 
 import orthocas as oc
@@ -33,6 +32,7 @@ from orthocas.errors import (
     UnknownNameError,
     UnreachableReferenceError,
 )
+from orthocas.problems.iiwa import urdf_path
 
 RNG = np.random.default_rng(21)
 

@@ -12,7 +12,7 @@ from orthocas.errors import DomainError, InvalidValueError, ShapeError
 
 
 def panda() -> oc.Robot:
-    return oc.Robot.chain_from_file(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+    return oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
 
 
 def test_samples_fill_the_box_uniformly_and_follow_the_seed() -> None:
@@ -48,6 +48,33 @@ def test_contains_is_true_inside_and_false_outside_a_box() -> None:
     box = oc.Box([0.0, 0.0], 1.0)
     np.testing.assert_array_equal(oc.contains(box, [[0.9, -0.9], [1.1, 0.0]]), [True, False])
     assert oc.contains(box, [1.0, 1.0])
+    np.testing.assert_array_equal(box.contains([[0.9, -0.9], [1.1, 0.0]]), [True, False])
+    assert box.contains([1.0, 1.0])
+    assert not box.contains([1.0, 1.1])
+    assert oc.Torus(2).contains([100.0, -100.0])
+    with pytest.raises(ShapeError, match=r"q has shape \(3,\)"):
+        box.contains([0.0, 0.0, 0.0])
+
+
+def test_box_from_limits_reaches_from_one_to_the_other() -> None:
+    box = oc.Box.from_limits([-1.0, 0.5], [2.0, 0.7])
+    np.testing.assert_allclose(box.centre, [0.5, 0.6])
+    np.testing.assert_allclose(box.half_width, [1.5, 0.1])
+    assert box.contains([[-1.0, 0.5], [2.0, 0.7]]).all()
+    assert not box.contains([[-1.001, 0.6], [0.0, 0.701]]).any()
+    with pytest.raises(InvalidValueError, match=r"lower\[1\] is 0.7, expected a number below upper\[1\] = 0.5"):
+        oc.Box.from_limits([0.0, 0.7], [1.0, 0.5])
+    with pytest.raises(ShapeError, match="upper"):
+        oc.Box.from_limits([0.0, 0.0], [1.0])
+    with pytest.raises(InvalidValueError, match=r"upper\[0\] is inf"):
+        oc.Box.from_limits([0.0], [np.inf])
+
+
+def test_default_box_takes_a_half_width_per_joint() -> None:
+    widths = np.array([0.4, 0.4, 0.4, 0.1, 0.4, 0.4, 0.2])
+    np.testing.assert_array_equal(default_box(panda(), half_width=widths).half_width, widths)
+    with pytest.raises(ShapeError, match="half_width"):
+        default_box(panda(), half_width=[0.4, 0.1])
 
 
 def test_default_box_respects_joint_limits() -> None:
@@ -61,7 +88,7 @@ def test_default_box_respects_joint_limits() -> None:
 
 
 def test_default_box_of_prismatic_joint_is_in_metres() -> None:
-    robot = oc.Robot.chain_from_file(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
+    robot = oc.Robot.from_urdf(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
     np.testing.assert_allclose(default_box(robot).half_width[0], 0.35 / 2)
 
 
@@ -85,7 +112,7 @@ def test_domain_outside_limits_names_the_joint() -> None:
 
 
 def test_torus_with_a_prismatic_joint_is_refused() -> None:
-    robot = oc.Robot.chain_from_file(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
+    robot = oc.Robot.from_urdf(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
     with pytest.raises(DomainError, match="torso_lift_joint.*prismatic"):
         require_within_limits(robot, oc.Torus(robot.n))
 

@@ -103,8 +103,17 @@ def test_distillation_keeps_more_with_the_degree(tmp_path: Path, capsys: pytest.
 def test_gallery_shrinks_pictures(tmp_path: Path) -> None:
     assert set(gallery.main(tmp_path, "fig11", quick=True)) == {"fig11"}
     with Image.open(tmp_path / "fig11.png") as picture:
-        assert picture.mode == "P"
+        assert picture.mode == "RGB"
         assert 600 < picture.width <= gallery.WIDTH
+
+
+def test_gallery_keeps_every_colour(tmp_path: Path) -> None:
+    red, green = np.meshgrid(np.arange(0, 256, 4, dtype=np.uint8), np.arange(0, 256, 4, dtype=np.uint8))
+    colours = np.stack([red, green, red ^ green], axis=2)  # 4096 of them
+    Image.fromarray(colours).save(tmp_path / "many.png")
+    gallery.shrink(tmp_path / "many.png")
+    with Image.open(tmp_path / "many.png") as picture:
+        assert np.array_equal(np.asarray(picture), colours)
 
 
 def test_gallery_page_shows_every_figure() -> None:

@@ -114,7 +114,7 @@ def test_panda_and_ur10_fit_without_tuning_straight_from_their_urdfs() -> None:
         ("panda_description/urdf/panda.urdf", "panda_hand", "panda_joint7"),
         ("ur_description/urdf/ur10_robot.urdf", None, "wrist_3_joint"),
     ):
-        robot = oc.Robot.chain_from_file(robot_data(file), tip)
+        robot = oc.Robot.from_urdf(robot_data(file), tip)
         fit = oc.fit(oc.Problem(robot, oc.Task.position(robot)), oc.Polynomial(3))
         report = oc.evaluate(fit.chart, samples=5000)
         assert fit.idle_joints == (idle,)

@@ -23,6 +23,8 @@ from orthocas.errors import (
     ShapeError,
     UnknownNameError,
 )
+from orthocas.files.archive import read_archive, write_archive
+from orthocas.files.chart_file import CHART
 from orthocas.growing import Arrival, GrownCoordinates, TaskFlow, leaf_from_arrays
 from orthocas.metrics import metric_matrices
 
@@ -120,6 +122,32 @@ def test_files_hold_everything(chart: oc.Chart, tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.phi(points), chart.phi(points))
     np.testing.assert_array_equal(again.jacobian(points), chart.jacobian(points))
     assert again.coordinates.label == chart.coordinates.label
+
+
+def test_faces_are_integers_in_memory_and_in_files(tmp_path: Path) -> None:
+    chart = oc.grow(planar_3r("euclidean"), 0.0, cells=20)
+    chart.save(tmp_path / "disk.orthocas")
+    kept = read_archive(tmp_path / "disk.orthocas", CHART)[1]["leaf_faces"]
+    assert kept.dtype == chart.coordinates.leaf.faces.dtype == np.int64
+    with pytest.raises(ValueError, match="read-only"):
+        chart.coordinates.leaf.faces[0, 0] = 1
+
+
+def test_faces_kept_as_floats_by_early_versions_still_load(tmp_path: Path) -> None:
+    chart = oc.grow(planar_3r("euclidean"), 0.0, cells=20)
+    chart.save(tmp_path / "new.orthocas")
+    header, arrays = read_archive(tmp_path / "new.orthocas", CHART)
+    arrays["leaf_faces"] = arrays["leaf_faces"].astype(float)
+    write_archive(tmp_path / "old.orthocas", CHART, {k: v for k, v in header.items() if k != "sha256"}, arrays)
+    old = oc.load(tmp_path / "old.orthocas")
+    points = known_points(chart, 20)
+    np.testing.assert_array_equal(old.phi(points), chart.phi(points))
+    assert old.coordinates.leaf.faces.dtype == np.int64
+    for bad, shown in ((0.5, "0.5"), (1e6, "1e\\+06")):
+        arrays["leaf_faces"][0, 0] = bad
+        write_archive(tmp_path / "bad.orthocas", CHART, {k: v for k, v in header.items() if k != "sha256"}, arrays)
+        with pytest.raises(ChartFileError, match=f"faces is {shown}, expected whole numbers from 0 to"):
+            oc.load(tmp_path / "bad.orthocas")
 
 
 def test_one_point_and_many_have_the_usual_shapes(chart: oc.Chart) -> None:

@@ -9,7 +9,6 @@ import pinocchio as pin
 import pytest
 from charts import with_metric
 from conftest import robot_data
-from orthocas.problems.iiwa import urdf_path
 from programs import Run
 from scipy.integrate import solve_ivp
 from scipy.linalg import inv, sqrtm
@@ -20,6 +19,7 @@ from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
+from orthocas.problems.iiwa import urdf_path
 
 BOX = oc.Box([0.6, 0.8, 0.8], 0.3)
 
@@ -62,7 +62,7 @@ def test_one_task_component_is_always_involutive(name: str, metric) -> None:
     if name == "iiwa":
         robot = problems.get("iiwa").robot
     elif name == "panda":
-        robot = oc.Robot.chain_from_file(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+        robot = oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
     else:
         robot = arm(int(name[-2]))
     found = oc.involutivity(oc.Problem(robot, oc.Task.position(robot, "x"), metric), samples=200)

@@ -101,9 +101,9 @@ def test_disk_values_and_points_are_inverse() -> None:
 def test_disk_gradients_agree_with_differences_within_a_triangle() -> None:
     cell = oc.Box([np.pi / 2, 0, 0], [np.pi / 2, np.pi, np.pi])
     leaf = disk_leaf(oc.Problem(ARM, oc.Task.position(ARM, "x"), "euclidean", cell), np.zeros(1), cell, 20)
-    centres = leaf.vertices[leaf.mesh.faces].mean(axis=1)
+    centres = leaf.vertices[leaf.faces].mean(axis=1)
     values = leaf.values(centres)
-    corners, images = leaf.vertices[leaf.mesh.faces], leaf.disk[leaf.mesh.faces]
+    corners, images = leaf.vertices[leaf.faces], leaf.disk[leaf.faces]
     for k in range(3):
         along = corners[:, k] - centres
         change = np.einsum("frn,fn->fr", values.gradients, along)

@@ -1,15 +1,17 @@
 """Level surfaces of functions of three joints: on the surface, on the box, of the right topology, round triangles."""
 
+from collections import Counter, defaultdict
+
 import mesh_chart
 import numpy as np
 import pytest
+import trimesh
 from numpy.testing import assert_allclose
 
 from orthocas.checks import Array
 from orthocas.errors import InvalidValueError, NotADiskError, ShapeError
 from orthocas.growing.level_surface import Function, TriangleMesh, level_surface, require_disk
-from orthocas.growing.mesh_improvement import cotangents, flip_to_delaunay
-from orthocas.growing.triangle_mesh import edge_keys, half_edges
+from orthocas.growing.mesh_improvement import flip_to_delaunay
 
 PI = np.pi
 ARM_BOX = ((0.0, -PI, -PI), (PI, PI, PI))  # of the joints of a planar 3R arm; its leaves are disks
@@ -51,15 +53,18 @@ def topology(mesh: TriangleMesh) -> tuple[int, int, int, int]:
     return mesh.components, mesh.boundary_loops, mesh.euler_characteristic, mesh.clashing_edges
 
 
-def inner_weights(mesh: TriangleMesh) -> Array:
-    """cot(alpha) + cot(beta) of every edge of two triangles."""
-    keys = edge_keys(*half_edges(mesh.faces), len(mesh.vertices))
-    _, edge, count = np.unique(keys, return_inverse=True, return_counts=True)
-    return np.bincount(edge, cotangents(mesh.vertices, mesh.faces).T.ravel())[count == 2]
+def angles(mesh: TriangleMesh) -> Array:
+    """Of the corners, (F, 3)."""
+    return np.asarray(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).face_angles)
 
 
-def smallest_angle(mesh: TriangleMesh) -> float:
-    return float(np.degrees(np.arctan2(1.0, cotangents(mesh.vertices, mesh.faces))).min())
+def opposite_angles(mesh: TriangleMesh) -> Array:
+    """Sums of both angles opposite an inner edge."""
+    found = defaultdict(list)
+    for face, corners in zip(mesh.faces.tolist(), angles(mesh), strict=True):
+        for k in range(3):
+            found[frozenset((face[k - 2], face[k - 1]))].append(corners[k])
+    return np.array([sum(pair) for pair in found.values() if len(pair) == 2])
 
 
 @pytest.mark.parametrize("cells", [20, 21])  # with and without grid points on the sphere
@@ -103,9 +108,22 @@ def test_leaf_of_the_arm_is_a_disk_on_its_level(level: float) -> None:
     assert np.abs(tip_x(mesh.vertices) - level).max() <= ON_LEVEL
     assert np.all((mesh.vertices >= ARM_BOX[0]) & (mesh.vertices <= ARM_BOX[1]))
     loop = require_disk(mesh)
-    assert sorted(loop) == np.unique(mesh.boundary_edges).tolist()
-    steps = set(zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
-    assert steps == {tuple(edge) for edge in mesh.boundary_edges.tolist()}
+    around = [(face[k], face[k - 2]) for face in mesh.faces.tolist() for k in range(3)]
+    count = Counter(frozenset(edge) for edge in around)
+    rim = {edge for edge in around if count[frozenset(edge)] == 1}  # counterclockwise as their triangles are
+    assert set(zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True)) == rim
+    assert {tuple(edge) for edge in mesh.boundary_edges.tolist()} == rim
+    assert len(loop) == len(rim)
+    assert loop[0] == min(loop)
+
+
+def test_structure_equals_that_of_trimesh() -> None:
+    for mesh in (arm_leaf(), sphere(1.25, 12), sphere(0.8, 12), arm_leaf(box=((0.0, -PI, 0.0), (PI, PI, 2 * PI)))):
+        peer = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        assert np.array_equal(mesh.edges[np.lexsort(mesh.edges.T)], peer.edges_unique[np.lexsort(peer.edges_unique.T)])
+        assert mesh.euler_characteristic == peer.euler_number
+        assert mesh.components == peer.body_count
+        assert mesh.boundary_loops == (0 if peer.is_watertight else len(peer.outline().entities))
 
 
 def test_leaf_of_a_whole_first_turn_is_a_tube() -> None:
@@ -144,8 +162,8 @@ def test_meshes_that_are_nearly_disks_are_refused() -> None:
 @pytest.mark.parametrize("level", [0.0, 0.3])
 def test_triangles_are_round_and_delaunay(cells: int, level: float) -> None:
     mesh = arm_leaf(level, cells)
-    assert inner_weights(mesh).min() > -1e-8
-    assert smallest_angle(mesh) > 12  # measured 17 to 24; marching cubes alone: 5
+    assert opposite_angles(mesh).max() < PI + 1e-8
+    assert np.degrees(angles(mesh).min()) > 12  # measured 17 to 24; marching cubes alone: 5
 
 
 def test_flips_keep_a_square_and_turn_its_bad_diagonal() -> None:
@@ -235,7 +253,7 @@ def test_bad_arguments_are_named() -> None:
         surface(cells=1)
     with pytest.raises(InvalidValueError, match="level is nan"):
         surface(level=np.nan)
-    with pytest.raises(InvalidValueError, match="faces is 3, expected indices of 3 vertices"):
+    with pytest.raises(InvalidValueError, match="faces is 3, expected whole numbers from 0 to 2"):
         TriangleMesh(np.zeros((3, 3)), np.array([[0, 1, 3]]))
     with pytest.raises(ShapeError, match="faces has shape"):
         TriangleMesh(np.zeros((3, 3)), np.array([0, 1, 2]))

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas.coordinates.fitted import joint_space
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import graph_objective
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.graph_objective import GraphObjective
-from orthocas.fitting.loss import REGULAR_VOLUME, LossShape, Weights, mutual_cosines, pairs, task_cosines
+from orthocas.fitting.loss import REGULAR_VOLUME, Loss, Sizes, Weights, mutual_cosines, pairs, task_cosines
 from orthocas.fitting.spectral_start import spectral_start
+from orthocas.parametrisations import JointSpace
 from orthocas.samples import Draw, Samples, sample_problem, samples_at
 
-WEIGHTS = Weights(1000.0, 30.0)
+WEIGHTS = Weights.of((1000.0, 30.0))
 REGULAR = Weights(1000.0, 30.0, 120.0)
 EVEN = Weights(1000.0, 30.0, 120.0, 3.0)
 
@@ -50,7 +50,7 @@ def objectives(
     problem: oc.Problem, parametrisation: oc.Polynomial, weights: Weights = WEIGHTS
 ) -> tuple[BasisObjective, GraphObjective, Samples]:
     samples = sample_problem(problem, 60, 9)
-    family = parametrisation.family(joint_space(problem), problem.r)
+    family = parametrisation.family(JointSpace.of(problem), problem.r)
     theta = family.initial(3)
     settings = (family, samples, weights, theta, draw_from(problem))
     return BasisObjective(*settings), GraphObjective(*settings), samples
@@ -104,7 +104,7 @@ def test_weights_split_the_loss_into_its_terms(problem: oc.Problem) -> None:
 @pytest.mark.slow
 def test_fresh_batches_are_new_samples_of_the_same_loss(problem: oc.Problem) -> None:
     for objective in objectives(problem, oc.Polynomial(2), REGULAR)[:2]:
-        theta = oc.Polynomial(2).family(joint_space(problem), problem.r).initial(3)
+        theta = oc.Polynomial(2).family(JointSpace.of(problem), problem.r).initial(3)
         first, second = ([part.value(theta) for part in objective.batches(400, 3, (seed,))] for seed in (0, 1))
         assert len(first) == 3
         assert len({*first, *second}) == 6
@@ -115,7 +115,7 @@ def test_fresh_batches_are_new_samples_of_the_same_loss(problem: oc.Problem) -> 
 
 
 def test_graph_cut_into_blocks_gives_the_same_loss(planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    family = oc.MLP((6, 5)).family(joint_space(planar_x), 2)
+    family = oc.MLP((6, 5)).family(JointSpace.of(planar_x), 2)
     settings = (family, sample_problem(planar_x, 50, 2), REGULAR, family.initial(1), draw_from(planar_x))
     value, gradient = GraphObjective(*settings).value_and_gradient(family.initial(1))
     monkeypatch.setattr(graph_objective, "_CHUNK_ENTRIES", 7 * 2 * family.width)  # blocks of 7, 1 left over
@@ -127,7 +127,7 @@ def test_graph_cut_into_blocks_gives_the_same_loss(planar_x: oc.Problem, monkeyp
 
 @pytest.mark.parametrize("parametrisation", [oc.Polynomial(2), oc.Fourier(1), oc.MLP((6,))], ids=lambda p: p.label)
 def test_taylor_remainder_falls_with_the_square_of_the_step(planar_x: oc.Problem, parametrisation: object) -> None:
-    family = parametrisation.family(joint_space(planar_x), planar_x.r)
+    family = parametrisation.family(JointSpace.of(planar_x), planar_x.r)
     objective = GraphObjective(family, sample_problem(planar_x, 40, 2), REGULAR, family.initial(1), draw_from(planar_x))
     theta = family.initial(1)
     direction = np.random.default_rng(2).normal(size=family.size)
@@ -140,13 +140,13 @@ def test_taylor_remainder_falls_with_the_square_of_the_step(planar_x: oc.Problem
 
 def test_gauss_newton_matrix_is_that_of_the_residuals(planar_x: oc.Problem) -> None:
     twice = samples_at(planar_x, np.repeat(sample_problem(planar_x, 40, 9).points, 2, axis=0))  # every second is used
-    family = oc.Polynomial(2).family(joint_space(planar_x), 2)
+    family = oc.Polynomial(2).family(JointSpace.of(planar_x), 2)
     theta = family.initial(3)
     objective = BasisObjective(family, twice, REGULAR, theta, draw_from(planar_x))
-    shape = LossShape(3, 1, 2, False, REGULAR)
-    J, data = ca.SX.sym("J", 2, 3), shape.symbols()
-    rho = ca.Function("rho", [J, *data], [shape.residuals(J, data)])
-    parts = twice.loss_data(twice.orientation(objective.coordinate_jacobians(theta)))
+    loss = Loss.of(Sizes(n=3, m=1, r=2, identity_metric=False), REGULAR.by_name)
+    J, data = loss.arguments()
+    rho = ca.Function("rho", [J, *data], [loss.residuals(J, data)])
+    parts = twice.described(loss.data, twice.orientation(objective.coordinate_jacobians(theta)))
 
     def residuals(theta: np.ndarray) -> np.ndarray:
         rows = zip(objective.coordinate_jacobians(theta), *parts, strict=True)
@@ -211,7 +211,7 @@ def test_spectral_start_finds_an_exact_linear_coordinate() -> None:
     robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
     task = oc.Task.custom(robot, "sum", lambda q: q[0] + 2 * q[1])
     problem = oc.Problem(robot, task, domain=oc.Box([0.0, 0.0], 1.0))
-    family = oc.Polynomial(2).family(joint_space(problem), 1)
+    family = oc.Polynomial(2).family(JointSpace.of(problem), 1)
     theta = spectral_start(family, sample_problem(problem, 100, 0))
     objective = BasisObjective(family, sample_problem(problem, 100, 1), WEIGHTS, theta, draw_from(problem))
     directions = objective.coordinate_jacobians(theta)[:, 0]
@@ -223,7 +223,7 @@ def test_batches_share_out_what_is_left_of_dropped_samples() -> None:
     robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
     task = oc.Task.custom(robot, "half", lambda q: ca.fmax(q[0], 0) ** 2)
     problem = oc.Problem(robot, task, domain=oc.Box([0.0, 0.0], 1.0))
-    family = oc.MLP((3,)).family(joint_space(problem), 1)
+    family = oc.MLP((3,)).family(JointSpace.of(problem), 1)
     theta = family.initial(0)
     objective = GraphObjective(family, sample_problem(problem, 64, 1), WEIGHTS, theta, draw_from(problem))
     for seed in range(5):

@@ -1,12 +1,16 @@
 """Metrics: kinds, and refusal of what is not symmetric positive definite."""
 
+import dataclasses
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import robot_data
 
 import orthocas as oc
 from orthocas.errors import MetricError, ShapeError, UnknownNameError
-from orthocas.metrics import metric_matrices
+from orthocas.metrics import Metric, metric_matrices
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (10, 2))
 
@@ -56,3 +60,40 @@ def test_wrong_shape_and_unknown_name_are_refused() -> None:
         problem(lambda q: q)
     with pytest.raises(UnknownNameError, match="known: euclidean, inertia"):
         problem("mass")
+
+
+def test_named_metric_shows_its_name_in_reports_and_after_loading(tmp_path: Path) -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [3.0, 3.0])
+    stiffness = Metric.custom(robot, "stiffness", lambda q: ca.diag(ca.vertcat(1 + q[0] ** 2, 2)))
+    chart = oc.fit(oc.Problem(robot, oc.Task.position(robot, "x"), stiffness), oc.Polynomial(1)).chart
+    assert oc.evaluate(chart, 50).metric == "stiffness"
+    chart.save(tmp_path / "a.orthocas")
+    again = oc.load(tmp_path / "a.orthocas").problem.metric
+    assert again.name == "stiffness"
+    np.testing.assert_array_equal(metric_matrices(again, POINTS), metric_matrices(stiffness, POINTS))
+
+
+def test_name_of_a_custom_metric_does_not_make_it_the_identity() -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [3.0, 3.0])
+    metric = Metric.custom(robot, "euclidean", lambda q: 3 * ca.SX.eye(2))
+    assert not metric.is_identity
+    np.testing.assert_array_equal(metric_matrices(metric, POINTS)[0], 3 * np.eye(2))
+
+
+def massless(robot: oc.Robot, i: int, **change: object) -> oc.Robot:
+    """The robot with body i without mass."""
+    masses, inertias = robot.tree.masses.copy(), robot.tree.inertias.copy()
+    masses[i], inertias[i] = 0, 0
+    return oc.Robot(dataclasses.replace(robot.tree, masses=masses, inertias=inertias, **change))
+
+
+def test_joint_that_moves_no_mass_is_named_when_inertia_is_the_metric() -> None:
+    ur5 = oc.Robot.from_urdf(robot_data("ur_description/urdf/ur5_robot.urdf"), "tool0")
+    robot = massless(ur5, 5)
+    with pytest.raises(MetricError, match="joint 'wrist_3_joint' moves no mass.*--lock wrist_3_joint=0"):
+        oc.Problem(robot, oc.Task.position(robot), "inertia")
+    oc.Problem(robot, oc.Task.position(robot), "euclidean")  # needs no mass
+    rotor = massless(ur5, 5, armatures=np.full(6, 0.01))
+    oc.check(oc.Problem(rotor, oc.Task.position(rotor), "inertia"))
+    carried = massless(ur5, 2)  # carries what has mass
+    oc.check(oc.Problem(carried, oc.Task.position(carried), "inertia"))

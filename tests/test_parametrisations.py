@@ -8,8 +8,8 @@ from conftest import robot_data
 import orthocas as oc
 from orthocas.coordinates.point_functions import point_functions
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
-from orthocas.parametrisations import JointSpace, component_gradients, embed, parse_parametrisation
-from orthocas.parametrisations.product_basis import LinearFamily
+from orthocas.fitting.basis_gradients import BasisGradients
+from orthocas.parametrisations import JointSpace, ProductFamily, component_gradients, parse_parametrisation
 
 SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))
 SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE.joint_names)
@@ -119,22 +119,23 @@ def test_mlp_is_the_formula_of_the_paper_and_takes_sliding_joints_raw() -> None:
 def test_embedding_keeps_the_function() -> None:
     coarse, fine = oc.Polynomial(2).family(SPACE, 2), oc.Polynomial(4).family(SPACE, 2)
     theta = coarse.initial(3)
-    wide = embed(theta, 2, coarse.terms, fine.terms)
+    wide = fine.embed(theta, coarse)
     points = np.random.default_rng(1).uniform(-0.5, 0.5, (4, 3))
     got = values(oc.Polynomial(4), SPACE, points, wide)
     np.testing.assert_allclose(got, values(oc.Polynomial(2), SPACE, points, theta), atol=1e-12)
 
 
 def test_basis_gradients_match_differences_of_the_basis() -> None:
-    family: LinearFamily = oc.Polynomial(3).family(SPACE, 1)
+    family: ProductFamily = oc.Polynomial(3).family(SPACE, 1)
+    gradients = BasisGradients(family, 3)
     point = np.array([0.2, 0.1, -0.1])
     q = ca.SX.sym("q", 3)
     psi = ca.Function("psi", [q], [family.basis(q)])
-    G = family.dense_gradients(family.basis_gradients(point[None]), 1)[0]  # (n, K)
+    G = gradients.dense(gradients.at(point[None]), 1)[0]  # (n, K)
     step = 1e-6
     want = [np.array(psi(point + step * e) - psi(point - step * e)).ravel() / (2 * step) for e in np.eye(3)]
     np.testing.assert_allclose(G, want, atol=1e-7)
-    for i, places in enumerate(family.terms_of_joints):
+    for i, places in enumerate(gradients.terms_of_joints):
         others = np.setdiff1d(np.arange(len(family.terms)), places)
         assert not np.any(G[i, others])
         assert np.all(np.array(family.terms)[places, i] > 0)
@@ -190,7 +191,7 @@ def test_bad_labels_are_refused(label: str, error: type[Exception], message: str
 def test_fourier_refuses_a_prismatic_joint_by_name() -> None:
     with pytest.raises(InvalidValueError, match="joint 'b' of a Fourier basis is prismatic"):
         oc.Fourier(2).family(SLIDING, 1)
-    robot = oc.Robot.chain_from_file(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
+    robot = oc.Robot.from_urdf(robot_data("tiago_description/robots/tiago.urdf"), "arm_tool_link")
     with pytest.raises(InvalidValueError, match="torso_lift_joint"):
         oc.fit(oc.Problem(robot, oc.Task.position(robot)), oc.Fourier(1))
 

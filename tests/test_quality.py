@@ -7,10 +7,11 @@ import scipy.linalg
 
 import orthocas as oc
 from orthocas.chart import Chart
-from orthocas.coordinates.fitted import Coordinates, joint_space
+from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError, MemoryNeedError, SingularTaskError
 from orthocas.fitting.fit import Fit
+from orthocas.parametrisations import JointSpace
 from orthocas.quality import AngleStatistics
 
 
@@ -18,7 +19,7 @@ def chart_with_normals(normals: list[list[float]], metric: object = "euclidean")
     """Task q1 of a three-joint arm, with linear coordinates of given normals."""
     robot = oc.Robot.planar([1.0] * 3, [1.0] * 3)
     problem = oc.Problem(robot, oc.Task.custom(robot, "q1", lambda q: q[0]), metric)
-    coordinates = Coordinates(oc.Linear(), joint_space(problem), (), np.ravel(normals), np.zeros(2), np.ones(2))
+    coordinates = Coordinates(oc.Linear(), JointSpace.of(problem), (), np.ravel(normals), np.zeros(2), np.ones(2))
     return Chart(problem, coordinates)
 
 
@@ -53,7 +54,7 @@ def test_conditioning_ignores_how_the_task_is_scaled_but_not_the_metric() -> Non
     robot = plain_robot = oc.Robot.planar([1.0] * 3, [1.0] * 3)
     task = oc.Task.custom(plain_robot, "1000 q1", lambda q: 1000 * q[0])
     problem = oc.Problem(robot, task)
-    coordinates = Coordinates(oc.Linear(), joint_space(problem), (), np.ravel(normals), np.zeros(2), np.ones(2))
+    coordinates = Coordinates(oc.Linear(), JointSpace.of(problem), (), np.ravel(normals), np.zeros(2), np.ones(2))
     assert oc.evaluate(Chart(problem, coordinates), 100).conditioning == plain.conditioning
     other = oc.evaluate(chart_with_normals(normals, np.diag([1.0, 4.0, 9.0])), 100)
     assert abs(other.conditioning.mean - plain.conditioning.mean) > 0.01
@@ -79,11 +80,11 @@ def test_folded_samples_are_counted() -> None:
     """xi = q2^2 - 1.2 q2 folds at q2 = 0.6: on |q2| <= pi/4 that is the part above, 11.8 % of the box."""
     robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
     problem = oc.Problem(robot, oc.Task.custom(robot, "q1", lambda q: q[0]))
-    family = oc.Polynomial(2).family(joint_space(problem), 1)
+    family = oc.Polynomial(2).family(JointSpace.of(problem), 1)
     half = np.pi / 4
     C = {(0, 2): half**2 * 2 / 3 / np.sqrt(5), (0, 1): -1.2 * half / np.sqrt(3)}  # Legendre coefficients
     theta = np.array([C.get(term, 0.0) for term in family.terms])
-    chart = Chart(problem, Coordinates(oc.Polynomial(2), joint_space(problem), (), theta, np.zeros(1), np.ones(1)))
+    chart = Chart(problem, Coordinates(oc.Polynomial(2), JointSpace.of(problem), (), theta, np.zeros(1), np.ones(1)))
     np.testing.assert_allclose(chart.jacobian([0.0, 0.3])[1], [0, 2 * 0.3 - 1.2], atol=1e-12)
     report = oc.evaluate(chart, 20_000)
     assert report.folded_samples / report.samples == pytest.approx((half - 0.6) / (2 * half), abs=0.01)

@@ -1,8 +1,9 @@
 """Figures of the paper: their numbers, the files, the scene they are drawn in, and the command."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -92,7 +93,7 @@ def test_numbers_of_figure(name: str) -> None:
 
 
 @pytest.fixture
-def two_figures(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
+def two_figures() -> Iterator[list[tuple[str, bool]]]:
     """Two recipes in place of all; which ones were drawn, and whether quickly."""
     drawn: list[tuple[str, bool]] = []
 
@@ -103,20 +104,28 @@ def two_figures(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
 
         return Recipe(f"title of {name}", draw)
 
-    for name in list(registry.FIGURES):
-        monkeypatch.delitem(registry.FIGURES, name)
-    for name in ("fig06", "fig11"):
-        monkeypatch.setitem(registry.FIGURES, name, recipe(name))
-    return drawn
+    recipes = {name: recipe(name) for name in ("fig06", "fig11")}
+    with patch.dict(registry.FIGURES, recipes, clear=True):  # unlike monkeypatch, it restores the order too
+        yield drawn
 
 
 def test_save_writes_pictures_meshes_and_numbers(tmp_path: Path) -> None:
     figures = {suffix: Figure(figsize=(0.2, 0.1)) for suffix in ("", "b")}
+    figures["b"].add_subplot(projection="3d")
     files = save(Drawing(figures, {"one": 1.0}, {"leaf": trimesh.creation.box()}), "fig07", tmp_path)
-    assert [file.name for file in files] == ["fig07.png", "fig07b.png", "fig07_leaf.stl", "fig07.json"]
+    assert [file.name for file in files] == ["fig07.png", "fig07.pdf", "fig07b.png", "fig07_leaf.stl", "fig07.json"]
     assert {path.name for path in tmp_path.iterdir()} == {file.name for file in files}
     assert json.loads((tmp_path / "fig07.json").read_text()) == {"one": 1.0}
     assert trimesh.load_mesh(tmp_path / "fig07_leaf.stl").is_watertight
+
+
+def test_saving_twice_writes_the_same_bytes(tmp_path: Path) -> None:
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        save(Drawing({"": Figure(figsize=(0.2, 0.1))}, {}), "fig07", tmp_path / folder)
+    for file in ("fig07.png", "fig07.pdf"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+    assert (tmp_path / "one" / "fig07.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_what_cannot_be_saved_leaves_what_was_there(tmp_path: Path) -> None:
@@ -153,7 +162,7 @@ def test_ctrl_c_leaves_finished_figures(two_figures: list[tuple[str, bool]], tmp
 
     with pytest.raises(KeyboardInterrupt):
         reproduce("all", tmp_path, True, stop)
-    assert {path.name for path in tmp_path.iterdir()} == {"fig06.png", "fig06.json"}
+    assert {path.name for path in tmp_path.iterdir()} == {"fig06.png", "fig06.pdf", "fig06.json"}
 
 
 @pytest.mark.parametrize("word", ["fig7", "7", "07", "fig07"])

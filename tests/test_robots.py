@@ -1,5 +1,6 @@
 """Symbolic kinematics and dynamics against Pinocchio's numbers, and what robots are refused."""
 
+import dataclasses
 from pathlib import Path
 
 import casadi as ca
@@ -7,10 +8,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import ROBOTS, arm, pinocchio_position, robot_data
-from orthocas.problems.iiwa import robot as iiwa_robot
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, RobotError, ShapeError, UnknownNameError
+from orthocas.problems.iiwa import robot as iiwa_robot
+from orthocas.robots import files
 from orthocas.robots.planar import planar_model
 
 
@@ -144,7 +146,7 @@ def test_continuous_joints_are_one_angle_without_limits() -> None:
 
 
 def test_limits_come_from_the_file() -> None:
-    robot = oc.Robot.chain_from_file(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+    robot = oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
     np.testing.assert_allclose(robot.upper[3], -0.0698, atol=1e-12)
 
 
@@ -175,9 +177,66 @@ def test_ranges_of_mjcf_slides_are_metres(tmp_path: Path, angle: str, hinge: flo
     np.testing.assert_allclose(robot.upper, [2, np.pi / 2])
 
 
-def test_mimic_joint_is_refused_by_name() -> None:
-    with pytest.raises(RobotError, match="panda_finger_joint2.*mimic"):
-        oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+def test_mimic_joint_on_the_way_names_the_joint_to_lock() -> None:
+    path = robot_data("panda_description/urdf/panda.urdf")
+    remedy = r"locked=\{'panda_finger_joint1': 0.0\} or --lock panda_finger_joint1=0"
+    with pytest.raises(RobotError, match=f"panda_finger_joint2.*mimic.*{remedy}"):
+        oc.Robot.from_urdf(path, "panda_rightfinger")
+    with pytest.raises(RobotError, match=f"'panda_finger_joint2' mimics joint 'panda_finger_joint1'.*{remedy}"):
+        oc.Robot.from_urdf(path, "panda_rightfinger", {"panda_finger_joint2": 0.0})
+    finger = oc.Robot.from_urdf(path, "panda_rightfinger", {"panda_finger_joint1": 0.03})
+    hand = oc.Robot.from_urdf(path, "panda_hand")
+    q = np.full(7, 0.3)
+    assert finger.joint_names == hand.joint_names == tuple(f"panda_joint{k}" for k in range(1, 8))
+    offset = hand.tip_rotation(q).T @ (finger.tip_position(q) - hand.tip_position(q))
+    np.testing.assert_allclose(offset, [0, -0.03, 0.0584], atol=1e-12)  # the mimic joint follows its leader
+
+
+def test_joints_off_the_way_are_locked_next_to_zero_and_those_of_the_user_where_asked() -> None:
+    path = robot_data("panda_description/urdf/panda.urdf")
+    q = np.full(7, 0.3)
+    model = files.lock_joints(files.read_urdf(path), {"panda_finger_joint1": 0.0})
+    want = oc.Robot.from_model(model, "panda_hand").mass_matrix(q)
+    np.testing.assert_allclose(oc.Robot.from_urdf(path, "panda_hand").mass_matrix(q), want, atol=1e-12)
+    opened = oc.Robot.from_urdf(path, "panda_hand", {"panda_finger_joint1": 0.04}).mass_matrix(q)
+    assert np.abs(opened - want).max() > 1e-5
+
+
+def test_locked_joint_on_the_way_to_the_tip_stays_where_it_is() -> None:
+    path = robot_data("tiago_description/robots/tiago.urdf")
+    free = oc.Robot.from_file(path, "arm_tool_link")
+    locked = oc.Robot.from_file(path, "arm_tool_link", {"torso_lift_joint": 0.2, "arm_4_joint": 1.0})
+    assert set(free.joint_names) - set(locked.joint_names) == {"torso_lift_joint", "arm_4_joint"}
+    q = np.linspace(0.1, 0.9, free.n)
+    q[[free.joint_names.index(name) for name in ("torso_lift_joint", "arm_4_joint")]] = 0.2, 1.0
+    rest = q[[name in locked.joint_names for name in free.joint_names]]
+    np.testing.assert_allclose(locked.tip_position(rest), free.tip_position(q), atol=1e-12)
+
+
+def test_floating_base_on_the_way_is_locked_by_zero(tmp_path: Path) -> None:
+    path = tmp_path / "humanoid.xml"
+    path.write_text(
+        """<mujoco><worldbody><body name="trunk" pos="0 0 1"><freejoint name="root"/>
+        <geom type="sphere" size="0.1" mass="5"/>
+        <body name="a"><joint name="j1" type="hinge" axis="0 0 1"/>
+        <geom type="capsule" size="0.05" fromto="0 0 0 1 0 0" mass="2"/>
+        <body name="hand" pos="1 0 0"><joint name="j2" type="hinge" axis="0 0 1"/>
+        <geom type="sphere" size="0.1" mass="1"/></body></body>
+        <body name="b"><joint name="ball" type="ball"/><geom type="sphere" size="0.1" mass="1"/></body>
+        </body></worldbody></mujoco>"""
+    )
+    with pytest.raises(RobotError, match=r"'root' .*6 degrees of freedom.*locked=\{'root': 0.0\} or --lock root=0"):
+        oc.Robot.from_file(path, "hand")
+    with pytest.raises(RobotError, match="locked position of joint 'root' is 0.5, expected 0: .*neutral position only"):
+        oc.Robot.from_file(path, "hand", {"root": 0.5})
+    robot = oc.Robot.from_file(path, "hand", {"root": 0.0})
+    assert robot.joint_names == ("j1", "j2")
+    np.testing.assert_allclose(robot.tip_position(np.array([np.pi / 2, 0.3]))[:2], [0, 1], atol=1e-12)
+
+
+def test_misspelled_tip_gets_the_similar_names_first() -> None:
+    with pytest.raises(UnknownNameError, match="unknown frame 'panda_hnd', known: panda_hand, "):
+        oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hnd")
 
 
 @pytest.mark.parametrize(
@@ -223,7 +282,7 @@ def test_unknown_frame_and_joint_list_what_exists() -> None:
 
 def test_branching_robot_needs_a_tip() -> None:
     with pytest.raises(RobotError, match="name the tip frame"):
-        oc.Robot.chain_from_file(robot_data("tiago_description/robots/tiago.urdf"))
+        oc.Robot.from_urdf(robot_data("tiago_description/robots/tiago.urdf"))
 
 
 @pytest.mark.parametrize(
@@ -265,7 +324,7 @@ def test_broken_inertias_are_not_swallowed(tmp_path: Path, mass: str, message: s
 
 
 def test_link_and_joint_may_share_a_name(tmp_path: Path) -> None:
-    robot = oc.Robot.chain_from_file(one_joint(tmp_path, joint="a"), "a")
+    robot = oc.Robot.from_urdf(one_joint(tmp_path, joint="a"), "a")
     assert robot.joint_names == ("a",)
 
 
@@ -274,15 +333,15 @@ def test_limits_the_wrong_way_round_are_refused(tmp_path: Path) -> None:
         oc.Robot.from_urdf(one_joint(tmp_path, lower="2"), "a")
 
 
-def test_joints_of_any_type_off_the_chain_are_locked(tmp_path: Path) -> None:
+def test_joints_of_any_type_off_the_chain_are_locked_unless_a_model_is_taken_whole(tmp_path: Path) -> None:
     path = one_joint(tmp_path)
     floating = (
         """<link name="b"/><joint name="free" type="floating"><parent link="base"/><child link="b"/></joint></robot>"""
     )
     path.write_text(path.read_text().replace("</robot>", floating))
-    assert oc.Robot.chain_from_file(path, "a").joint_names == ("j",)
-    with pytest.raises(RobotError, match="free"):
-        oc.Robot.from_urdf(path, "a")
+    assert oc.Robot.from_urdf(path, "a").joint_names == ("j",)
+    with pytest.raises(RobotError, match="'free' .*--lock free=0"):
+        oc.Robot.from_model(files.read_urdf(path), "a")
 
 
 def test_locked_must_be_a_mapping_to_numbers() -> None:
@@ -323,3 +382,116 @@ def test_bad_planar_arms_are_refused() -> None:
         planar_model([1.0, 1.0], [1.0])
     with pytest.raises(InvalidValueError, match="lengths"):
         planar_model([1.0, -1.0], [1.0, 1.0])
+
+
+def test_effort_and_velocity_limits_come_from_the_file() -> None:
+    robot = oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+    np.testing.assert_array_equal(robot.effort_limits, [87, 87, 87, 87, 12, 12, 12])
+    np.testing.assert_array_equal(robot.velocity_limits, [2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
+    wrist = oc.Robot.from_urdf(
+        robot_data("panda_description/urdf/panda.urdf"), "panda_hand", dict.fromkeys(robot.joint_names[:4], -0.5)
+    )
+    np.testing.assert_array_equal(wrist.effort_limits, [12, 12, 12])  # locking joints keeps the others' limits
+    assert np.isinf(oc.Robot.planar([1.0, 1.0], [1.0, 1.0]).velocity_limits).all()
+
+
+@pytest.mark.parametrize(
+    ("written", "effort", "velocity"),
+    [
+        ('effort="0" velocity="0"', np.inf, np.inf),
+        ('effort="7" velocity="0"', 7, np.inf),
+        ('effort="1e300" velocity="3"', np.inf, 3),
+    ],
+)
+def test_limits_of_nothing_are_unknown(tmp_path: Path, written: str, effort: float, velocity: float) -> None:
+    path = one_joint(tmp_path)
+    path.write_text(path.read_text().replace('effort="1" velocity="1"', written))
+    robot = oc.Robot.from_urdf(path, "a")
+    assert (robot.effort_limits[0], robot.velocity_limits[0]) == (effort, velocity)
+
+
+def test_effort_limits_must_be_positive() -> None:
+    tree = oc.Robot.planar([1.0, 1.0], [1.0, 1.0]).tree
+    for bad in (-1.0, 0.0, np.nan):
+        with pytest.raises(RobotError, match="joint 'q2' has the effort limit"):
+            dataclasses.replace(tree, effort_limits=np.array([1.0, bad]))
+
+
+def test_tool_moves_the_tip_as_a_transform_of_the_old_one() -> None:
+    path = robot_data("panda_description/urdf/panda.urdf")
+    hand = oc.Robot.from_urdf(path, "panda_hand")
+    q = np.random.default_rng(2).uniform(-1, 1, (20, 7))
+    R, p = hand.tip_rotation(q), hand.tip_position(q)
+    angles = np.array([0.3, -0.4, 1.2])
+    turn = pin.rpy.rpyToMatrix(angles)
+    offset = np.array([0.01, -0.02, 0.15])
+    full = np.eye(4)
+    full[:3, :3], full[:3, 3] = turn, offset
+    for tool, rotation in ((offset, np.eye(3)), (np.concatenate([offset, angles]), turn), (full, turn)):
+        for robot in (hand.with_tool(tool), oc.Robot.from_urdf(path, "panda_hand", tool=tool)):
+            np.testing.assert_allclose(robot.tip_position(q), p + R @ offset, atol=1e-12)
+            np.testing.assert_allclose(robot.tip_rotation(q), R @ rotation, atol=1e-12)
+            np.testing.assert_array_equal(robot.mass_matrix(q), hand.mass_matrix(q))  # no mass
+            assert robot.tree.tip_name == "panda_hand + tool"
+    tcp = oc.Robot.from_urdf(path, "panda_hand_tcp")
+    np.testing.assert_allclose(hand.with_tool((0, 0, 0.1034)).tip_position(q), tcp.tip_position(q), atol=1e-12)
+
+
+def test_bad_tools_are_refused() -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    with pytest.raises(InvalidValueError, match=r"shape of tool is \(2,\), expected \(3,\), \(6,\) or \(4, 4\)"):
+        robot.with_tool([0.1, 0.2])
+    with pytest.raises(InvalidValueError, match="rotation of tool"):
+        robot.with_tool(2 * np.eye(4) - np.diag([0, 0, 0, 1]))
+    with pytest.raises(InvalidValueError, match="last row of tool"):
+        robot.with_tool(np.ones((4, 4)))
+    with pytest.raises(InvalidValueError, match=r"tool\[1\] is nan"):
+        robot.with_tool([0.0, np.nan, 0.0])
+
+
+def test_homes_come_from_the_srdf_file_of_a_urdf() -> None:
+    panda = oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+    want = [0, -0.785398, 0, -2.35619, 0, 1.5707, 0.785398]
+    np.testing.assert_allclose(panda.home("default"), want, atol=1e-6)
+    xarm = oc.Robot.from_urdf(robot_data("xarm_description/urdf/xarm7.urdf"), "link_eef")
+    assert set(xarm.homes) == {"home", "hold-up"}
+    np.testing.assert_array_equal(xarm.home("hold-up"), [0, 0, 0, 0, 0, -1.5708, 0])
+    kinova = oc.Robot.from_urdf(robot_data("kinova_description/robots/kinova.urdf"), "j2s6s200_end_effector")
+    np.testing.assert_array_equal(kinova.home("arm_up"), [1.5707, 2.618, -1.5707, 3.1415, 2.618, 0])
+    with pytest.raises(UnknownNameError, match="unknown home 'up', known: home, hold-up"):
+        xarm.home("up")
+    with pytest.raises(UnknownNameError, match="the robot's files name no posture"):
+        iiwa_robot().home("up")
+    assert set(panda.with_tool((0, 0, 0.1)).with_scaled_masses(2.0).homes) == {"default"}
+
+
+def test_homes_leave_out_locked_joints_and_states_of_other_joints(tmp_path: Path) -> None:
+    path = robot_data("panda_description/urdf/panda.urdf")
+    robot = oc.Robot.from_urdf(path, "panda_hand", {"panda_joint3": 0.1})
+    np.testing.assert_allclose(robot.home("default"), [0, -0.785398, -2.35619, 0, 1.5707, 0.785398], atol=1e-6)
+    assert oc.Robot.from_urdf(path, "panda_hand").homes.keys() == {"default"}
+    own = one_joint(tmp_path)
+    (tmp_path / "arm.srdf").write_text(
+        """<robot name="r"><group_state name="up" group="arm"><joint name="j" value="0.5"/></group_state>
+        <group_state name="open" group="hand"><joint name="finger" value="0.5"/></group_state>
+        <group_state name="odd" group="arm"><joint name="j" value="0 0 0"/></group_state></robot>"""
+    )
+    assert list(oc.Robot.from_urdf(own, "a").homes) == ["up"]
+    (tmp_path / "arm.srdf").write_text("<robot")
+    with pytest.raises(RobotError, match=r"arm\.srdf is not an SRDF file"):
+        oc.Robot.from_urdf(own, "a")
+
+
+def test_homes_come_from_the_keyframes_of_an_mjcf_file(tmp_path: Path) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        """<mujoco><worldbody><body name="trunk"><freejoint name="root"/><geom type="sphere" size="0.1" mass="5"/>
+        <body name="a"><joint name="j1" type="hinge" axis="0 0 1"/>
+        <geom type="capsule" size="0.05" fromto="0 0 0 1 0 0" mass="2"/>
+        <body name="hand" pos="1 0 0"><joint name="j2" type="slide" axis="0 0 1"/>
+        <geom type="sphere" size="0.1" mass="1"/></body></body></body></worldbody>
+        <keyframe><key name="ready" qpos="0 0 1 1 0 0 0 0.5 0.2"/></keyframe></mujoco>"""
+    )
+    robot = oc.Robot.from_mjcf(path, "hand", {"root": 0.0})
+    assert list(robot.homes) == ["ready"]
+    np.testing.assert_allclose(robot.home("ready"), [0.5, 0.2])

@@ -9,12 +9,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import robot_data
-from orthocas.problems.iiwa import CENTRE, urdf_path
-from orthocas.problems.iiwa import robot as iiwa_robot
 
 import orthocas as oc
 from orthocas.errors import RobotError, UnknownNameError
 from orthocas.parametrisations.shoulder_elbow_wrist import SEW_KINDS, sew_angle
+from orthocas.problems.iiwa import CENTRE, urdf_path
+from orthocas.problems.iiwa import robot as iiwa_robot
 from orthocas.robots import files
 
 Z = np.array([0.0, 0.0, 1.0])

@@ -10,7 +10,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from charts import with_metric
-from orthocas.problems.iiwa import urdf_path
 from scipy.integrate import solve_ivp
 
 import orthocas as oc
@@ -19,6 +18,7 @@ from orthocas.control import ControlStatus, Impedance, Kinematic, KinematicProje
 from orthocas.control.controller import Controller
 from orthocas.errors import InvalidValueError, ShapeError, TrajectoryFileError, UnreachableReferenceError
 from orthocas.minimising.watch import Progress
+from orthocas.problems.iiwa import urdf_path
 from orthocas.robots.planar import planar_model
 from orthocas.simulation import (
     Friction,

@@ -90,6 +90,8 @@ def test_units_follow_task_and_joints() -> None:
     assert (units["q1"], units["x"]) == ("rad", "m")
     custom = oc.Task.custom(arm, "sum", lambda q: q[0] + q[1])
     assert units_of(oc.Problem(arm, custom, "euclidean", box)) == {"q1": "rad", "q2": "rad"}
+    named = oc.Task.custom(arm, "sum", lambda q: q[0] + q[1], units=("rad",))
+    assert units_of(oc.Problem(arm, named, "euclidean", box))["sum[0]"] == "rad"
 
 
 def test_moving_picture_draws_the_arm_where_it_is(planar_run: Trajectory, planar_fit: Fit) -> None:

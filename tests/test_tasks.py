@@ -4,23 +4,33 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from orthocas.problems.iiwa import robot as iiwa_robot
+from conftest import robot_data
 
 import orthocas as oc
 from orthocas.casadi_tools.tape import from_tape, to_tape
+from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
+from orthocas.problems.iiwa import robot as iiwa_robot
 
 Q = np.array([0.3, 0.7, -0.4, -1.0, 0.5, 0.9, 0.2])
+READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])  # of the Panda: its hand points down
 
 
-@pytest.mark.parametrize("kind", ["position", "position:xz", "polar", "orientation", "pose"])
+KINDS = ["position", "position:xz", "polar", "orientation", "pose", "axis", "axis:x", "axis:y", "position+axis"]
+
+
+def panda() -> oc.Robot:
+    return oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_task_jacobian_matches_central_differences(kind: str) -> None:
     task = oc.Task.named(iiwa_robot(), kind, Q + 0.2)
     step = 1e-6
     h = [np.array(task.function(Q + s * step * e)).ravel() for e in np.eye(7) for s in (1, -1)]
     want = np.array([(h[2 * k] - h[2 * k + 1]) / (2 * step) for k in range(7)]).T
     np.testing.assert_allclose(np.array(task.jacobian_function(Q)), want, atol=1e-8)
-    assert task.m == want.shape[0] == len(task.labels)
+    assert task.m == want.shape[0] == len(task.labels) == len(task.units)
 
 
 def test_orientation_is_half_angle_vector_of_the_relative_rotation() -> None:
@@ -39,6 +49,79 @@ def test_orientation_is_zero_at_the_reference_and_its_jacobian_is_the_angular_on
     np.testing.assert_allclose(np.array(task.function(Q)), 0, atol=1e-12)
     want = reference.T @ robot.tip_jacobian(Q)[3:]
     np.testing.assert_allclose(np.array(task.jacobian_function(Q)), want, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", "xyz")
+def test_axis_task_is_the_tilt_of_that_axis_whatever_the_turn_about_it(name: str) -> None:
+    robot, k = iiwa_robot(), "xyz".index(name)
+    reference = np.array([0.3, -0.5, -2.0])
+    task = oc.Task.axis(robot, name, reference)
+    for q in np.random.default_rng(5).uniform(-2, 2, (50, 7)):
+        direction = robot.tip_rotation(q)[:, k]
+        angle = np.arccos(direction @ reference / np.linalg.norm(reference))
+        x = np.array(task.function(q)).ravel()
+        np.testing.assert_allclose(np.linalg.norm(x), 2 * np.sin(angle / 2), atol=1e-12)
+    about_z = np.array(oc.Task.axis(robot, "z", reference).jacobian_function(Q))[:, 6]
+    np.testing.assert_allclose(about_z, 0, atol=1e-12)  # the last joint turns about the flange's z axis
+
+
+def test_axis_task_is_the_angular_velocity_across_the_axis_at_the_reference() -> None:
+    robot = iiwa_robot()
+    task = oc.Task.named(robot, "axis:z", Q)
+    np.testing.assert_allclose(np.array(task.function(Q)), 0, atol=1e-12)
+    turning = robot.tip_rotation(Q).T @ robot.tip_jacobian(Q)[3:]  # z tilts towards x by a turn about y
+    np.testing.assert_allclose(np.array(task.jacobian_function(Q)), [turning[1], -turning[0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "rank"), [("axis:x", 2), ("axis:z", 2), ("position+axis:y", 5), ("position+axis", 5)])
+def test_axis_tasks_have_full_rank_and_turn_smoothly(kind: str, rank: int) -> None:
+    robot = panda()
+    task = oc.Task.named(robot, kind, READY)
+    points = READY + np.random.default_rng(1).uniform(-0.6, 0.6, (200, 7))
+    J = task.batched_jacobian(points)[0].reshape(-1, rank, 7)
+    assert task.m == rank
+    assert np.linalg.svd(J, compute_uv=False)[:, -1].min() > 1e-3
+    way = READY + np.linspace(-1, 1, 2001)[:, None] * np.array([0.3, -0.6, 0.5, 0.4, 0.6, -0.5, 2.5])
+    x = task.batched(way)[0]
+    assert np.abs(np.diff(x, axis=0)).max() < 4e-3  # steps of 1e-3 along 2.8 rad: no jump
+    assert np.abs(np.diff(x, 2, axis=0)).max() < 2e-5
+
+
+def test_hand_that_points_down_gets_its_reference_from_the_domain() -> None:
+    robot = panda()
+    hand = robot.tip_rotation(READY)
+    np.testing.assert_allclose(hand[:, 2], [0, 0, -1], atol=1e-4)
+    box = oc.Box(READY, 0.2)
+    way = READY + np.linspace(-1, 1, 2000)[:, None] * np.full(7, 0.2)
+    from_identity = oc.Task.orientation(robot, np.eye(3)).batched(way)[0]
+    assert np.abs(np.diff(from_identity, axis=0)).max() > 3.9  # through the half turn, from 2 to -2
+    for task, at in ((oc.Task.orientation(robot), 0), (oc.Task.pose(robot), 3), (oc.Task.axis(robot), 0)):
+        bound = oc.Problem(robot, task, domain=box).task
+        assert task.lacks_reference
+        assert not bound.lacks_reference
+        x = bound.batched(way)[0][:, at:]
+        np.testing.assert_allclose(np.array(bound.function(READY)).ravel()[at:], 0, atol=1e-12)
+        assert np.abs(np.diff(x, axis=0)).max() < 2e-3
+        middle = np.array(task.function(default_box(robot).centre)).ravel()[at:]
+        np.testing.assert_allclose(middle, 0, atol=1e-12)  # the task alone: the default centre
+
+
+def test_problem_keeps_a_task_that_has_its_reference() -> None:
+    robot = panda()
+    box = oc.Box(READY, 0.2)
+    for task in (oc.Task.position(robot), oc.Task.pose(robot, np.eye(3)), oc.Task.axis(robot, "z", [0, 0, -1])):
+        assert oc.Problem(robot, task, domain=box).task is task
+
+
+def test_units_follow_the_kind_of_task() -> None:
+    robot = iiwa_robot()
+    assert oc.Task.position(robot, "zx").units == ("m", "m")
+    assert oc.Task.polar(robot).units == ("m", "rad")
+    assert oc.Task.pose(robot).units == ("m",) * 3 + ("rad",) * 3
+    assert oc.Task.position_and_axis(robot, "y").labels == ("x", "y", "z", "tilt_x", "tilt_z")
+    assert oc.Task.position_and_axis(robot, "y").units == ("m",) * 3 + ("rad",) * 2
+    assert oc.Task.custom(robot, "a", lambda q: q[:2]).units == ("", "")
+    assert oc.Task.custom(robot, "a", lambda q: q[:2], units=("rad", "")).units == ("rad", "")
 
 
 def test_polar_and_cartesian_tasks_have_the_same_row_space() -> None:
@@ -73,6 +156,17 @@ def test_bad_tasks_are_refused() -> None:
             oc.Task.position(robot, axes)
     with pytest.raises(UnknownNameError, match="unknown task 'grasp', known: position"):
         oc.Task.named(robot, "grasp")
+    with pytest.raises(UnknownNameError, match="unknown axis of the tip 'w', known: x, y, z"):
+        oc.Task.named(robot, "position+axis:w")
+    for axis in ("", "xy"):
+        with pytest.raises(UnknownNameError, match="axis of the tip"):
+            oc.Task.axis(robot, axis)
+    with pytest.raises(InvalidValueError, match="a direction other than zero"):
+        oc.Task.axis(robot, "z", [0, 0, 0])
+    with pytest.raises(ShapeError, match="reference"):
+        oc.Task.axis(robot, "z", np.eye(3))
+    with pytest.raises(ShapeError, match="units"):
+        oc.Task.custom(robot, "one", lambda q: q[0], units=("m", "m"))
     with pytest.raises(InvalidValueError, match="rotation matrix"):
         oc.Task.orientation(robot, np.ones((3, 3)))
     with pytest.raises(ShapeError, match="reference"):

@@ -5,6 +5,7 @@ derivatives included, is built by CasADi as usual and rewritten last.
 """
 
 from collections.abc import Sequence
+from threading import local
 from typing import Any
 
 import casadi as ca
@@ -93,22 +94,23 @@ class NumpyGraph:
         self._nodes: list[NumpyNode] = []
         with deferred():  # CasADi asks nodes for their shapes, and would swallow Ctrl-C there
             self.function = ca.Function(name, list(inputs), self._rewritten(inputs, ca.cse(list(outputs))))
-        buffer: Any  # the stub of set_arg and set_res asks for a size, the method takes none
-        buffer, self._evaluate = self.function.buffer()
-        self._buffer = buffer
+        self._memory = local()
 
     def __call__(self, *inputs: Array) -> list[Array]:
         """Evaluate without copies: matrices come and go transposed, contiguous, and of the right size.
 
-        Large graphs need large scratch memory, which is kept from call to call.
+        Large graphs need large scratch memory, which every thread keeps from call to call.
         """
+        if not hasattr(self._memory, "buffer"):
+            self._memory.buffer, self._memory.evaluate = self.function.buffer()
+        buffer, evaluate = self._memory.buffer, self._memory.evaluate
         for i, array in enumerate(inputs):
-            self._buffer.set_arg(i, array.data)
+            buffer.set_arg(i, array.data)
         results = [np.empty(self.function.size_out(i)[::-1]) for i in range(self.function.n_out())]
         for i, array in enumerate(results):
-            self._buffer.set_res(i, array.data)
+            buffer.set_res(i, array.data)
         with deferred():
-            self._evaluate()
+            evaluate()
         return results
 
     def _rewritten(self, inputs: Sequence[ca.MX], outputs: list[ca.MX]) -> list[ca.MX]:

@@ -9,13 +9,13 @@ the other. The last block is filled up with copies of the first sample.
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import THREADS
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.tape import Tape, replay, to_tape
 from orthocas.checks import Array
 

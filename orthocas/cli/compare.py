@@ -10,11 +10,14 @@ from orthocas.cli.output import AsJson, note, print_json, print_table, whole_num
 from orthocas.cli.problem_argument import (
     CentreText,
     HalfWidth,
+    HomeName,
+    Locks,
     MetricName,
     ProblemName,
     ProblemOptions,
     TaskName,
     TipName,
+    ToolText,
     build_problem,
 )
 from orthocas.cli.progress import terminal_monitor
@@ -31,6 +34,8 @@ _PARAMETRISATIONS = ["linear", "polynomial:2", "polynomial:3", "polynomial:4", "
 def compare(
     problem: ProblemName,
     tip: TipName = None,
+    lock: Locks = None,
+    tool: ToolText = None,
     task: TaskName = None,
     metric: MetricName = None,
     param: Annotated[
@@ -41,6 +46,7 @@ def compare(
     ] = None,
     seeds: Annotated[int, typer.Option("--seeds", parser=whole_number, help="Number of seeds of every fit.")] = 1,
     centre: CentreText = None,
+    home: HomeName = None,
     half_width: HalfWidth = None,
     samples: Annotated[
         int | None, typer.Option("--samples", parser=whole_number, help="Training samples; default by size.")
@@ -58,7 +64,8 @@ def compare(
     json: AsJson = False,
 ) -> None:
     """Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts."""
-    built = build_problem(problem, ProblemOptions(tip, task, metric, centre, half_width))
+    words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width)
+    built = build_problem(problem, words)
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers = [get_solver(name) for name in solver] if solver else None
     loss = parse_weights(weights)

@@ -9,11 +9,14 @@ from orthocas.cli.output import AsJson, note, number, print_json, print_rows, re
 from orthocas.cli.problem_argument import (
     CentreText,
     HalfWidth,
+    HomeName,
+    Locks,
     MetricName,
     ProblemName,
     ProblemOptions,
     TaskName,
     TipName,
+    ToolText,
     build_problem,
     parse_numbers,
 )
@@ -22,18 +25,20 @@ from orthocas.errors import ChartFileError, InvalidValueError
 from orthocas.files.atomic import require_writable
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
-from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers
+from orthocas.fitting.loss import DEFAULT_WEIGHTS, Weights
 from orthocas.minimising.solver import Status
 from orthocas.parametrisations import parse_parametrisation
 from orthocas.quality import Report, evaluate
 from orthocas.solvers import get as get_solver
 
-WEIGHTS_TEXT = ",".join(f"{value:g}" for value in DEFAULT_WEIGHTS)
+WEIGHTS_TEXT = f"{DEFAULT_WEIGHTS.task:g},{DEFAULT_WEIGHTS.mutual:g},{DEFAULT_WEIGHTS.regularity:g}"
 
 
 def fit(
     problem: ProblemName,
     tip: TipName = None,
+    lock: Locks = None,
+    tool: ToolText = None,
     task: TaskName = None,
     metric: MetricName = None,
     param: Annotated[
@@ -44,6 +49,7 @@ def fit(
         typer.Option("--solver", help="gauss_newton, lbfgs, ipopt, adam or gradient_flow; default what suits."),
     ] = None,
     centre: CentreText = None,
+    home: HomeName = None,
     half_width: HalfWidth = None,
     samples: Annotated[
         int | None, typer.Option("--samples", parser=whole_number, help="Training samples; default by size.")
@@ -68,7 +74,8 @@ def fit(
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
-    built = build_problem(problem, ProblemOptions(tip, task, metric, centre, half_width))
+    words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width)
+    built = build_problem(problem, words)
     target = out or Path(f"{built.name}.orthocas")
     require_writable(target, ChartFileError)
     parametrisation = parse_parametrisation(param)
@@ -97,16 +104,12 @@ def fit(
         raise typer.Exit(130)
 
 
-def parse_weights(text: str) -> WeightNumbers:
+def parse_weights(text: str) -> Weights:
     """Read "1000,30", "1000,30,150" or "1000,30,150,0.01"."""
-    match parse_numbers("--weights", text).tolist():
-        case [task, mutual]:
-            return task, mutual
-        case [task, mutual, regularity]:
-            return task, mutual, regularity
-        case [task, mutual, regularity, length]:
-            return task, mutual, regularity, length
-    raise InvalidValueError("--weights", repr(text), "two to four numbers")
+    numbers = parse_numbers("--weights", text).tolist()
+    if not 2 <= len(numbers) <= 4:
+        raise InvalidValueError("--weights", repr(text), "two to four numbers")
+    return Weights.of(numbers)
 
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:

@@ -6,23 +6,34 @@ from typing import Any
 from orthocas import problems
 from orthocas.chart import Chart
 from orthocas.cli.output import AsJson, print_json, print_rows
-from orthocas.cli.problem_argument import ProblemName, ProblemOptions, TipName, build_problem, is_robot_file
-from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.cli.problem_argument import (
+    Locks,
+    ProblemName,
+    ProblemOptions,
+    TipName,
+    ToolText,
+    build_problem,
+    build_robot,
+    is_robot_file,
+)
+from orthocas.errors import SingularTaskError
 from orthocas.files.json import plain
 from orthocas.involutivity import involutivity
 from orthocas.problem import Problem, check
 from orthocas.robots import Robot
 
 
-def info(target: ProblemName, tip: TipName = None, json: AsJson = False) -> None:
+def info(
+    target: ProblemName, tip: TipName = None, lock: Locks = None, tool: ToolText = None, json: AsJson = False
+) -> None:
     """Show a chart file, a named problem, or a robot file."""
+    words = ProblemOptions(tip, tuple(lock or ()), tool)
     if is_robot_file(target):
-        data = _robot(Robot.chain_from_file(target, tip))
+        data = _robot(build_robot(target, words))
     elif target in problems.names():
-        data = _problem(build_problem(target, ProblemOptions(tip=tip)))
-    elif tip is not None:
-        raise InvalidValueError("--tip", tip, f"no tip for the chart {target}, it has its own")
+        data = _problem(build_problem(target, words))
     else:
+        words.require_no_robot(f"the chart {target}")
         chart = Chart.load(_chart_path(target))
         data = {
             **_problem(chart.problem),
@@ -50,6 +61,9 @@ def _robot(robot: Robot) -> dict[str, Any]:
         "kinds": list(robot.tree.joint_kinds),
         "lower": plain(robot.lower),
         "upper": plain(robot.upper),
+        "effort_limits": plain(robot.effort_limits),
+        "velocity_limits": plain(robot.velocity_limits),
+        "homes": list(robot.homes),
         "tip": robot.tree.tip_name,
         "mass_kg": float(robot.tree.masses.sum()),
     }
@@ -88,7 +102,7 @@ def _involutivity(problem: Problem) -> dict[str, Any]:
 
 def _text(value: Any) -> str:
     if isinstance(value, list):
-        return ", ".join(_text(item) for item in value)
+        return ", ".join(_text(item) for item in value) or "none"
     if isinstance(value, dict):
         return ", ".join(f"{name} {_text(item)}" for name, item in value.items())
     if value is None:

@@ -57,28 +57,8 @@ def note(text: str) -> None:
 
 
 def report_rows(report: Report) -> dict[str, str]:
-    """A quality report as rows."""
-    task, mutual, conditioning = report.task_angle, report.mutual_angle, report.conditioning
-    quality = f"mean {conditioning.mean:.3f}, 1 % quantile {conditioning.p01:.3f}, min {conditioning.min:.3g}"
-    rows = {
-        "problem": f"n = {report.n} joints, m = {report.m} task, r = {report.r} extra, metric {report.metric}",
-        "task angle": f"mean {task.mean:.2f}, std {task.std:.2f}, largest deviation {task.max:.1f} deg",
-        "mutual angle": f"mean {mutual.mean:.2f}, std {mutual.std:.2f}, largest deviation {mutual.max:.1f} deg",
-        "conditioning": quality,
-        "lengths": f"of gradients differ by a factor of {report.length_ratio:.3g} (99 % to 1 % quantile)",
-        "samples": f"{report.samples} held out, seed {report.seed}",
-    }
-    if report.r == 1:
-        rows["mutual angle"] = "none, r = 1"
-    if report.folded_samples:
-        at = ", ".join(f"{value:.2f}" for value in report.worst_point)
-        share = report.folded_samples / report.samples
-        rows["folded"] = f"{share:.3%} of the domain, where det J changes sign; conditioning worst at q = ({at})"
-    if report.singular_samples:
-        rows["left out"] = f"{report.singular_samples / report.samples:.3%} of the domain: singular, or without a value"
+    """A quality report as rows, with advice for the command line."""
+    rows = report.facts()
     if report.length_ratio > _UNEVEN:
         rows["lengths"] += "; for controllers fit with --weights 1000,30,150,1"
-    if report.degenerate:
-        advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
-        rows["DEGENERATE"] = f"coordinates are nearly parallel or lean into the task: {advice}"
     return rows

@@ -1,27 +1,43 @@
 """Building a problem from command-line words: a named problem or a robot file, with overrides."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from orthocas import problems
-from orthocas.checks import Array, as_float_array
-from orthocas.cli.output import number
+from orthocas.checks import Array
 from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, UnknownNameError
+from orthocas.postures.regular_box import regular_box
 from orthocas.problem import Problem
 from orthocas.robots import Robot
 from orthocas.tasks import Task
 
 ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem, or a URDF file.")]
-TipName = Annotated[str | None, typer.Option("--tip", help="Tip frame of a URDF file; default the end of its chain.")]
-TaskName = Annotated[str | None, typer.Option("--task", help="position, position:xy, polar, orientation or pose.")]
+TipName = Annotated[str | None, typer.Option("--tip", help="Tip frame of a robot file; default the end of its chain.")]
+Locks = Annotated[
+    list[str] | None,
+    typer.Option("--lock", metavar="JOINT=VALUE", help="Fix a joint of a robot file [rad or m]; repeat for more."),
+]
+ToolText = Annotated[
+    str | None,
+    typer.Option("--tool", help='Tool on the tip of a robot file, "x,y,z" or "x,y,z,roll,pitch,yaw" [m, rad].'),
+]
+TaskName = Annotated[
+    str | None,
+    typer.Option("--task", help="position, position:xy, polar, orientation, pose, axis:z or position+axis:z."),
+]
 MetricName = Annotated[str | None, typer.Option("--metric", help="euclidean or inertia.")]
 CentreText = Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')]
+HomeName = Annotated[
+    str | None,
+    typer.Option("--home", help="Centre of the domain by its name in the SRDF file beside a URDF, or in an MJCF file."),
+]
 HalfWidth = Annotated[
-    float | None, typer.Option("--half-width", parser=number, help="Half-width of the domain [rad or m].")
+    str | None, typer.Option("--half-width", help='Half-width of the domain, "0.4" or one per joint [rad or m].')
 ]
 
 
@@ -30,14 +46,23 @@ class ProblemOptions:
     """The words of a command line that describe a problem."""
 
     tip: str | None = None
+    lock: tuple[str, ...] = ()
+    tool: str | None = None
     task: str | None = None
     metric: str | None = None
     centre: str | None = None
-    half_width: float | None = None
+    home: str | None = None
+    half_width: str | None = None
 
     def given(self) -> bool:
         """Whether any was given."""
-        return any(value is not None for value in (self.tip, self.task, self.metric, self.centre, self.half_width))
+        return any(value not in (None, ()) for value in astuple(self))
+
+    def require_no_robot(self, owner: str) -> None:
+        """Raise InvalidValueError if a word describes a robot, which `owner` has already."""
+        for option, value in (("tip", self.tip), ("lock", ", ".join(self.lock) or None), ("tool", self.tool)):
+            if value is not None:
+                raise InvalidValueError(f"--{option}", value, f"no {option} for {owner}, it has its own robot")
 
 
 def is_robot_file(name: str) -> bool:
@@ -45,39 +70,80 @@ def is_robot_file(name: str) -> bool:
     return Path(name).suffix.lower() in (".urdf", ".xml")
 
 
+def build_robot(path: str, options: ProblemOptions) -> Robot:
+    """Build the chain that a command line describes; joints of the file that do not move the tip are locked.
+
+    Raises:
+        OrthocasError: if anything does not fit together.
+    """
+    tool = None if options.tool is None else parse_numbers("--tool", options.tool)
+    return Robot.from_file(path, options.tip, _locked(options.lock), tool)
+
+
 def build_problem(name: str, options: ProblemOptions) -> Problem:
     """Build the problem that a command line describes.
-
-    Joints of a robot file that do not move the tip are locked.
 
     Raises:
         UnknownNameError: if it is neither a named problem nor a robot file.
         OrthocasError: if anything does not fit together.
     """
     if is_robot_file(name):
-        return _from_file(Path(name), options)
+        return _from_file(name, options)
     if name not in problems.names():
         raise UnknownNameError("problem", name, (*problems.names(), "or a FILE.urdf"))
-    base = problems.get(name)
+    base: Problem = problems.get(name)
     if not options.given():
         return base
-    if options.tip is not None:
-        raise InvalidValueError("--tip", options.tip, f"no tip for the named problem '{name}', it has its own")
-    centre = base.domain.centre if options.centre is None else parse_numbers("--centre", options.centre)
-    kept = options.centre is None and options.half_width is None
-    domain = base.domain if kept else default_box(base.robot, centre, options.half_width)
-    task = base.task if options.task is None else Task.named(base.robot, options.task, domain.centre)
+    options.require_no_robot(f"the named problem '{name}'")
+    centre, half_width = _centre(base.robot, options), _half_width(options)
+    domain = base.domain
+    if centre is not None or half_width is not None:
+        domain = default_box(base.robot, base.domain.centre if centre is None else centre, half_width)
+    task = base.task if options.task is None else Task.named(base.robot, options.task)
     return Problem(base.robot, task, base.metric if options.metric is None else options.metric, domain, name)
 
 
 def parse_numbers(option: str, text: str) -> Array:
     """Read "0,0.5,..."."""
-    return as_float_array(option, [part.strip() for part in text.split(",")])
+    words = [part.strip() for part in text.split(",")]
+    try:
+        return np.array([float(word) for word in words])
+    except ValueError:
+        raise InvalidValueError(option, words, "an array of numbers") from None
 
 
-def _from_file(path: Path, options: ProblemOptions) -> Problem:
-    robot = Robot.chain_from_file(path, options.tip)
-    centre = None if options.centre is None else parse_numbers("--centre", options.centre)
-    domain = default_box(robot, centre, options.half_width)
-    task = Task.named(robot, "position" if options.task is None else options.task, domain.centre)
-    return Problem(robot, task, "euclidean" if options.metric is None else options.metric, domain, path.stem)
+def _from_file(name: str, options: ProblemOptions) -> Problem:
+    robot = build_robot(name, options)
+    task = Task.named(robot, "position" if options.task is None else options.task)
+    centre = _centre(robot, options)
+    centre = regular_box(robot, task).centre if centre is None else centre
+    domain = default_box(robot, centre, _half_width(options))
+    return Problem(robot, task, "euclidean" if options.metric is None else options.metric, domain, Path(name).stem)
+
+
+def _centre(robot: Robot, options: ProblemOptions) -> Array | None:
+    """The centre that --centre or --home gives."""
+    if options.home is None:
+        return None if options.centre is None else parse_numbers("--centre", options.centre)
+    if options.centre is not None:
+        raise InvalidValueError("--home", options.home, "either --home or --centre, not both")
+    return robot.home(options.home)
+
+
+def _half_width(options: ProblemOptions) -> Array | None:
+    """One number for all joints, or one per joint."""
+    if options.half_width is None:
+        return None
+    numbers = parse_numbers("--half-width", options.half_width)
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def _locked(words: tuple[str, ...]) -> dict[str, float]:
+    """Read "joint=value" words."""
+    locked = {}
+    for word in words:
+        joint, equals, value = word.rpartition("=")
+        if not (joint and equals):
+            raise InvalidValueError("--lock", word, "JOINT=VALUE")
+        locked[joint] = float(parse_numbers(f"--lock {joint}", value)[0])
+    return locked

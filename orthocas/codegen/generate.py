@@ -9,9 +9,11 @@ import casadi as ca
 
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.chart import Chart
+from orthocas.checks import require_kind
 from orthocas.codegen.interface import filled, template_values
 from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.control import Controller
+from orthocas.control.controller import require_controller
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.files.atomic import published, require_writable
 
@@ -57,6 +59,9 @@ def generate_c(
         ArchiveError: if the folder cannot be written.
         CompileError: if this version of CasADi writes C that is not understood.
     """
+    require_kind("chart", chart, Chart)
+    if controller is not None:
+        require_controller(controller)
     name = _name(chart, controller) if name is None else name
     _require_matching(chart, controller, name)
     kernels = generate_kernels(_functions(chart, controller), f"{name}_kernel")

@@ -4,11 +4,11 @@ import ctypes
 import shutil
 import subprocess
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, require_shape
 from orthocas.codegen.generate import GeneratedC
 from orthocas.control import Controller

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthocas.casadi_tools.batch import Batched
 from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.checks import Array, require_kind
 from orthocas.codegen.generate import GeneratedC
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
 from orthocas.control import Controller, ControlStatus
@@ -45,6 +45,7 @@ def check_c(
         ProofError: if a result differs by more than 1e-10 of its largest entry, or a status differs. Near
             singularities, where commands change by more than 1e-12 if q moves by one rounding, a hundred times that.
     """
+    require_kind("chart", chart, Chart)
     n, domain, places = chart.n, chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, chart.n))
     q = domain.centre + domain.half_width * np.vstack([_REACH * places, _corner_cases(n)])
     differences: dict[str, float] = {}

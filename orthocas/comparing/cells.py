@@ -15,13 +15,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from orthocas.casadi_tools.batch import THREADS
-from orthocas.fitting.fit import fit
+from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.loss import Weights
 from orthocas.minimising.solver import Solver, Status
 from orthocas.minimising.watch import Monitor, Progress, silent
-from orthocas.parametrisations import SEW, Given, Linear, Parametrisation
+from orthocas.parametrisations import Parametrisation
 from orthocas.problem import Problem
-from orthocas.quality import evaluate
+from orthocas.quality import Report, evaluate
 
 HELD_OUT_SEED = 2**31  #: seed of the held-out samples: no fit of a grid has it
 _DIED = "its process died: out of memory, or a script that calls compare outside `if __name__ == '__main__'`"
@@ -33,7 +33,7 @@ class Cell:
     """One fit of a grid: plain settings that can be sent to another process."""
 
     problem: Problem
-    parametrisation: Parametrisation | SEW
+    parametrisation: Parametrisation
     solver: Solver
     seed: int
     weights: Weights
@@ -44,7 +44,7 @@ class Cell:
     @property
     def solver_name(self) -> str:
         """Name of the solver; coordinates in closed form need none."""
-        return "closed form" if isinstance(self.parametrisation, Linear | Given | SEW) else self.solver.name
+        return self.solver.name if self.parametrisation.closed_form is None else "closed form"
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,11 @@ def run_cell(cell: Cell) -> CellResult:
         report = evaluate(found.chart, cell.held_out, HELD_OUT_SEED)
     except Exception as error:
         return failure(cell, f"{type(error).__name__}: {error}")
+    return _result(cell, found, report, history)
+
+
+def _result(cell: Cell, found: Fit, report: Report, history: list[tuple[float, float]]) -> CellResult:
+    """The numbers of a fit."""
     results = [stage.result for stage in found.stages]
     return CellResult(
         problem=cell.problem.name,

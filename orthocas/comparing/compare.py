@@ -6,24 +6,24 @@ from concurrent.futures import Executor
 from itertools import product
 from pathlib import Path
 
-from orthocas.checks import require_count
+from orthocas.checks import require_count, require_kind
 from orthocas.comparing.cells import Cell, CellResult, run_cells
 from orthocas.comparing.report import Comparison
 from orthocas.comparing.ticks import with_control_ticks
 from orthocas.errors import ChartFileError, InvalidValueError
 from orthocas.files.atomic import require_writable
-from orthocas.fitting.fit import default_solver
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers, Weights
+from orthocas.fitting.settings import default_solver
 from orthocas.minimising.solver import Solver
 from orthocas.minimising.watch import Monitor, silent
-from orthocas.parametrisations import SEW, Given, Linear, Parametrisation
+from orthocas.parametrisations import Parametrisation, require_savable
 from orthocas.problem import Problem
 from orthocas.solvers import GaussNewton
 
 
 def compare(
     problem: Problem,
-    parametrisations: Sequence[Parametrisation | SEW],
+    parametrisations: Sequence[Parametrisation],
     solvers: Sequence[Solver] | None = None,
     *,
     seeds: int = 1,
@@ -63,6 +63,7 @@ def compare(
         InvalidValueError: if the grid is empty, or two of its parametrisations or solvers have the same name.
         ChartFileError: if the folder for charts cannot be written.
     """
+    require_kind("problem", problem, Problem)
     count, loss = require_count("seeds", seeds), Weights.of(weights)
     jobs = None if jobs is None else require_count("jobs", jobs)
     held_out = require_count("held_out", held_out)
@@ -70,6 +71,8 @@ def compare(
     folder = None if charts is None else Path(charts)
     if folder is not None:
         require_writable(folder / "chart", ChartFileError)
+        for parametrisation in parametrisations:
+            require_savable(parametrisation.for_problem(problem))
     elif control_ticks:
         raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
     cells = [
@@ -80,11 +83,14 @@ def compare(
 
 
 def _fits(
-    parametrisations: Sequence[Parametrisation | SEW], solvers: Sequence[Solver] | None, seeds: int, folder: Path | None
-) -> Iterator[tuple[Parametrisation | SEW, Solver, int, Path | None]]:
+    parametrisations: Sequence[Parametrisation],
+    solvers: Sequence[Solver] | None,
+    seeds: int,
+    folder: Path | None,
+) -> Iterator[tuple[Parametrisation, Solver, int, Path | None]]:
     """Parametrisation, solver, seed and chart file of every fit of a grid."""
     for parametrisation in parametrisations:
-        closed = isinstance(parametrisation, Linear | Given | SEW)
+        closed = parametrisation.closed_form is not None
         fitting = [default_solver(parametrisation)] if closed or solvers is None else solvers
         for solver, seed in product(fitting, range(1 if closed else seeds)):
             name = re.sub(r"[^\w.-]", "-", f"{parametrisation.label}_{solver.name}_{seed}.orthocas")
@@ -108,10 +114,10 @@ def _run_grid(
     return Comparison(tuple(results), interrupted)
 
 
-def _require_grid(parametrisations: Sequence[Parametrisation | SEW], solvers: Sequence[Solver] | None) -> None:
+def _require_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence[Solver] | None) -> None:
     """Refuse grids that are empty, hold something else, or whose results could not be told apart."""
     for name, members, kinds, example in (
-        ("parametrisations", parametrisations, Parametrisation | SEW, "Polynomial(degree=4)"),
+        ("parametrisations", parametrisations, Parametrisation, "Polynomial(degree=4)"),
         ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
     ):
         if not members:

@@ -12,6 +12,7 @@ from typing import Any
 from orthocas.comparing.cells import CellResult
 from orthocas.files.atomic import published
 from orthocas.files.json import plain, to_json
+from orthocas.showing import Shown
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,8 @@ class Summary:
     mutual_spread: float
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """All fits of a grid."""
 
     results: tuple[CellResult, ...]
@@ -66,6 +67,15 @@ class Comparison:
         return {
             "summaries": [plain(asdict(summary)) for summary in self.summaries()],
             "fits": [plain(asdict(result)) for result in self.results],
+        }
+
+    def facts(self) -> dict[str, str]:
+        """The summaries, best task angle first."""
+        failed = sum(result.failed for result in self.results)
+        ended = ", interrupted" if self.interrupted else ""
+        return {
+            "comparison": f"{len(self.results)} fits, {failed} failed{ended}",
+            **{f"{s.parametrisation}, {s.solver}": _in_words(s) for s in self.summaries()},
         }
 
     def rows(self) -> list[list[str]]:
@@ -103,6 +113,12 @@ def _summary(results: Sequence[CellResult]) -> Summary:
         task_spread=spread("task_std_deg"),
         mutual_spread=spread("mutual_std_deg"),
     )
+
+
+def _in_words(s: Summary) -> str:
+    if s.failed == s.seeds:
+        return f"failed: {s.error}"
+    return f"task std {s.task_std_deg:.3f} deg, mutual std {s.mutual_std_deg:.3f} deg, {s.seconds:.2f} s"
 
 
 def _row(s: Summary) -> list[str]:

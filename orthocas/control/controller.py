@@ -8,7 +8,9 @@ from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.control.status import guard
 from orthocas.domains import Domain
+from orthocas.errors import InvalidValueError
 from orthocas.problem import Problem
+from orthocas.showing import listed, number_list
 
 Command = Literal["torque", "velocity"]
 
@@ -64,6 +66,23 @@ class Controller(Protocol):
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError, with time and place, if the reference leaves what the law can follow."""
         ...
+
+
+def law_facts(controller: Controller, **settings: str) -> dict[str, str]:
+    """What a controller shows: quantities, gains, other settings and problem."""
+    return {
+        "law": f"{controller.name}, commands {controller.command} of {controller.problem.n} joints",
+        "quantities": listed(controller.labels),
+        **{name: number_list(gain) for name, gain in controller.gains.items()},
+        **settings,
+        "problem": controller.problem.heading,
+    }
+
+
+def require_controller(controller: Controller) -> None:
+    """Raise InvalidValueError for what has not the attributes of a controller; none of its functions is built."""
+    if not all(hasattr(controller, name) for name in ("name", "problem", "command", "labels", "gains")):
+        raise InvalidValueError("controller", f"a {type(controller).__name__}", "a controller, such as PDPlus")
 
 
 def named_inputs(n: int, gains: dict[str, Array], k: int) -> dict[str, ca.MX]:

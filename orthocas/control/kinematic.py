@@ -1,24 +1,25 @@
 """Velocity control in the coordinates phi = [x; xi] ([AS2023] Sec. 9)."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar
 
 import casadi as ca
 from numpy.typing import ArrayLike
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.control.controller import Command, guarded_graph, named_inputs
+from orthocas.checks import Array, require_kind
+from orthocas.control.controller import Command, guarded_graph, law_facts, named_inputs
 from orthocas.control.gains import command_limit, non_negative_gains
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
 from orthocas.problem import Problem
+from orthocas.showing import Shown
 
 
-@dataclass(frozen=True, eq=False)
-class Kinematic:
+@dataclass(frozen=True, eq=False, repr=False)
+class Kinematic(Shown):
     """Joint velocity dq = J^-1 (d_phi_d + Lambda (phi_d - phi)).
 
     Args:
@@ -43,6 +44,7 @@ class Kinematic:
     energy: ClassVar[None] = None
 
     def __init__(self, chart: Chart, feedback: ArrayLike = 0.0, limit: ArrayLike | None = None) -> None:
+        require_kind("chart", chart, Chart)
         chart.function("xi")  # refuses grown charts
         object.__setattr__(self, "chart", chart)
         object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))
@@ -52,6 +54,10 @@ class Kinematic:
     def problem(self) -> Problem:
         """Robot, task, metric and domain of the chart."""
         return self.chart.problem
+
+    def facts(self) -> dict[str, str]:
+        """Quantities, gains and problem."""
+        return law_facts(self)
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ import numpy as np
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.checks import Array, require_kind
 from orthocas.control.gains import positive_gains
 from orthocas.control.inertia import block_inertia
 from orthocas.domains import sample_uniform
@@ -27,6 +27,7 @@ def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY) -> Arra
     Source:
         ours
     """
+    require_kind("chart", chart, Chart)
     q = ca.MX.sym("q", chart.n)
     J, M = chart.function("jacobian")(q), chart.problem.robot.mass_matrix(q)
     inertia = ca.diag(block_inertia(chart.n, (chart.m, chart.r))(J, M)[1])
@@ -35,6 +36,7 @@ def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY) -> Arra
 
 def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUENCY) -> Array:
     """The same for the springs in the joints, with the diagonal of M, (n,)."""
+    require_kind("problem", problem, Problem)
     q = ca.MX.sym("q", problem.n)
     return _springs(problem, q, ca.diag(problem.robot.mass_matrix(q)), frequency)
 

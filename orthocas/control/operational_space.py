@@ -1,7 +1,6 @@
 """Impedance control and PD+ in the coordinates phi = [x; xi] ([AS2023] Sec. 7), coupled or decoupled."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar, Literal
 
 import casadi as ca
@@ -9,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_known
-from orthocas.control.controller import Command, guarded_graph, named_function, named_inputs
+from orthocas.checks import Array, require_kind, require_known
+from orthocas.control.controller import Command, guarded_graph, law_facts, named_function, named_inputs
 from orthocas.control.damping import DAMPING_DESIGNS, DampingDesign, damping_matrix
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
 from orthocas.control.inertia import block_inertia, median_volume
@@ -19,6 +19,7 @@ from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
 from orthocas.domains import sample_uniform
 from orthocas.problem import Problem
+from orthocas.showing import Shown
 
 Coupling = Literal["coupled", "decoupled"]
 COUPLINGS: tuple[Coupling, ...] = ("coupled", "decoupled")
@@ -34,8 +35,8 @@ class DampingCheck:
     worst_point: tuple[float, ...]  #: [rad] or [m]
 
 
-@dataclass(frozen=True, eq=False)
-class _OperationalSpace:
+@dataclass(frozen=True, eq=False, repr=False)
+class _OperationalSpace(Shown):
     """What impedance and PD+ share: settings, inertia and damping in the coordinates of a chart.
 
     Args:
@@ -74,6 +75,7 @@ class _OperationalSpace:
     ) -> None:
         require_known("coupling", coupling, COUPLINGS)
         require_known("damping", damping, DAMPING_DESIGNS)
+        require_kind("chart", chart, Chart)
         chart.function("xi")  # refuses grown charts
         n = chart.n
         for name, value in {
@@ -90,6 +92,10 @@ class _OperationalSpace:
     def problem(self) -> Problem:
         """Robot, task, metric and domain of the chart."""
         return self.chart.problem
+
+    def facts(self) -> dict[str, str]:
+        """Quantities, gains, design and problem."""
+        return law_facts(self, coupling=self.coupling, damping=self.damping)
 
     @property
     def labels(self) -> tuple[str, ...]:

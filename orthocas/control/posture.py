@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.chart import Chart
-from orthocas.checks import frozen_array
+from orthocas.checks import require_kind
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
 
@@ -20,7 +20,8 @@ def posture_reference(chart: Chart, reference: Reference, q_start: ArrayLike) ->
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.
     """
-    path = joint_path(chart, reference, frozen_array("q_start", q_start, (chart.n,)))
+    require_kind("chart", chart, Chart)
+    path = joint_path(chart, reference, q_start)
     times = reference.grid()
     task = reference.sample(times)[0][:, : chart.m]
     labels = (*chart.problem.task.labels, *chart.problem.robot.joint_names)

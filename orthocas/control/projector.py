@@ -1,26 +1,27 @@
 """The state of the art to compare with: null-space projectors on torque and on velocity level."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
-from orthocas.checks import Array, frozen_array
-from orthocas.control.controller import Command, guarded_graph, named_function, named_inputs
+from orthocas.checks import Array, frozen_array, require_kind
+from orthocas.control.controller import Command, guarded_graph, law_facts, named_function, named_inputs
 from orthocas.control.damping import damping_matrix
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reference import Reference
 from orthocas.errors import UnreachableReferenceError
 from orthocas.problem import Problem
+from orthocas.showing import Shown
 
 
-@dataclass(frozen=True, eq=False)
-class Projector:
+@dataclass(frozen=True, eq=False, repr=False)
+class Projector(Shown):
     """Impedance control of the task, and a joint spring to a posture q_d behind the projector of the task.
 
     tau = J_x^T (-K_x (x - x_d) - D_x J_x dq) + P^T (-K_q (q - q_d) - D_q dq) + g, P = I - J_x^#A J_x, with A the metric
@@ -54,6 +55,7 @@ class Projector:
         damping_ratio: ArrayLike = 0.7,
         limit: ArrayLike | None = None,
     ) -> None:
+        require_kind("problem", problem, Problem)
         n, m = problem.n, problem.m
         task = positive_gains("stiffness", stiffness, m)
         posture = positive_gains("posture_stiffness", posture_stiffness, n)
@@ -61,6 +63,10 @@ class Projector:
         object.__setattr__(self, "stiffness", frozen_array("stiffness", np.concatenate([task, posture]), (m + n,)))
         object.__setattr__(self, "damping_ratio", non_negative_gains("damping_ratio", damping_ratio, m + n))
         object.__setattr__(self, "limit", command_limit("limit", limit, n))
+
+    def facts(self) -> dict[str, str]:
+        """Quantities, gains and problem."""
+        return law_facts(self)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -128,8 +134,8 @@ class Projector:
         return self.measured(q) - inputs["reference"], D_x, D_q
 
 
-@dataclass(frozen=True, eq=False)
-class KinematicProjector:
+@dataclass(frozen=True, eq=False, repr=False)
+class KinematicProjector(Shown):
     """Joint velocity dq = J_x^#A (d_x_d + Lambda_x (x_d - x)) + P (d_q_d + Lambda_q (q_d - q)).
 
     With both feedbacks 0 and a constant posture this is pseudo-inverse control. The reference is [x_d; q_d].
@@ -159,11 +165,16 @@ class KinematicProjector:
         posture_feedback: ArrayLike = 0.0,
         limit: ArrayLike | None = None,
     ) -> None:
+        require_kind("problem", problem, Problem)
         task = non_negative_gains("feedback", feedback, problem.m)
         posture = non_negative_gains("posture_feedback", posture_feedback, problem.n)
         object.__setattr__(self, "problem", problem)
         object.__setattr__(self, "feedback", np.concatenate([task, posture]))
         object.__setattr__(self, "limit", command_limit("limit", limit, problem.n))
+
+    def facts(self) -> dict[str, str]:
+        """Quantities, gains and problem."""
+        return law_facts(self)
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -1,21 +1,25 @@
 """Whether a reference can be followed inside the domain of a chart, found before anything moves."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.checks import Array, as_point, require_kind
 from orthocas.control.reference import Reference
 from orthocas.domains import contains
 from orthocas.errors import InvalidValueError, InverseError, UnreachableReferenceError
 
 
-def joint_path(chart: Chart, reference: Reference, q_start: Array) -> Array:
+def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
     """Joint positions that have the reference's values, followed from q_start, (N, n) on `reference.grid()`.
 
     Raises:
         UnreachableReferenceError: with the first time at which there is no such q near the one before, or it lies
             outside the domain.
     """
+    require_kind("chart", chart, Chart)
+    require_kind("reference", reference, Reference)
+    q_start = as_point("q_start", q_start, chart.n)
     if reference.labels != chart.labels:
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
     if not contains(chart.problem.domain, q_start):

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from math import factorial
 from typing import Self
 
@@ -12,9 +11,11 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_float_array, frozen_array, require_known, require_shape
 from orthocas.control.low_pass import low_pass_response
 from orthocas.errors import InvalidValueError
+from orthocas.showing import Shown, listed, number_list
 
 NATURAL_FREQUENCY = 2 * np.pi  #: omega0 [rad/s] of [AS2023] Sec. 8
 DAMPING_RATIO = 0.7  #: zeta of [AS2023] Sec. 8
@@ -24,8 +25,8 @@ _DEGREE = 5  # of splines through points
 Change = tuple[float, Mapping[str, float]]  #: a time [s] and the new targets by label
 
 
-@dataclass(frozen=True, eq=False)
-class Reference:
+@dataclass(frozen=True, eq=False, repr=False)
+class Reference(Shown):
     """Phi_d(t) and two derivatives, smooth on each of S segments. Use `steps` or `through` to build one."""
 
     labels: tuple[str, ...]  #: names of the k quantities
@@ -98,6 +99,16 @@ class Reference:
         coefficients = np.stack(taylor, axis=2).reshape(len(t) - 1, -1)
         spacing = min(_GRID, float(np.diff(t).min()) / 4)
         return cls(names, t, values[1:], values[0], coefficients, _polynomial(len(names)), spacing)
+
+    def facts(self) -> dict[str, str]:
+        """Quantities, time, start and targets."""
+        return {
+            "reference": f"{len(self.labels)} quantities, {self.duration:.4g} s in {len(self.parameters)} segments",
+            "quantities": listed(self.labels),
+            "times": number_list(self.times),
+            "start": listed(f"{value:.4g}" for value in self.start),
+            "end": listed(f"{value:.4g}" for value in self.targets[-1]),
+        }
 
     @property
     def duration(self) -> float:

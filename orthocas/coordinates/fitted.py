@@ -1,28 +1,21 @@
 """The coordinates xi(q) of a chart: a fitted family on the active joints, and the idle joints as they are."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import Batched, dense_function, evaluate_columns
 from orthocas.casadi_tools.blas_graph import NumpyGraph
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.checks import Array, frozen_array
 from orthocas.coordinates.point_functions import point_functions
 from orthocas.parametrisations import Family, JointSpace, Parametrisation
 from orthocas.parametrisations.family import Expression
-from orthocas.problem import Problem
 
 _COLUMNS = 256  # samples side by side in matrix-shaped graphs
-
-
-def joint_space(problem: Problem) -> JointSpace:
-    """The joints of a problem as parametrisations see them."""
-    robot, domain = problem.robot, problem.domain
-    return JointSpace(domain.centre, domain.half_width, robot.tree.prismatic, robot.joint_names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,15 +27,16 @@ class Coordinates:
     """
 
     parametrisation: Parametrisation
-    space: JointSpace  #: all joints of the robot
+    space: JointSpace = field(repr=False)  #: all joints of the robot
     idle: tuple[int, ...]  #: joints that are coordinates themselves, listed last
-    theta: Array  #: parameters of the family, (size,)
-    offset: Array  #: (r - idle,)
-    scale: Array  #: (r - idle,)
+    theta: Array = field(repr=False)  #: parameters of the family, (size,)
+    offset: Array = field(repr=False)  #: (r - idle,)
+    scale: Array = field(repr=False)  #: (r - idle,)
 
     def __post_init__(self) -> None:
         fitted = len(self.offset)
-        object.__setattr__(self, "theta", frozen_array("theta", self.theta, (self.family.size,)))
+        size = self.family.size if fitted else 0
+        object.__setattr__(self, "theta", frozen_array("theta", self.theta, (size,)))
         object.__setattr__(self, "offset", frozen_array("offset", self.offset, (fitted,)))
         object.__setattr__(self, "scale", frozen_array("scale", self.scale, (fitted,)))
 
@@ -53,8 +47,8 @@ class Coordinates:
 
     @property
     def label(self) -> str:
-        """Short name of the parametrisation."""
-        return self.parametrisation.label
+        """Short name of the parametrisation, or 'joints' if all coordinates are idle joints."""
+        return self.parametrisation.label if len(self.offset) else "joints"
 
     @property
     def size(self) -> int:
@@ -65,6 +59,11 @@ class Coordinates:
     def active(self) -> list[int]:
         """Joints the fitted family depends on."""
         return [i for i in range(self.space.n) if i not in self.idle]
+
+    @property
+    def as_matrices(self) -> bool:
+        """Whether graphs of them are made of dense products, as networks are."""
+        return bool(len(self.offset)) and self.family.as_matrices
 
     @cached_property
     def family(self) -> Family:
@@ -85,13 +84,13 @@ class Coordinates:
 
     def xi(self, points: Array) -> Array:
         """Coordinates at points (N, n), (N, r)."""
-        if self.family.as_matrices:
+        if self.as_matrices:
             return evaluate_columns(self._column_graphs["xi"].function, _COLUMNS, points)[0]
         return self._batched["xi"](points)[0]
 
     def jacobian(self, points: Array) -> Array:
         """J_xi at points (N, n), (N, r, n)."""
-        if self.family.as_matrices:
+        if self.as_matrices:
             flat = evaluate_columns(self._column_graphs["jacobian"].function, _COLUMNS, points)[0]
             return flat.reshape(len(points), self.r, self.space.n)
         return self._batched["jacobian"](points)[0].reshape(len(points), self.r, self.space.n)

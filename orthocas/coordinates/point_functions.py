@@ -7,8 +7,7 @@ import numpy as np
 
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.checks import Array
-from orthocas.parametrisations.family import Family
-from orthocas.parametrisations.product_basis import LinearFamily
+from orthocas.parametrisations.family import Family, LinearFamily, SelfDerivativeFamily
 
 
 def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Function]:
@@ -17,8 +16,10 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
     The last is d^2 xi(q)[v, w]. Bases are evaluated once, and their coefficients are a table that a loop multiplies
     with: written out, a polynomial of degree 4 on seven joints is ten thousand operations.
     """
+    if isinstance(family, SelfDerivativeFamily):
+        return _from_tables(family, theta, n)
     if isinstance(family, LinearFamily):
-        return _from_basis(family, theta)
+        return _from_basis(family, theta, n)
     kind: Any = ca.MX if family.as_matrices else ca.SX
     q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
     parameters: Any = ca.DM(theta)  # numbers, so that slices and transposes of weights are not done at every call
@@ -32,12 +33,24 @@ def second_derivative(values: Any, q: Any, v: Any, w: Any) -> Any:
     return ca.jtimes(ca.jtimes(values, q, w), q, v)
 
 
-def _from_basis(family: LinearFamily, theta: Array) -> dict[str, ca.Function]:
+def _from_basis(family: LinearFamily, theta: Array, n: int) -> dict[str, ca.Function]:
+    """With C the coefficients and psi the basis: xi = C psi, J = C dpsi/dq, and C d^2 psi[v, w]."""
+    x, a, b = (ca.SX.sym(name, n) for name in ("q", "v", "w"))
+    psi = family.basis(x)
+    basis = ca.Function("basis", [x], [psi])
+    slopes = ca.Function("basis_slopes", [x], [ca.densify(ca.jacobian(psi, x))])
+    bends = ca.Function("basis_bends", [x, a, b], [ca.densify(second_derivative(psi, x, a, b))])
+    C = ca.MX(ca.DM(theta.reshape(family.outputs, family.width)))
+    q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
+    return _functions(C @ basis(q), C @ slopes(q), C @ bends(q, v, w), q, v, w)
+
+
+def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str, ca.Function]:
     """Derivatives of basis functions are sums of basis functions: d xi / d q_i = C_i psi' with few of them, psi'.
 
     For a polynomial of degree d, psi' are those of degree d - 1, and J is one table times psi'.
     """
-    n, r = family.space.n, family.outputs
+    r = family.outputs
     tables = family.derivative_tables(theta)
     places = np.flatnonzero(tables.any(axis=(0, 1)))
     x, u = ca.SX.sym("q", n), ca.SX.sym("v", n)

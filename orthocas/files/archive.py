@@ -11,10 +11,12 @@ from tokenize import TokenError
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from orthocas.checks import Array
 from orthocas.errors import ArchiveError
 from orthocas.files.atomic import published, require_writable
+
+Stored = NDArray[Any]  #: an array in a file, of floats or integers
 
 _HEADER, _DIGEST = "header.json", "digest.txt"
 _PACKED = zipfile.ZIP_DEFLATED
@@ -35,7 +37,7 @@ class Kind:
         return f"orthocas-{self.name}"
 
 
-def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, Stored]) -> None:
     """Write header and arrays to a file that appears whole or not at all.
 
     Raises:
@@ -63,7 +65,7 @@ def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], array
         raise kind.error(f"cannot write {target}: {error.strerror}") from None
 
 
-def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str, Array]]:
+def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Read header and arrays back.
 
     Raises:
@@ -115,7 +117,7 @@ def _read_header(source: Path, kind: Kind, entries: Mapping[str, bytes]) -> dict
     return {**header, "sha256": sums}
 
 
-def _npy_bytes(array: Array) -> bytes:
+def _npy_bytes(array: Stored) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.asarray(array), allow_pickle=False)
     return buffer.getvalue()

@@ -9,15 +9,15 @@ import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.tape import from_tape, to_tape
-from orthocas.checks import Array, require_count, require_known
-from orthocas.coordinates.fitted import Coordinates, joint_space
+from orthocas.checks import require_count, require_known
+from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.domains import Box, Domain, Torus
 from orthocas.errors import ChartFileError, OrthocasError
-from orthocas.files.archive import Kind, read_archive, write_archive
+from orthocas.files.archive import Kind, Stored, read_archive, write_archive
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
-from orthocas.parametrisations import parametrisation_from_data, parametrisation_to_data
+from orthocas.parametrisations import JointSpace, parametrisation_from_data, parametrisation_to_data
 from orthocas.problem import Problem
 from orthocas.robots import KinematicTree, Robot
 from orthocas.tasks import Task
@@ -75,7 +75,7 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:
         raise ChartFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
 
 
-def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Array]]:
+def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Coordinates as plain data and arrays."""
     if isinstance(coordinates, GrownCoordinates):
         arrays = {f"{_LEAF}{name}": array for name, array in coordinates.leaf.to_arrays().items()}
@@ -85,13 +85,13 @@ def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], di
     return data, {"theta": coordinates.theta, "offset": coordinates.offset, "scale": coordinates.scale}
 
 
-def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Array]) -> CoordinateMap:
+def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> CoordinateMap:
     if "leaf" in data:
         own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
         return GrownCoordinates(problem, leaf_from_arrays(problem, data["leaf"], own))
     return Coordinates(
         parametrisation_from_data(data),
-        joint_space(problem),
+        JointSpace.of(problem),
         _idle(data["idle"], problem.n),
         arrays["theta"],
         arrays["offset"],
@@ -112,15 +112,17 @@ def _idle(joints: list[int], n: int) -> tuple[int, ...]:
     return idle
 
 
-def _tree(data: Mapping[str, Any], arrays: Mapping[str, Array]) -> KinematicTree:
+def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTree:
     numbers: dict[str, Any] = {
         name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
     }
+    for name in ("effort_limits", "velocity_limits"):  # unknown to older files
+        numbers.setdefault(name, np.full(len(data["joint_names"]), np.inf))
     texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
     return KinematicTree(**texts, **numbers)
 
 
-def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Array]) -> Problem:
+def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
     require_known("domain", data["domain"], ("box", "torus"))
     box = Box(arrays["domain_centre"], arrays["domain_half_width"])
     domain: Domain = Torus(robot.n) if data["domain"] == "torus" else box
@@ -129,14 +131,13 @@ def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Array])
 
 def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
     if recipe["kind"] == "custom":
-        return Task.custom(robot, recipe["name"], lambda q: from_tape(recipe["tape"], q), recipe["labels"])
-    if recipe["kind"] in ("orientation", "pose"):
-        build = Task.pose if recipe["kind"] == "pose" else Task.orientation
-        return build(robot, recipe["reference"])
-    return Task.named(robot, recipe["kind"])
+        labels, units = recipe["labels"], recipe.get("units", ())  # older files have no units
+        return Task.custom(robot, recipe["name"], lambda q: from_tape(recipe["tape"], q), labels, units)
+    return Task.from_recipe(robot, recipe)
 
 
 def _metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:
     if recipe["kind"] == "custom":
-        return Metric.from_spec(robot, lambda q: from_tape(recipe["tape"], q))
+        name = recipe.get("name", "custom")  # older files have no name
+        return Metric.custom(robot, name, lambda q: from_tape(recipe["tape"], q))
     return Metric.from_spec(robot, recipe["matrix"] if recipe["kind"] == "constant" else recipe["kind"])

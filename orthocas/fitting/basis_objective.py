@@ -2,24 +2,17 @@
 
 from collections.abc import Iterator
 from copy import copy
-from dataclasses import replace
-from functools import cached_property
+from itertools import combinations
 from typing import Self
 
 import numpy as np
 
 from orthocas.casadi_tools.columns import blocked, by_sample, shares
 from orthocas.checks import Array
-from orthocas.fitting.loss import (
-    LossShape,
-    Weights,
-    curvature_columns,
-    loss_columns,
-    pairs,
-    residual_columns,
-    value_columns,
-)
-from orthocas.parametrisations.product_basis import LinearFamily
+from orthocas.fitting.basis_gradients import BasisGradients
+from orthocas.fitting.loss import Loss, Sizes, Weights
+from orthocas.fitting.loss.residuals import curvature_columns, loss_columns, residual_columns, value_columns
+from orthocas.parametrisations import LinearFamily
 from orthocas.samples import Draw, Samples, even_parts
 
 _CHUNK = 512  # samples per block of the Gauss-Newton matrix: the rows stay in the cache
@@ -45,26 +38,35 @@ class BasisObjective:
     """
 
     def __init__(self, family: LinearFamily, samples: Samples, weights: Weights, start: Array, draw: Draw) -> None:
-        self.family, self._draw = family, draw
-        self.r, self.K = family.outputs, len(family.terms)
+        self.family, self.weights, self._draw = family, weights, draw
+        self.r, self.K = family.outputs, family.width
         m, self.n = samples.task_jacobian.shape[1:]
-        self._shape = LossShape(self.n, m, self.r, samples.metric_inverse is None, weights)
+        self._gradients = BasisGradients(family, self.n)
+        self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name)
         self._put(samples)
-        self._orientation = samples.orientation(self.coordinate_jacobians(start)) if self._shape.regular else None
-        self._data = [blocked(part) for part in samples.loss_data(self._orientation)]
+        self._orientation = samples.orientation(self.coordinate_jacobians(start)) if self._loss.oriented else None
+        self._describe(samples)
 
     def _put(self, samples: Samples) -> None:
-        self.N, self.G = len(samples), self.family.basis_gradients(samples.points)
+        self.N, self.G = len(samples), self._gradients.at(samples.points)
         self._share = shares(self.N)
+        self._expanded: dict[str, Array] = {}
+
+    def _describe(self, samples: Samples) -> None:
+        found = samples.described(self._loss.data, self._orientation)
+        self._described = dict(zip(self._loss.data, map(blocked, found), strict=True))
+
+    @property
+    def _data(self) -> list[Array]:
+        """Data of the samples in blocks, in the order of the loss."""
+        return [self._described[name] for name in self._loss.data]
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each."""
         for part in even_parts(self._draw(size * count, seed), count):
             other = copy(self)
-            for stale in ("_dense", "_half"):
-                other.__dict__.pop(stale, None)
             other._put(part)
-            other._data = [blocked(data) for data in part.loss_data(self._orientation)]
+            other._describe(part)
             yield other
 
     def coordinate_jacobians(self, theta: Array) -> Array:
@@ -73,13 +75,13 @@ class BasisObjective:
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
-        (losses,) = value_columns(self._shape)(self._jacobian_entries(theta), *self._data)
+        (losses,) = value_columns(self._loss)(self._jacobian_entries(theta), *self._data)
         return float(np.vdot(losses[:, 0], self._share))
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
         C, value, gradient = self._by_joint(theta), 0.0, np.zeros((self.n, self.r, self.G.shape[2]))
-        on_block = loss_columns(self._shape).on_one_block()
+        on_block = loss_columns(self._loss).on_one_block()
         for G, share, *data in zip(self.G, self._share, *self._data, strict=True):  # G leaves memory only once
             losses, slopes = on_block((C @ G).reshape(self.n * self.r, -1), *data)
             value += float(losses[0] @ share)
@@ -89,16 +91,17 @@ class BasisObjective:
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """L(theta), its gradient, and the Gauss-Newton matrix, whose products are taken in single precision."""
         value, gradient = self.value_and_gradient(theta)
-        derivatives = residual_columns(self._shape)(self._jacobian_entries(theta), *self._data)
+        derivatives = residual_columns(self._loss)(self._jacobian_entries(theta), *self._data)
         H = self._gauss_newton_matrix(derivatives[: self.r])
-        if self._shape.regular:
-            H += self._regularity_matrix(*derivatives[self.r :])
+        hinges = derivatives[self.r :]
+        for residual, derivative in zip(hinges[::2], hinges[1::2], strict=True):
+            H += self._hinge_matrix(residual, derivative)
         return value, gradient, H
 
     def hessian(self, theta: Array) -> Array:
         """d^2L/dtheta^2, exact, (size, size)."""
         r, n, K = self.r, self.n, self.K
-        (curvature,) = curvature_columns(self._shape)(self._jacobian_entries(theta), *self._data)
+        (curvature,) = curvature_columns(self._loss)(self._jacobian_entries(theta), *self._data)
         W = by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.empty((r, K, r, K))
         for i in range(r):
@@ -108,17 +111,11 @@ class BasisObjective:
                 H[j, :, i] = H[i, :, j].T
         return H.reshape(r * K, r * K)
 
-    @property
-    def weights(self) -> Weights:
-        """Weights of the loss."""
-        return self._shape.weights
-
     def reweighted(self, weights: Weights) -> Self:
-        """The same loss on the same samples with other weights; a regularity term cannot be added later."""
-        assert self._shape.regular or weights.regularity == 0
+        """The same loss on the same samples with other weights; terms that need other data cannot be added later."""
         other = copy(self)
-        other._shape = replace(self._shape, weights=weights)
-        other._data = self._data[: len(other._shape.symbols())]  # the null basis is the last
+        other.weights, other._loss = weights, Loss.of(self._loss.sizes, weights.by_name)
+        assert set(other._loss.data) <= set(self._described)
         return other
 
     @property
@@ -128,25 +125,29 @@ class BasisObjective:
         product: Array = G.T @ G / self.N
         return product
 
-    @cached_property
+    @property
     def _dense(self) -> Array:
         """G sample by sample, (N, n, K)."""
-        return self.family.dense_gradients(self.G, self.N)
+        if "all" not in self._expanded:
+            self._expanded["all"] = self._gradients.dense(self.G, self.N)
+        return self._expanded["all"]
 
-    @cached_property
+    @property
     def _half(self) -> Array:
         """G at every second sample, (N / 2, n, K), in single precision."""
-        return self.family.dense_gradients(self.G.astype(np.float32), self.N, _STRIDE)
+        if "half" not in self._expanded:
+            self._expanded["half"] = self._gradients.dense(self.G.astype(np.float32), self.N, _STRIDE)
+        return self._expanded["half"]
 
     def _by_joint(self, theta: Array) -> Array:
         """Coefficients of the terms that depend on each joint, (n, r, W)."""
-        C = theta.reshape(self.r, self.K)[:, self.family.terms_of_joints]
+        C = theta.reshape(self.r, self.K)[:, self._gradients.terms_of_joints]
         return np.ascontiguousarray(C.transpose(1, 0, 2))
 
     def _collected(self, gradient: Array) -> Array:
         """Slopes with respect to theta, (size,), from those of `_by_joint`."""
         total = np.zeros((self.r, self.K))
-        for places, slopes in zip(self.family.terms_of_joints, gradient, strict=True):
+        for places, slopes in zip(self._gradients.terms_of_joints, gradient, strict=True):
             known = places >= 0
             total[:, places[known]] += slopes[:, known]
         return total.ravel()
@@ -157,10 +158,10 @@ class BasisObjective:
         return J.reshape(len(J), self.n * self.r, -1)
 
     def _gauss_newton_matrix(self, derivatives: list[Array]) -> Array:
-        """Part of the residuals of (24), block by block for pairs of coordinates, from every second sample."""
+        """Part of the smooth residuals, block by block for pairs of coordinates, from every second sample."""
         r, K = self.r, self.K
         blocks = np.zeros((r, r, K, K))
-        rows = [self._shape.rows_of(j) for j in range(r)]
+        rows = self._loss.smooth_rows
         D = [self._rows(derivative) for derivative in derivatives]
         used = len(self._half)
         for start in range(0, used, _CHUNK):
@@ -169,11 +170,10 @@ class BasisObjective:
             for j in range(r):
                 flat = X[j].reshape(-1, K)
                 blocks[j, j] += flat.T @ flat
-            for p, (i, j) in enumerate(pairs(r)):
-                row = r * self._shape.m + p
+            for i, j, row in self._loss.shared_rows:
                 blocks[i, j] += X[i][:, rows[i].index(row)].T @ X[j][:, rows[j].index(row)]
-        for i, j in pairs(r):
-            blocks[j, i] = blocks[i, j].T
+        for i, j in combinations(range(r), 2):
+            blocks[i, j] = blocks[j, i].T
         return blocks.transpose(0, 2, 1, 3).reshape(r * K, r * K) / used
 
     def _rows(self, derivative: Array) -> Array:
@@ -181,12 +181,12 @@ class BasisObjective:
         blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
         return by_sample(blocks, self.N, _STRIDE).astype(np.float32)
 
-    def _regularity_matrix(self, residual: Array, derivative: Array) -> Array:
-        """Part of the regularity residual, which couples all coordinates but acts at few samples."""
+    def _hinge_matrix(self, residual: Array, derivative: Array) -> Array:
+        """Part of a hinge residual, which couples all coordinates but acts at few samples."""
         block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
         D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
         chosen: Array = self.G[block, :, :, column]  # (active, n, W)
-        G = self.family.dense_gradients(chosen.transpose(1, 2, 0)[None], len(chosen))
+        G = self._gradients.dense(chosen.transpose(1, 2, 0)[None], len(chosen))
         rows = (D @ G.astype(np.float32)).reshape(-1, self.r * self.K)
         product: Array = (rows.T @ rows).astype(float) / self.N
         return product

@@ -27,8 +27,9 @@ class BoundedMutual:
 
     def __init__(self, objective: BasisObjective, bound: float) -> None:
         weights, self._gram = objective.weights, objective.gram  # sampled once, shared by what follows
-        self._task = objective.reweighted(Weights(weights.task, 0.0, weights.regularity))
-        self._mutual = objective.reweighted(Weights(0.0, 2.0))  # twice a half: the mean of squares itself
+        self._task = objective.reweighted(Weights(weights.task, mutual=0.0, regularity=weights.regularity))
+        only_mutual = Weights(task=0.0, mutual=2.0, regularity=0.0)  # twice a half: the mean of squares itself
+        self._mutual = objective.reweighted(only_mutual)
         self._r, self._K, self._bound = objective.r, objective.K, bound
 
     def value(self, theta: Array) -> float:

@@ -12,7 +12,8 @@ import numpy as np
 from orthocas.casadi_tools.blas_graph import NumpyGraph
 from orthocas.casadi_tools.tape import replay
 from orthocas.checks import Array
-from orthocas.fitting.loss import LossShape, Weights, loss_columns
+from orthocas.fitting.loss import Loss, Sizes, Weights
+from orthocas.fitting.loss.residuals import loss_columns
 from orthocas.parametrisations import Family
 from orthocas.samples import Draw, Samples, even_parts
 
@@ -33,9 +34,9 @@ class GraphObjective:
 
     def __init__(self, family: Family, samples: Samples, weights: Weights, start: Array, draw: Draw) -> None:
         m, n = samples.task_jacobian.shape[1:]
-        shape = LossShape(n, m, family.outputs, samples.metric_inverse is None, weights)
-        self._graphs, self._draw = _Graphs(family, shape), draw
-        self._orientation = _orientation(family, start, samples[:_ORIENTING]) if shape.regular else None
+        loss = Loss.of(Sizes(n, m, family.outputs, samples.metric_inverse is None), weights.by_name)
+        self._graphs, self._draw = _Graphs(family, loss), draw
+        self._orientation = _orientation(family, start, samples[:_ORIENTING]) if loss.oriented else None
         self._put(samples, len(samples))
 
     def value(self, theta: Array) -> float:
@@ -56,8 +57,7 @@ class GraphObjective:
 
     def _put(self, samples: Samples, room: int) -> None:
         """Take samples; graphs are made for `room` of them, so that smaller sets share them."""
-        data = samples.loss_data(self._orientation)
-        entries = np.concatenate([part.transpose(0, 2, 1).reshape(len(samples), -1) for part in data], axis=1)
+        entries = _entries(samples.described(self._graphs.loss.data, self._orientation), len(samples))
         graph = self._graphs.of_size(room)
         self._blocks = [
             _Block.filled(graph, samples.points[k : k + graph.columns], entries[k : k + graph.columns], len(samples))
@@ -70,7 +70,7 @@ class _Graphs:
     """Graphs of one loss, one for every number of columns."""
 
     family: Family
-    shape: LossShape
+    loss: Loss
     known: dict[int, "_LossGraph"] = field(default_factory=dict)
 
     def of_size(self, samples: int) -> "_LossGraph":
@@ -78,26 +78,27 @@ class _Graphs:
         most = max(1, _CHUNK_ENTRIES // (self.family.outputs * self.family.width))
         columns = ceil(samples / ceil(samples / most))
         if columns not in self.known:
-            self.known[columns] = _LossGraph(self.family, self.shape, columns)
+            self.known[columns] = _LossGraph(self.family, self.loss, columns)
         return self.known[columns]
 
 
 class _LossGraph:
     """Loss and gradient of samples side by side: functions of theta, q (n, c), data (c, entries) and shares (c, 1)."""
 
-    def __init__(self, family: Family, shape: LossShape, columns: int) -> None:
+    def __init__(self, family: Family, loss: Loss, columns: int) -> None:
         self.columns = columns
-        theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", shape.n, columns)
-        data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in shape.symbols()))
+        theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", loss.sizes.n, columns)
+        data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in loss.symbols()))
         share = ca.MX.sym("share", columns)
         gradients = family.jacobian(q, theta)
         by_component = [ca.horzsplit(gradient.T) for gradient in gradients]  # r times n columns of samples
         entries = [column for by_joint in zip(*by_component, strict=True) for column in by_joint]
-        loss, *slopes = replay(loss_columns(shape).tape, [*entries, *ca.horzsplit(data)])
-        weighted = [ca.horzcat(*(share * slope for slope in slopes[j :: shape.r])) for j in range(shape.r)]
+        r = loss.sizes.r
+        values, *slopes = replay(loss_columns(loss).tape, [*entries, *(ca.horzsplit(data) if loss.data else [])])
+        weighted = [ca.horzcat(*(share * slope for slope in slopes[j::r])) for j in range(r)]
         # the chain rule, cut at J_xi: slopes of the loss come from one sample's graph, replayed on columns
         by_theta = ca.jtimes(ca.horzcat(*gradients), theta, ca.horzcat(*(part.T for part in weighted)), True)
-        value, inputs = ca.dot(share, loss), [theta, q, data, share]
+        value, inputs = ca.dot(share, values), [theta, q, data, share]
         self.value = NumpyGraph("loss", inputs, [value])
         self.both = NumpyGraph("loss_and_gradient", inputs, [value, ca.densify(by_theta)])
 
@@ -123,6 +124,12 @@ class _Block:
         graph = self.graph.both if gradient else self.graph.value
         value, *slopes = graph(np.ascontiguousarray(theta), self.points, self.data, self.share)
         return float(value[0, 0]), slopes[0][0] if gradient else np.empty(0)
+
+
+def _entries(data: list[Array], samples: int) -> Array:
+    """Data of samples in rows, matrices column by column, (N, entries)."""
+    flat = [(part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(samples, -1) for part in data]
+    return np.concatenate([np.empty((samples, 0)), *flat], axis=1)
 
 
 def _orientation(family: Family, theta: Array, samples: Samples) -> float:

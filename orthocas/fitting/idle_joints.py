@@ -5,7 +5,7 @@ import numpy as np
 from orthocas.problem import Problem
 from orthocas.samples import Samples
 
-_NEGLIGIBLE = 1e-12
+_NEGLIGIBLE = 1e-10  # angles with ten decimals in robot files
 
 
 def idle_joints(problem: Problem, samples: Samples) -> list[int]:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from orthocas.checks import Array
+from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.parametrisations import LinearFamily
 from orthocas.samples import Samples
 
@@ -21,7 +22,8 @@ def spectral_start(family: LinearFamily, samples: Samples) -> Array:
     Source:
         ours, docs/derivations.md#spectral-start.
     """
-    G = family.dense_gradients(family.basis_gradients(samples.points), len(samples))  # (N, n, K)
+    gradients = BasisGradients(family, samples.points.shape[1])
+    G = gradients.dense(gradients.at(samples.points), len(samples))  # (N, n, K)
     N, _, K = G.shape
     along_task = (samples.task_basis @ G).reshape(-1, K)  # e_i^T d psi, the components along the task gradients
     S = along_task.T @ along_task / N

@@ -1,6 +1,6 @@
 """The minimisations a fit is made of: samples, a start, an objective, a solver."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 
 import numpy as np
@@ -13,17 +13,33 @@ from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.bounded_mutual import BoundedMutual
 from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.graph_objective import GraphObjective
-from orthocas.fitting.loss import DEFAULT_WEIGHTS, Weights, pairs
+from orthocas.fitting.loss import DEFAULT_WEIGHTS, pairs
+from orthocas.fitting.settings import FitSettings
 from orthocas.fitting.spectral_start import spectral_start
 from orthocas.minimising.objective import Objective
 from orthocas.minimising.solver import Solver, SolveResult, Status
 from orthocas.minimising.watch import Monitor, Progress, Watch
-from orthocas.parametrisations import Family, GradedParametrisation, JointSpace, LinearFamily, Parametrisation, embed
+from orthocas.parametrisations import Family, GradedParametrisation, JointSpace, LinearFamily, Parametrisation
 from orthocas.problem import Problem
 from orthocas.samples import Samples, sample_problem, samples_at
+from orthocas.solvers import GaussNewton
 
 MLP_SAMPLES = 2000  #: default sample count of families that are not linear in theta
+_START_SEED = 0  # of the samples that spectral starts are found on, the same for all fits
 _FRESH = 2000  # tag of samples drawn while a solver runs, apart from those of the stages
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Minimisations that are done, and the parametrisation they reached."""
+
+    stages: tuple[Stage, ...]
+    parametrisation: Parametrisation
+
+    @property
+    def theta(self) -> Array:
+        """Parameters that the last minimisation found."""
+        return self.stages[-1].result.theta
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,19 +47,25 @@ class StageRunner:
     """What the stages of one fit share."""
 
     problem: Problem
-    space: JointSpace  #: active joints only
-    active: list[int]
-    weights: Weights
-    max_mutual: float | None  #: bound on the root mean square mutual cosine, over all pairs of coordinates
-    samples: int | None
-    seed: int
+    settings: FitSettings
+    active: list[int]  #: joints that are not coordinates themselves
     monitor: Monitor
     checkpoint: Checkpoint
-    starter: Solver | None = None  #: solves the weighted problem before a bounded one: minima far from it are worse
 
-    def graded(
-        self, target: GradedParametrisation, r: int, solver: Solver
-    ) -> tuple[list[Stage], GradedParametrisation]:
+    @property
+    def space(self) -> JointSpace:
+        """The active joints."""
+        return JointSpace.of(self.problem).restricted_to(self.active)
+
+    def run(self, r: int) -> Solved:
+        """All minimisations for r coordinates of the active joints."""
+        parametrisation, solver = self.settings.parametrisation, self.settings.solver
+        if isinstance(parametrisation, GradedParametrisation):
+            return self.graded(parametrisation, r, solver)
+        stage = self.stage(parametrisation, parametrisation.family(self.space, r), None, solver)
+        return Solved((stage,), parametrisation)
+
+    def graded(self, target: GradedParametrisation, r: int, solver: Solver) -> Solved:
         """Degree continuation: solve a low degree from a spectral start, embed, solve the next, ..."""
         self._require_memory(target, r)
         stages: list[Stage] = []
@@ -51,7 +73,7 @@ class StageRunner:
         for degree in range(min(target.degree, 2), target.degree + 1):
             current = target.of_degree(degree)
             family = current.family(self.space, r)
-            start = None if lower is None else embed(stages[-1].result.theta, r, lower.terms, family.terms)
+            start = None if lower is None else family.embed(stages[-1].result.theta, lower)
             final = degree == target.degree
             try:
                 minimiser = solver if final else solver.coarser()
@@ -59,11 +81,11 @@ class StageRunner:
             except KeyboardInterrupt:  # between minimisations: the last degree is the best so far
                 if not stages:
                     raise
-                return [*stages[:-1], stages[-1].interrupted()], target.of_degree(degree - 1)
+                return Solved((*stages[:-1], stages[-1].interrupted()), target.of_degree(degree - 1))
             lower = family
             if stages[-1].result.status is Status.INTERRUPTED:
-                return stages, current
-        return stages, target
+                return Solved(tuple(stages), current)
+        return Solved(tuple(stages), target)
 
     def stage(
         self,
@@ -85,7 +107,7 @@ class StageRunner:
             return done
         count = self._sample_count(family)
         self.monitor(Progress(label, 0.0, f"sampling {count} points"))
-        points = sample_evenly(self.problem.domain, count, (self.seed, 1 + degree))
+        points = sample_evenly(self.problem.domain, count, (self.settings.seed, 1 + degree))
         samples = samples_at(self.problem, points).restricted_to(self.active)
         with deferred():  # CasADi may swallow Ctrl-C while graphs are built
             objective, theta = self._objective(label, family, samples, theta)
@@ -96,7 +118,8 @@ class StageRunner:
             keeper.flush()
         if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
             if final:
-                raise self._missed(label, objective, result)
+                assert self.settings.max_mutual is not None
+                raise missed_bound(label, self.settings.max_mutual, objective, result)
         else:
             result.raise_if_failed()
         stage = Stage(label, family.size, len(samples), result)
@@ -106,54 +129,44 @@ class StageRunner:
     def _objective(self, label: str, family: Family, samples: Samples, theta: Array | None) -> tuple[Objective, Array]:
         """The loss of a family on samples, and where to start."""
         if not isinstance(family, LinearFamily):
-            if self.max_mutual is not None:
+            if self.settings.max_mutual is not None:
                 raise InvalidValueError(
                     "max_mutual_deg", f"given with {label}", "a parametrisation linear in its parameters, as polynomial"
                 )
             self._require_graph_memory(label, family, len(samples))
-            theta = family.initial(self.seed) if theta is None else theta
-            return GraphObjective(family, samples, self.weights, theta, self._draw), theta
+            theta = family.initial(self.settings.seed) if theta is None else theta
+            return GraphObjective(family, samples, self.settings.weights, theta, self._draw), theta
         fresh = theta is None
-        theta = spectral_start(family, samples) if theta is None else theta
-        objective = BasisObjective(family, samples, self.weights, theta, self._draw)
-        if self.max_mutual is None:
+        theta = self._spectral_start(family, len(samples)) if theta is None else theta
+        objective = BasisObjective(family, samples, self.settings.weights, theta, self._draw)
+        if self.settings.max_mutual is None:
             return objective, theta
         fitted, all_pairs = len(pairs(family.outputs)), len(pairs(self.problem.r))
         if not fitted:
             raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
         # pairs with an idle joint are exactly orthogonal, so the others may use their share
-        bounded = BoundedMutual(objective, self.max_mutual * (all_pairs / fitted) ** 0.5)
-        if fresh and self.starter is not None:
-            weighted = Weights(self.weights.task, DEFAULT_WEIGHTS[1], self.weights.regularity, self.weights.length)
-            theta = self.starter.minimise(objective.reweighted(weighted), theta).theta
+        bounded = BoundedMutual(objective, self.settings.max_mutual * (all_pairs / fitted) ** 0.5)
+        if fresh:  # the weighted problem first: minima far from its own are worse
+            weighted = replace(self.settings.weights, mutual=DEFAULT_WEIGHTS.mutual)
+            theta = GaussNewton().minimise(objective.reweighted(weighted), theta).theta
         return bounded, bounded.in_gauge(theta)
 
-    def _missed(self, label: str, objective: BoundedMutual, result: SolveResult) -> SolveError:
-        """The error that says how far a bound was missed, and why."""
-        assert self.max_mutual is not None
-        wanted = np.degrees(self.max_mutual)
-        reached = wanted * objective.constraints(result.theta)[0][0] ** 0.5
-        found = f"{label} coordinates with mutual angles within {wanted:.4g} deg"
-        if result.status is Status.INFEASIBLE:
-            return InfeasibleError(
-                f"there are no {found} near, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
-            )
-        return SolveError(
-            f"no {found} found in {result.iterations} iterations, the closest have {reached:.4g} deg: "
-            "raise max_mutual_deg, the degree, or the number of iterations"
-        )
+    def _spectral_start(self, family: LinearFamily, count: int) -> Array:
+        """A start that does not depend on the seed: eigenvalues lie close, and other samples would mix coordinates."""
+        points = sample_evenly(self.problem.domain, count, _START_SEED)
+        return spectral_start(family, samples_at(self.problem, points).restricted_to(self.active))
 
     def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
-        return sample_problem(self.problem, count, (self.seed, _FRESH, *seed)).restricted_to(self.active)
+        return sample_problem(self.problem, count, (self.settings.seed, _FRESH, *seed)).restricted_to(self.active)
 
     def _sample_count(self, family: Family) -> int:
         if isinstance(family, LinearFamily):
-            return self._linear_sample_count(len(family.terms), family.outputs)
-        return self.samples or MLP_SAMPLES
+            return self._linear_sample_count(family.width, family.outputs)
+        return self.settings.samples or MLP_SAMPLES
 
     def _linear_sample_count(self, terms: int, r: int) -> int:
         """Samples for a linear family: enough that every coefficient sees about 140 residuals."""
-        return self.samples or 1000 + ceil(140 * terms / (self.problem.m + r - 1))
+        return self.settings.samples or 1000 + ceil(140 * terms / (self.problem.m + r - 1))
 
     def _require_graph_memory(self, label: str, family: Family, count: int) -> None:
         """Refuse a network whose parameters and minimiser memory do not fit."""
@@ -163,6 +176,21 @@ class StageRunner:
         """Refuse a degree that does not fit, before building anything."""
         K = target.term_count(self.space.n)
         N = self._linear_sample_count(K, r)
-        curvature = (self.space.n * r) ** 2 if self.max_mutual is not None else 0
+        curvature = (self.space.n * r) ** 2 if self.settings.max_mutual is not None else 0
         needed = 8 * (N * (2 * self.space.n * K + 2 * curvature) + 4 * (r * K) ** 2)
         require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)
+
+
+def missed_bound(label: str, bound: float, objective: BoundedMutual, result: SolveResult) -> SolveError:
+    """The error that says how far a bound on mutual angles [rad] was missed, and why."""
+    wanted = np.degrees(bound)
+    reached = wanted * objective.constraints(result.theta)[0][0] ** 0.5
+    found = f"{label} coordinates with mutual angles within {wanted:.4g} deg"
+    if result.status is Status.INFEASIBLE:
+        return InfeasibleError(
+            f"there are no {found} near, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
+        )
+    return SolveError(
+        f"no {found} found in {result.iterations} iterations, the closest have {reached:.4g} deg: "
+        "raise max_mutual_deg, the degree, or the number of iterations"
+    )

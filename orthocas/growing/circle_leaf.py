@@ -1,14 +1,14 @@
 """A closed base leaf of dimension one, charted by its arc length ([AS2023] Sec. 5.1)."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array, frozen_array
 from orthocas.errors import GrowError, InvalidValueError
@@ -32,9 +32,9 @@ class CircleLeaf:
     The point opposite to the first sample is the cut: a circle has no single smooth coordinate.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     level: Array  #: x0, (m,)
-    curve: Array  #: samples at equal arc lengths, (K + 1, n); the last is the first one, up to whole turns
+    curve: Array = field(repr=False)  #: samples at equal arc lengths, (K + 1, n); the last is the first, up to turns
     length: Array  #: L, (1,)
     kind = "circle"
     turn = 2 * np.pi
@@ -70,12 +70,12 @@ class CircleLeaf:
         return LeafValues(xi[:, None], gradients[:, None, :], inside)
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
-        """Points of the leaf with coordinates xi (N, 1) in [-pi, pi], whose ends are the cut; NaN for others."""
+        """Points of the leaf with coordinates xi (N, 1) in [-pi, pi], both ends at the cut; NaN for others."""
         along = xi[:, 0] * self.length[0] / (2 * np.pi)
         return np.where(np.abs(xi) <= np.pi + 1e-9, self._at(along), np.nan)
 
     def to_arrays(self) -> Mapping[str, Array]:
-        """All numbers, for chart files."""
+        """All arrays, for chart files."""
         return {"level": self.level, "curve": self.curve, "length": self.length}
 
     @cached_property
@@ -132,7 +132,7 @@ def circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAM
 
 
 def _closed(problem: Problem, level: Array, start: Array, length: float, samples: int) -> CircleLeaf:
-    """Trace once around with the length made exact."""
+    """Trace the leaf once around, with its length corrected."""
     trace = _tracer(problem, level, samples)
     for _ in range(_CLOSINGS):
         curve = trace(start, length)
@@ -152,7 +152,7 @@ def _singular(level: Array) -> GrowError:
 def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, float], Array]:
     """A map (point, length) -> points at equal arc lengths (steps + 1, n) along the leaf, by SUNDIALS.
 
-    The curve follows the unit vector across all task gradients, and is drawn to the leaf by -J_x^# (h - x0).
+    The curve follows the unit vector orthogonal to all task gradients; -J_x^# (h - x0) pulls it back to the leaf.
     """
     q, length = ca.SX.sym("q", problem.n), ca.SX.sym("length")
     J = problem.task.jacobian_function(q)

@@ -1,12 +1,12 @@
 """A base leaf with the topology of a disk, three joints and one task, charted by a harmonic map ([AS2023] Sec. 5.2)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from orthocas.checks import Array, frozen_array, require_memory
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.checks import Array, Indices, frozen_array, frozen_indices, require_memory
 from orthocas.domains import Box, sample_uniform
 from orthocas.errors import GrowError, InvalidValueError
 from orthocas.growing.harmonic import harmonic_disk
@@ -26,17 +26,17 @@ _SCALE_SAMPLES = 1000  # that tell the size of the gradient
 class DiskLeaf:
     """xi0(q): the harmonic map of a triangulated leaf onto the unit disk, linear on every triangle.
 
-    A point of the leaf belongs to the nearest point of the mesh. From triangle to triangle the gradient jumps by about
-    the size of a cell, and the value by about its third power.
+    A point of the leaf gets the coordinates of the nearest point of the mesh. From one triangle to the next, the jump
+    of the gradient is of the order of the cell size, and that of the value of its third power.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     level: Array  #: x0, (1,)
     region_centre: Array  #: (3,)
     region_half_width: Array  #: (3,)
-    vertices: Array  #: (V, 3), on the leaf
-    faces: Array  #: (F, 3), whole numbers
-    disk: Array  #: images of the vertices, (V, 2)
+    vertices: Array = field(repr=False)  #: (V, 3), on the leaf
+    faces: Indices = field(repr=False)  #: (F, 3), indices of vertices
+    disk: Array = field(repr=False)  #: images of the vertices, (V, 2)
     kind = "disk"
     turn = 0.0
     periodic = True
@@ -49,42 +49,42 @@ class DiskLeaf:
             "region_half_width": (3,),
             "vertices": (count, 3),
             "disk": (count, 2),
-            "faces": (None, 3),
         }
         for name, shape in shapes.items():
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
-        if not np.array_equal(self.faces, np.round(self.faces)) or len(self.mesh.faces) == 0:
-            raise InvalidValueError("faces", "empty or not whole numbers", "indices of vertices")
+        object.__setattr__(self, "faces", frozen_indices("faces", self.faces, (None, 3), count))
+        if not len(self.faces):
+            raise InvalidValueError("faces", "empty", "at least one triangle")
         if np.linalg.norm(self.disk, axis=1).max() > 1 + 1e-9:
             raise InvalidValueError("disk", "outside the unit disk", "images of the vertices in the unit disk")
         require_on_leaf(self.problem, self.level, self.vertices)
 
     @property
     def region(self) -> Box:
-        """The part of joint space that holds the leaf."""
+        """The box whose part of the leaf is charted."""
         return Box(self.region_centre, self.region_half_width)
 
     @cached_property
     def mesh(self) -> TriangleMesh:
         """The leaf as triangles."""
-        return TriangleMesh(self.vertices, self.faces.astype(np.int64))
+        return TriangleMesh(self.vertices, self.faces)
 
     def values(self, points: Array) -> LeafValues:
         """Coordinates of points on the leaf, (N, 3)."""
         points = self.region_centre + without_turns(self.problem, points - self.region_centre)
         found = self._in_space.locate(points)
-        corners = self.disk[self.mesh.faces[found.face]]
+        corners = self.disk[self.faces[found.face]]
         xi = np.einsum("sk,skr->sr", found.barycentric, corners)
         return LeafValues(xi, self._gradients[found.face], covers(self.region, points))
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for others.
 
-        The point of the triangle is moved along the triangle's normal onto the leaf, so that `values` leads back.
+        The point of the triangle is moved along the triangle's normal onto the leaf, so that `values` returns xi.
         """
         inside = np.hypot(xi[:, 0], xi[:, 1]) <= 1
         found = self._in_disk.locate(np.where(inside[:, None], xi, 0.0))
-        corners = self.mesh.faces[found.face]
+        corners = self.faces[found.face]
         feet = np.einsum("sk,skn->sn", found.barycentric, self.vertices[corners])
         normals = self._normals[found.face]
         height = np.zeros((len(xi), 1))
@@ -98,23 +98,23 @@ class DiskLeaf:
         known = inside & (found.distance < _ON_LEAF)
         return np.where(known[:, None], feet + height * normals, np.nan)
 
-    def to_arrays(self) -> Mapping[str, Array]:
-        """All numbers, for chart files."""
+    def to_arrays(self) -> Mapping[str, Array | Indices]:
+        """All arrays, for chart files."""
         names = ("level", "region_centre", "region_half_width", "vertices", "faces", "disk")
         return {name: getattr(self, name) for name in names}
 
     @cached_property
     def _in_space(self) -> TriangleLocator:
-        return TriangleLocator(self.vertices, self.mesh.faces)
+        return TriangleLocator(self.vertices, self.faces)
 
     @cached_property
     def _in_disk(self) -> TriangleLocator:
-        return TriangleLocator(self.disk, self.mesh.faces)
+        return TriangleLocator(self.disk, self.faces)
 
     @cached_property
     def _edges(self) -> tuple[Array, Array]:
         """Two edges of every triangle in space, (F, 2, 3), and in the disk, (F, 2, 2)."""
-        first, *others = (self.mesh.faces[:, k] for k in range(3))
+        first, *others = (self.faces[:, k] for k in range(3))
         in_space = np.stack([self.vertices[other] - self.vertices[first] for other in others], axis=1)
         in_disk = np.stack([self.disk[other] - self.disk[first] for other in others], axis=1)
         return in_space, in_disk
@@ -142,7 +142,7 @@ def disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -
 
     Raises:
         GrowError: if n or m differ.
-        NotADiskError: if that part of the leaf is not a disk; says what it is.
+        NotADiskError: if that part of the leaf is not a disk; the message says what it is.
     """
     if (problem.n, problem.m) != (3, 1):
         raise GrowError(f"a disk chart is for n = 3 joints and m = 1 task, got n = {problem.n} and m = {problem.m}")
@@ -167,4 +167,4 @@ def disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -
         cells,
     )
     disk = harmonic_disk(mesh)
-    return DiskLeaf(problem, level, region.centre, region.half_width, mesh.vertices, mesh.faces.astype(float), disk)
+    return DiskLeaf(problem, level, region.centre, region.half_width, mesh.vertices, mesh.faces, disk)

@@ -1,11 +1,10 @@
 """Many independent initial value problems at once, each with its own step size.
 
 Mapped SUNDIALS solvers are several times slower on systems of a few states (benchmarks/growing_queries.py): here one
-step of every trajectory is an operation on columns of samples, so that little but arithmetic is left.
+step of all trajectories is an operation on columns of samples, which leaves little but arithmetic.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -14,11 +13,12 @@ from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.columns import ColumnFunction, blocked, by_sample
 from orthocas.checks import Array
 
 _STAGES = 12
-_FEW = 64  # trajectories that are not worth a block of columns
+_FEW = 64  # trajectories, or fewer, for which a block of columns does not pay
 _FIRST = 0.25  # first step
 _SMALLEST = 1e-9  # step at which a trajectory is given up: its field is singular there
 _SHRINK, _GROW, _SAFETY = 0.2, 10.0, 0.9

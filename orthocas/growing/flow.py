@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.casadi_tools.batch import dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.growing.dormand_prince import BatchedFlow
 from orthocas.metrics import metric_matrices

@@ -1,12 +1,12 @@
 """Coordinates grown from a base leaf: exact ones, evaluated by following a flow ([AS2023] Sec. 5)."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_point_set
 from orthocas.errors import NoExpressionError
 from orthocas.growing.flow import TOLERANCE, Arrival, Moved, TaskFlow
@@ -25,7 +25,7 @@ class GrownCoordinates:
     chart of the leaf; `pull` tells which.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     leaf: LeafChart
 
     @property
@@ -40,12 +40,12 @@ class GrownCoordinates:
 
     @property
     def size(self) -> int:
-        """Number of numbers that describe the chart of the leaf."""
+        """How many numbers describe the chart of the leaf."""
         return sum(array.size for array in self.leaf.to_arrays().values())
 
     @property
     def turn(self) -> float:
-        """What may be added to a coordinate without changing the point: 2 pi on a circle, otherwise 0."""
+        """Period of the coordinates: 2 pi on a circle, otherwise 0 (none)."""
         return self.leaf.turn
 
     def pull(self, points: ArrayLike, tolerance: float = TOLERANCE) -> Moved:
@@ -74,8 +74,8 @@ class GrownCoordinates:
     def inverse(self, phi: Array, q_start: Array) -> Array:
         """Joint positions with given task values and coordinates, (N, n): from the leaf back along the flow.
 
-        The start (N, n) tells which whole turns are wanted, and, where a linear leaf has several sheets, which one. NaN
-        where there is none.
+        The start (N, n) selects the whole turns and, where a linear leaf has several sheets, the sheet. NaN where there
+        is no solution.
         """
         m, n = self.problem.m, self.problem.n
         start = self.flow.pull(q_start, self.leaf.level)
@@ -89,7 +89,7 @@ class GrownCoordinates:
     def _onto_task(self, points: Array, x: Array) -> Array:
         """Points (N, n) after a Newton step along the task gradients to the task values x (N, m).
 
-        It takes away what the integration has lost, which counts when a task value has large units.
+        It removes the error of the integration, which matters if task values are large numbers.
         """
         dx = x - self.problem.task.batched(points)[0]
         return self.flow.move(points, dx, _INVERSE_TOLERANCE).points
@@ -112,7 +112,7 @@ class GrownCoordinates:
         return TaskFlow(self.problem)
 
     def _on_leaf(self, moved: Moved) -> LeafValues:
-        """The leaf's chart at end points; those that did not arrive stand in as any point."""
+        """The leaf's chart at end points; an arbitrary point replaces those that did not arrive."""
         return self.leaf.values(np.where(moved.reached[:, None], moved.points, self.problem.domain.centre))
 
     @staticmethod

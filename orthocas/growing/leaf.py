@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.checks import Array
+from orthocas.checks import Array, Indices
 from orthocas.domains import Box
 from orthocas.errors import InvalidValueError
 from orthocas.problem import Problem, task_jacobians
@@ -21,7 +21,7 @@ class LeafValues:
 
     xi: Array  #: (N, r)
     gradients: Array  #: d xi0 / dq along the leaf, (N, r, n)
-    inside: NDArray[np.bool_]  #: which points the chart covers, (N,); the other rows mean nothing
+    inside: NDArray[np.bool_]  #: which points the chart covers, (N,); the other rows are meaningless
 
 
 class LeafChart(Protocol):
@@ -43,7 +43,7 @@ class LeafChart(Protocol):
 
     @property
     def turn(self) -> float:
-        """What may be added to the coordinates without changing the point: 2 pi on a circle, otherwise 0."""
+        """Period of the coordinates: 2 pi on a circle, otherwise 0 (none)."""
         ...
 
     @property
@@ -56,12 +56,12 @@ class LeafChart(Protocol):
 
         Args:
             xi: coordinates.
-            near: points of the leaf, (N, n), NaN if unknown; where there are several solutions, one near them is taken.
+            near: points of the leaf, (N, n), NaN if unknown. If several solutions exist, one near these is returned.
         """
         ...
 
-    def to_arrays(self) -> Mapping[str, Array]:
-        """All numbers, for chart files."""
+    def to_arrays(self) -> Mapping[str, Array | Indices]:
+        """All arrays, for chart files."""
         ...
 
 
@@ -86,4 +86,5 @@ def require_on_leaf(problem: Problem, level: Array, points: Array) -> None:
     off = np.abs(problem.task.batched(points)[0] - level).max(axis=1)
     size = np.sqrt((J**2).sum(axis=(1, 2)).mean())
     if not off.max() <= _ON_LEAF * size:
-        raise InvalidValueError("points of the base leaf", f"{off.max():.3g} off h(q) = {level.tolist()}", "on it")
+        what = f"error of the task on the base leaf h(q) = {level.tolist()}"
+        raise InvalidValueError(what, f"{off.max():.3g}", f"at most {_ON_LEAF * size:.3g}")

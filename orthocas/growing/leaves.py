@@ -1,8 +1,11 @@
 """The kinds of base leaves by name, for chart files."""
 
 from collections.abc import Mapping
+from typing import Any
 
-from orthocas.checks import Array, require_known
+from numpy.typing import NDArray
+
+from orthocas.checks import require_known
 from orthocas.growing.circle_leaf import CircleLeaf
 from orthocas.growing.disk_leaf import DiskLeaf
 from orthocas.growing.leaf import LeafChart
@@ -14,8 +17,8 @@ LEAVES: dict[str, type[LinearLeaf] | type[CircleLeaf] | type[DiskLeaf]] = {
 }
 
 
-def leaf_from_arrays(problem: Problem, kind: str, arrays: Mapping[str, Array]) -> LeafChart:
-    """Build a leaf's chart from its numbers.
+def leaf_from_arrays(problem: Problem, kind: str, arrays: Mapping[str, NDArray[Any]]) -> LeafChart:
+    """Build a leaf's chart from its arrays.
 
     Raises:
         UnknownNameError: if there is no such kind.

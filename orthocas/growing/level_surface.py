@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from skimage.measure import marching_cubes
 
-from orthocas.checks import Array, frozen_array, require_count, require_finite, require_shape
+from orthocas.checks import Array, Indices, frozen_array, require_count, require_finite, require_shape
 from orthocas.errors import InvalidValueError
 from orthocas.growing.mesh_improvement import flip_to_delaunay, steps_to_neighbours
-from orthocas.growing.triangle_mesh import Indices, TriangleMesh, require_disk
+from orthocas.growing.triangle_mesh import TriangleMesh, require_disk
 
 __all__ = ["TriangleMesh", "level_surface", "require_disk"]
 
@@ -32,7 +32,7 @@ def level_surface(
     """The surface {q : low <= q <= high, h(q) = level}.
 
     Marching cubes finds its topology, Newton steps along the gradient bring every vertex onto it, and flips of edges
-    and tangential smoothing make its triangles round and Delaunay. Vertices on faces of the box stay there.
+    and tangential smoothing make its triangles round and Delaunay. Vertices on faces of the box stay on them.
 
     Args:
         h: function (N, 3) -> (N,).
@@ -44,7 +44,7 @@ def level_surface(
 
     Returns:
         A mesh with |h - level| <= 1e-12 (relative to the largest |h| if that is above 1) at its vertices and normals
-        along the gradient. Parts smaller than a cell are missed.
+        along the gradient. Parts smaller than a cell may be missed.
 
     Raises:
         ShapeError: if low, high, or a value of h or its gradient has another shape.
@@ -71,7 +71,7 @@ def level_surface(
 
 @dataclass(frozen=True)
 class _Sheet:
-    """The surface and the box, for moves of the mesh's vertices."""
+    """The surface and the box, on which the vertices of the mesh move."""
 
     h: Function
     gradient: Function
@@ -89,7 +89,7 @@ class _Sheet:
         return moved
 
     def slide(self, points: Array, steps: Array) -> Array:
-        """Move vertices by the part of the steps along the surface and the faces of the box; some may stay."""
+        """Move vertices by the part of their steps along the surface and the box; they stay where Newton fails."""
         normal = _values(self.gradient, points, "gradient", (3,)) * self.free
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), _TINY)
         along = steps * self.free
@@ -98,7 +98,7 @@ class _Sheet:
         return moved
 
     def _newton(self, start: Array) -> tuple[Array, Mask]:
-        """Newton steps along the free part of the gradient, and where they fail or lead further than a cell."""
+        """Newton steps along the free part of the gradient, and which vertices fail or move farther than a cell."""
         points, moving = start.copy(), np.arange(len(start))
         for _ in range(_NEWTON_STEPS):
             gap = self._gap(points[moving])
@@ -130,12 +130,12 @@ class _Sheet:
         return points
 
     def _gap(self, points: Array) -> Array:
-        """The checked h - level."""
+        """Values of h - level, checked."""
         return _values(self.h, points, "h", ()) - self.level
 
 
 def _grid_axes(corners: Array, cells: int) -> list[Array]:
-    """Grid coordinates along each axis: cells close to cubes, `cells` of them along the longest edge."""
+    """Grid coordinates along each axis: nearly cubic cells, `cells` of them along the longest edge."""
     width = corners[1] - corners[0]
     counts = np.maximum(1, np.ceil(cells * width / width.max() - 1e-9)).astype(int) + 1
     return [np.linspace(corners[0, i], corners[1, i], counts[i]) for i in range(3)]

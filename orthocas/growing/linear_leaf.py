@@ -1,11 +1,11 @@
 """Linear coordinates on the base leaf: the chart that exists for any number of joints."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, frozen_array
 from orthocas.errors import InvalidValueError
 from orthocas.growing.leaf import LeafValues, require_on_leaf
@@ -26,10 +26,10 @@ class LinearLeaf:
     the leaf folds over, the Jacobian of the grown chart loses rank, and `evaluate` shows it.
     """
 
-    problem: Problem
+    problem: Problem = field(repr=False)
     level: Array  #: x0 = h(q0), (m,)
     centre: Array  #: q0, (n,)
-    normals: Array  #: N, (n, r), unit columns with J_x(q0) A^-1(q0) N = 0
+    normals: Array = field(repr=False)  #: N, (n, r), unit columns with J_x(q0) A^-1(q0) N = 0
     kind = "linear"
     turn = 0.0
     periodic = False
@@ -50,7 +50,7 @@ class LinearLeaf:
     def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf with coordinates xi (N, r), NaN where there is none.
 
-        Newton's method along the straight way from the coordinates of `near`, or of q0, to xi: one sheet is kept.
+        Newton's method along the straight line from the coordinates of `near`, or of q0, to xi: it stays on one sheet.
         """
         q = np.broadcast_to(self.centre, (len(xi), len(self.centre)))
         q = q if near is None else np.where(np.isfinite(near), near, q)
@@ -67,7 +67,7 @@ class LinearLeaf:
         return np.where(solved[:, None], q, np.nan)
 
     def to_arrays(self) -> Mapping[str, Array]:
-        """All numbers, for chart files."""
+        """All arrays, for chart files."""
         return {"level": self.level, "centre": self.centre, "normals": self.normals}
 
     def _residual(self, q: Array, xi: Array) -> Array:

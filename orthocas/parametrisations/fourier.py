@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from math import comb, sqrt
+from typing import TYPE_CHECKING, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -9,7 +10,10 @@ import numpy as np
 from orthocas.checks import Array, require_count
 from orthocas.errors import InvalidValueError
 from orthocas.parametrisations.family import JointSpace
-from orthocas.parametrisations.product_basis import LinearFamily, terms_up_to
+from orthocas.parametrisations.product_basis import ProductFamily, product_family, terms_up_to
+
+if TYPE_CHECKING:
+    from orthocas.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -21,6 +25,8 @@ class Fourier:
     """
 
     degree: int
+    linear: ClassVar[bool] = True
+    closed_form: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", require_count("degree", self.degree))
@@ -30,6 +36,10 @@ class Fourier:
         """'fourier:DEGREE'."""
         return f"fourier:{self.degree}"
 
+    def for_problem(self, problem: "Problem") -> "Fourier":
+        """Itself."""
+        return self
+
     def of_degree(self, degree: int) -> "Fourier":
         """The same with another degree."""
         return Fourier(degree)
@@ -38,7 +48,7 @@ class Fourier:
         """Sum over j of C(n, j) C(d, j) 2^j, without the constant."""
         return sum(comb(n, j) * comb(self.degree, j) * 2**j for j in range(1, min(n, self.degree) + 1))
 
-    def family(self, space: JointSpace, outputs: int) -> LinearFamily:
+    def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Fourier terms of the joint angles.
 
         Raises:
@@ -64,4 +74,4 @@ class Fourier:
             return D
 
         degrees = [[0] + [k for k in range(1, self.degree + 1) for _ in range(2)]] * space.n
-        return LinearFamily(space, outputs, tuple(terms_up_to(degrees, self.degree)), waves, derivatives)
+        return product_family(space, outputs, tuple(terms_up_to(degrees, self.degree)), waves, derivatives)

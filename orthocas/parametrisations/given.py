@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -11,7 +12,10 @@ from orthocas.casadi_tools.batch import dense_function
 from orthocas.casadi_tools.tape import Tape, replay, to_tape
 from orthocas.casadi_tools.user_expression import expression_of
 from orthocas.checks import Array, require_shape
-from orthocas.parametrisations.family import Expression, JointSpace, component_gradients
+from orthocas.parametrisations.family import ClosedForm, Expression, JointSpace, component_gradients
+
+if TYPE_CHECKING:
+    from orthocas.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +31,7 @@ class Given:
     label: str
     n: int
     tape: Tape
+    linear: ClassVar[bool] = True
 
     @classmethod
     def from_function(cls, name: str, n: int, function: Callable[[ca.SX], ca.SX] | ca.Function) -> "Given":
@@ -39,6 +44,14 @@ class Given:
         xi = expression_of(f"coordinates '{name}'", function, q)
         require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
         return cls(name, n, to_tape(dense_function("xi", [q], [xi])))
+
+    def for_problem(self, problem: "Problem") -> "Given":
+        """Itself."""
+        return self
+
+    def closed_form(self, problem: "Problem") -> ClosedForm:
+        """No parameters."""
+        return ClosedForm(np.zeros(0))
 
     def family(self, space: JointSpace, outputs: int) -> "GivenFamily":
         """The coordinates as a family without parameters.

@@ -1,15 +1,17 @@
 """Linear coordinates: stacks of parallel planes ([AS2023] Sec. 4)."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import casadi as ca
 import numpy as np
 
 from orthocas.checks import Array, frozen_array, require_known
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.parametrisations.family import JointSpace
-from orthocas.parametrisations.product_basis import LinearFamily
+from orthocas.metrics import metric_matrices
+from orthocas.parametrisations.family import ClosedForm, JointSpace
+from orthocas.parametrisations.product_basis import ProductFamily, product_family
+from orthocas.problem import Problem, task_jacobians
 
 Normals = Literal["orthonormal", "paper"]
 
@@ -26,6 +28,7 @@ class Linear:
 
     base: tuple[float, ...] | None = None
     normals: Normals = "orthonormal"
+    linear: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         require_known("normals", self.normals, ("orthonormal", "paper"))
@@ -37,14 +40,32 @@ class Linear:
         """'linear'."""
         return "linear"
 
-    def family(self, space: JointSpace, outputs: int) -> LinearFamily:
+    def for_problem(self, problem: Problem) -> "Linear":
+        """Itself."""
+        return self
+
+    def closed_form(self, problem: Problem) -> ClosedForm:
+        """Normals at the base; the coordinates vanish there and keep their unit normals.
+
+        Raises:
+            ShapeError: if the base does not have n entries.
+            InvalidValueError, SingularTaskError: if the task is singular there.
+        """
+        base = frozen_array("base", problem.domain.centre if self.base is None else self.base, (problem.n,))
+        J, A = task_jacobians(problem, base[None])[0], metric_matrices(problem.metric, base[None])[0]
+        if not (J**2).sum(axis=1).all():
+            raise InvalidValueError("base", base.tolist(), "a joint position where no task gradient vanishes")
+        theta = self.normal_vectors(np.linalg.solve(A, J.T).T).ravel()
+        return ClosedForm(theta, base, scaled=False)
+
+    def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Linear functions of q; the parameters are the normals, row by row."""
         terms = tuple(tuple(int(i == k) for i in range(space.n)) for k in range(space.n))
 
         def displacement(i: int, q: ca.SX) -> list[ca.SX]:
             return [1 + 0 * q, q - space.centre[i]]
 
-        return LinearFamily(space, outputs, terms, displacement, lambda i: np.array([[0.0, 0.0], [1.0, 0.0]]))
+        return product_family(space, outputs, terms, displacement, lambda i: np.array([[0.0, 0.0], [1.0, 0.0]]))
 
     def normal_vectors(self, gradients: Array) -> Array:
         """Rows n_j with n_j . grad_A h_i = 0, unit length, (r, n).

@@ -1,7 +1,9 @@
 """Multilayer perceptron with sine and cosine inputs ([AS2023] Sec. 6, Fig. 16)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TYPE_CHECKING, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -9,6 +11,9 @@ import numpy as np
 from orthocas.checks import Array, require_count
 from orthocas.errors import InvalidValueError
 from orthocas.parametrisations.family import Expression, JointSpace
+
+if TYPE_CHECKING:
+    from orthocas.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -20,6 +25,8 @@ class MLP:
     """
 
     hidden: tuple[int, ...] = (64, 64)
+    linear: ClassVar[bool] = False
+    closed_form: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.hidden, tuple | list) or not self.hidden:
@@ -30,6 +37,10 @@ class MLP:
     def label(self) -> str:
         """'mlp:WIDTHxWIDTH'."""
         return "mlp:" + "x".join(map(str, self.hidden))
+
+    def for_problem(self, problem: "Problem") -> "MLP":
+        """Itself."""
+        return self
 
     def family(self, space: JointSpace, outputs: int) -> "MLPFamily":
         """The network on the given joints."""
@@ -125,3 +136,9 @@ class MLPFamily:
             bound = np.sqrt(6 / (width + out))
             parts += [rng.uniform(-bound, bound, out * width), np.zeros(out)]
         return np.concatenate(parts)
+
+    def reordered(self, theta: Array, order: Sequence[int]) -> Array:
+        """The outputs in another order, (size,)."""
+        last = self.outputs * (self.widths[-2] + 1)  # W_out column by column, then b_out
+        columns = theta[-last:].reshape(-1, self.outputs)[:, list(order)]
+        return np.concatenate([theta[:-last], columns.ravel()])

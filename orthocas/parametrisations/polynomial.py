@@ -2,13 +2,17 @@
 
 from dataclasses import dataclass
 from math import comb, sqrt
+from typing import TYPE_CHECKING, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from orthocas.checks import Array, require_count
 from orthocas.parametrisations.family import JointSpace
-from orthocas.parametrisations.product_basis import LinearFamily, terms_up_to
+from orthocas.parametrisations.product_basis import ProductFamily, product_family, terms_up_to
+
+if TYPE_CHECKING:
+    from orthocas.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -20,6 +24,8 @@ class Polynomial:
     """
 
     degree: int
+    linear: ClassVar[bool] = True
+    closed_form: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", require_count("degree", self.degree))
@@ -29,6 +35,10 @@ class Polynomial:
         """'polynomial:DEGREE'."""
         return f"polynomial:{self.degree}"
 
+    def for_problem(self, problem: "Problem") -> "Polynomial":
+        """Itself."""
+        return self
+
     def of_degree(self, degree: int) -> "Polynomial":
         """The same with another degree."""
         return Polynomial(degree)
@@ -37,7 +47,7 @@ class Polynomial:
         """C(n + d, d) - 1."""
         return comb(n + self.degree, self.degree) - 1
 
-    def family(self, space: JointSpace, outputs: int) -> LinearFamily:
+    def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Polynomials in u_i = (q_i - centre_i) / half_width_i."""
 
         def legendre(i: int, q: ca.SX) -> list[ca.SX]:
@@ -54,4 +64,4 @@ class Polynomial:
             return values
 
         degrees = [list(range(self.degree + 1))] * space.n
-        return LinearFamily(space, outputs, tuple(terms_up_to(degrees, self.degree)), legendre, derivatives)
+        return product_family(space, outputs, tuple(terms_up_to(degrees, self.degree)), legendre, derivatives)

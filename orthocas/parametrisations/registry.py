@@ -1,11 +1,13 @@
-"""Parametrisations by name: short labels for the command line, plain data for chart files."""
+"""Parametrisations by name: short labels for the command line, plain data for chart files, and how to add your own."""
 
+import json
+import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any
 
 from orthocas.checks import require_known
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, NotSavableWarning
 from orthocas.parametrisations.family import Parametrisation
 from orthocas.parametrisations.fourier import Fourier
 from orthocas.parametrisations.given import Given
@@ -15,66 +17,120 @@ from orthocas.parametrisations.polynomial import Polynomial
 from orthocas.parametrisations.sew import SEW
 
 
-def _whole(label: str, text: str) -> int:
+@dataclass(frozen=True)
+class Registration:
+    """A parametrisation that files and the command line know."""
+
+    kind: type[Parametrisation]
+    parse: Callable[[str], Parametrisation] | None  #: from what follows 'name:' on the command line
+
+
+_REGISTERED: dict[str, Registration] = {}
+
+
+def register(name: str, kind: type[Parametrisation], parse: Callable[[str], Parametrisation] | None = None) -> None:
+    """Make a parametrisation known by a name: charts of it can be saved and loaded, and the command line can read it.
+
+    Whoever opens such a chart file must have registered the same name first.
+
+    Args:
+        name: unique; labels begin with it.
+        kind: a dataclass whose fields are plain data (numbers, texts, tuples of them), and which can be made of them.
+        parse: what follows the colon in 'name:text' -> parametrisation; without it the command line cannot name it.
+
+    Raises:
+        InvalidValueError: if the name belongs to another class, or the class is not a dataclass.
+    """
+    known = _REGISTERED.get(name)
+    if known is not None and known.kind is not kind:
+        raise InvalidValueError("name", repr(name), f"a name that is not taken by {known.kind.__name__}")
+    if not is_dataclass(kind):
+        raise InvalidValueError("kind", repr(kind), "a dataclass: chart files hold its fields")
+    _REGISTERED[name] = Registration(kind, parse)
+
+
+def parametrisation_names() -> tuple[str, ...]:
+    """Names that the command line understands."""
+    return tuple(name for name, known in _REGISTERED.items() if known.parse is not None)
+
+
+def require_savable(parametrisation: Parametrisation) -> None:
+    """Raise InvalidValueError unless charts of this parametrisation can be saved, before anything is fitted."""
+    parametrisation_to_data(parametrisation)
+
+
+def warn_unless_savable(parametrisation: Parametrisation) -> None:
+    """Warn before a fit, with NotSavableWarning, if its chart could not be saved."""
     try:
-        return int(text)
-    except ValueError:
-        raise InvalidValueError(
-            "parametrisation", repr(label), "whole numbers, as in polynomial:4 or mlp:64x64"
-        ) from None
-
-
-def _linear(label: str, text: str) -> Linear:
-    if text:
-        raise InvalidValueError("parametrisation", repr(label), "'linear' without a number")
-    return Linear()
-
-
-PARAMETRISATIONS: dict[str, Callable[[str, str], Parametrisation | SEW]] = {
-    "linear": _linear,
-    "polynomial": lambda label, text: Polynomial(_whole(label, text)),
-    "fourier": lambda label, text: Fourier(_whole(label, text)),
-    "mlp": lambda label, text: MLP(tuple(_whole(label, width) for width in text.split("x"))),
-    "sew": lambda label, text: SEW(text or "stereographic"),
-}
-
-
-_CLASSES: dict[str, type[Linear] | type[Polynomial] | type[Fourier] | type[MLP] | type[Given]] = {
-    kind.__name__: kind for kind in (Linear, Polynomial, Fourier, MLP, Given)
-}
+        require_savable(parametrisation)
+    except InvalidValueError as error:
+        warnings.warn(f"charts of this fit cannot be saved: {error}", NotSavableWarning, stacklevel=3)
 
 
 def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
     """Kind and settings as plain data.
 
     Raises:
-        InvalidValueError: if it is not one of ours, so that it could not be read back.
+        InvalidValueError: if it is not registered, or its settings are not plain data.
     """
-    if not isinstance(parametrisation, Linear | Polynomial | Fourier | MLP | Given):
-        known = ", ".join(_CLASSES)
+    kind = type(parametrisation)
+    if kind not in {known.kind for known in _REGISTERED.values()} or not is_dataclass(parametrisation):
         raise InvalidValueError(
-            "parametrisation", type(parametrisation).__name__, f"one that chart files know: {known}"
+            "parametrisation",
+            kind.__name__,
+            f"a registered one, for a chart file: orthocas.parametrisations.register('...', {kind.__name__})",
         )
-    return {"parametrisation": type(parametrisation).__name__, "settings": asdict(parametrisation)}
+    settings = asdict(parametrisation)
+    try:
+        json.dumps(settings)
+    except (TypeError, ValueError) as error:
+        raise InvalidValueError(f"settings of {kind.__name__}", f"no plain data ({error})", "plain data") from None
+    return {"parametrisation": kind.__name__, "settings": settings}
 
 
 def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
     """Read `parametrisation_to_data` back.
 
     Raises:
-        UnknownNameError: if there is no such parametrisation.
+        UnknownNameError: if there is no such parametrisation here.
     """
-    require_known("parametrisation", data["parametrisation"], _CLASSES)
-    return _CLASSES[data["parametrisation"]](**data["settings"])
+    kinds = {known.kind.__name__: known.kind for known in _REGISTERED.values()}
+    require_known("parametrisation", data["parametrisation"], kinds)
+    return kinds[data["parametrisation"]](**data["settings"])
 
 
-def parse_parametrisation(label: str) -> Parametrisation | SEW:
-    """Read 'polynomial:4', 'fourier:2', 'mlp:64x64', 'linear' or 'sew:stereographic'.
+def parse_parametrisation(label: str) -> Parametrisation:
+    """Read 'polynomial:4', 'fourier:2', 'mlp:64x64', 'linear', 'sew:stereographic', or the label of a registered one.
 
     Raises:
         UnknownNameError: if there is no such parametrisation.
-        InvalidValueError: if the part behind the colon does not fit.
+        InvalidValueError: if the part after the colon does not fit.
     """
     name, _, text = label.partition(":")
-    require_known("parametrisation", name, PARAMETRISATIONS)
-    return PARAMETRISATIONS[name](label, text)
+    require_known("parametrisation", name, parametrisation_names())
+    parse = _REGISTERED[name].parse
+    assert parse is not None
+    return parse(text)
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise InvalidValueError(
+            "parametrisation", repr(text), "whole numbers, as in polynomial:4 or mlp:64x64"
+        ) from None
+
+
+def _linear(text: str) -> Linear:
+    if text:
+        raise InvalidValueError("parametrisation", repr(f"linear:{text}"), "'linear' without a number")
+    return Linear()
+
+
+register("linear", Linear, _linear)
+register("polynomial", Polynomial, lambda text: Polynomial(_whole(text)))
+register("fourier", Fourier, lambda text: Fourier(_whole(text)))
+register("mlp", MLP, lambda text: MLP(tuple(_whole(width) for width in text.split("x"))))
+register("sew", SEW, lambda text: SEW(text or "stereographic"))
+register("given", Given)

@@ -1,10 +1,12 @@
 """The shoulder-elbow-wrist angle as a coordinate: what 7-joint arms with a pose task use today."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from orthocas.checks import require_known
 from orthocas.errors import InvalidValueError
-from orthocas.parametrisations.given import Given
+from orthocas.parametrisations.family import ClosedForm, JointSpace
+from orthocas.parametrisations.given import Given, GivenFamily
 from orthocas.parametrisations.shoulder_elbow_wrist import SEW_KINDS, sew_angle
 from orthocas.problem import Problem
 
@@ -20,6 +22,7 @@ class SEW:
     """
 
     kind: str = "stereographic"
+    linear: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         require_known("SEW angle", self.kind, SEW_KINDS)
@@ -39,3 +42,15 @@ class SEW:
         if problem.r != 1:
             raise InvalidValueError("r", problem.r, "1, one SEW angle: take the task pose of a 7-joint arm")
         return Given.from_function(self.label, problem.n, sew_angle(problem.robot, self.kind))
+
+    def closed_form(self, problem: Problem) -> ClosedForm:
+        """No parameters."""
+        return self.for_problem(problem).closed_form(problem)
+
+    def family(self, space: JointSpace, outputs: int) -> GivenFamily:
+        """Not known yet.
+
+        Raises:
+            InvalidValueError: always: the angle depends on the robot, which `for_problem` looks at.
+        """
+        raise InvalidValueError("parametrisation", self.label, "the angle of a robot: for_problem(problem)")

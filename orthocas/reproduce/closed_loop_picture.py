@@ -10,10 +10,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.control import ControlStatus
-from orthocas.reproduce.planar_loop import Run
-from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, THIRD, TICK
+from orthocas.reproduce.drawing import Drawing
+from orthocas.reproduce.planar_loop import GENTLE, INTERLEAVED, Arm, Run, follow, task_angle_std
+from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, THIRD, TICK, new_figure
 
 COLOURS = {"x": TASK, "y": "#8e44ad", "xi1": EXTRA, "xi2": THIRD}  #: of coordinates
 JOINTS = (INK, "#c51b7d", "#8a8f98")  #: colours of joints
@@ -124,3 +126,28 @@ def curve_legend(figure: Figure, run: Run, joints: bool = True, extra: Sequence[
 def _style(axes: Any) -> None:
     axes.tick_params(labelsize=TICK)
     axes.grid(alpha=0.3)
+
+
+def interleaved(chart: Chart, quick: bool) -> Drawing:
+    """The picture of Figs. 22 and 23 for a chart around the base."""
+    arm = Arm()
+    run = follow(chart, arm.base(GENTLE), INTERLEAVED)
+    return Drawing(
+        {"": _picture(run)}, run.numbers() | {"task_angle_std_deg": task_angle_std(chart, arm.box(GENTLE), quick)}
+    )
+
+
+def _picture(run: Run) -> Figure:
+    figure = new_figure(3.6)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1))
+    above, below = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, 0])
+    draw_coordinates(above, run)
+    draw_joints(below, run)
+    plane = figure.add_subplot(grid[:, 1])
+    draw_plane(plane, run, "x", "xi1")
+    name_panel(above, "(a) coordinates [m], [1]")
+    name_panel(plane, r"(b) plane of $x$ and $\xi_1$")
+    name_panel(below, "(c) joint motion [rad]")
+    below.set_xlabel("time [s]", fontsize=LABEL)
+    curve_legend(figure, run)
+    return figure

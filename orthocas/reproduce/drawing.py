@@ -25,6 +25,9 @@ class Drawing:
 def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
     """Write `<name><suffix>.png`, `<name>_<suffix>.stl` and `<name>.json`; each appears whole or not at all.
 
+    Figures without 3-D axes are written as `<name><suffix>.pdf` too, in vectors. In 3-D these would be large files with
+    hairlines between triangles.
+
     Args:
         drawing: what to write.
         name: how file names begin, for example "fig07".
@@ -42,6 +45,8 @@ def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
     writers: dict[str, Callable[[Path], object]] = {}
     for suffix, figure in drawing.figures.items():
         writers[f"{name}{suffix}.png"] = partial(figure.savefig, dpi=DPI)
+        if not any(axes.name == "3d" for axes in figure.axes):
+            writers[f"{name}{suffix}.pdf"] = partial(figure.savefig, dpi=DPI, metadata={"CreationDate": None})
     for suffix, mesh in drawing.meshes.items():
         writers[f"{name}_{suffix}.stl"] = mesh.export
     writers[f"{name}.json"] = lambda draft: draft.write_text(text)

@@ -89,15 +89,13 @@ def _cube_axes(figure: Any, left: float, bottom: float, title: str) -> Any:
 def _draw_triangles(axes: Any, leaf: DiskLeaf) -> None:
     scene = Scene()
     scene.add_cube(_LOW, _HIGH, 0.02)
-    add_with_edges(scene, leaf.vertices, leaf.mesh.faces, _quadrants(leaf), np.array(to_rgb(INK)), 0.03)
+    add_with_edges(scene, leaf.vertices, leaf.faces, _quadrants(leaf), np.array(to_rgb(INK)), 0.03)
     scene.draw(axes, _VIEW, _LOW, _HIGH, _ZOOM)
 
 
 def _draw_disk(figure: Any, leaf: DiskLeaf) -> None:
     axes = figure.add_axes((0.6, 0.595, 0.36, 0.36 * 6.3 / 6.7))
-    triangles = PolyCollection(
-        list(leaf.disk[leaf.mesh.faces]), facecolors=_quadrants(leaf), edgecolors=INK, linewidths=0.4
-    )
+    triangles = PolyCollection(list(leaf.disk[leaf.faces]), facecolors=_quadrants(leaf), edgecolors=INK, linewidths=0.4)
     axes.add_collection(triangles)
     axes.set(xlim=(-1.04, 1.04), ylim=(-1.04, 1.04), aspect="equal")
     axes.set_title("(b) the same in the unit disk", fontsize=LABEL)
@@ -109,7 +107,7 @@ def _draw_disk(figure: Any, leaf: DiskLeaf) -> None:
 
 def _quadrants(leaf: DiskLeaf) -> Array:
     """Colours of triangles by the quadrant of the disk their middles lie in, (F, 3)."""
-    right, upper = (leaf.disk[leaf.mesh.faces].mean(axis=1) > 0).T
+    right, upper = (leaf.disk[leaf.faces].mean(axis=1) > 0).T
     tints: Array = _TINTS[2 * right + upper]
     return tints
 
@@ -119,7 +117,7 @@ def _draw_leaves(axes: Any, leaf: DiskLeaf, cuts: Mapping[float, float]) -> None
     scene = Scene()
     scene.add_cube(_LOW, _HIGH, 0.02)
     for x, cut in cuts.items():
-        vertices, faces, xi = part_below(moved_leaf(leaf, x), leaf.mesh.faces, leaf.disk[:, 1], cut, leaf.disk)
+        vertices, faces, xi = part_below(moved_leaf(leaf, x), leaf.faces, leaf.disk[:, 1], cut, leaf.disk)
         families = [
             Isolines(xi[:, k], _LEVELS, np.tile(to_rgba(colour), (len(_LEVELS), 1)), 0.055)
             for k, colour in enumerate((FIRST, SECOND))
@@ -129,7 +127,7 @@ def _draw_leaves(axes: Any, leaf: DiskLeaf, cuts: Mapping[float, float]) -> None
 
 
 def _mesh_numbers(fine: DiskLeaf, coarse: DiskLeaf) -> dict[str, float]:
-    flipped = [np.sum(signed_areas(leaf.disk, leaf.mesh.faces) <= 0) for leaf in (fine, coarse)]
+    flipped = [np.sum(signed_areas(leaf.disk, leaf.faces) <= 0) for leaf in (fine, coarse)]
     off = fine.problem.task.batched(fine.vertices)[0]
     return {
         "coarse_triangles": float(len(coarse.faces)),

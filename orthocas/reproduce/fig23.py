@@ -1,7 +1,7 @@
 """[AS2023] Fig. 23: the interleaved steps of Fig. 22 with fitted coordinates."""
 
+from orthocas.reproduce.closed_loop_picture import interleaved
 from orthocas.reproduce.drawing import Drawing
-from orthocas.reproduce.fig22 import interleaved
 from orthocas.reproduce.planar_loop import GENTLE, Arm
 
 

@@ -13,19 +13,18 @@ import numpy as np
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
 from orthocas.checks import Array
-from orthocas.coordinates.fitted import Coordinates, joint_space
+from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import sample_evenly
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import fit
 from orthocas.fitting.loss import Weights
-from orthocas.parametrisations import Fourier
-from orthocas.parametrisations.product_basis import LinearFamily
+from orthocas.parametrisations import Fourier, JointSpace, LinearFamily
 from orthocas.problem import Problem
 from orthocas.reproduce.planar_flow import grown_chart
 from orthocas.samples import sample_problem, samples_at
 from orthocas.solvers import GaussNewton
 
-_WEIGHTS = Weights(1000.0, 0.0)  # one coordinate: no mutual angles
+_WEIGHTS = Weights.of((1000.0, 0.0))  # one coordinate: no mutual angles
 
 
 def freely_fitted(problem: Problem, quick: bool) -> Chart:
@@ -35,7 +34,7 @@ def freely_fitted(problem: Problem, quick: bool) -> Chart:
 
 def fitted_from_grown(problem: Problem, quick: bool) -> Chart:
     """The minimum of the loss (25) that is reached from the cosine of the grown coordinate."""
-    space, series = joint_space(problem), _series(quick)
+    space, series = JointSpace.of(problem), _series(quick)
     family = series.family(space, 1)
     points = sample_evenly(problem.domain, _sample_count(quick), 0)
     start = _cosine_of_grown(problem, family, points)

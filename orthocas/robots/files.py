@@ -1,68 +1,49 @@
-"""Reading URDF and MJCF files through Pinocchio, and locking joints."""
+"""Reading URDF files into Pinocchio models, and locking joints of any model."""
 
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
 from orthocas.checks import Array, require_known
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.robots.pinocchio_model import frame_index
-
-_SLIDE = """<mujoco><worldbody><body name="b"><joint name="s" type="slide" range="-1 1"/>
-<geom type="sphere" size="0.1" mass="1"/></body></worldbody></mujoco>"""  # a range of 1 m
+from orthocas.robots.pinocchio_model import frame_index, joint_axis, leader_of, remedy
+from orthocas.robots.urdf_checks import check_urdf
+from orthocas.robots.xml_files import read_xml
 
 
 def read_urdf(path: str | Path) -> pin.Model:
     """Read a URDF file; mimic joints stay visible so that they can be refused or locked.
 
     Raises:
-        RobotError: if the file is missing or is not a URDF model.
+        RobotError: if the file is missing or is not a URDF model, or a joint moves along no axis.
     """
-    return _read(Path(path), "robot", "URDF", lambda name: pin.buildModelFromUrdf(name, mimic=True))
-
-
-def read_mjcf(path: str | Path) -> pin.Model:
-    """Read a MuJoCo MJCF file.
-
-    Raises:
-        RobotError: if the file is missing or is not an MJCF model.
-    """
-    model = _read(Path(path), "mujoco", "MJCF", pin.buildModelFromMJCF)
-    compiler = ElementTree.parse(path).getroot().find("compiler")
-    if compiler is None or compiler.get("angle", "degree") == "degree":
-        _in_metres(model)
+    check_urdf(path, read_xml(path, "URDF", "robot"))
+    with _captured_stderr() as notes:
+        try:
+            model = pin.buildModelFromUrdf(str(path), mimic=True)
+        except (ValueError, RuntimeError) as error:
+            raise RobotError(f"{path} is not a usable URDF model: {_text(notes) or error}") from None
+        complaints = _text(notes)
+    if "Error:" in complaints:  # the parser goes on without what it could not read, a mass for example
+        raise RobotError(f"{path} is not a usable URDF model: {complaints}")
     return model
-
-
-def _in_metres(model: pin.Model) -> None:
-    """Undo what Pinocchio (4.1) does to ranges of slides in files with angles in degrees: it scales them like angles.
-
-    How much it scales is asked of it, so that a version that does it right stays untouched.
-    """
-    slides = [joint.idx_q for joint in model.joints if joint.shortname().startswith("JointModelP") and joint.nq == 1]
-    if not slides:
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        probe = Path(folder) / "probe.xml"
-        probe.write_text(_SLIDE)
-        scale = pin.buildModelFromMJCF(str(probe)).upperPositionLimit[0]
-    for limits in (model.lowerPositionLimit, model.upperPositionLimit):
-        limits[slides] /= scale
 
 
 def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
     """Fix joints at the given positions [rad] or [m]; joints that mimic a locked joint follow it.
 
+    A joint with several degrees of freedom (floating, spherical, planar) is fixed at its neutral position, which is 0.
+
     Raises:
         UnknownNameError: if there is no such joint.
         InvalidValueError: if a position is not finite.
+        RobotError: if the joint mimics another one, or has several degrees of freedom and a position other than 0.
     """
     if not isinstance(locked, Mapping):
         raise InvalidValueError("locked", locked, "a mapping from joint names to positions")
@@ -75,7 +56,7 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
             raise InvalidValueError(f"locked position of joint '{name}'", repr(value), "a finite number")
         ids.append(model.getJointId(name))
         _set_position(model, ids[-1], float(value), position)
-    ids += [i for i in _mimic_ids(model) if i not in ids and _is_led_by(model, i, ids)]
+    ids += [i for i in model.mimicking_joints if leader_of(model, i) in ids]
     return pin.buildReducedModel(model, ids, position) if ids else model
 
 
@@ -84,13 +65,16 @@ def lock_off_chain(model: pin.Model, tip: str) -> pin.Model:
 
     Raises:
         UnknownNameError: if there is no frame called tip.
+        RobotError: if a joint that moves the tip is not revolute, continuous or prismatic (named in the message).
     """
-    chain = set(model.supports[model.frames[frame_index(model, tip)].parentJoint])
+    chain = [i for i in model.supports[model.frames[frame_index(model, tip)].parentJoint] if i > 0]
+    for i in chain:
+        joint_axis(model, i)
     ids = [i for i in range(1, model.njoints) if i not in chain]
-    position = pin.neutral(model)
+    position, mimics = pin.neutral(model), set(model.mimicking_joints)
     for i in ids:
         joint = model.joints[i]
-        if joint.nq == joint.nv == 1 and i not in _mimic_ids(model):
+        if joint.nq == joint.nv == 1 and i not in mimics:
             limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
             position[joint.idx_q] = np.clip(0.0, *limits)
     return pin.buildReducedModel(model, ids, position) if ids else model
@@ -108,27 +92,6 @@ def default_tip(model: pin.Model) -> str:
     if len(leaves) != 1:
         raise RobotError(f"the robot ends in {len(leaves)} places, name the tip frame: {', '.join(last.values())}")
     return last[leaves[0]]
-
-
-def _read(path: Path, root: str, kind: str, build: Callable[[str], pin.Model]) -> pin.Model:
-    """Check that the file is XML of the right kind, then let Pinocchio build the model."""
-    try:
-        found = ElementTree.parse(path).getroot().tag
-    except OSError as error:
-        raise RobotError(f"cannot read {kind} file {path}: {error.strerror}") from None
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise RobotError(f"{path} is not a {kind} file: {error}") from None
-    if found != root:
-        raise RobotError(f"{path} is not a {kind} file: its root element is <{found}>, expected <{root}>")
-    with _captured_stderr() as notes:
-        try:
-            model = build(str(path))
-        except (ValueError, RuntimeError) as error:
-            raise RobotError(f"{path} is not a usable {kind} model: {_text(notes) or error}") from None
-        complaints = _text(notes)
-    if "Error:" in complaints:  # the parser goes on without what it could not read, a mass for example
-        raise RobotError(f"{path} is not a usable {kind} model: {complaints}")
-    return model
 
 
 @contextmanager
@@ -152,16 +115,15 @@ def _text(notes: IO[bytes]) -> str:
 
 def _set_position(model: pin.Model, i: int, value: float, position: Array) -> None:
     """Write a joint position into a configuration; Pinocchio keeps cos and sin of a continuous joint."""
-    joint = model.joints[i]
+    joint, name = model.joints[i], model.names[i]
+    if i in set(model.mimicking_joints):
+        leader = model.names[leader_of(model, i)]
+        raise RobotError(f"joint '{name}' mimics joint '{leader}', expected an independent joint: {remedy(leader)}")
     if joint.nv != 1:
-        raise RobotError(f"joint '{model.names[i]}' is of type {joint.shortname()} and cannot be locked at one number")
+        if value != 0:
+            raise RobotError(
+                f"locked position of joint '{name}' is {value:g}, expected 0: "
+                f"a joint with {joint.nv} degrees of freedom is locked at its neutral position only"
+            )
+        return
     position[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(value), np.sin(value)) if joint.nq == 2 else value
-
-
-def _mimic_ids(model: pin.Model) -> list[int]:
-    return [i for i in range(1, model.njoints) if model.joints[i].shortname() == "JointModelMimic"]
-
-
-def _is_led_by(model: pin.Model, mimic: int, ids: list[int]) -> bool:
-    """Whether a mimic joint takes its position from one of the joints ids (it shares its index in q)."""
-    return any(model.joints[i].idx_q == model.joints[mimic].idx_q for i in ids)

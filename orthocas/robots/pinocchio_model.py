@@ -5,9 +5,9 @@ import pinocchio as pin
 
 from orthocas.checks import Array, require_known
 from orthocas.errors import RobotError
+from orthocas.robots.spatial import rotation_z_to, snap
 from orthocas.robots.tree import JointKind, KinematicTree
 
-_ROUNDING = 1e-14  # rotation entries this close to 0 or +-1 come from rounding in rpy -> matrix
 _UNLIMITED = 1e10  # Pinocchio writes the largest double for "no limit"
 
 
@@ -19,8 +19,8 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         RobotError: if a joint is not revolute, continuous or prismatic (named in the message).
     """
     frame = model.frames[frame_index(model, tip)]
-    axes = [_joint_axis(model, i) for i in range(1, model.njoints)]
-    turns = [np.eye(3)] + [_rotation_z_to(axis) for _, axis in axes]  # body frame -> frame with the axis along z
+    axes = [joint_axis(model, i) for i in range(1, model.njoints)]
+    turns = [np.eye(3)] + [rotation_z_to(axis) for _, axis in axes]  # body frame -> frame with the axis along z
     bodies = range(1, model.njoints)
     carrier = frame.parentJoint
     continuous = [model.joints[i].nq == 2 for i in bodies]
@@ -29,7 +29,7 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         joint_kinds=tuple(kind for kind, _ in axes),
         parents=tuple(model.parents[i] - 1 for i in bodies),
         rotations=np.array(
-            [_snap(turns[model.parents[i]].T @ model.jointPlacements[i].rotation @ turns[i]) for i in bodies]
+            [snap(turns[model.parents[i]].T @ model.jointPlacements[i].rotation @ turns[i]) for i in bodies]
         ),
         translations=np.array([turns[model.parents[i]].T @ model.jointPlacements[i].translation for i in bodies]),
         masses=np.array([model.inertias[i].mass for i in bodies]),
@@ -38,34 +38,42 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         armatures=np.array([model.armature[model.joints[i].idx_v] for i in bodies]),
         lower=_limits(model, model.lowerPositionLimit, continuous, -np.inf),
         upper=_limits(model, model.upperPositionLimit, continuous, np.inf),
+        effort_limits=_largest(model, model.effortLimit),
+        velocity_limits=_largest(model, model.velocityLimit),
         tip_name=tip,
         tip_parent=carrier - 1,
-        tip_rotation=_snap(turns[carrier].T @ frame.placement.rotation),
+        tip_rotation=snap(turns[carrier].T @ frame.placement.rotation),
         tip_translation=turns[carrier].T @ frame.placement.translation,
         gravity=np.array(model.gravity.linear),
     )
 
 
 def frame_index(model: pin.Model, name: str) -> int:
-    """Index of a frame; where a link and a joint share a name, as URDF allows, the link's.
+    """Index of a frame; where a link, a site and a joint share a name, the link's before the site's before the joint's.
 
     Raises:
         UnknownNameError: if there is no such frame.
     """
     require_known("frame", name, [frame.name for frame in model.frames])
     found = [i for i, frame in enumerate(model.frames) if frame.name == name]
-    return min(found, key=lambda i: model.frames[i].type != pin.FrameType.BODY)
+    kinds = {i: model.frames[i].type for i in found}
+    return min(found, key=lambda i: (kinds[i] != pin.FrameType.BODY, kinds[i] == pin.FrameType.JOINT))
 
 
-def _joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
-    """Kind and axis of joint i, read off its motion subspace."""
+def joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
+    """Kind and axis of joint i, read off its motion subspace.
+
+    Raises:
+        RobotError: if the joint is not revolute, continuous or prismatic; the message tells which joint to lock.
+    """
     joint, name = model.joints[i], model.names[i]
-    if joint.shortname() == "JointModelMimic":
-        raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: lock the joint it follows")
+    if i in set(model.mimicking_joints):
+        leader = model.names[leader_of(model, i)]
+        raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: {remedy(leader)}")
     if joint.nv != 1:
         raise RobotError(
             f"joint '{name}' is of type {joint.shortname()} with {joint.nv} degrees of freedom, "
-            "expected revolute, continuous or prismatic joints"
+            f"expected revolute, continuous or prismatic joints: {remedy(name)}"
         )
     data = joint.createData()
     joint.calc(data, pin.neutral(model))
@@ -75,25 +83,26 @@ def _joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
         return "revolute", angular
     if not angular.any():
         return "prismatic", linear
-    raise RobotError(f"joint '{name}' is helical, expected revolute, continuous or prismatic joints")
+    raise RobotError(f"joint '{name}' is helical, expected revolute, continuous or prismatic joints: {remedy(name)}")
 
 
-def _rotation_z_to(axis: Array) -> Array:
-    """A rotation T with T z = axis; a signed permutation where axis is a coordinate axis, so that zeros stay zeros."""
-    z = _snap(axis / np.linalg.norm(axis))
-    helper = np.roll(np.eye(3)[int(np.argmax(np.abs(z)))], 1)
-    y = np.cross(z, helper)
-    y = _snap(y / np.linalg.norm(y))
-    return np.column_stack([np.cross(y, z), y, z])
+def leader_of(model: pin.Model, mimic: int) -> int:
+    """The joint that a mimic joint follows."""
+    return int(model.mimicked_joints[list(model.mimicking_joints).index(mimic)])
 
 
-def _snap(values: Array) -> Array:
-    """Round entries that are 0 or +-1 up to rounding, so that CasADi drops the terms."""
-    rounded = np.round(values)
-    return np.where(np.abs(values - rounded) < _ROUNDING, rounded, values) + 0.0
+def remedy(joint: str) -> str:
+    """How to lock a joint, in Python and on the command line."""
+    return f"lock it with locked={{'{joint}': 0.0}} or --lock {joint}=0"
 
 
 def _limits(model: pin.Model, limits: Array, continuous: list[bool], unlimited: float) -> Array:
     """Position limits, one per joint; a continuous joint has none."""
     values = [unlimited if free else limits[model.joints[i + 1].idx_q] for i, free in enumerate(continuous)]
     return np.array([unlimited if abs(value) > _UNLIMITED else value for value in values])
+
+
+def _largest(model: pin.Model, limits: Array) -> Array:
+    """Limits of effort or velocity, one per joint; 0, which files write for want of a number, means none."""
+    values = np.array([limits[joint.idx_v] for joint in model.joints[1:]])
+    return np.where((values > 0) & (values < _UNLIMITED), values, np.inf)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,29 +11,39 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_known
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
+from orthocas.robots.homes import model_states, postures, srdf_states
+from orthocas.robots.mjcf import model_from_mjcf
 from orthocas.robots.pinocchio_model import frame_index, tree_from_model
+from orthocas.robots.tool import with_tool
 from orthocas.robots.tree import KinematicTree
+from orthocas.showing import Shown, listed, number_list
+
+Locked = Mapping[str, float] | None  #: joint -> position where it stays [rad] or [m]
+Tool = ArrayLike | None
 
 
-class Robot:
+class Robot(Shown):
     """A fixed-base robot with n revolute or prismatic joints and one tip frame.
 
     Methods take CasADi columns (n, 1), SX or MX, and return the same kind; or NumPy, one state (n,) or a set
     (N, n), and return NumPy. Positions in rad or m, velocities in rad/s or m/s, forces in N m or N.
     """
 
-    def __init__(self, tree: KinematicTree) -> None:
+    def __init__(self, tree: KinematicTree, homes: Mapping[str, ArrayLike] | None = None) -> None:
         self.tree = tree
+        #: postures (n,) that the robot's files name: SRDF group states, MJCF keyframes. Chart files do not keep them.
+        self.homes = {name: frozen_array(f"home '{name}'", q, (tree.n,)) for name, q in (homes or {}).items()}
 
     @classmethod
-    def from_model(cls, model: pin.Model, tip: str, locked: Mapping[str, float] | None = None) -> Self:
-        """Build from a Pinocchio model.
+    def from_model(cls, model: pin.Model, tip: str, locked: Locked = None) -> Self:
+        """Build from a Pinocchio model, with all its joints.
 
         Args:
-            model: the model; joints may be revolute, continuous or prismatic.
+            model: the model; joints left free must be revolute, continuous or prismatic.
             tip: name of any frame of the model.
             locked: joints to fix, with their positions [rad] or [m].
 
@@ -43,29 +52,41 @@ class Robot:
             RobotError: if a joint left free is of another type (floating base, spherical, mimic, ...).
         """
         frame_index(model, tip)
-        return cls(tree_from_model(files.lock_joints(model, locked or {}), tip))
+        tree = tree_from_model(files.lock_joints(model, locked or {}), tip)
+        return cls(tree, postures(model_states(model), tree.joint_names))
 
     @classmethod
-    def from_urdf(cls, path: str | Path, tip: str | None = None, locked: Mapping[str, float] | None = None) -> Self:
-        """Build from a URDF file; see `from_model`. Without a tip, the last frame of a single chain."""
-        model = files.read_urdf(path)
-        return cls.from_model(model, tip or files.default_tip(model), locked)
-
-    @classmethod
-    def from_mjcf(cls, path: str | Path, tip: str | None = None, locked: Mapping[str, float] | None = None) -> Self:
-        """Build from a MuJoCo MJCF file; see `from_model`. Without a tip, the last frame of a single chain."""
-        model = files.read_mjcf(path)
-        return cls.from_model(model, tip or files.default_tip(model), locked)
-
-    @classmethod
-    def chain_from_file(cls, path: str | Path, tip: str | None = None) -> Self:
-        """Build the chain that moves the tip from a URDF or MJCF (.xml) file.
+    def from_file(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
+        """Build the chain that moves the tip from a robot file: MJCF if its name ends in .xml, else URDF.
 
         Every joint that does not move the tip, of any type, is locked at zero, or at the limit next to zero.
+
+        Args:
+            path: the file. Named postures (`homes`) come from an SRDF file with the same stem, beside it or in ../srdf,
+                or from the keyframes of the MJCF file.
+            tip: name of any frame; without it, the last frame of a robot with a single chain.
+            locked: joints to fix elsewhere, or on the way to the tip, with their positions [rad] or [m]. Joints that
+                mimic them follow. A floating, spherical or planar joint is fixed at its neutral position, by 0.
+            tool: where the tip of a massless tool is in the tip frame; see `with_tool`.
+
+        Raises:
+            RobotError: if the file cannot be read, the robot branches and has no tip, or a joint on the way to the tip
+                is not revolute, continuous or prismatic (the message tells which one to lock).
+            UnknownNameError: if the frame or a locked joint does not exist.
         """
-        model = files.read_mjcf(path) if Path(path).suffix == ".xml" else files.read_urdf(path)
-        tip = tip or files.default_tip(model)
-        return cls.from_model(files.lock_off_chain(model, tip), tip)
+        build = cls.from_mjcf if Path(path).suffix.lower() == ".xml" else cls.from_urdf
+        return build(path, tip, locked, tool)
+
+    @classmethod
+    def from_urdf(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
+        """Build the chain that moves the tip from a URDF file; see `from_file`."""
+        robot = cls._chain(files.read_urdf(path), tip, locked, tool)
+        return cls(robot.tree, postures(srdf_states(path), robot.joint_names))
+
+    @classmethod
+    def from_mjcf(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
+        """Build the chain that moves the tip from a MuJoCo MJCF file; see `from_file`."""
+        return cls._chain(model_from_mjcf(path), tip, locked, tool)
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
@@ -82,7 +103,35 @@ class Robot:
         if factors.min() <= 0:
             raise InvalidValueError("factor", factors.min(), "numbers > 0")
         masses, inertias = self.tree.masses * factors, self.tree.inertias * factors[:, None, None]
-        return type(self)(replace(self.tree, masses=masses, inertias=inertias))
+        return type(self)(replace(self.tree, masses=masses, inertias=inertias), self.homes)
+
+    def with_tool(self, tool: ArrayLike) -> Self:
+        """The same robot with its tip at the end of a massless tool: tip pose = old tip pose times the tool's.
+
+        Args:
+            tool: (3,) position in the tip frame [m], (6,) position and roll, pitch, yaw [rad] as in URDF, or a
+                homogeneous transform (4, 4).
+
+        Raises:
+            InvalidValueError: if it is none of these.
+        """
+        return type(self)(with_tool(self.tree, tool), self.homes)
+
+    def home(self, name: str) -> Array:
+        """A posture (n,) that the robot's files name.
+
+        Raises:
+            UnknownNameError: if there is no such posture, with those that do exist.
+        """
+        require_known("home", name, self.homes or {"none, the robot's files name no posture": None})
+        return self.homes[name]
+
+    @classmethod
+    def _chain(cls, model: pin.Model, tip: str | None, locked: Locked, tool: Tool) -> Self:
+        """The joints of a model that move the tip, less those the user locks."""
+        tip = tip or files.default_tip(model)
+        robot = cls.from_model(files.lock_off_chain(files.lock_joints(model, locked or {}), tip), tip)
+        return robot if tool is None else robot.with_tool(tool)
 
     @property
     def n(self) -> int:
@@ -103,6 +152,28 @@ class Robot:
     def upper(self) -> Array:
         """Upper joint limits (n,) [rad] or [m], inf where unlimited."""
         return self.tree.upper
+
+    @property
+    def effort_limits(self) -> Array:
+        """Largest joint torques [N m] or forces [N], (n,), inf where the file has none, or 0."""
+        return self.tree.effort_limits
+
+    @property
+    def velocity_limits(self) -> Array:
+        """Largest joint speeds [rad/s] or [m/s], (n,), inf where the file has none, or 0."""
+        return self.tree.velocity_limits
+
+    def facts(self) -> dict[str, str]:
+        """Joints, limits, tip and mass."""
+        tree = self.tree
+        sliding = [name for name, slides in zip(tree.joint_names, tree.prismatic, strict=True) if slides]
+        return {
+            "robot": f"{self.n} joints, tip {tree.tip_name}, {tree.masses.sum():.4g} kg",
+            "joints": listed(tree.joint_names),
+            **({"prismatic": listed(sliding)} if sliding else {}),
+            "lower": number_list(self.lower),
+            "upper": number_list(self.upper),
+        }
 
     def mass_matrix(self, q: Any) -> Any:
         """M(q), (n, n), symmetric positive definite."""

@@ -1,8 +1,13 @@
-"""Small pieces of rigid-body algebra on CasADi SX columns."""
+"""Small pieces of rigid-body algebra: on CasADi SX columns, and on numbers."""
 
 import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
 
-from orthocas.checks import Array
+from orthocas.checks import Array, frozen_array
+from orthocas.errors import InvalidValueError
+
+_ROUNDING = 1e-14  # rotation entries this close to 0 or +-1 come from rounding in rpy -> matrix
 
 
 def skew(v: ca.SX) -> ca.SX:
@@ -17,6 +22,48 @@ def turn(q: ca.SX) -> ca.SX:
     return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
 
 
+def half_angle_vector(R: ca.SX) -> ca.SX:
+    """2 sin(angle / 2) axis of a rotation matrix, (3, 1): vee(R - R^T) / sqrt(1 + trace R)."""
+    vee = ca.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
+    return vee / ca.sqrt(1 + ca.trace(R))
+
+
+def tilt(R: ca.SX, axis: int) -> ca.SX:
+    """2 sin(angle / 2) times the direction in which a rotation matrix tilts a coordinate axis, (2, 1).
+
+    With d = R e_axis, the two other entries of d times sqrt(2 / (1 + d_axis)): Lambert's equal-area map of the sphere.
+    """
+    d = R[:, axis]
+    return d[[k for k in range(3) if k != axis]] * ca.sqrt(2 / (1 + d[axis]))
+
+
 def constant(values: Array) -> ca.SX:
     """A constant with its zeros dropped from the structure, so that products with them vanish."""
     return ca.SX(ca.sparsify(ca.DM(values)))
+
+
+def rotation_matrix(name: str, value: ArrayLike) -> Array:
+    """A rotation (3, 3), checked and read-only.
+
+    Raises:
+        ShapeError, InvalidValueError: if it is not a rotation matrix.
+    """
+    rotation = frozen_array(name, value, (3, 3))
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
+        raise InvalidValueError(name, rotation.tolist(), "a rotation matrix")
+    return rotation
+
+
+def rotation_z_to(axis: Array) -> Array:
+    """A rotation T with T z = axis; a signed permutation where axis is a coordinate axis, so that zeros stay zeros."""
+    z = snap(axis / np.linalg.norm(axis))
+    helper = np.roll(np.eye(3)[int(np.argmax(np.abs(z)))], 1)
+    y = np.cross(z, helper)
+    y = snap(y / np.linalg.norm(y))
+    return np.column_stack([np.cross(y, z), y, z])
+
+
+def snap(values: Array) -> Array:
+    """Round entries that are 0 or +-1 up to rounding, so that CasADi drops the terms."""
+    rounded = np.round(values)
+    return np.where(np.abs(values - rounded) < _ROUNDING, rounded, values) + 0.0

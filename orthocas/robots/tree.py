@@ -9,6 +9,8 @@ from orthocas.checks import Array, frozen_array, require_known, require_shape
 from orthocas.errors import InvalidValueError, RobotError
 
 JointKind = Literal["revolute", "prismatic"]
+REVOLUTE_ROOM = np.pi / 4  #: [rad] either side of a default posture, the hyper-cube of [AS2023] Sec. 9
+PRISMATIC_ROOM = 0.25  #: [m]
 JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "prismatic")
 
 
@@ -32,6 +34,8 @@ class KinematicTree:
     armatures: Array  #: (n,) rotor inertia seen at the joint [kg m^2] or [kg]
     lower: Array  #: (n,) joint limits [rad] or [m], -inf where unlimited
     upper: Array  #: (n,)
+    effort_limits: Array  #: (n,) largest torque [N m] or force [N], inf where unknown
+    velocity_limits: Array  #: (n,) largest speed [rad/s] or [m/s], inf where unknown
     tip_name: str
     tip_parent: int  #: body that carries the tip, -1 for the base
     tip_rotation: Array  #: (3, 3) in that body's frame
@@ -55,7 +59,7 @@ class KinematicTree:
         }
         for name, shape in shapes.items():
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
-        for name in ("lower", "upper"):  # may be infinite
+        for name in ("lower", "upper", "effort_limits", "velocity_limits"):  # may be infinite
             limits = np.array(getattr(self, name), dtype=float)
             require_shape(name, limits.shape, (n,))
             limits.setflags(write=False)
@@ -74,6 +78,9 @@ class KinematicTree:
                 raise RobotError(
                     f"joint '{name}' has limits [{self.lower[i]:g}, {self.upper[i]:g}], expected lower <= upper"
                 )
+            for what, limit in (("effort", self.effort_limits[i]), ("velocity", self.velocity_limits[i])):
+                if not limit > 0:
+                    raise RobotError(f"joint '{name}' has the {what} limit {limit:g}, expected a number > 0")
             if self.masses[i] < 0:
                 raise RobotError(f"the body moved by joint '{name}' has mass {self.masses[i]:g} kg, expected >= 0")
         if not -1 <= self.tip_parent < self.n:
@@ -83,6 +90,18 @@ class KinematicTree:
     def n(self) -> int:
         """Number of joints."""
         return len(self.joint_names)
+
+    @property
+    def middle(self) -> Array:
+        """A posture away from the joint limits, (n,) [rad] or [m].
+
+        Their middle; where there is one limit or none, the value next to 0 that leaves pi/4 rad (0.25 m) of room.
+        """
+        room = np.where(self.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
+        posture = np.clip(np.zeros(self.n), self.lower + room, self.upper - room)
+        limited = np.isfinite(self.lower) & np.isfinite(self.upper)
+        posture[limited] = (self.lower[limited] + self.upper[limited]) / 2
+        return np.asarray(posture)
 
     @property
     def prismatic(self) -> tuple[bool, ...]:

@@ -1,12 +1,12 @@
 """Where unwanted task acceleration comes from ([AS2023] Fig. 25b)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.checks import Array, require_kind
 from orthocas.errors import InvalidValueError
 from orthocas.simulation.trajectory import Trajectory
 
@@ -16,10 +16,10 @@ class Breakdown:
     """Parts of the task acceleration dd_x along a run, each (N, m). They add up to dd_x."""
 
     labels: tuple[str, ...]  #: of x
-    own: Array  #: J_x M^-1 J_x^T f_x: what the force in the task does
-    error: Array  #: J_x M^-1 J_xi^T f_xi, [AS2023] eq. (38): 0 where (5) holds with A = M
-    curvature: Array  #: dJ_x/dt dq
-    coriolis: Array  #: -J_x M^-1 C dq
+    own: Array = field(repr=False)  #: J_x M^-1 J_x^T f_x: what the force in the task does
+    error: Array = field(repr=False)  #: J_x M^-1 J_xi^T f_xi, [AS2023] eq. (38): 0 where (5) holds with A = M
+    curvature: Array = field(repr=False)  #: dJ_x/dt dq
+    coriolis: Array = field(repr=False)  #: -J_x M^-1 C dq
 
     @property
     def total(self) -> Array:
@@ -39,6 +39,8 @@ def task_acceleration_breakdown(chart: Chart, trajectory: Trajectory) -> Breakdo
     """
     if trajectory.kind != "torque":
         raise InvalidValueError("trajectory", f"one of '{trajectory.controller}'", "one of a torque controller")
+    require_kind("chart", chart, Chart)
+    require_kind("trajectory", trajectory, Trajectory)
     parts = Batched(_parts(chart))(trajectory.q, trajectory.dq, trajectory.command)
     return Breakdown(chart.problem.task.labels, *parts)
 

@@ -2,14 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.scalar_code import scalar_code
+from orthocas.checks import Array
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.errors import SimulationError
@@ -68,6 +69,15 @@ class ClosedLoop:
         command, _ = self.commanded(state, reference.profile.call([t, parameters]))
         rate = ca.Function("rate", [state, t, parameters, load], [self.plant_rate(state, command, load)])
         return scalar_code(rate) if self.controller.function.is_a("SXFunction") else rate
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A part of a run: N instants, each at the end of a step."""
+
+    times: Array  #: (N,) [s]
+    states: Array  #: (N, s)
+    held: tuple[Array, Array] | None = None  #: sampled controllers: commands (N, n) held until then, their status (N,)
 
 
 def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:

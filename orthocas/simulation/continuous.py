@@ -9,7 +9,7 @@ import numpy as np
 
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
-from orthocas.simulation.closed_loop import ClosedLoop, cvodes_options, run_compiled
+from orthocas.simulation.closed_loop import ClosedLoop, Piece, cvodes_options, run_compiled
 from orthocas.simulation.disturbances import Push, loads_at
 
 _OUTPUTS = 25  # instants of one integrator call: one object serves all, and Ctrl-C waits no longer than that
@@ -20,8 +20,8 @@ _SAME = 1e-9  # [s]: events closer than that differ by rounding
 
 def integrate(
     loop: ClosedLoop, reference: Reference, pushes: tuple[Push, ...], start: Array, step: float, tolerance: float
-) -> Iterator[tuple[Array, Array]]:
-    """Times (25,) and states (25, s) in turn, from after the start to the end of the reference.
+) -> Iterator[Piece]:
+    """Pieces of 25 instants in turn, from after the start to the end of the reference.
 
     Raises:
         SimulationError: when CVODES gives up.
@@ -35,7 +35,7 @@ def integrate(
         p = np.concatenate([[end - begin, since], reference.parameters[segment], load])
         states = np.asarray(run_compiled(run, x0=ca.DM(state), p=ca.DM(p))["xf"]).T
         state = states[-1]
-        yield begin + (end - begin) * np.arange(1, _OUTPUTS + 1) / _OUTPUTS, states
+        yield Piece(begin + (end - begin) * np.arange(1, _OUTPUTS + 1) / _OUTPUTS, states)
 
 
 def _pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> Iterator[tuple[float, float]]:

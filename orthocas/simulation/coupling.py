@@ -5,16 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.checks import Array, require_kind
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError
+from orthocas.showing import Shown
 from orthocas.simulation.trajectory import Trajectory
 
 _NO_STEP = 1e-9  # differences of targets that come from rounding
 
 
-@dataclass(frozen=True, eq=False)
-class Coupling:
+@dataclass(frozen=True, eq=False, repr=False)
+class Coupling(Shown):
     """Coupling indices: rows are disturbed coordinates, columns the commanded ones."""
 
     labels: tuple[str, ...]  #: of phi = [x; xi]
@@ -23,6 +24,13 @@ class Coupling:
     def of(self, disturbed: str, commanded: str) -> float:
         """The index of one pair, by labels: how much the first suffers from steps of the second."""
         return float(self.index[self.labels.index(disturbed), self.labels.index(commanded)])
+
+    def facts(self) -> dict[str, str]:
+        """For every commanded coordinate the one it disturbs most."""
+        known = [j for j in range(len(self.labels)) if np.isfinite(self.index[:, j]).any()]
+        worst = {j: int(np.nanargmax(self.index[:, j])) for j in known}
+        found = {f"steps of {self.labels[j]}": f"{self.index[i, j]:.3g} in {self.labels[i]}" for j, i in worst.items()}
+        return {"coupling": f"{len(known)} of {len(self.labels)} coordinates commanded alone", **found}
 
 
 def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -> Coupling:
@@ -42,6 +50,9 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
     Source:
         ours
     """
+    require_kind("chart", chart, Chart)
+    require_kind("reference", reference, Reference)
+    require_kind("trajectory", trajectory, Trajectory)
     if reference.labels != chart.labels:
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
     away = np.abs(chart.phi(trajectory.q) - reference.sample(np.minimum(trajectory.times, reference.duration))[0])

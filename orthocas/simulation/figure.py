@@ -16,20 +16,14 @@ ACTUAL, FALLBACK = "#3d85c6", "#d62728"
 _WANTED, _STORAGE = "#222222", "#1b9e77"
 _SMALL = 8.0  # font size [pt]
 _NARROWEST = 1e-2  # height of a panel, as a share of the widest range of all: what rests looks at rest
-_TASK_UNITS = {  #: by the kind of task
-    "position": {"x": "m", "y": "m", "z": "m"},
-    "polar": {"radius": "m", "angle": "rad"},
-    "orientation": {"rx": "rad", "ry": "rad", "rz": "rad"},
-    "pose": {"x": "m", "y": "m", "z": "m", "rx": "rad", "ry": "rad", "rz": "rad"},
-}
 
 
 def units_of(problem: Problem) -> dict[str, str]:
-    """Units of task components and joints, by label; coordinates and custom tasks have none that is known."""
+    """Units of task components and joints, by label; coordinates have none."""
     joints = {"revolute": "rad", "prismatic": "m"}
     tree = problem.robot.tree
     units = {name: joints[kind] for name, kind in zip(tree.joint_names, tree.joint_kinds, strict=True)}
-    return units | _TASK_UNITS.get(problem.task.name.partition(":")[0], {})
+    return units | {label: unit for label, unit in zip(problem.task.labels, problem.task.units, strict=True) if unit}
 
 
 def trajectory_figure(trajectory: Trajectory, units: Mapping[str, str] | None = None) -> Figure:

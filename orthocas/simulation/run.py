@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched
-from orthocas.checks import Array, as_float_array, frozen_array
-from orthocas.control.controller import Controller
+from orthocas.checks import Array, as_float_array, as_point, require_kind
+from orthocas.control.controller import Controller, require_controller
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, SimulationError
 from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.robots import Robot
-from orthocas.simulation.closed_loop import ClosedLoop
+from orthocas.simulation.closed_loop import ClosedLoop, Piece
 from orthocas.simulation.continuous import integrate
 from orthocas.simulation.disturbances import Friction, Noise, Push
 from orthocas.simulation.sampled import run_ticks
@@ -64,6 +64,7 @@ def simulate(
         UnreachableReferenceError: if the reference leaves the domain.
         ShapeError, InvalidValueError: for what does not fit.
     """
+    _require_kinds(controller, reference, plant, pushes, friction, noise)
     loop = ClosedLoop(controller, plant or controller.problem.robot, friction or Friction())
     for name, value in (
         ("step", step),
@@ -76,7 +77,8 @@ def simulate(
     start = _start_state(loop, q_start, dq_start)
     if must_be_reachable:
         controller.require_reachable(reference, start[: loop.n])
-    loads, pieces = tuple(pushes), []
+    loads = tuple(pushes)
+    pieces: list[Piece] = []
     outcome = Outcome.COMPLETE
     running = (
         integrate(loop, reference, loads, start, step, tolerance)
@@ -86,7 +88,7 @@ def simulate(
     try:
         for piece in running:
             pieces.append(piece)
-            monitor(_progress(controller.name, piece[0][-1], reference.duration))
+            monitor(_progress(controller.name, piece.times[-1], reference.duration))
     except KeyboardInterrupt:
         outcome = Outcome.INTERRUPTED
     except SimulationError:
@@ -97,17 +99,36 @@ def simulate(
         return _trajectory(loop, reference, start, pieces, Outcome.INTERRUPTED)
 
 
+def _require_kinds(
+    controller: Controller,
+    reference: Reference,
+    plant: Robot | None,
+    pushes: Sequence[Push],
+    friction: Friction | None,
+    noise: Noise | None,
+) -> None:
+    """Refuse objects of another class."""
+    require_controller(controller)
+    require_kind("reference", reference, Reference)
+    for name, value, kind in (("plant", plant, Robot), ("friction", friction, Friction), ("noise", noise, Noise)):
+        if value is not None:
+            require_kind(name, value, kind)
+    require_kind("pushes", pushes, Sequence)
+    for push in pushes:
+        require_kind("an entry of pushes", push, Push)
+
+
 def _progress(name: str, time: float, duration: float) -> Progress:
     return Progress(f"simulate {name}", time / duration, f"{time:.1f} s")
 
 
 def _start_state(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | None) -> Array:
-    q = frozen_array("q_start", q_start, (loop.n,))
+    q = as_point("q_start", q_start, loop.n)
     if not loop.torque:
         if dq_start is not None:
             raise InvalidValueError("dq_start", dq_start, "nothing: velocity controllers have no velocity as a state")
         return q
-    return np.concatenate([q, np.zeros(loop.n) if dq_start is None else frozen_array("dq_start", dq_start, (loop.n,))])
+    return np.concatenate([q, np.zeros(loop.n) if dq_start is None else as_point("dq_start", dq_start, loop.n)])
 
 
 def _require_fitting(
@@ -138,20 +159,21 @@ def _require_fitting(
 
 
 def _trajectory(
-    loop: ClosedLoop, reference: Reference, start: Array, pieces: Sequence[tuple[Array, ...]], outcome: Outcome
+    loop: ClosedLoop, reference: Reference, start: Array, pieces: Sequence[Piece], outcome: Outcome
 ) -> Trajectory:
     """Put the pieces in a row, and add what follows from states and reference."""
     controller, n = loop.controller, loop.n
-    times = np.concatenate([[0.0], *(piece[0] for piece in pieces)])
-    states = np.vstack([start, *(piece[1] for piece in pieces)])
+    times = np.concatenate([[0.0], *(piece.times for piece in pieces)])
+    states = np.vstack([start, *(piece.states for piece in pieces)])
     q = states[:, :n]
     wanted = reference.sample(np.minimum(times, reference.duration))
     dq = states[:, n:] if loop.torque else np.zeros_like(q)
     arguments = [q, dq, *wanted, *(np.tile(gain, (len(times), 1)) for gain in controller.gains.values())]
     command, status = Batched(controller.function)(*arguments)
-    if pieces and len(pieces[0]) > 2:  # commands were held from noisy measurements: take those that were sent
-        command = np.vstack([*(piece[2] for piece in pieces), pieces[-1][2][-1:]])
-        status = np.concatenate([*(piece[3] for piece in pieces), pieces[-1][3][-1:]])[:, None]
+    held = [piece.held for piece in pieces if piece.held is not None]
+    if held:  # commands come from noisy measurements: take those that were sent, the last one also for the end
+        command = np.vstack([*(sent for sent, _ in held), held[-1][0][-1:]])
+        status = np.concatenate([*(known for _, known in held), held[-1][1][-1:]])[:, None]
     unknown = [np.full((len(times), 1), np.nan)] * 2
     storage, power = unknown if controller.energy is None else Batched(controller.energy)(*arguments)
     return Trajectory(

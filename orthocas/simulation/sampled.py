@@ -7,7 +7,7 @@ import numpy as np
 
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
-from orthocas.simulation.closed_loop import ClosedLoop, cvodes_options, run_compiled
+from orthocas.simulation.closed_loop import ClosedLoop, Piece, cvodes_options, run_compiled
 from orthocas.simulation.disturbances import Noise, Push, mean_loads
 
 _TICKS = 50  # of one call
@@ -21,8 +21,8 @@ def run_ticks(
     rate: float,
     noise: Noise,
     tolerance: float,
-) -> Iterator[tuple[Array, Array, Array, Array]]:
-    """Times (50,), states (50, s) at their end, commands (50, n) and status (50,) of ticks, in turn.
+) -> Iterator[Piece]:
+    """Pieces of 50 ticks in turn, with the commands that were held.
 
     Raises:
         SimulationError: when CVODES gives up.
@@ -42,7 +42,7 @@ def run_ticks(
         outputs = run_compiled(run, ca.DM(state), *map(ca.DM, inputs))
         states, commands, status = (np.asarray(out).T[:count] for out in outputs)
         state = states[-1]
-        yield times[first : first + count] + 1 / rate, states, commands, status[:, 0]
+        yield Piece(times[first : first + count] + 1 / rate, states, (commands, status[:, 0]))
 
 
 def _filled(rows: Array) -> Array:

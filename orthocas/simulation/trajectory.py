@@ -15,6 +15,7 @@ from scipy.integrate import cumulative_simpson
 from orthocas.checks import Array
 from orthocas.errors import TrajectoryFileError
 from orthocas.files.atomic import published, require_writable
+from orthocas.showing import Shown, listed, number_list
 
 _VERSION = 1
 _WRONG_CONTENT = (ValueError, KeyError, TypeError, AttributeError)
@@ -42,8 +43,8 @@ class Outcome(Enum):
     DIVERGED = "diverged"  #: the integrator gave up; the arrays end there
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory:
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectory(Shown):
     """A closed loop over time: N instants, n joints, k controlled quantities.
 
     `orthocas.simulation.figure.trajectory_figure` draws it.
@@ -85,6 +86,19 @@ class Trajectory:
     def tracking_error(self) -> Array:
         """Largest |value - reference| of each quantity, (k,)."""
         return np.asarray(np.abs(self.value - self.reference).max(axis=0))
+
+    def facts(self) -> dict[str, str]:
+        """How it ended, errors and commands, and whether the law gave way."""
+        errors = zip(self.labels, self.tracking_error, strict=True)
+        bad = np.count_nonzero(self.status)
+        facts = {
+            "run": f"{self.controller}, {self.times[-1]:.4g} s: {self.outcome.value}",
+            "instants": f"{len(self.times)} of {self.q.shape[1]} joints",
+            "largest error": listed(f"{label} {error:.3g}" for label, error in errors),
+            f"largest {self.kind}": number_list(np.abs(self.command).max(axis=0)),
+            "fallback": f"at {bad} instants" if bad else "never",
+        }
+        return facts if np.isnan(self.storage).any() else facts | {"storage rise": f"{self.storage_rise:.3g} J"}
 
     def save(self, path: str | Path) -> None:
         """Write an NPZ file with every array, names and units; it appears whole or not at all.

@@ -1,0 +1,53 @@
+"""Values that an object builds on first use: once for all threads, and left behind when the object travels.
+
+CasADi functions with nodes in Python, buffers and compiled libraries can be neither pickled nor copied. They follow
+from the object's own data, so a copy builds its own when it needs them.
+"""
+
+from collections.abc import Callable
+from threading import RLock
+from typing import Any, Generic, Self, TypeVar, overload
+
+T = TypeVar("T")
+
+_PLACE = "_built"
+_building = RLock()  # one for all: what is built asks for other built values, in any order
+
+
+class _Store(dict[str, Any]):
+    """Built values of one object; pickled and deep-copied as an empty one."""
+
+    def __reduce__(self) -> tuple[type["_Store"], tuple[()]]:
+        return _Store, ()
+
+
+class cached_property(Generic[T]):  # noqa: N801  (takes the place of the one in functools)
+    """As `functools.cached_property`, but safe with threads in every version of Python, and never pickled or copied."""
+
+    def __init__(self, build: Callable[[Any], T]) -> None:
+        self._build, self._name = build, build.__name__
+        self.__doc__ = build.__doc__
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Self: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type | None = None) -> T: ...
+
+    def __get__(self, instance: object | None, owner: type | None = None) -> Self | T:
+        if instance is None:
+            return self
+        store = instance.__dict__.get(_PLACE)
+        if store is not None and self._name in store:
+            value: T = store[self._name]
+            return value
+        return self._once(instance)
+
+    def _once(self, instance: object) -> T:
+        """The value, built by the first thread that comes; the others wait for it."""
+        with _building:
+            store = instance.__dict__.setdefault(_PLACE, _Store())
+            if self._name not in store:
+                store[self._name] = self._build(instance)
+            value: T = store[self._name]
+            return value

@@ -1,0 +1,72 @@
+"""Gradients of basis functions at samples: of any linear family, without the zeros."""
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.casadi_tools.columns import ColumnFunction, blocked
+from orthocas.checks import Array
+from orthocas.parametrisations import LinearFamily
+
+
+class BasisGradients:
+    """d psi / dq of a linear family.
+
+    Most entries are zero: of all polynomials of total degree d in n joints, a share of d / (n + d) depends on a joint.
+    Which entries are not is read off CasADi's sparsity pattern of the Jacobian.
+
+    Args:
+        family: the basis, n joints and K functions.
+        n: number of joints.
+    """
+
+    def __init__(self, family: LinearFamily, n: int) -> None:
+        self._family, self._n = family, n
+
+    @cached_property
+    def terms_of_joints(self) -> NDArray[np.int_]:
+        """For every joint the places of the functions that depend on it, (n, W); a shorter row ends with -1."""
+        functions, joints = self._jacobian.sparsity().get_triplet()
+        rows: list[list[int]] = [[] for _ in range(self._n)]
+        for k, i in zip(functions, joints, strict=True):
+            rows[i].append(k)
+        width = max(len(row) for row in rows)
+        return np.array([sorted(row) + [-1] * (width - len(row)) for row in rows])
+
+    def at(self, points: Array) -> Array:
+        """The gradients d psi_k / dq_i that are not zero, at points (N, n), in blocks of c samples, (B, n, W, c).
+
+        Entry w of joint i belongs to function `terms_of_joints[i, w]`; blocks as in `orthocas.casadi_tools.columns`.
+        """
+        gradients = self._columns(blocked(points))[0]
+        return gradients.reshape(len(gradients), self._n, -1, gradients.shape[2])
+
+    def dense(self, gradients: Array, samples: int, every: int = 1) -> Array:
+        """All gradients sample by sample, zeros included, (N, n, K), from those of `at`.
+
+        Args:
+            gradients: (B, n, W, c).
+            samples: number of samples, without the copies that fill the last block.
+            every: take only every second, third, ... sample.
+        """
+        stack = gradients.transpose(0, 3, 1, 2).reshape(-1, *gradients.shape[1:3])[:samples:every]
+        dense = np.zeros((len(stack), self._n, self._family.width), dtype=gradients.dtype)
+        for i, places in enumerate(self.terms_of_joints):
+            known = places[places >= 0]
+            dense[:, i, known] = stack[:, i, : len(known)]
+        return dense
+
+    @cached_property
+    def _columns(self) -> ColumnFunction:
+        J = self._jacobian
+        entries = [J[int(k), i] if k >= 0 else 0 for i, row in enumerate(self.terms_of_joints) for k in row]
+        return ColumnFunction(ca.Function("basis_gradients", [self._q], [ca.densify(ca.vertcat(*entries))]))
+
+    @cached_property
+    def _q(self) -> ca.SX:
+        return ca.SX.sym("q", self._n)
+
+    @cached_property
+    def _jacobian(self) -> ca.SX:
+        return ca.jacobian(self._family.basis(self._q), self._q)

@@ -1,0 +1,99 @@
+"""What the loss leaves free: offset, scale, order and sign of coordinates, chosen the same way every time (ours)."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.coordinates.fitted import Coordinates
+from orthocas.errors import InvalidValueError, OrthocasError
+from orthocas.parametrisations import Parametrisation, ReorderableFamily
+from orthocas.parametrisations.family import JointSpace
+from orthocas.problem import Problem
+from orthocas.samples import Samples
+
+
+def in_closed_form(problem: Problem, parametrisation: Parametrisation, samples: Samples) -> Coordinates:
+    """Coordinates that need no fit; see `orthocas.parametrisations.ClosedForm`."""
+    assert parametrisation.closed_form is not None
+    found = parametrisation.closed_form(problem)
+    r = problem.r
+    raw = Coordinates(parametrisation, JointSpace.of(problem), (), found.theta, np.zeros(r), np.ones(r))
+    origin = problem.domain.centre if found.origin is None else found.origin
+    scaled = normalised(raw, origin, samples)
+    return scaled if found.scaled else replace(scaled, scale=np.ones(r))
+
+
+def normalised(raw: Coordinates, origin: Array, samples: Samples) -> Coordinates:
+    """Shift and scale fitted coordinates so that they vanish at the origin and their mean gradient length is 1.
+
+    Raises:
+        OrthocasError: if a coordinate has no gradient on the domain.
+    """
+    r = len(raw.offset)
+    lengths = np.linalg.norm(raw.jacobian(samples.points)[:, :r], axis=2).mean(axis=0)
+    if not lengths.min() > 0:
+        raise OrthocasError(f"coordinate {int(np.argmin(lengths))} has no gradient on the domain")
+    return replace(raw, offset=raw.xi(origin[None, :])[0, :r], scale=1 / lengths)
+
+
+def in_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
+    """The same coordinates in an order and with signs that do not depend on how a fit found them.
+
+    At the centre of the domain, coordinates that move the first joints come first: they are ordered by
+    sum_k k g_k^2 / |g|^2 with g the gradient, the joint that moves on average. The joint with the largest |g_k| moves
+    in the positive direction. Idle joints stay last.
+    """
+    g = coordinates.jacobian(centre[None, :])[0, : len(coordinates.offset)]
+    moved = (g**2 @ np.arange(g.shape[1])) / (g**2).sum(axis=1)
+    largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]
+    return _rearranged(coordinates, np.argsort(moved, kind="stable"), np.sign(largest))
+
+
+def aligned(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordinates:
+    """The same coordinates in the order and with the signs that bring them closest to those of a chart.
+
+    Each goes with the coordinate of the chart that its gradient is most parallel to, on average over samples.
+
+    Raises:
+        InvalidValueError: if the chart has other joints, another number of coordinates, or other idle joints.
+    """
+    fitted = len(coordinates.offset)
+    if chart.n != coordinates.space.n or chart.r != coordinates.r:
+        raise InvalidValueError(
+            "align_to",
+            f"a chart with n = {chart.n}, r = {chart.r}",
+            f"one with n = {coordinates.space.n}, r = {coordinates.r}",
+        )
+    ours, theirs = (
+        J / np.linalg.norm(J, axis=2, keepdims=True)
+        for J in (coordinates.jacobian(samples.points)[:, :fitted], chart.coordinates.jacobian(samples.points))
+    )
+    parallel = np.einsum("sin,sjn->ij", ours, theirs[:, :fitted]) / len(samples)
+    theirs_in_order, order = linear_sum_assignment(-np.abs(parallel.T))
+    signs = np.sign(parallel.T[theirs_in_order, order])
+    back = np.empty(fitted)
+    back[order] = signs
+    return _rearranged(coordinates, order, back)
+
+
+def _rearranged(coordinates: Coordinates, order: Array, signs: Array) -> Coordinates:
+    """Coordinates in another order, each times a sign; families that cannot change places keep theirs.
+
+    Args:
+        coordinates: as they are.
+        order: for every new place, the old one.
+        signs: of the coordinates in their old places.
+    """
+    family = coordinates.family
+    if not isinstance(family, ReorderableFamily):
+        return replace(coordinates, scale=coordinates.scale * signs)
+    places = [int(k) for k in order]
+    return replace(
+        coordinates,
+        theta=family.reordered(coordinates.theta, places),
+        offset=coordinates.offset[places],
+        scale=(coordinates.scale * signs)[places],
+    )

@@ -1,0 +1,27 @@
+"""The loss of a fit: terms, one module each, with weights; residuals of one sample and their derivatives."""
+
+from orthocas.fitting.loss.angles import mutual_cosines, pairs, task_cosines
+from orthocas.fitting.loss.length import log_lengths
+from orthocas.fitting.loss.registry import register, term_of
+from orthocas.fitting.loss.regularity import REGULAR_VOLUME, gradient_volume
+from orthocas.fitting.loss.residuals import Loss
+from orthocas.fitting.loss.term import Data, LossTerm, Sizes
+from orthocas.fitting.loss.weights import DEFAULT_WEIGHTS, WeightNumbers, Weights
+
+__all__ = [
+    "DEFAULT_WEIGHTS",
+    "REGULAR_VOLUME",
+    "Data",
+    "Loss",
+    "LossTerm",
+    "Sizes",
+    "WeightNumbers",
+    "Weights",
+    "gradient_volume",
+    "log_lengths",
+    "mutual_cosines",
+    "pairs",
+    "register",
+    "task_cosines",
+    "term_of",
+]

@@ -1,0 +1,31 @@
+"""The length term: gradients of even length, so that a gain means the same all over the domain (ours)."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from orthocas.fitting.loss.term import Data, Sizes
+
+
+def log_lengths(coordinate_jacobian: ca.SX) -> ca.SX:
+    """Logarithms of the lengths of the coordinate gradients, (r, 1).
+
+    Angles leave free how fast a coordinate grows along itself: xi^7 is as orthogonal as xi, and flat at 0.
+
+    Source:
+        ours, docs/derivations.md#lengths.
+    """
+    return ca.log(ca.sum2(coordinate_jacobian**2)) / 2
+
+
+@dataclass(frozen=True)
+class LengthTerm:
+    """Mean over coordinates of the squared `log_lengths`."""
+
+    name: str = "length"
+    data: tuple[str, ...] = ()
+    hinge: bool = False
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """Logarithms over sqrt(r), (r, 1)."""
+        return (1 / sizes.r) ** 0.5 * log_lengths(coordinate_jacobian)

@@ -1,0 +1,43 @@
+"""The regularity term: coordinates whose gradients keep their volume make a chart without folds (ours)."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from orthocas.fitting.loss.term import Data, Sizes
+
+REGULAR_VOLUME = 0.9  #: volume of the gradients below which the term acts
+
+
+def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
+    """Signed volume of the coordinate gradients across the task, det(D) with D_jk = v_xi,j . z_k / |v_xi,j|_A^-1.
+
+    The z_k are an A-orthonormal basis of ker J_x, so D holds the parts of the unit gradients that the task does not
+    see. |det D| is 1 for perfect coordinates, and the chart phi is regular exactly where det D is not 0.
+
+    Args:
+        coordinate_jacobian: J_xi, (r, n).
+        null_basis: columns z_1..z_r, (n, r), oriented continuously over the domain.
+        metric_inverse: A^-1, (n, n); None for the identity.
+
+    Source:
+        ours, docs/derivations.md#regularity.
+    """
+    J = coordinate_jacobian
+    raised = J if metric_inverse is None else J @ metric_inverse
+    lengths = ca.sqrt(ca.sum2(raised * J))
+    return ca.det((J @ null_basis) / ca.repmat(lengths, 1, J.shape[0]))
+
+
+@dataclass(frozen=True)
+class RegularityTerm:
+    """max(0.9 - det D, 0)^2, with det D the `gradient_volume`."""
+
+    name: str = "regularity"
+    data: tuple[str, ...] = ("metric_inverse", "null_basis")
+    hinge: bool = True
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """One residual, (1, 1)."""
+        volume = gradient_volume(coordinate_jacobian, data["null_basis"], data["metric_inverse"])
+        return ca.fmax(REGULAR_VOLUME - volume, 0)

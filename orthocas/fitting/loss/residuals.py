@@ -1,0 +1,156 @@
+"""The loss of one sample as least squares in J_xi, and its derivatives on columns of samples."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import casadi as ca
+
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.casadi_tools.columns import ColumnFunction
+from orthocas.fitting.loss.registry import term_of
+from orthocas.fitting.loss.term import SAMPLE_DATA, LossTerm, Sizes
+
+
+@dataclass(frozen=True)
+class Loss:
+    """The loss of one sample: L = |rho|^2 / 2, with the residuals of all terms that have a weight.
+
+    Rows come in the order of the terms, those of hinge terms last.
+    """
+
+    sizes: Sizes
+    weights: tuple[tuple[str, float], ...]  #: positive weights by the names of terms
+
+    @classmethod
+    def of(cls, sizes: Sizes, weights: Mapping[str, float]) -> "Loss":
+        """The terms with a positive weight.
+
+        Raises:
+            UnknownNameError: if a weight belongs to no term.
+        """
+        return cls(sizes, tuple((name, weight) for name, weight in weights.items() if weight > 0 and term_of(name)))
+
+    @cached_property
+    def terms(self) -> tuple[tuple[LossTerm, float], ...]:
+        """Terms and weights."""
+        known = [(term_of(name), weight) for name, weight in self.weights]
+        return tuple(sorted(known, key=lambda pair: pair[0].hinge))
+
+    @cached_property
+    def data(self) -> tuple[str, ...]:
+        """What the terms need of a sample, in the order in which the functions of this module take it."""
+        needed = {name for term, _ in self.terms for name in term.data}
+        if self.sizes.identity_metric:
+            needed.discard("metric_inverse")
+        return tuple(sorted(needed))
+
+    @cached_property
+    def oriented(self) -> bool:
+        """Whether it needs a null basis, whose orientation has to be that of the coordinates."""
+        return "null_basis" in self.data
+
+    def symbols(self) -> list[ca.SX]:
+        """Symbols of the data of one sample, in the order of `data`."""
+        return [ca.SX.sym(name, *SAMPLE_DATA[name](self.sizes)) for name in self.data]
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: list[ca.SX]) -> ca.SX:
+        """Residuals rho of one sample, (rows, 1)."""
+        named = {"metric_inverse": None, **dict(zip(self.data, data, strict=True))}
+        rho: ca.SX = ca.vertcat(
+            *(weight**0.5 * term.residuals(coordinate_jacobian, named, self.sizes) for term, weight in self.terms)
+        )
+        return rho
+
+    @cached_property
+    def smooth_rows(self) -> tuple[tuple[int, ...], ...]:
+        """For every coordinate j, the rows that depend on it, hinge rows left out."""
+        touched = self._touched
+        return tuple(
+            tuple(row for row, coordinates in enumerate(touched) if j in coordinates and row not in self.hinge_rows)
+            for j in range(self.sizes.r)
+        )
+
+    @cached_property
+    def shared_rows(self) -> tuple[tuple[int, int, int], ...]:
+        """(i, j, row) with i > j for every row that depends on both coordinates, hinge rows left out."""
+        return tuple(
+            (i, j, row)
+            for row, coordinates in enumerate(self._touched)
+            for i in coordinates
+            for j in coordinates
+            if i > j and row not in self.hinge_rows
+        )
+
+    @cached_property
+    def hinge_rows(self) -> range:
+        """Rows of hinge terms: the last ones."""
+        J, data = self.arguments()
+        named = {"metric_inverse": None, **dict(zip(self.data, data, strict=True))}
+        counts = [term.residuals(J, named, self.sizes).shape[0] for term, _ in self.terms if not term.hinge]
+        return range(sum(counts), len(self._touched))
+
+    @cached_property
+    def _touched(self) -> list[list[int]]:
+        """The coordinates that each row depends on."""
+        J, data = self.arguments()
+        by_entry = ca.jacobian(self.residuals(J, data), ca.vec(J)).sparsity()
+        touched: list[set[int]] = [set() for _ in range(by_entry.size1())]
+        for row, entry in zip(*by_entry.get_triplet(), strict=True):
+            touched[row].add(entry % self.sizes.r)
+        return [sorted(coordinates) for coordinates in touched]
+
+    def arguments(self) -> tuple[ca.SX, list[ca.SX]]:
+        """Symbols of J_xi (r, n) and of the data of one sample."""
+        return ca.SX.sym("J", self.sizes.r, self.sizes.n), self.symbols()
+
+
+@cache
+def sample_loss(loss: Loss) -> ca.Function:
+    """Loss of one sample, (1, 1), of J_xi (r, n) and the data of `Loss.symbols`."""
+    J, data = loss.arguments()
+    return ca.Function("sample_loss", [J, *data], [ca.sumsqr(loss.residuals(J, data)) / 2])
+
+
+@cache
+def loss_columns(loss: Loss) -> ColumnFunction:
+    """Loss of one sample (1, 1) and its slopes dL/dJ_xi (r, n); inputs as for `sample_loss`."""
+    J, data = loss.arguments()
+    value = ca.sumsqr(loss.residuals(J, data)) / 2
+    return ColumnFunction(ca.Function("loss", [J, *data], [value, ca.gradient(value, J)]))
+
+
+@cache
+def value_columns(loss: Loss) -> ColumnFunction:
+    """Loss of one sample; inputs as for `sample_loss`."""
+    return ColumnFunction(sample_loss(loss))
+
+
+@cache
+def residual_columns(loss: Loss) -> ColumnFunction:
+    """Derivatives of the residuals of one sample with respect to J_xi, for the Gauss-Newton matrix.
+
+    Inputs as for `sample_loss`. Outputs: for every coordinate j the derivative of `smooth_rows[j]` with respect to row
+    j of J_xi, (rows, n); then for every hinge row the residual (1, 1) and its derivative with respect to J_xi, (r, n).
+    """
+    J, data = loss.arguments()
+    r, n = loss.sizes.r, loss.sizes.n
+    rho = loss.residuals(J, data)
+    by_entry = ca.jacobian(rho, ca.vec(J))  # columns: J_xi column by column
+    outputs = [by_entry[list(loss.smooth_rows[j]), j::r] for j in range(r)]
+    for row in loss.hinge_rows:
+        outputs += [rho[row], ca.reshape(by_entry[row, :], r, n)]
+    return ColumnFunction(ca.Function("residuals", [J, *data], outputs))
+
+
+@cache
+def curvature_columns(loss: Loss) -> ColumnFunction:
+    """Second derivatives of the loss of one sample with respect to J_xi column by column, (n r, n r).
+
+    Inputs as for `sample_loss`.
+    """
+    J, data = loss.arguments()
+    column = ca.SX.sym("v", loss.sizes.r * loss.sizes.n)
+    value = sample_loss(loss)(ca.reshape(column, loss.sizes.r, loss.sizes.n), *data)
+    second = ca.Function("second", [column, *data], [ca.hessian(value, column)[0]])
+    return ColumnFunction(ca.Function("curvature", [J, *data], [second(ca.vec(J), *data)]))

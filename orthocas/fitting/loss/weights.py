@@ -1,0 +1,74 @@
+"""Weights of the loss: one number for each of its terms."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from orthocas.checks import as_float_array
+from orthocas.errors import InvalidValueError, ShapeError
+
+WeightNumbers = Sequence[float]  #: two to four numbers: task, mutual, regularity, length
+
+
+@dataclass(frozen=True)
+class Weights:
+    """lambda1 (task) and lambda2 (mutual) of [AS2023] eq. (24); lambda3 (regularity) and lambda4 (length) are ours.
+
+    The ratio of the first two picks a point on the front of task angles against mutual angles. At the paper's 1000 : 1
+    the optimum can lose rank. The regularity term keeps the gradients of the coordinates from collapsing anywhere, the
+    length term keeps their lengths even, which controllers want.
+
+    Args:
+        task: lambda1 > 0.
+        mutual: lambda2 >= 0.
+        regularity: lambda3 >= 0.
+        length: lambda4 >= 0.
+        extra: weights >= 0 of terms added by `orthocas.fitting.loss.register`, by name.
+
+    Raises:
+        InvalidValueError: if a weight is negative or not finite, or no term has one.
+    """
+
+    task: float = 1000.0
+    mutual: float = 30.0
+    regularity: float = 150.0
+    length: float = 0.0
+    extra: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        for k, name in enumerate(("task", "mutual", "regularity", "length")):
+            object.__setattr__(self, name, _weight(f"lambda{k + 1}", getattr(self, name)))
+        extra = {name: _weight(f"weight of {name}", value) for name, value in self.extra.items()}
+        object.__setattr__(self, "extra", extra)
+        if not any(self.by_name.values()):
+            raise InvalidValueError("weights", "all zero", "at least one positive number")
+
+    @classmethod
+    def of(cls, weights: "Weights | WeightNumbers") -> "Weights":
+        """Weights as they are, or from two to four numbers in the order of the fields; those left out are 0.
+
+        Raises:
+            ShapeError, InvalidValueError: for numbers that do not fit; a fit needs a positive task weight.
+        """
+        if not isinstance(weights, Weights):
+            values = as_float_array("weights", weights)
+            if values.shape not in ((2,), (3,), (4,)):
+                raise ShapeError("weights", values.shape, (4,))
+            weights = cls(*values.tolist(), *[0.0] * (4 - len(values)))
+        if weights.task == 0:
+            raise InvalidValueError("lambda1", weights.task, "a positive number")
+        return weights
+
+    @property
+    def by_name(self) -> dict[str, float]:
+        """The weight of every term that has one here, by the name of the term."""
+        own = {"task": self.task, "mutual": self.mutual, "regularity": self.regularity, "length": self.length}
+        return own | dict(self.extra)
+
+
+def _weight(name: str, value: float) -> float:
+    if not 0 <= value < float("inf"):
+        raise InvalidValueError(name, value, "a finite number >= 0")
+    return float(value)
+
+
+DEFAULT_WEIGHTS = Weights()  #: what a fit takes unless told otherwise

@@ -1,0 +1,106 @@
+"""What is fitted, and how: the settings of one fit, checked once."""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthocas.checks import require_count
+from orthocas.errors import InvalidValueError
+from orthocas.fitting.loss import WeightNumbers, Weights
+from orthocas.minimising.solver import Solver
+from orthocas.parametrisations import Parametrisation
+from orthocas.problem import Problem
+from orthocas.samples import sample_problem
+from orthocas.solvers import LBFGS, GaussNewton, Ipopt
+
+_TELLTALE = (20, (0, 1000))  # samples that tell one problem from another: number and seed
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Everything that decides what a fit of a problem finds."""
+
+    parametrisation: Parametrisation
+    solver: Solver
+    weights: Weights
+    samples: int | None
+    seed: int
+    max_mutual_deg: float | None
+
+    @classmethod
+    def checked(
+        cls,
+        problem: Problem,
+        parametrisation: Parametrisation,
+        solver: Solver | None,
+        weights: Weights | WeightNumbers,
+        samples: int | None,
+        seed: int,
+        max_mutual_deg: float | None,
+    ) -> "FitSettings":
+        """Settings that fit together, with the default solver where there is none.
+
+        Raises:
+            InvalidValueError, ShapeError: for settings that do not.
+        """
+        require_parametrisation(parametrisation)
+        bound = parametrisation.for_problem(problem)
+        if max_mutual_deg is not None:
+            _require_bound(bound, max_mutual_deg)
+        if solver is None:
+            solver = default_solver(bound) if max_mutual_deg is None else Ipopt()
+        require_solver(solver)
+        if max_mutual_deg is not None and not isinstance(solver, Ipopt):
+            raise InvalidValueError("solver", solver.name, "ipopt, which alone can keep max_mutual_deg")
+        count = None if samples is None else require_count("samples", samples, least=2)
+        return cls(bound, solver, Weights.of(weights), count, require_count("seed", seed, least=0), max_mutual_deg)
+
+    @property
+    def max_mutual(self) -> float | None:
+        """Bound on the root mean square mutual angle's deviation from a right angle [rad]."""
+        return None if self.max_mutual_deg is None else float(np.radians(self.max_mutual_deg))
+
+    def identity(self, problem: Problem) -> dict[str, str]:
+        """What tells this fit from others, for its checkpoint."""
+        return {
+            "problem": _digest(problem),
+            "parametrisation": self.parametrisation.label,
+            "solver": repr(self.solver),
+            "weights": repr(self.weights),
+            "samples": repr(self.samples),
+            "seed": repr(self.seed),
+            "max_mutual_deg": repr(self.max_mutual_deg),
+        }
+
+
+def default_solver(parametrisation: Parametrisation) -> Solver:
+    """Gauss-Newton for families linear in their parameters, L-BFGS for others."""
+    return GaussNewton() if parametrisation.linear else LBFGS()
+
+
+def require_parametrisation(value: object) -> None:
+    """Raise InvalidValueError unless it is a parametrisation."""
+    if not isinstance(value, Parametrisation) or isinstance(value, type):
+        raise InvalidValueError("parametrisation", repr(value), "an object such as Polynomial(degree=4)")
+
+
+def require_solver(value: object) -> None:
+    """Raise InvalidValueError unless it is a solver."""
+    if not isinstance(value, Solver) or isinstance(value, type):
+        raise InvalidValueError("solver", repr(value), "an object such as GaussNewton()")
+
+
+def _require_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> None:
+    if parametrisation.closed_form is not None:
+        raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", "a parametrisation to fit")
+    if not 0 < max_mutual_deg < 90:
+        raise InvalidValueError("max_mutual_deg", max_mutual_deg, "an angle between 0 and 90 degrees")
+
+
+def _digest(problem: Problem) -> str:
+    """A fingerprint of a problem: task, metric and domain as they act on some samples."""
+    samples = sample_problem(problem, *_TELLTALE)
+    parts = [samples.points, samples.task_jacobian]
+    parts += [] if samples.metric_inverse is None else [samples.metric_inverse]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]

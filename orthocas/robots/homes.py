@@ -1,0 +1,77 @@
+"""Postures that a robot's files name: group states of an SRDF file, keyframes of an MJCF file."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+
+from orthocas.checks import Array
+from orthocas.errors import RobotError
+
+States = dict[str, dict[str, float]]  #: name of a posture -> joint -> position [rad] or [m]
+_NOT_IN_THE_FILE = "qpos0"  # Pinocchio's name for the zero posture of an MJCF file
+
+
+def srdf_states(urdf: str | Path) -> States:
+    """Group states of the SRDF file that belongs to a URDF file: same stem, beside it or in ../srdf; none without one.
+
+    States of several groups with the same name are one posture. Joints with several degrees of freedom are left out.
+
+    Raises:
+        RobotError: if the SRDF file cannot be read.
+    """
+    urdf = Path(urdf)
+    name = f"{urdf.stem}.srdf"
+    path = next((p for p in (urdf.parent / name, urdf.parent.parent / "srdf" / name) if p.is_file()), None)
+    if path is None:
+        return {}
+    try:
+        root = ElementTree.parse(path).getroot()
+    except (OSError, ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise RobotError(f"{path} is not an SRDF file: {error}") from None
+    states: States = {}
+    for state in root.iter("group_state"):
+        joints = states.setdefault(state.get("name", ""), {})
+        for joint in state.iter("joint"):
+            value = _number(joint.get("value", ""))
+            if value is not None:
+                joints[joint.get("name", "")] = value
+    return states
+
+
+def model_states(model: pin.Model) -> States:
+    """Reference configurations of a Pinocchio model, which are the keyframes of an MJCF file."""
+    states: States = {}
+    for entry in model.referenceConfigurations:
+        position = entry.data()
+        states[entry.key()] = {
+            model.names[i]: _joint_position(position[joint.idx_q : joint.idx_q + joint.nq])
+            for i, joint in enumerate(model.joints)
+            if i > 0 and joint.nv == 1
+        }
+    states.pop(_NOT_IN_THE_FILE, None)
+    return states
+
+
+def postures(states: Mapping[str, Mapping[str, float]], joint_names: Sequence[str]) -> dict[str, Array]:
+    """States as joint positions (n,), less those that leave a joint out."""
+    return {
+        name: np.array([joints[joint] for joint in joint_names])
+        for name, joints in states.items()
+        if all(joint in joints for joint in joint_names)
+    }
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if np.isfinite(value) else None
+
+
+def _joint_position(part: Array) -> float:
+    """Pinocchio keeps cos and sin of a continuous joint."""
+    return float(part[0]) if len(part) == 1 else float(np.arctan2(part[1], part[0]))

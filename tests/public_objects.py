@@ -1,0 +1,249 @@
+"""One of every public object, small and quick to build, and the numbers that tell whether two of them are equal."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cache, singledispatch
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+import orthocas as oc
+from orthocas import control, problems, solvers
+from orthocas.casadi_tools.batch import Batched
+from orthocas.checks import Array
+from orthocas.comparing.report import Comparison
+from orthocas.control import Controller, Reference
+from orthocas.domains import sample_uniform
+from orthocas.fitting.fit import Fit
+from orthocas.metrics import Metric, metric_matrices
+from orthocas.samples import sample_problem
+from orthocas.simulation import Friction, Noise, Push, Trajectory, coupling_index, simulate
+
+
+@cache
+def planar(metric: str = "inertia") -> oc.Problem:
+    known = problems.get("planar_3r_x")
+    return oc.Problem(known.robot, known.task, metric, known.domain, "planar_3r_x")
+
+
+@cache
+def fitted() -> Fit:
+    return oc.fit(planar(), oc.Polynomial(degree=3), samples=500)
+
+
+@cache
+def network() -> oc.Chart:
+    return oc.fit(planar(), oc.MLP((6, 6)), solvers.LBFGS(max_iterations=10), samples=300).chart
+
+
+@cache
+def with_idle_joint() -> oc.Chart:
+    known = problems.get("planar_3r_x")
+    task = oc.Task.custom(known.robot, "bent", lambda q: ca.sin(q[0]) + q[2] ** 2 * q[0])
+    return oc.fit(oc.Problem(known.robot, task, domain=oc.Box(known.domain.centre, 0.3)), oc.Polynomial(2)).chart
+
+
+@cache
+def given() -> oc.Chart:
+    return oc.fit(planar(), oc.Given.from_function("hand", 3, lambda q: ca.vertcat(q[1], ca.sin(q[2])))).chart
+
+
+@cache
+def circle() -> oc.Chart:
+    return oc.grow(problems.get("planar_2r"), 1.0, origin=[np.pi / 3, 0.0])
+
+
+@cache
+def disk() -> oc.Chart:
+    problem = oc.Problem(
+        planar().robot, planar().task, "euclidean", oc.Box([np.pi / 2, 0, 0], [np.pi / 2, np.pi, np.pi])
+    )
+    return oc.grow(problem, 0.0, cells=20)
+
+
+@cache
+def on_planes() -> oc.Chart:
+    return oc.grow(planar("euclidean"), leaf="linear")
+
+
+@cache
+def impedance() -> control.Impedance:
+    return control.Impedance(fitted().chart, 60.0, limit=90.0)
+
+
+@cache
+def steps() -> Reference:
+    phi = fitted().chart.phi(planar().domain.centre)
+    return Reference.steps(fitted().chart.labels, phi, [(0.1, {"x": float(phi[0]) + 0.02})], 0.5)
+
+
+@cache
+def trajectory() -> Trajectory:
+    return simulate(impedance(), steps(), planar().domain.centre, step=0.05)
+
+
+@cache
+def distilled() -> Any:
+    return oc.distil(on_planes(), oc.Polynomial(3), samples=200)
+
+
+@cache
+def comparison() -> Comparison:
+    return oc.compare(planar(), [oc.Linear(), oc.Polynomial(1)], samples=200, held_out=500, jobs=1)
+
+
+def generated_c() -> Any:
+    with TemporaryDirectory() as folder:
+        return oc.generate_c(fitted().chart, Path(folder) / "c")
+
+
+CHARTS: dict[str, Callable[[], oc.Chart]] = {
+    "polynomial chart": lambda: fitted().chart,
+    "linear chart": lambda: oc.fit(planar(), oc.Linear()).chart,
+    "Fourier chart": lambda: oc.fit(planar(), oc.Fourier(1), samples=300).chart,
+    "network chart": network,
+    "given chart": given,
+    "chart with an idle joint": with_idle_joint,
+    "circle chart": circle,
+    "disk chart": disk,
+    "linear leaf chart": on_planes,
+}
+CONTROLLERS: dict[str, Callable[[], Controller]] = {
+    "impedance": impedance,
+    "PD+": lambda: control.PDPlus(fitted().chart, 60.0, coupling="decoupled", damping="double_diagonal"),
+    "PD+ of a network": lambda: control.PDPlus(network(), 60.0),
+    "kinematic": lambda: control.Kinematic(fitted().chart, 1.0),
+    "projector": lambda: control.Projector(planar(), 80.0, 10.0),
+    "kinematic projector": lambda: control.KinematicProjector(planar(), 1.0, 0.5),
+}
+OBJECTS: dict[str, Callable[[], Any]] = {
+    **CHARTS,
+    **CONTROLLERS,
+    "fit": fitted,
+    "robot": lambda: planar().robot,
+    "task": lambda: planar().task,
+    "custom task": lambda: with_idle_joint().problem.task,
+    "inertia metric": lambda: planar().metric,
+    "custom metric": lambda: Metric.from_spec(planar().robot, lambda q: ca.diag(2 + ca.cos(q))),
+    "problem": planar,
+    "check of a problem": lambda: oc.check(planar(), 100),
+    "box": lambda: planar().domain,
+    "torus": lambda: oc.Torus(3),
+    "polynomial": lambda: oc.Polynomial(3),
+    "linear": oc.Linear,
+    "Fourier": lambda: oc.Fourier(2),
+    "network": oc.MLP,
+    "SEW": oc.SEW,
+    "given coordinates": lambda: given().coordinates.parametrisation,  # type: ignore[attr-defined]
+    "solver": solvers.GaussNewton,
+    "samples": lambda: sample_problem(planar(), 20, 0),
+    "report": lambda: oc.evaluate(fitted().chart, 500),
+    "involutivity": lambda: oc.involutivity(planar(), 100),
+    "singular point": lambda: oc.singular_points(problems.get("planar_2r"))[0],
+    "jump": lambda: oc.jumps(circle())[0],
+    "distilled": distilled,
+    "steps": steps,
+    "spline": lambda: Reference.through(("a", "b"), [0.0, 1.0, 2.0], [[0.0, 1.0], [1.0, 0.5], [0.0, 2.0]]),
+    "damping check": lambda: impedance().check_damping(50),
+    "trajectory": trajectory,
+    "coupling": lambda: coupling_index(fitted().chart, steps(), trajectory()),
+    "push": lambda: Push(0.5, 1.0, [1.0, 0.0, 0.0]),
+    "friction": lambda: Friction([1.0, 2.0, 3.0]),
+    "noise": lambda: Noise(1e-3),
+    "comparison": comparison,
+    "generated C": generated_c,
+}
+
+
+def numbers(thing: Any) -> list[Array]:
+    """Everything that can be computed with an object, and all numbers and words it holds."""
+    return [np.asarray(part) for part in _numbers(thing)]
+
+
+def points_of(chart: oc.Chart) -> Array:
+    """Joint positions near the middle of the domain, (6, n)."""
+    domain = chart.problem.domain
+    return np.asarray(domain.centre + 0.2 * domain.half_width * np.random.default_rng(3).uniform(-1, 1, (6, chart.n)))
+
+
+def states_of(law: Controller) -> list[Array]:
+    """Inputs of a controller at four states, (4, .) each."""
+    rng = np.random.default_rng(4)
+    n, k, domain = law.problem.n, len(law.labels), law.problem.domain
+    q = domain.centre + 0.2 * domain.half_width * rng.uniform(-1, 1, (4, n))
+    wanted = Batched(law.measured)(q)[0] + 1e-2
+    gains = [np.tile(gain, (4, 1)) for gain in law.gains.values()]
+    return [q, rng.normal(size=(4, n)), wanted, *rng.normal(size=(2, 4, k)), *gains]
+
+
+@singledispatch
+def _numbers(thing: Any) -> Iterator[Any]:
+    """Of data: what it holds."""
+    if is_dataclass(thing):
+        yield type(thing).__name__
+        for part in fields(thing):
+            yield from _numbers(getattr(thing, part.name))
+    elif isinstance(thing, tuple | list | dict):
+        for part in thing.values() if isinstance(thing, dict) else thing:
+            yield from _numbers(part)
+    elif thing is not None:
+        yield str(thing) if isinstance(thing, Path | Enum) else thing
+
+
+@_numbers.register
+def _of_chart(chart: oc.Chart) -> Iterator[Any]:
+    q = points_of(chart)
+    phi = chart.phi(q)
+    yield from (phi, chart.xi(q[0]), chart.jacobian(q), chart.labels, str(dict(chart.notes)))
+    known = np.isfinite(phi).all(axis=1)
+    yield chart.inverse(phi[known], q[known] + 1e-3)
+    if not isinstance(chart, oc.GrownChart):
+        yield from (np.asarray(chart.function(name)(q[0])) for name in ("xi", "phi", "jacobian"))
+
+
+@_numbers.register
+def _of_robot(robot: oc.Robot) -> Iterator[Any]:
+    q = np.linspace(-1, 1, 2 * robot.n).reshape(2, robot.n)
+    yield from (robot.joint_names, robot.mass_matrix(q), robot.bias(q, q), robot.tip_position(q), robot.upper)
+
+
+@_numbers.register
+def _of_task(task: oc.Task) -> Iterator[Any]:
+    q = np.linspace(-1, 1, 2 * task.robot.n).reshape(2, task.robot.n)
+    yield from (task.name, task.labels, task.batched(q)[0], task.batched_jacobian(q)[0])
+
+
+@_numbers.register
+def _of_problem(problem: oc.Problem) -> Iterator[Any]:
+    yield from (*_numbers(problem.task), *_numbers(problem.robot), *_numbers(problem.domain), problem.name)
+    yield metric_matrices(problem.metric, sample_uniform(problem.domain, 5, 0))
+
+
+@_numbers.register
+def _of_domain(domain: oc.Box | oc.Torus) -> Iterator[Any]:
+    yield from (domain.name, sample_uniform(domain, 5, 0))
+
+
+@_numbers.register
+def _of_reference(reference: Reference) -> Iterator[Any]:
+    yield from (*reference.sample(reference.grid()), reference.labels)
+
+
+@_numbers.register
+def _of_function(function: ca.Function) -> Iterator[Any]:
+    yield from (np.asarray(out) for out in function.call([0.1] * function.n_in()))
+
+
+def _of_controller(law: Controller) -> Iterator[Any]:
+    states = states_of(law)
+    yield from (law.name, law.labels, *Batched(law.function)(*states))
+    if law.energy is not None:
+        yield from Batched(law.energy)(*states)
+
+
+for _law in (control.Impedance, control.PDPlus, control.Kinematic, control.Projector, control.KinematicProjector):
+    _numbers.register(_law, _of_controller)

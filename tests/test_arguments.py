@@ -1,0 +1,147 @@
+"""Arguments of many kinds: columns and expressions are understood, text and objects of other classes are refused."""
+
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from public_objects import CHARTS, circle, fitted, impedance, planar, points_of, steps, trajectory
+
+import orthocas as oc
+from orthocas import control, simulation
+from orthocas.checks import as_float_array, as_point, as_point_set
+from orthocas.codegen import check_c
+from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError
+
+EVALUATIONS = ("xi", "task", "phi", "jacobian")
+
+
+@pytest.mark.parametrize("name", EVALUATIONS)
+def test_a_column_is_one_joint_position(name: str) -> None:
+    chart = fitted().chart
+    q = points_of(chart)[0]
+    evaluate = getattr(chart, name)
+    for column in (ca.DM(q), q[:, None]):
+        np.testing.assert_array_equal(evaluate(column), evaluate(q))
+    np.testing.assert_array_equal(chart.problem.robot.mass_matrix(ca.DM(q)), chart.problem.robot.mass_matrix(q))
+
+
+def test_columns_are_taken_where_a_motion_starts() -> None:
+    chart, q = fitted().chart, planar().domain.centre
+    np.testing.assert_array_equal(chart.inverse(ca.DM(chart.phi(q)), ca.DM(q)), chart.inverse(chart.phi(q), q))
+    run = oc.simulate(impedance(), steps(), ca.DM(q), ca.DM.zeros(3), step=0.05)
+    np.testing.assert_array_equal(run.q, trajectory().q)
+    path = control.joint_path(chart, steps(), q)
+    np.testing.assert_array_equal(control.joint_path(chart, steps(), ca.DM(q)), path)
+
+
+def test_sets_stay_sets() -> None:
+    """Three points of three joints are a set, and with one joint a column is a set of points."""
+    square = np.arange(9.0).reshape(3, 3)
+    assert not as_point_set("q", square, 3)[1]
+    points, single = as_point_set("q", [[1.0], [2.0]], 1)
+    assert points.shape == (2, 1)
+    assert not single
+    assert as_point_set("q", [[1.0]], 1)[1] is False
+    with pytest.raises(ShapeError, match=r"q has shape \(3, 1\), expected \('any', 4\)"):
+        as_point_set("q", np.zeros((3, 1)), 4)
+    with pytest.raises(ShapeError, match=r"q has shape \(3, 3\), expected \(3,\)"):
+        as_point("q", square, 3)
+
+
+@pytest.mark.parametrize("kind", [ca.SX, ca.MX])
+@pytest.mark.parametrize("chart", ["polynomial chart", "network chart"])
+@pytest.mark.parametrize("name", EVALUATIONS)
+def test_symbols_give_expressions(name: str, chart: str, kind: Any) -> None:
+    found = CHARTS[chart]()
+    q = kind.sym("q", 3)
+    expression = getattr(found, name)(q)
+    assert isinstance(expression, kind)
+    at = points_of(found)[0]
+    value = np.asarray(ca.Function("f", [q], [expression])(at))
+    wanted = getattr(found, name)(at)
+    np.testing.assert_allclose(value.reshape(wanted.shape), wanted, rtol=1e-12, atol=1e-13)
+
+
+def test_symbols_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ShapeError, match=r"q has shape \(4, 1\), expected \(3, 1\)"):
+        fitted().chart.phi(ca.SX.sym("q", 4))
+    with pytest.raises(NoExpressionError, match="distil"):
+        circle().phi(ca.MX.sym("q", 2))
+
+
+NO_NUMBERS = {
+    "text": "1.0",
+    "texts": ["1", "2", "3"],
+    "text as an object": np.array(["1"], dtype=object),
+    "bytes": b"1",
+    "complex": 1j,
+    "complex array": np.array([1.0 + 0j]),
+    "None": None,
+    "None inside": [1.0, None],
+    "date": np.datetime64("2020-01-01"),
+    "mapping": {1: 2},
+    "ragged": [[1], [1, 2]],
+    "SX": ca.SX.sym("q", 3),
+    "MX": ca.MX.sym("q", 3),
+    "object": object(),
+}
+
+
+@pytest.mark.parametrize("value", NO_NUMBERS.values(), ids=NO_NUMBERS)
+def test_only_real_numbers_are_numbers(value: Any) -> None:
+    with pytest.raises(InvalidValueError, match="^q is .*, expected an array of numbers$"):
+        as_float_array("q", value)
+
+
+def test_numbers_of_any_class_are_taken() -> None:
+    values = [1, True, 1.5, np.float32(2), np.int8(3), Fraction(1, 2), ca.DM(4.0)]
+    for value, wanted in zip(values, [1, 1, 1.5, 2, 3, 0.5, 4], strict=True):
+        assert float(as_float_array("q", value).squeeze()) == wanted
+
+
+WRONG: dict[str, Callable[[], Any]] = {
+    "problem of fit": lambda: oc.fit("iiwa"),  # type: ignore[arg-type]
+    "problem of compare": lambda: oc.compare("iiwa", [oc.Linear()]),  # type: ignore[arg-type]
+    "problem of check": lambda: oc.check(fitted().chart),  # type: ignore[arg-type]
+    "problem of involutivity": lambda: oc.involutivity(fitted().chart),  # type: ignore[arg-type]
+    "problem of grow": lambda: oc.grow(fitted().chart),  # type: ignore[arg-type]
+    "problem of singular_points": lambda: oc.singular_points(fitted().chart),  # type: ignore[arg-type]
+    "problem of a chart": lambda: oc.Chart("iiwa", fitted().chart.coordinates),  # type: ignore[arg-type]
+    "problem of Projector": lambda: control.Projector(fitted().chart, 1.0, 1.0),  # type: ignore[arg-type]
+    "problem of KinematicProjector": lambda: control.KinematicProjector("iiwa"),  # type: ignore[arg-type]
+    "chart of evaluate": lambda: oc.evaluate(planar()),  # type: ignore[arg-type]
+    "chart of distil": lambda: oc.distil(planar()),  # type: ignore[arg-type]
+    "chart of jumps": lambda: oc.jumps(planar()),  # type: ignore[arg-type]
+    "chart of generate_c": lambda: oc.generate_c(planar(), "unused"),  # type: ignore[arg-type]
+    "chart of Impedance": lambda: control.Impedance(planar(), 1.0),  # type: ignore[arg-type]
+    "chart of Kinematic": lambda: control.Kinematic(planar(), 1.0),  # type: ignore[arg-type]
+    "chart of matched_stiffness": lambda: control.matched_stiffness(planar()),  # type: ignore[arg-type]
+    "chart of joint_path": lambda: control.joint_path(planar(), steps(), [0, 0, 0]),  # type: ignore[arg-type]
+    "chart of coupling_index": lambda: simulation.coupling_index(planar(), steps(), trajectory()),  # type: ignore[arg-type]
+    "chart of a breakdown": lambda: simulation.task_acceleration_breakdown(planar(), trajectory()),  # type: ignore[arg-type]
+    "robot of a task": lambda: oc.Task.position(planar()),  # type: ignore[arg-type]
+    "controller of simulate": lambda: oc.simulate(fitted().chart, steps(), [0, 0, 0]),  # type: ignore[arg-type]
+    "controller of generate_c": lambda: oc.generate_c(fitted().chart, "unused", "pd_plus"),  # type: ignore[arg-type]
+    "reference of simulate": lambda: oc.simulate(impedance(), [1, 2], [0, 0, 0]),  # type: ignore[arg-type]
+    "pushes of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], pushes=[1]),  # type: ignore[list-item]
+    "friction of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], friction=1.0),  # type: ignore[arg-type]
+    "plant of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], plant=planar()),  # type: ignore[arg-type]
+    "chart of check_c": lambda: check_c(None, planar()),  # type: ignore[arg-type]
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_objects_of_another_class_are_refused_by_name(name: str) -> None:
+    argument = name.partition(" ")[0]
+    with pytest.raises(InvalidValueError, match=rf"{argument} is ('\w+'|1|1\.0|None|a \w+), expected a ") as refusal:
+        WRONG[name]()
+    assert "\n" not in str(refusal.value)
+
+
+def test_objects_in_errors_take_one_line() -> None:
+    with pytest.raises(InvalidValueError, match="expected an object such as Polynomial") as refusal:
+        oc.fit(planar(), fitted().chart)  # type: ignore[arg-type]
+    assert "\n" not in str(refusal.value)

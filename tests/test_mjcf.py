@@ -1,0 +1,312 @@
+"""MJCF files: mass matrix, bias and poses are MuJoCo's, or the file is refused by name and reason."""
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import orthocas as oc
+from orthocas.errors import RobotError, UnknownNameError
+from orthocas.robots.files import lock_joints
+from orthocas.robots.mjcf import model_from_mjcf
+
+mujoco = pytest.importorskip("mujoco", minversion="4")  # older ones find principal axes to 1e-7 only
+
+DATA = Path(__file__).parent / "data" / "mjcf"
+TIPS = {
+    "arm_with_gripper": "attachment_site",
+    "shapes": "tip",
+    "joints": "end",
+    "orientations": "tip",
+    "corrected": "c",
+}
+TOLERANCE = 1e-10  # relative; both sides work in double precision, MuJoCo by way of principal axes
+
+
+def mujoco_dynamics(model, q: np.ndarray, dq: np.ndarray):  # type: ignore[no-untyped-def]
+    """MuJoCo's data after a forward pass, its mass matrix and its bias."""
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel = q, dq
+    mujoco.mj_forward(model, data)
+    M = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    return data, M, data.qfrc_bias.copy()
+
+
+def assert_close(got: np.ndarray, want: np.ndarray) -> None:
+    np.testing.assert_allclose(got, want, rtol=0, atol=TOLERANCE * max(1.0, np.abs(want).max()))
+
+
+def assert_agrees(path: Path, states: int = 5) -> None:
+    """Names, limits, mass matrix, bias, and the poses of all named bodies and sites."""
+    theirs, ours = mujoco.MjModel.from_xml_path(str(path)), model_from_mjcf(path)
+    data = ours.createData()
+    assert list(ours.names)[1:] == [theirs.joint(i).name or f"joint{i}" for i in range(theirs.njnt)]
+    ranges = np.where(theirs.jnt_limited[:, None], theirs.jnt_range, [-np.inf, np.inf])
+    np.testing.assert_allclose(np.column_stack([ours.lowerPositionLimit, ours.upperPositionLimit]), ranges)
+    for q, dq in np.random.default_rng(7).uniform(-2, 2, (states, 2, ours.nq)):
+        state, M, bias = mujoco_dynamics(theirs, q, dq)
+        upper = np.triu(pin.crba(ours, data, q))
+        assert_close(upper + np.triu(upper, 1).T, M)
+        assert_close(pin.nonLinearEffects(ours, data, q, dq), bias)
+        pin.framesForwardKinematics(ours, data, q)
+        for kind, count in (("body", theirs.nbody), ("site", theirs.nsite)):
+            for name in filter(None, (getattr(theirs, kind)(i).name for i in range(1 if kind == "body" else 0, count))):
+                found = ours.getFrameId(name, pin.FrameType.BODY if kind == "body" else pin.FrameType.OP_FRAME)
+                assert_close(data.oMf[found].translation, getattr(state, kind)(name).xpos)
+                assert_close(data.oMf[found].rotation, getattr(state, kind)(name).xmat.reshape(3, 3))
+
+
+@pytest.mark.parametrize("name", TIPS)
+def test_robot_has_the_mass_matrix_bias_and_tip_pose_of_mujoco(name: str) -> None:
+    path, tip = DATA / f"{name}.xml", TIPS[name]
+    assert_agrees(path)
+    robot, theirs = oc.Robot.from_model(model_from_mjcf(path), tip), mujoco.MjModel.from_xml_path(str(path))
+    for q, dq in np.random.default_rng(3).uniform(-2, 2, (5, 2, robot.n)):
+        state, M, bias = mujoco_dynamics(theirs, q, dq)
+        there = state.body(tip) if name in ("joints", "corrected") else state.site(tip)
+        assert_close(robot.mass_matrix(q), M)
+        assert_close(robot.bias(q, dq), bias)
+        assert_close(robot.tip_position(q), there.xpos)
+        assert_close(robot.tip_rotation(q), there.xmat.reshape(3, 3))
+
+
+def test_included_arm_beside_free_bodies_has_the_dynamics_of_mujoco() -> None:
+    path = DATA / "scene.xml"
+    robot, theirs = oc.Robot.from_mjcf(path, "tool"), mujoco.MjModel.from_xml_path(str(path))
+    assert robot.joint_names == ("shoulder_pan", "shoulder_lift", "elbow", "wrist1", "wrist2", "wrist3")
+    np.testing.assert_allclose(robot.upper, [6.28319, 6.28319, 3.1415, 6.28319, 6.28319, 6.28319])
+    for q, dq in np.random.default_rng(5).uniform(-2, 2, (5, 2, 6)):
+        still = np.zeros(theirs.nv - 6)  # the box and the lamp come behind the arm
+        state, M, bias = mujoco_dynamics(theirs, np.append(q, theirs.qpos0[6:]), np.append(dq, still))
+        assert_close(robot.mass_matrix(q), M[:6, :6])
+        assert_close(robot.bias(q, dq), bias[:6])
+        assert_close(robot.tip_position(q), state.site("tool").xpos)
+    with pytest.raises(RobotError, match="box.*FreeFlyer"):
+        oc.Robot.from_model(model_from_mjcf(path), "tool")
+
+
+def test_locked_joints_keep_armatures_and_masses_of_the_others() -> None:
+    path = DATA / "arm_with_gripper.xml"
+    robot = oc.Robot.from_mjcf(path, "hand", {"finger_joint1": 0.01, "finger_joint2": 0.03})
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    for q, dq in np.random.default_rng(1).uniform(-2, 2, (5, 2, 7)):
+        _, M, bias = mujoco_dynamics(theirs, np.append(q, [0.01, 0.03]), np.append(dq, [0.0, 0.0]))
+        assert_close(robot.mass_matrix(q), M[:7, :7])
+        assert_close(robot.bias(q, dq), bias[:7])
+
+
+def test_total_mass_scales_every_body(tmp_path: Path) -> None:
+    path = tmp_path / "arm.xml"
+    text = (DATA / "shapes.xml").read_text().replace('<geom type="mesh" mesh="hull"/>', '<geom type="box"/>')
+    path.write_text(text)
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    mujoco.mj_setTotalmass(theirs, 14.0)
+    path.write_text(text.replace("<compiler ", '<compiler settotalmass="14" '))
+    ours = model_from_mjcf(path)
+    q, dq = np.random.default_rng(2).uniform(-2, 2, (2, 4))
+    assert_close(pin.nonLinearEffects(ours, ours.createData(), q, dq), mujoco_dynamics(theirs, q, dq)[2])
+
+
+def random_mjcf(rng: np.random.Generator) -> str:
+    """A random robot out of hinges, slides, solids and sites, turned in every way that MJCF knows."""
+
+    def vector(count: int, size: float = 0.5) -> str:
+        return " ".join(str(x) for x in rng.uniform(-size, size, count))
+
+    def turn(degrees: float) -> str:
+        kind = rng.choice(["quat", "axisangle", "xyaxes", "zaxis", "euler", ""])
+        turns = {
+            "quat": vector(4),
+            "axisangle": vector(3) + f" {rng.uniform(-3, 3) * degrees}",
+            "xyaxes": vector(6),
+            "zaxis": vector(3),
+            "euler": vector(3, 3 * degrees),
+        }
+        return f'{kind}="{turns[kind]}"' if kind else ""
+
+    def geom(degrees: float) -> str:
+        kind = rng.choice(["sphere", "capsule", "cylinder", "ellipsoid", "box"])
+        size = " ".join(str(x) for x in rng.uniform(0.02, 0.2, 3))
+        mass = rng.choice(["", 'mass="0.7"', 'density="400"', 'class="heavy"'])
+        if kind != "sphere" and rng.random() < 0.3:
+            return f'<geom type="{kind}" fromto="{vector(6)}" size="{size}" {mass}/>'
+        return f'<geom type="{kind}" pos="{vector(3)}" {turn(degrees)} size="{size}" {mass}/>'
+
+    def body(depth: int, degrees: float) -> str:
+        joints = ""
+        for _ in range(rng.integers(0 if depth else 1, 3)):
+            kind = rng.choice(["hinge", "slide"])
+            ref = rng.uniform(-1, 1) * (degrees if kind == "hinge" else 1)
+            joints += f'<joint type="{kind}" axis="{vector(3)}" pos="{vector(3)}" ref="{ref}" range="{-1} {ref + 90}"/>'
+        inner = joints + geom(degrees) + (geom(degrees) if rng.random() < 0.5 else "")
+        for k in range(rng.integers(0, 3) if depth < 4 else 0):
+            child = body(depth + 1, degrees) + f'<site name="s{rng.integers(1 << 40)}" {turn(degrees)}/>'
+            inner += f'<frame pos="{vector(3)}" {turn(degrees)}>{child}</frame>' if k else child
+        return f'<body pos="{vector(3)}" {turn(degrees)}>{inner}</body>'
+
+    angle, degrees = ("degree", 180 / np.pi) if rng.random() < 0.5 else ("radian", 1.0)
+    sequence = "".join(rng.choice(list("xyzXYZ"), 3))
+    return f"""<mujoco><compiler angle="{angle}" eulerseq="{sequence}"/><option gravity="{vector(3, 10)}"/>
+    <default><joint armature="0.3"/><default class="heavy"><geom mass="3"/></default></default>
+    <worldbody>{body(0, degrees)}</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_random_robots_have_the_dynamics_of_mujoco(tmp_path: Path, seed: int) -> None:
+    path = tmp_path / "random.xml"
+    path.write_text(random_mjcf(np.random.default_rng(seed)))
+    assert_agrees(path, states=2)
+
+
+def write(folder: Path, body: str = "", before: str = "", after: str = "") -> Path:
+    """A file with one moving body b, and what is given in it, before and after the worldbody."""
+    path = folder / "arm.xml"
+    path.write_text(
+        f'<mujoco>{before}<worldbody><body name="b"><joint name="j"/><geom size="0.1"/>{body}</body></worldbody>'
+        f"{after}</mujoco>"
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ('<site name="s" pos="0.4"/>', "pos of <site name='s'> of body 'b' is '0.4', expected 3 numbers"),
+        ('<joint range="l4"/>', "range of <joint> of body 'b' is 'l4', expected 2 numbers"),
+        ('<joint axis="0 0 0"/>', "axis of <joint> of body 'b' is '0 0 0', expected a vector that is not zero"),
+        ('<joint axis="0 0 nan"/>', "axis of <joint> of body 'b' is '0 0 nan'"),
+        ('<joint range="1 -1"/>', r"limits \[0.0174533, -0.0174533\]"),
+        ('<joint type="screw"/>', "type of <joint> of body 'b' is 'screw'"),
+        ('<joint armature="-1"/>', "armature -1"),
+        ('<joint class="none"/>', "<joint class='none'> of body 'b' is of class 'none', known: main"),
+        ('<joint name="j"/>', "<joint name='j'> of body 'b' has the name of another joint"),
+        ('<body name="b"/>', "<body name='b'> has the name of another body"),
+        ('<geom size="0.1" mas="2"/>', "<geom> of body 'b' has an attribute 'mas'"),
+        ('<geom size="0.1" mass="1e999"/>', "mass of <geom> of body 'b' is '1e999'"),
+        ('<geom size="0.1" mass="-1"/>', "negative mass"),
+        ('<geom type="box" size="0.1 0.2"/>', "size '0.1 0.2', expected 3 numbers for a box"),
+        ('<geom size="-0.1"/>', "size '-0.1', expected numbers > 0"),
+        ('<geom type="mesh" mesh="m"/>', "<geom> of body 'b' takes its inertia from a mesh"),
+        ('<geom type="box" mesh="m"/>', "takes its inertia from a mesh"),
+        ('<geom size="0.1" shellinertia="true"/>', "shellinertia"),
+        ('<geom fromto="0 0 0 1 0 0" size="0.1"/>', "fromto"),
+        ('<inertial mass="1" diaginertia="1 1 1"/>', "<inertial> of body 'b' has no attribute 'pos'"),
+        ('<inertial pos="0 0 0" mass="1"/>', "diaginertia or fullinertia"),
+        ('<inertial pos="0 0 0" mass="-1" diaginertia="1 1 1"/>', "mass -1 kg"),
+        ('<inertial pos="0 0 0" mass="1" diaginertia="1 1 3"/>', "moments of inertia 1, 1, 3"),
+        ('<inertial pos="0 0 0" mass="1" diaginertia="-1 1 1"/>', "moments of inertia -1, 1, 1"),
+        ('<inertial pos="0 0 0" mass="1" quat="1 0 0 1" fullinertia="1 1 1 0 0 0"/>', "fullinertia and an orientation"),
+        ('<site name="s" euler="1 2 3" quat="1 0 0 0"/>', "several orientations"),
+        ('<site name="s" quat="0 0 0 0"/>', "quaternion 0 0 0 0"),
+        ('<frame scale="2"/>', "<frame> of body 'b' scales"),
+        ('<replicate count="2"/>', "<replicate> of body 'b'"),
+        ('<include file="nowhere.xml"/>', r"nowhere\.xml: No such file"),
+        ('<include file="arm.xml"/>', r"arm\.xml a second time"),
+    ],
+)
+def test_files_that_cannot_be_read_right_are_refused_by_name(tmp_path: Path, body: str, message: str) -> None:
+    with pytest.raises(RobotError, match=rf"arm\.xml.*{message}|{message}"):
+        oc.Robot.from_mjcf(write(tmp_path, body), "b")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ('<compiler angle="grad"/>', "", "angle of <compiler> is 'grad'"),
+        ('<compiler eulerseq="xy"/>', "", "eulerseq 'xy'"),
+        ('<compiler coordinate="global"/>', "", "global coordinates"),
+        ('<option gravity="0 0"/>', "", "gravity of <option> is '0 0', expected 3 numbers"),
+        ('<option gravty="0 0 0"/>', "", "attribute 'gravty'"),
+        ("<defaults/>", "", "<defaults> is an element that orthocas does not know in <mujoco>"),
+        ("<default><jiont/></default>", "", "<jiont> is an element that orthocas does not know in <default>"),
+        ('<default class="other"/>', "", "outermost class"),
+        ('<default><default class="a"/><default class="a"/></default>', "", "class 'a' a second time"),
+        ('<default><tendon armature="1"/></default>', "", "<tendon> has an armature"),
+        ("", '<tendon><fixed name="t" armature="1"/></tendon>', "<fixed name='t'> has an armature"),
+        ("", '<actuator><motor joint="j" armature="1"/></actuator>', "<motor> has an armature"),
+        ("", '<deformable><flex name="f"/></deformable>', "<flex name='f'> is a flexible body"),
+        ('<worldbody><attach model="m" prefix=""/></worldbody>', "", "<attach> of body 'world'"),
+        ("<worldbody><joint/></worldbody>", "", "<joint> is in the world"),
+    ],
+)
+def test_settings_that_cannot_be_read_right_are_refused_by_name(
+    tmp_path: Path, before: str, after: str, message: str
+) -> None:
+    with pytest.raises(RobotError, match=message):
+        oc.Robot.from_mjcf(write(tmp_path, before=before, after=after), "b")
+
+
+def test_range_without_limited_needs_autolimits(tmp_path: Path) -> None:
+    path = write(tmp_path, '<joint range="0 1"/>', '<compiler autolimits="false"/>')
+    with pytest.raises(ValueError, match="limited"):
+        mujoco.MjModel.from_xml_path(str(path))
+    with pytest.raises(RobotError, match="range but not limited"):
+        oc.Robot.from_mjcf(path, "b")
+
+
+def test_file_without_joints_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "props.xml"
+    path.write_text('<mujoco><worldbody><body name="b"/></worldbody></mujoco>')
+    with pytest.raises(RobotError, match=r"props\.xml has no joint"):
+        oc.Robot.from_mjcf(path)
+
+
+def test_body_wins_over_a_site_of_its_name_and_a_site_over_a_joint(tmp_path: Path) -> None:
+    path = write(tmp_path, '<site name="b" pos="1 2 3"/><site name="j" pos="4 5 6"/>')
+    np.testing.assert_array_equal(oc.Robot.from_mjcf(path, "b").tip_position(np.zeros(1)), np.zeros(3))
+    np.testing.assert_array_equal(oc.Robot.from_mjcf(path, "j").tip_position(np.zeros(1)), [4, 5, 6])
+
+
+def test_last_site_is_the_default_tip_and_wrong_tips_list_bodies_and_sites(tmp_path: Path) -> None:
+    path = write(tmp_path, '<site name="flange" pos="1 2 3"/>')
+    np.testing.assert_array_equal(oc.Robot.from_mjcf(path).tip_position(np.zeros(1)), [1, 2, 3])
+    with pytest.raises(UnknownNameError, match="unknown frame 'hand'.*j, b, flange"):
+        oc.Robot.from_mjcf(path, "hand")
+
+
+def test_ball_joints_are_refused_unless_they_can_be_locked_off_the_chain(tmp_path: Path) -> None:
+    path = write(tmp_path, '<body name="c"><joint name="neck" type="ball"/><geom size="0.1"/></body>')
+    with pytest.raises(RobotError, match="neck.*Spherical"):
+        oc.Robot.from_model(model_from_mjcf(path), "b")
+    assert oc.Robot.from_mjcf(path, "b").joint_names == ("j",)
+    with pytest.raises(RobotError, match="neck.*degrees of freedom"):
+        lock_joints(model_from_mjcf(path), {"neck": 0.5})
+
+
+BOMB = '<!DOCTYPE m [<!ENTITY a "ha">' + "".join(
+    f'<!ENTITY a{i} "{(f"&a{i - 1};" if i else "&a;") * 10}">' for i in range(12)
+)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+@pytest.mark.parametrize(("root", "read"), [("mujoco", oc.Robot.from_mjcf), ("robot", oc.Robot.from_urdf)])
+def test_entity_bombs_are_refused_before_they_go_off(tmp_path: Path, encoding: str, root: str, read) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "bomb.xml"
+    path.write_text(f'<?xml version="1.0" encoding="{encoding}"?>{BOMB}]><{root}>&a11;</{root}>', encoding=encoding)
+    with pytest.raises(RobotError, match="declares a document type"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<worldbody>" + "<body>" * 100_000 + "</body>" * 100_000 + "</worldbody>", "nest more than 200 deep"),
+        ("<worldbody>" + "<body><joint/></body>" * 5_000 + "</worldbody>", "more than 1000 bodies"),
+        ("<a/>" * 300_000, "more than 200000 elements"),
+        (" " * 17 * 2**20, "more than 16777216 bytes"),
+    ],
+)
+def test_files_larger_than_any_robot_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "huge.xml"
+    path.write_text(f"<mujoco>{text}</mujoco>")
+    with pytest.raises(RobotError, match=message):
+        oc.Robot.from_mjcf(path, "b")
+
+
+def test_long_chain_of_includes_is_refused(tmp_path: Path) -> None:
+    for i in range(300):
+        (tmp_path / f"{i}.xml").write_text(f'<mujoco><include file="{i + 1}.xml"/></mujoco>')
+    with pytest.raises(RobotError, match="nest more than 200 deep"):
+        oc.Robot.from_mjcf(tmp_path / "0.xml", "b")

@@ -1,0 +1,72 @@
+"""Default domains of a problem: the middle of the limits where the task is regular, a bent posture elsewhere."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from conftest import ROBOTS, robot_data
+
+import orthocas as oc
+from orthocas.domains import default_box, require_within_limits
+from orthocas.postures.regular_box import regular_box
+from orthocas.problems.iiwa import robot as iiwa_robot
+
+
+def arm(name: str) -> oc.Robot:
+    file, tip = ROBOTS[name]
+    return oc.Robot.from_urdf(robot_data(file), tip)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("panda", "position"), ("panda", "pose"), ("ur10", "position")])
+def test_middle_of_the_limits_stays_where_the_task_is_regular(name: str, kind: str) -> None:
+    robot = arm(name)
+    box, middle = regular_box(robot, oc.Task.named(robot, kind)), default_box(robot)
+    np.testing.assert_array_equal(box.centre, middle.centre)
+    np.testing.assert_array_equal(box.half_width, middle.half_width)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("iiwa", "position"),
+        ("iiwa", "pose"),
+        ("ur10", "position+axis"),
+        ("kinova", "position"),
+        ("kinova", "position+axis"),
+    ],
+)
+def test_singular_middle_is_left_for_a_bent_posture_inside_the_limits(name: str, kind: str) -> None:
+    """The independent judge is `check`, on other samples than the choice used."""
+    robot = iiwa_robot() if name == "iiwa" else arm(name)
+    task = oc.Task.named(robot, kind)
+    problem, middle = oc.Problem(robot, task), default_box(robot)
+    require_within_limits(robot, problem.domain)
+    stretched = oc.check(oc.Problem(robot, task, domain=middle), 5000, 3)
+    bent = oc.check(problem, 5000, 3)
+    assert bent.smallest_singular_value > 5 * stretched.smallest_singular_value
+    assert bent.singular_samples == 0 < stretched.singular_samples
+    assert problem.domain.centre[0] == middle.centre[0]  # a turn of the base changes nothing, so there is none
+    np.testing.assert_array_equal(regular_box(robot, task).centre, problem.domain.centre)
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "inertia"])
+def test_pose_of_the_iiwa_fits_without_folds_on_its_default_domain(metric: str) -> None:
+    robot = iiwa_robot()
+    chart = oc.fit(oc.Problem(robot, oc.Task.pose(robot), metric), oc.Polynomial(2)).chart
+    report = oc.evaluate(chart, 20_000, 1)
+    assert not report.degenerate
+    assert report.conditioning.p01 > 0.4
+    assert report.folded_samples == 0
+
+
+def test_hopeless_tasks_keep_the_default_box_for_check_to_judge() -> None:
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
+    idle = oc.Task.position(robot, "z")
+    undefined = oc.Task.custom(robot, "undefined", lambda q: ca.sqrt(-1 - q[0] ** 2))
+    for task in (idle, undefined):
+        np.testing.assert_array_equal(regular_box(robot, task).centre, default_box(robot).centre)
+
+
+def test_planar_arm_bends_its_joints() -> None:
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
+    centre = regular_box(robot, oc.Task.position(robot, "xy")).centre
+    assert np.abs(centre[1:]).max() > 0.7

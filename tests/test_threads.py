@@ -1,0 +1,151 @@
+"""Eight threads that share one chart, law or robot get the numbers that one thread gets, to the last bit."""
+
+import copy
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from public_objects import (
+    circle,
+    disk,
+    fitted,
+    impedance,
+    network,
+    numbers,
+    planar,
+    points_of,
+    states_of,
+    steps,
+)
+
+import orthocas as oc
+from orthocas.casadi_tools.batch import Batched
+from orthocas.casadi_tools.blas_graph import NumpyGraph
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.checks import Array
+from orthocas.control import Controller
+from orthocas.simulation import simulate
+
+THREADS = 8
+Call = Callable[[int], Any]  #: the k-th call of a series
+
+
+@pytest.fixture(autouse=True)
+def hurried() -> Iterator[None]:
+    """Threads take turns five hundred times as often as usual."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    yield
+    sys.setswitchinterval(before)
+
+
+def in_threads(call: Call, count: int) -> list[Any]:
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(pool.map(call, range(count)))
+
+
+def calls_of_chart(chart: oc.Chart) -> list[Call]:
+    """Methods of a chart at points that change from call to call."""
+    q = points_of(chart)
+    phi = chart.phi(q)
+    fitted_calls: list[Call] = [
+        lambda k: np.asarray(chart.function("phi")(q[k % 6])),
+        lambda k: np.asarray(chart.function("jacobian")(q[k % 6])),
+    ]
+    return [
+        lambda k: chart.phi(q[k % 6]),
+        lambda k: chart.jacobian(q[: 1 + k % 6]),
+        lambda k: chart.inverse(phi[k % 6], q[k % 6] + 0.02),
+        lambda k: chart.problem.robot.mass_matrix(q[k % 6]),
+        *([] if isinstance(chart, oc.GrownChart) else fitted_calls),
+    ]
+
+
+def calls_of_law(law: Controller) -> list[Call]:
+    """A law at states that change from call to call."""
+    states = states_of(law)
+    batched = Batched(law.function)
+
+    def command(k: int) -> Array:
+        return np.hstack(batched(*(part[k % 4 :][:1] for part in states)))
+
+    return [command]
+
+
+SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 10,000 calls
+    "polynomial": (lambda: calls_of_chart(copy.deepcopy(fitted().chart)), 4800),
+    "network": (lambda: calls_of_chart(copy.deepcopy(network())), 2400),
+    "circle": (lambda: calls_of_chart(copy.deepcopy(circle())), 120),
+    "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 80),
+    "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 2600),
+}
+
+
+@pytest.mark.parametrize("name", SERIES)
+def test_threads_share(name: str) -> None:
+    build, count = SERIES[name]
+    calls = build()
+    expected = [calls[k % len(calls)](k) for k in range(12 * len(calls))]  # after that they repeat
+    shared = build()  # its functions are not built yet: that happens in the threads
+    for k, found in enumerate(in_threads(lambda k: shared[k % len(shared)](k), count)):
+        np.testing.assert_array_equal(found, expected[k % len(expected)], err_msg=f"call {k}")
+
+
+def test_simulations_share_a_law() -> None:
+    start = planar().domain.centre
+    expected = numbers(simulate(impedance(), steps(), start, step=0.05, control_rate=None))
+    sampled = numbers(simulate(impedance(), steps(), start, control_rate=100.0))
+    law, reference = copy.deepcopy(impedance()), copy.deepcopy(steps())
+    runs = in_threads(lambda k: simulate(law, reference, start, 0 * start, 0.05, [None, 100.0][k % 2]), 16)
+    for k, run in enumerate(runs):
+        for found, wanted in zip(numbers(run), sampled if k % 2 else expected, strict=True):
+            np.testing.assert_array_equal(found, wanted)
+
+
+def test_graphs_with_nodes_in_python_keep_memory_apart() -> None:
+    x = ca.MX.sym("x", 20, 30)
+    weights = ca.DM(np.random.default_rng(0).normal(size=(25, 20)))
+    graph = NumpyGraph("graph", [x], [ca.tanh(weights @ x)])
+    points = np.random.default_rng(1).normal(size=(8, 30, 20))
+    expected = [graph(part)[0] for part in points]
+    for k, (found,) in enumerate(in_threads(lambda k: graph(points[k % 8]), 800)):
+        np.testing.assert_array_equal(found, expected[k % 8])
+
+
+def test_a_value_is_built_once() -> None:
+    """Threads that come while it is being built wait for the first one; errors are not kept."""
+    gate, built = threading.Barrier(THREADS), []
+
+    class Thing:
+        @cached_property
+        def value(self) -> object:
+            built.append(threading.get_ident())
+            if len(built) == 1:
+                raise RuntimeError("not yet")
+            return object()
+
+    thing = Thing()
+    with pytest.raises(RuntimeError, match="not yet"):
+        _ = thing.value
+
+    def look(k: int) -> object:
+        gate.wait(60)
+        return thing.value
+
+    assert len({id(value) for value in in_threads(look, THREADS)}) == 1
+    assert len(built) == 2
+
+
+def test_fits_in_threads_are_those_of_one_thread() -> None:
+    def theta(k: int) -> Array:
+        chart = oc.fit(planar(), [oc.Polynomial(2), oc.MLP((4,))][k % 2], samples=100).chart
+        return np.asarray(chart.coordinates.theta)  # type: ignore[attr-defined]
+
+    expected = [theta(0), theta(1)]
+    for k, found in enumerate(in_threads(theta, 4)):
+        np.testing.assert_array_equal(found, expected[k % 2])

@@ -1,0 +1,49 @@
+"""URDF files that Pinocchio's parser accepts although they describe no robot."""
+
+from pathlib import Path
+
+import pytest
+
+import orthocas as oc
+from orthocas.errors import RobotError
+
+ARM = """<robot name="r"><link name="base"/><link name="a"/>
+<joint name="j" type="{kind}"><parent link="base"/><child link="a"/>{axis}
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
+
+def write(folder: Path, kind: str, axis: str) -> Path:
+    path = folder / "arm.urdf"
+    path.write_text(ARM.format(kind=kind, axis=axis))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
+@pytest.mark.parametrize(
+    ("axis", "message"),
+    [
+        ('<axis xyz="0 0 0"/>', "xyz of <axis> of joint 'j' is '0 0 0', expected a vector that is not zero"),
+        ("<axis/>", "<axis> of joint 'j' has no attribute 'xyz'"),
+        ('<axis xyz="0 1"/>', "xyz of <axis> of joint 'j' is '0 1', expected 3 numbers"),
+        ('<axis xyz="0 x 0"/>', "xyz of <axis> of joint 'j' is '0 x 0', expected 3 numbers"),
+    ],
+)
+def test_joints_along_no_axis_are_refused_by_name(tmp_path: Path, kind: str, axis: str, message: str) -> None:
+    with pytest.raises(RobotError, match=rf"arm\.urdf: {message}"):
+        oc.Robot.from_urdf(write(tmp_path, kind, axis), "a")
+
+
+def test_joint_without_axis_element_moves_along_x_as_urdf_says(tmp_path: Path) -> None:
+    robot = oc.Robot.from_urdf(write(tmp_path, "prismatic", ""), "a")
+    assert robot.tip_position([0.3]).tolist() == [0.3, 0.0, 0.0]
+
+
+def test_urdf_with_more_links_than_any_robot_is_refused(tmp_path: Path) -> None:
+    joints = "".join(
+        f'<link name="l{i}"/><joint name="j{i}" type="continuous"><parent link="l{i - 1}"/><child link="l{i}"/></joint>'
+        for i in range(1, 5000)
+    )
+    path = tmp_path / "snake.urdf"
+    path.write_text(f'<robot name="snake"><link name="l0"/>{joints}</robot>')
+    with pytest.raises(RobotError, match=r"snake\.urdf has 5000 links, expected at most 1000"):
+        oc.Robot.from_urdf(path)
