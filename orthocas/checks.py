@@ -84,8 +84,8 @@ def as_float_array(name: str, value: Any) -> Array:
     """
     try:
         array = np.asarray(value)
-        mixed = array.dtype.kind == "O" and not any(isinstance(entry, _NO_NUMBER) for entry in array.flat)
-        if mixed or array.dtype.kind in _REAL:
+        kind = array.dtype.kind
+        if kind in _REAL or (kind == "O" and not any(isinstance(entry, _NO_NUMBER) for entry in array.flat)):
             return np.asarray(array, dtype=float)
     except (TypeError, ValueError):
         pass

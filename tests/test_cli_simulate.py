@@ -185,7 +185,7 @@ def test_points_and_pushes(run: Run) -> None:
         (("pd_plus", "--stiffness", "-1"), "stiffness[0] is -1.0, expected positive numbers"),
         (("pd_plus", "--stiffness", "soft"), "--stiffness is ['soft'], expected an array of numbers"),
         (("pd_plus", "--limit", "0"), "limit[0] is 0.0, expected positive numbers"),
-        (("kinematic_projector", "--feedback", "1,2"), "--feedback is 1,2, expected one number, or 4"),
+        (("kinematic_projector", "--feedback", "1,2"), "feedback (task, then joints) has shape (2,), expected (4,)"),
         (("pd_plus", "--rate", "0"), "control_rate is 0.0, expected a finite number > 0"),
         (("pd_plus", "--noise", "1,1"), "--noise is 1,1, expected none without --rate"),
         (("pd_plus", "--noise", "1", "--rate", "100"), "--noise is '1', expected two numbers"),

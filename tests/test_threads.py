@@ -3,6 +3,7 @@
 import copy
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -127,6 +128,7 @@ def test_a_value_is_built_once() -> None:
             built.append(threading.get_ident())
             if len(built) == 1:
                 raise RuntimeError("not yet")
+            time.sleep(0.05)  # so that the others come meanwhile
             return object()
 
     thing = Thing()

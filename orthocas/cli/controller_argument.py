@@ -1,38 +1,19 @@
 """Building a controller from command-line words, and refusing words that another controller takes."""
 
 from dataclasses import dataclass
-from typing import Annotated, cast
+from typing import Annotated
 
-import numpy as np
 import typer
 
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_known
+from orthocas.checks import Array
 from orthocas.cli.problem_argument import parse_numbers
-from orthocas.control import (
-    Controller,
-    Impedance,
-    Kinematic,
-    KinematicProjector,
-    PDPlus,
-    Projector,
-    matched_posture_stiffness,
-    matched_stiffness,
-)
-from orthocas.control.damping import DampingDesign
-from orthocas.control.operational_space import Coupling
+from orthocas.control import Controller, Law, law_names, law_of
 from orthocas.errors import InvalidValueError
 
-_SPRINGS, _BY_TORQUE = ("stiffness", "damping_ratio"), ("mass_factor", "friction")
-_OPTIONS = {  #: which options each controller takes, by the names of fields
-    "impedance": (*_SPRINGS, "coupling", "damping", *_BY_TORQUE),
-    "pd_plus": (*_SPRINGS, "coupling", "damping", *_BY_TORQUE),
-    "kinematic": ("feedback",),
-    "projector": (*_SPRINGS, "posture_stiffness", *_BY_TORQUE),
-    "kinematic_projector": ("feedback",),
-}
-CONTROLLERS = tuple(_OPTIONS)
-
+CONTROLLERS = law_names()
+_OF_THE_PLANT = ("mass_factor", "friction")  # options for laws that command torques
+_CHOICES = ("coupling", "damping")  # options that are words
 
 Stiffness = Annotated[
     str | None, typer.Option("--stiffness", help='"100" or one for each; default 2 Hz with the median inertia.')
@@ -76,10 +57,10 @@ def require_options(name: str, options: ControllerOptions) -> None:
         UnknownNameError: if there is no such controller.
         InvalidValueError: for an option that it would ignore.
     """
-    require_known("controller", name, CONTROLLERS)
+    taken = _taken(law_of(name))
     for field, value in vars(options).items():
-        if value is not None and field not in _OPTIONS[name]:
-            takers = ", ".join(other for other, fields in _OPTIONS.items() if field in fields)
+        if value is not None and field not in taken:
+            takers = ", ".join(other for other in CONTROLLERS if field in _taken(law_of(other)))
             raise InvalidValueError(
                 f"--{field.replace('_', '-')}", value, f"no such option with {name}: it belongs to {takers}"
             )
@@ -91,29 +72,18 @@ def build_controller(name: str, chart: Chart, options: ControllerOptions, limit:
     Raises:
         OrthocasError: if anything does not fit together.
     """
-    bounds = None if limit is None else _one_or_all("--limit", limit)
-    if name == "kinematic":
-        return Kinematic(chart, _one_or_all("--feedback", options.feedback or "0"), bounds)
-    if name == "kinematic_projector":
-        m, n = chart.m, chart.n
-        feedback = _one_or_all("--feedback", options.feedback or "0")
-        if feedback.ndim and len(feedback) != m + n:
-            raise InvalidValueError("--feedback", options.feedback, f"one number, or {m + n}: for task, then joints")
-        spread = np.broadcast_to(feedback, m + n)
-        return KinematicProjector(chart.problem, spread[:m], spread[m:], bounds)
-    ratio = _one_or_all("--damping-ratio", options.damping_ratio or "0.7")
-    given = None if options.stiffness is None else _one_or_all("--stiffness", options.stiffness)
-    if name == "projector":
-        posture = options.posture_stiffness
-        joints = (
-            matched_posture_stiffness(chart.problem) if posture is None else _one_or_all("--posture-stiffness", posture)
-        )
-        stiffness = matched_stiffness(chart)[: chart.m] if given is None else given
-        return Projector(chart.problem, stiffness, joints, ratio, bounds)
-    law = Impedance if name == "impedance" else PDPlus
-    coupling = cast(Coupling, "coupled" if options.coupling is None else options.coupling)  # the law checks it
-    design = cast(DampingDesign, "square_root" if options.damping is None else options.damping)
-    return law(chart, matched_stiffness(chart) if given is None else given, ratio, coupling, design, bounds)
+    law = law_of(name)
+    words = {field: value for field in law.options if (value := getattr(options, field)) is not None}
+    settings = {
+        field: word if field in _CHOICES else _one_or_all(f"--{field.replace('_', '-')}", word)
+        for field, word in words.items()
+    }
+    return law.on_chart(chart, None if limit is None else _one_or_all("--limit", limit), **settings)
+
+
+def _taken(law: type[Law]) -> tuple[str, ...]:
+    """Options that a law takes."""
+    return (*law.options, *(_OF_THE_PLANT if law.command == "torque" else ()))
 
 
 def _one_or_all(option: str, text: str) -> Array:

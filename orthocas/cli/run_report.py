@@ -38,7 +38,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
     largest = np.abs(seen.command).max(axis=0)
     report = {
         "controller": controller.name,
-        "coupling": getattr(controller, "coupling", None),
+        "coupling": controller.settings.get("coupling"),
         "gains": controller.gains,
         "outcome": seen.outcome.value,
         "duration": float(seen.times[-1]),

@@ -27,7 +27,7 @@ from orthocas.cli.output import AsJson, note, number, print_json, print_rows, wh
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.cli.progress import terminal_monitor
 from orthocas.cli.run_report import fallback_text, run_report, run_rows
-from orthocas.control import Controller, Impedance, PDPlus, Reference, posture_reference
+from orthocas.control import Controller, Reference, posture_reference
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.files.atomic import published, require_writable
 from orthocas.files.json import to_json
@@ -186,16 +186,8 @@ def _finish(
 
 def _notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
     """What to know about the run, on standard error."""
-    metric = law.problem.metric.name
-    if law.name in ("impedance", "pd_plus") and metric != "inertia":
-        note(
-            f"the metric of this chart is {metric}: task and extra coordinates are decoupled only with A = M (inertia)"
-        )
-    if isinstance(law, Impedance | PDPlus) and (found := law.check_damping()).indefinite_share:
-        note(
-            f"the damping matrix (29) is not positive at {found.indefinite_share:.1%} of the domain with these gains: "
-            "--damping double_diagonal always is"
-        )
+    for remark in law.remarks():
+        note(remark)
     fallback = fallback_text(report)
     if fallback is not None:
         note(fallback)

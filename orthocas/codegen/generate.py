@@ -104,7 +104,7 @@ def _require_matching(chart: Chart, controller: Controller | None, name: str) ->
         )
     if controller is None:
         return
-    if getattr(controller, "chart", chart) is not chart or controller.problem is not chart.problem:
+    if (controller.chart or chart) is not chart or controller.problem is not chart.problem:
         raise InvalidValueError("controller", f"one of another chart ({controller.name})", "one of this very chart")
 
 

@@ -18,19 +18,6 @@ from orthocas.version import VERSION
 _MAX_EVALUATIONS = 100  # of the chart in one call of the inverse map
 _IN_DOMAIN = "OUTSIDE_DOMAIN: q lies outside the domain of the chart."
 _EVERYWHERE = "This law needs no chart: it is never OUTSIDE_DOMAIN."
-_GAINS = {
-    "stiffness": "J per squared unit of the quantity, > 0",
-    "damping_ratio": "1 is critical damping",
-    "feedback": "1/s",
-    "limit": "largest command, by joints, > 0; INFINITY for none",
-}
-_LAWS = {
-    "impedance": "Impedance control: tau = J^T (-K (phi - phi_d) - D J dq) + g(q).",
-    "pd_plus": "Operational space PD+: tau = J^T (f_imp + f_FF) + g(q).",
-    "projector": "Task impedance and a posture spring behind the projector of the task, plus g(q).",
-    "kinematic": "Velocity control dq = J^-1 (d phi_d + Lambda (phi_d - phi)); the input dq is not used.",
-    "kinematic_projector": "Velocity control by pseudo-inverse and projector; the input dq is not used.",
-}
 
 
 def template_values(
@@ -96,20 +83,21 @@ def _control_values(controller: Controller) -> dict[str, str]:
     return {
         "k": str(len(controller.labels)),
         "reference_labels": ", ".join(_words(controller.labels)),
-        "gain_fields": "\n".join(f"  double {gain}[{len(gains[gain])}];{_remark(gain)}" for gain in gains),
+        "gain_fields": "\n".join(f"  double {gain}[{len(gains[gain])}];{_remark(controller, gain)}" for gain in gains),
         "gain_values": ",\n".join(f"  {{{_numbers(value)}}}" for value in gains.values()),
         "gain_table": "\n".join(f"| `{gain}` | {_numbers(value)} |" for gain, value in gains.items()),
         "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
         "commands_torque": str(int(torque)),
-        "law": _LAWS.get(controller.name, f"The law {controller.name}."),
+        "law": controller.formula,
         "fallback": "the torque of gravity, or zero where that is not finite" if torque else "zero velocity",
-        "where": _IN_DOMAIN if hasattr(controller, "chart") else _EVERYWHERE,
+        "where": _EVERYWHERE if controller.chart is None else _IN_DOMAIN,
         "command": controller.command,
     }
 
 
-def _remark(gain: str) -> str:
-    return f" /* {_GAINS[gain]} */" if gain in _GAINS else ""
+def _remark(controller: Controller, gain: str) -> str:
+    units = controller.gain_units.get(gain)
+    return "" if units is None else f" /* {_words([units])[0]} */"
 
 
 def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:

@@ -1,6 +1,6 @@
 """Controllers as CasADi functions of state, reference and gains, and the references they follow."""
 
-from orthocas.control.controller import Controller
+from orthocas.control.controller import Controller, Law
 from orthocas.control.kinematic import Kinematic
 from orthocas.control.matched_stiffness import matched_posture_stiffness, matched_stiffness
 from orthocas.control.operational_space import DampingCheck, Impedance, PDPlus
@@ -8,6 +8,7 @@ from orthocas.control.posture import posture_reference
 from orthocas.control.projector import KinematicProjector, Projector
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
+from orthocas.control.registry import law_names, law_of, register
 from orthocas.control.status import ControlStatus
 
 __all__ = [
@@ -17,11 +18,15 @@ __all__ = [
     "Impedance",
     "Kinematic",
     "KinematicProjector",
+    "Law",
     "PDPlus",
     "Projector",
     "Reference",
     "joint_path",
+    "law_names",
+    "law_of",
     "matched_posture_stiffness",
     "matched_stiffness",
     "posture_reference",
+    "register",
 ]

@@ -1,8 +1,10 @@
 """What every controller offers: one CasADi function of state, reference and gains, with the gains it was made with."""
 
-from typing import Literal, Protocol
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 import casadi as ca
+from numpy.typing import ArrayLike
 
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
@@ -11,6 +13,9 @@ from orthocas.domains import Domain
 from orthocas.errors import InvalidValueError
 from orthocas.problem import Problem
 from orthocas.showing import listed, number_list
+
+if TYPE_CHECKING:
+    from orthocas.chart import Chart
 
 Command = Literal["torque", "velocity"]
 
@@ -21,6 +26,16 @@ class Controller(Protocol):
     @property
     def name(self) -> str:
         """Short name, for example 'pd_plus'."""
+        ...
+
+    @property
+    def formula(self) -> str:
+        """The law in one line, for generated C."""
+        ...
+
+    @property
+    def chart(self) -> "Chart | None":
+        """The chart whose coordinates it uses, and whose domain it keeps to; None for laws without one."""
         ...
 
     @property
@@ -41,6 +56,20 @@ class Controller(Protocol):
     @property
     def gains(self) -> dict[str, Array]:
         """Values of the gains, by the names of their inputs."""
+        ...
+
+    @property
+    def gain_units(self) -> Mapping[str, str]:
+        """Units of the gains and what they allow, in words, by name."""
+        ...
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """Choices that are no numbers, for example the coupling."""
+        ...
+
+    def remarks(self) -> list[str]:
+        """What to know before it is switched on, in sentences; empty if there is nothing."""
         ...
 
     @property
@@ -68,13 +97,30 @@ class Controller(Protocol):
         ...
 
 
-def law_facts(controller: Controller, **settings: str) -> dict[str, str]:
+class Law(Controller, Protocol):
+    """A controller that can be built by name on a chart, for the command line; see `orthocas.control.registry`."""
+
+    options: ClassVar[tuple[str, ...]]  #: names of the settings that `on_chart` takes
+
+    @classmethod
+    def on_chart(cls, chart: "Chart", limit: ArrayLike | None = None, **settings: Any) -> Self:
+        """The law on a chart, or on its problem.
+
+        Args:
+            chart: the chart.
+            limit: largest command of each joint.
+            settings: gains and choices by the names in `options`; those left out have defaults.
+        """
+        ...
+
+
+def law_facts(controller: Controller) -> dict[str, str]:
     """What a controller shows: quantities, gains, other settings and problem."""
     return {
         "law": f"{controller.name}, commands {controller.command} of {controller.problem.n} joints",
         "quantities": listed(controller.labels),
         **{name: number_list(gain) for name, gain in controller.gains.items()},
-        **settings,
+        **controller.settings,
         "problem": controller.problem.heading,
     }
 

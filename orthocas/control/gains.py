@@ -6,6 +6,13 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.checks import Array, as_float_array, frozen_array, require_shape
 from orthocas.errors import InvalidValueError
 
+STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
+    "J per squared unit of the quantity, > 0",
+    "1 is critical damping, >= 0",
+    "1/s, >= 0",
+    "largest command, by joints, > 0; INFINITY for none",
+)
+
 
 def positive_gains(name: str, value: ArrayLike, length: int) -> Array:
     """Finite numbers > 0, (length,), from one number or (length,)."""

@@ -1,7 +1,8 @@
 """Velocity control in the coordinates phi = [x; xi] ([AS2023] Sec. 9)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import casadi as ca
 from numpy.typing import ArrayLike
@@ -10,7 +11,7 @@ from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind
 from orthocas.control.controller import Command, guarded_graph, law_facts, named_inputs
-from orthocas.control.gains import command_limit, non_negative_gains
+from orthocas.control.gains import FEEDBACK, LIMIT, command_limit, non_negative_gains
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
@@ -40,8 +41,12 @@ class Kinematic(Shown):
     limit: Array
 
     name: ClassVar[str] = "kinematic"
+    formula: ClassVar[str] = "Velocity control dq = J^-1 (d phi_d + Lambda (phi_d - phi)); the input dq is not used."
     command: ClassVar[Command] = "velocity"
     energy: ClassVar[None] = None
+    gain_units: ClassVar[Mapping[str, str]] = {"feedback": FEEDBACK, "limit": LIMIT}
+    settings: ClassVar[Mapping[str, str]] = {}
+    options: ClassVar[tuple[str, ...]] = ("feedback",)
 
     def __init__(self, chart: Chart, feedback: ArrayLike = 0.0, limit: ArrayLike | None = None) -> None:
         require_kind("chart", chart, Chart)
@@ -49,6 +54,15 @@ class Kinematic(Shown):
         object.__setattr__(self, "chart", chart)
         object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))
         object.__setattr__(self, "limit", command_limit("limit", limit, chart.n))
+
+    @classmethod
+    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
+        """The law on a chart; `feedback` is 0 unless given."""
+        return cls(chart, limit=limit, **settings)
+
+    def remarks(self) -> list[str]:
+        """Nothing."""
+        return []
 
     @property
     def problem(self) -> Problem:

@@ -1,7 +1,8 @@
 """Impedance control and PD+ in the coordinates phi = [x; xi] ([AS2023] Sec. 7), coupled or decoupled."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import casadi as ca
 import numpy as np
@@ -13,8 +14,16 @@ from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind, require_known
 from orthocas.control.controller import Command, guarded_graph, law_facts, named_function, named_inputs
 from orthocas.control.damping import DAMPING_DESIGNS, DampingDesign, damping_matrix
-from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
+from orthocas.control.gains import (
+    DAMPING_RATIO,
+    LIMIT,
+    STIFFNESS,
+    command_limit,
+    non_negative_gains,
+    positive_gains,
+)
 from orthocas.control.inertia import block_inertia, median_volume
+from orthocas.control.matched_stiffness import matched_stiffness
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
 from orthocas.domains import sample_uniform
@@ -62,7 +71,10 @@ class _OperationalSpace(Shown):
 
     feed_forward: ClassVar[bool]
     name: ClassVar[str]
+    formula: ClassVar[str]
     command: ClassVar[Command] = "torque"
+    gain_units: ClassVar[Mapping[str, str]] = {"stiffness": STIFFNESS, "damping_ratio": DAMPING_RATIO, "limit": LIMIT}
+    options: ClassVar[tuple[str, ...]] = ("stiffness", "damping_ratio", "coupling", "damping")
 
     def __init__(
         self,
@@ -88,6 +100,32 @@ class _OperationalSpace(Shown):
         }.items():
             object.__setattr__(self, name, value)
 
+    @classmethod
+    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
+        """The law on a chart; `stiffness` is that of springs of 2 Hz with the median inertia unless given."""
+        stiffness = settings.pop("stiffness", None)
+        return cls(chart, matched_stiffness(chart) if stiffness is None else stiffness, limit=limit, **settings)
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """Coupling and damping design."""
+        return {"coupling": self.coupling, "damping": self.damping}
+
+    def remarks(self) -> list[str]:
+        """Whether the metric decouples task and extra coordinates, and whether D is positive semi-definite."""
+        found, metric = [], self.problem.metric.name
+        if metric != "inertia":
+            found.append(
+                f"the metric of this chart is {metric}: task and extra coordinates are decoupled only with A = M "
+                "(inertia)"
+            )
+        if share := self.check_damping().indefinite_share:
+            found.append(
+                f"the damping matrix (29) is not positive at {share:.1%} of the domain with these gains: "
+                "the damping design double_diagonal always is"
+            )
+        return found
+
     @property
     def problem(self) -> Problem:
         """Robot, task, metric and domain of the chart."""
@@ -95,7 +133,7 @@ class _OperationalSpace(Shown):
 
     def facts(self) -> dict[str, str]:
         """Quantities, gains, design and problem."""
-        return law_facts(self, coupling=self.coupling, damping=self.damping)
+        return law_facts(self)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -211,6 +249,7 @@ class Impedance(_OperationalSpace):
 
     feed_forward = False
     name = "impedance"
+    formula = "Impedance control: tau = J^T (-K (phi - phi_d) - D J dq) + g(q)."
 
 
 class PDPlus(_OperationalSpace):
@@ -224,6 +263,7 @@ class PDPlus(_OperationalSpace):
 
     feed_forward = True
     name = "pd_plus"
+    formula = "Operational space PD+: tau = J^T (f_imp + f_FF) + g(q)."
 
 
 def _block_damping(design: DampingDesign, blocks: tuple[int, ...]) -> ca.Function:

@@ -1,7 +1,8 @@
 """The state of the art to compare with: null-space projectors on torque and on velocity level."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -9,11 +10,21 @@ from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
+from orthocas.chart import Chart
 from orthocas.checks import Array, frozen_array, require_kind
 from orthocas.control.controller import Command, guarded_graph, law_facts, named_function, named_inputs
 from orthocas.control.damping import damping_matrix
-from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
+from orthocas.control.gains import (
+    DAMPING_RATIO,
+    FEEDBACK,
+    LIMIT,
+    STIFFNESS,
+    command_limit,
+    non_negative_gains,
+    positive_gains,
+)
 from orthocas.control.inertia import block_inertia, median_volume
+from orthocas.control.matched_stiffness import matched_posture_stiffness, matched_stiffness
 from orthocas.control.reference import Reference
 from orthocas.errors import UnreachableReferenceError
 from orthocas.problem import Problem
@@ -45,7 +56,12 @@ class Projector(Shown):
     limit: Array
 
     name: ClassVar[str] = "projector"
+    formula: ClassVar[str] = "Task impedance and a posture spring behind the projector of the task, plus g(q)."
     command: ClassVar[Command] = "torque"
+    chart: ClassVar[None] = None
+    gain_units: ClassVar[Mapping[str, str]] = {"stiffness": STIFFNESS, "damping_ratio": DAMPING_RATIO, "limit": LIMIT}
+    settings: ClassVar[Mapping[str, str]] = {}
+    options: ClassVar[tuple[str, ...]] = ("stiffness", "damping_ratio", "posture_stiffness")
 
     def __init__(
         self,
@@ -63,6 +79,22 @@ class Projector(Shown):
         object.__setattr__(self, "stiffness", frozen_array("stiffness", np.concatenate([task, posture]), (m + n,)))
         object.__setattr__(self, "damping_ratio", non_negative_gains("damping_ratio", damping_ratio, m + n))
         object.__setattr__(self, "limit", command_limit("limit", limit, n))
+
+    @classmethod
+    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
+        """The law on the problem of a chart; springs of 2 Hz with the median inertia unless given."""
+        stiffness, posture = settings.pop("stiffness", None), settings.pop("posture_stiffness", None)
+        return cls(
+            chart.problem,
+            matched_stiffness(chart)[: chart.m] if stiffness is None else stiffness,
+            matched_posture_stiffness(chart.problem) if posture is None else posture,
+            limit=limit,
+            **settings,
+        )
+
+    def remarks(self) -> list[str]:
+        """Nothing."""
+        return []
 
     def facts(self) -> dict[str, str]:
         """Quantities, gains and problem."""
@@ -155,8 +187,13 @@ class KinematicProjector(Shown):
     limit: Array
 
     name: ClassVar[str] = "kinematic_projector"
+    formula: ClassVar[str] = "Velocity control by pseudo-inverse and projector; the input dq is not used."
     command: ClassVar[Command] = "velocity"
+    chart: ClassVar[None] = None
     energy: ClassVar[None] = None
+    gain_units: ClassVar[Mapping[str, str]] = {"feedback": FEEDBACK, "limit": LIMIT}
+    settings: ClassVar[Mapping[str, str]] = {}
+    options: ClassVar[tuple[str, ...]] = ("feedback",)
 
     def __init__(
         self,
@@ -171,6 +208,17 @@ class KinematicProjector(Shown):
         object.__setattr__(self, "problem", problem)
         object.__setattr__(self, "feedback", np.concatenate([task, posture]))
         object.__setattr__(self, "limit", command_limit("limit", limit, problem.n))
+
+    @classmethod
+    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
+        """The law on the problem of a chart; `feedback`, one number or (m + n,), is 0 unless given."""
+        m, n = chart.m, chart.n
+        feedback = non_negative_gains("feedback (task, then joints)", settings.pop("feedback", 0.0), m + n)
+        return cls(chart.problem, feedback[:m], feedback[m:], limit, **settings)
+
+    def remarks(self) -> list[str]:
+        """Nothing."""
+        return []
 
     def facts(self) -> dict[str, str]:
         """Quantities, gains and problem."""

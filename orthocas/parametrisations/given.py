@@ -1,14 +1,14 @@
 """Coordinates given in closed form: nothing to fit, but a chart to judge, save and use like any other."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
 import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import dense_function
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.tape import Tape, replay, to_tape
 from orthocas.casadi_tools.user_expression import expression_of
 from orthocas.checks import Array, require_shape
@@ -30,7 +30,7 @@ class Given:
 
     label: str
     n: int
-    tape: Tape
+    tape: Tape = field(repr=False)
     linear: ClassVar[bool] = True
 
     @classmethod

@@ -25,6 +25,7 @@ def simulate(
     controller: Controller,
     reference: Reference,
     q_start: ArrayLike,
+    *,
     dq_start: ArrayLike | None = None,
     step: float = 0.01,
     control_rate: float | None = None,

@@ -1,0 +1,41 @@
+"""Control laws by name, for the command line, and how to add your own."""
+
+from orthocas.checks import require_known
+from orthocas.control.controller import Law
+from orthocas.control.kinematic import Kinematic
+from orthocas.control.operational_space import Impedance, PDPlus
+from orthocas.control.projector import KinematicProjector, Projector
+from orthocas.errors import InvalidValueError
+
+_LAWS: dict[str, type[Law]] = {}
+
+
+def register(law: type[Law]) -> None:
+    """Make a law known by its name: `orthocas simulate` and `orthocas codegen` can then build it on a chart.
+
+    Raises:
+        InvalidValueError: if the name belongs to another law.
+    """
+    name = str(law.name)
+    if _LAWS.get(name, law) is not law:
+        raise InvalidValueError("name", repr(name), f"a name that is not taken by {_LAWS[name].__name__}")
+    _LAWS[name] = law
+
+
+def law_names() -> tuple[str, ...]:
+    """Names of all laws."""
+    return tuple(_LAWS)
+
+
+def law_of(name: str) -> type[Law]:
+    """The law of that name.
+
+    Raises:
+        UnknownNameError: if there is none.
+    """
+    require_known("controller", name, _LAWS)
+    return _LAWS[name]
+
+
+for _law in (Impedance, PDPlus, Kinematic, Projector, KinematicProjector):
+    register(_law)
