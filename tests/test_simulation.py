@@ -326,6 +326,7 @@ def test_unreachable_reference_is_reported_before_the_run(planar_chart: oc.Chart
     assert np.isfinite(run.command).all()
 
 
+@pytest.mark.slow
 def test_interrupt_keeps_what_was_simulated(planar_chart: oc.Chart, steps: Reference, q0: Array) -> None:
     for rate in (None, 500.0):
 
