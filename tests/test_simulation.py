@@ -154,7 +154,7 @@ def test_energy_books_balance_and_storage_falls(planar_chart: oc.Chart, q0: Arra
     """V(0) - V(t) is what the damping took: the closed loop is passive."""
     controller = law(planar_chart, K, 0.7, damping=damping)
     start, velocity = q0 + np.array([0.1, -0.1, 0.05]), np.array([0.5, -0.4, 0.3])
-    run = simulate(controller, resting(planar_chart, q0, 3.0), start, velocity, step=0.005, tolerance=1e-10)
+    run = simulate(controller, resting(planar_chart, q0, 3.0), start, dq_start=velocity, step=0.005, tolerance=1e-10)
     assert (run.status == ControlStatus.OK).all()
     assert np.abs(run.energy_balance).max() < 1e-5 * run.storage[0]  # Simpson's rule on 5 ms
     assert run.storage_rise < 1e-8 * run.storage[0]
@@ -438,7 +438,7 @@ def test_what_would_be_ignored_is_refused(planar_chart: oc.Chart, q0: Array) -> 
     with pytest.raises(InvalidValueError, match="a velocity controller sees no forces"):
         simulate(Kinematic(planar_chart), still, q0, plant=heavy)
     with pytest.raises(InvalidValueError, match="no velocity as a state"):
-        simulate(Kinematic(planar_chart), still, q0, np.zeros(3))
+        simulate(Kinematic(planar_chart), still, q0, dq_start=np.zeros(3))
     with pytest.raises(InvalidValueError, match=r"labels of the reference is \('x', 'xi1', 'xi2'\)"):
         simulate(KinematicProjector(planar_chart.problem), still, q0)
     with pytest.raises(InvalidValueError, match="duration of a push"):

@@ -103,7 +103,7 @@ def test_simulations_share_a_law() -> None:
     expected = numbers(simulate(impedance(), steps(), start, step=0.05, control_rate=None))
     sampled = numbers(simulate(impedance(), steps(), start, control_rate=100.0))
     law, reference = copy.deepcopy(impedance()), copy.deepcopy(steps())
-    runs = in_threads(lambda k: simulate(law, reference, start, 0 * start, 0.05, [None, 100.0][k % 2]), 16)
+    runs = in_threads(lambda k: simulate(law, reference, start, step=0.05, control_rate=[None, 100.0][k % 2]), 16)
     for k, run in enumerate(runs):
         for found, wanted in zip(numbers(run), sampled if k % 2 else expected, strict=True):
             np.testing.assert_array_equal(found, wanted)
