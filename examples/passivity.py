@@ -100,7 +100,9 @@ def run_all(arm: Arm, name: str) -> Found:
     """All runs of one controller; the same seed for each, so that they start alike."""
     rises, worst, left = [0.0], None, 0
     for controller, reference, q, dq in cases(arm, name):
-        run = oc.simulate(controller, reference, q, dq, STEP, must_be_reachable=False, tolerance=TOLERANCE)
+        run = oc.simulate(
+            controller, reference, q, dq_start=dq, step=STEP, must_be_reachable=False, tolerance=TOLERANCE
+        )
         if run.status.any():
             left += 1
             continue

@@ -289,6 +289,7 @@ def test_entity_bombs_are_refused_before_they_go_off(tmp_path: Path, encoding: s
         read(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -1,5 +1,6 @@
 """Closed loops: against an independent integrator on Pinocchio's dynamics, energy books, and sampled control."""
 
+import zipfile
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -325,6 +326,7 @@ def test_unreachable_reference_is_reported_before_the_run(planar_chart: oc.Chart
     assert np.isfinite(run.command).all()
 
 
+@pytest.mark.slow
 def test_interrupt_keeps_what_was_simulated(planar_chart: oc.Chart, steps: Reference, q0: Array) -> None:
     for rate in (None, 500.0):
 
@@ -386,6 +388,21 @@ def test_trajectory_file_keeps_everything(planar_chart: oc.Chart, steps: Referen
         Trajectory.load(tmp_path / "none.npz")
     with pytest.raises(TrajectoryFileError, match="does not exist"):
         run.save(tmp_path / "no" / "run.npz")
+
+
+def test_encrypted_and_garbled_arrays_are_damage(tmp_path: Path) -> None:
+    """NumPy raises RuntimeError for the first and TokenError for the second."""
+    file = tmp_path / "run.npz"
+    np.savez(file, header="{}")
+    whole = file.read_bytes()
+    flags = whole.index(b"PK\x01\x02") + 8
+    file.write_bytes(whole[:flags] + b"\x01" + whole[flags + 1 :])
+    with pytest.raises(TrajectoryFileError, match="not a trajectory file"):
+        Trajectory.load(file)
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("header.npy", np.lib.format.magic(1, 0) + b"\x0b\x00{'descr': (")
+    with pytest.raises(TrajectoryFileError, match="not a trajectory file"):
+        Trajectory.load(file)
 
 
 @pytest.mark.parametrize(

@@ -87,6 +87,7 @@ SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 10,000 calls
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SERIES)
 def test_threads_share(name: str) -> None:
     build, count = SERIES[name]
@@ -143,6 +144,7 @@ def test_a_value_is_built_once() -> None:
     assert len(built) == 2
 
 
+@pytest.mark.slow
 def test_fits_in_threads_are_those_of_one_thread() -> None:
     def theta(k: int) -> Array:
         chart = oc.fit(planar(), [oc.Polynomial(2), oc.MLP((4,))][k % 2], samples=100).chart
