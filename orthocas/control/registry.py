@@ -16,10 +16,9 @@ def register(law: type[Law]) -> None:
     Raises:
         InvalidValueError: if the name belongs to another law.
     """
-    name = str(law.name)
-    if _LAWS.get(name, law) is not law:
-        raise InvalidValueError("name", repr(name), f"a name that is not taken by {_LAWS[name].__name__}")
-    _LAWS[name] = law
+    if _LAWS.get(law.name, law) is not law:
+        raise InvalidValueError("name", repr(law.name), f"a name that is not taken by {_LAWS[law.name].__name__}")
+    _LAWS[law.name] = law
 
 
 def law_names() -> tuple[str, ...]:
