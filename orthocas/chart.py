@@ -35,6 +35,18 @@ class Chart(Shown):
     Joint positions are one (n,), a column (n, 1), or a set (N, n), [rad] or [m]; xi, task, phi and jacobian also take a
     CasADi column (n, 1), SX or MX, and give an expression. Grown coordinates are NaN at points from where their flow
     does not reach the charted part of the base leaf.
+
+    Example:
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> chart.labels
+        ('x', 'y', 'xi1')
+        >>> q = np.array([0.7, 0.9, 0.6])
+        >>> phi = chart.phi(q)
+        >>> np.allclose(chart.inverse(phi, q_start=[0.6, 0.8, 0.8]), q)
+        True
     """
 
     problem: Problem
@@ -273,7 +285,21 @@ class GrownChart(Chart):
 
 
 def load(path: str | Path) -> Chart:
-    """Read a chart file; see `Chart.load`. A grown chart comes back as a `GrownChart`."""
+    """Read a chart file; see `Chart.load`. A grown chart comes back as a `GrownChart`.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "arm.orthocas"
+        ...     chart.save(path)
+        ...     again = oc.load(path)
+        >>> bool((again.xi([0.7, 0.9, 0.6]) == chart.xi([0.7, 0.9, 0.6])).all())
+        True
+    """
     chart = Chart.load(path)
     if isinstance(chart.coordinates, GrownCoordinates):
         return GrownChart(chart.problem, chart.coordinates, chart.notes)

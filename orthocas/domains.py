@@ -45,6 +45,14 @@ class Box:
     Args:
         centre: (n,) [rad] or [m].
         half_width: (n,) or one number for all joints, > 0 [rad] or [m].
+
+    Example:
+        >>> import orthocas as oc
+        >>> box = oc.Box([0.0, 1.0], 0.5)
+        >>> box.half_width.tolist()
+        [0.5, 0.5]
+        >>> box.contains([[0.2, 1.4], [1.0, 1.0]]).tolist()
+        [True, False]
     """
 
     centre: Array
@@ -92,7 +100,13 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Torus:
-    """Whole turns of n revolute joints, sampled on (-pi, pi]."""
+    """Whole turns of n revolute joints, sampled on (-pi, pi].
+
+    Example:
+        >>> import orthocas as oc
+        >>> oc.Torus(2).half_width.round(3).tolist()
+        [3.142, 3.142]
+    """
 
     n: int
     name: str = "torus"

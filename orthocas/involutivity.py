@@ -86,6 +86,14 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
 
     Source:
         Theorem: [AS2023] Sec. 3. Defect, and expected angle: ours, docs/derivations.md#involutivity.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> oc.involutivity(problems.get("planar_3r_x"), samples=200).exact
+        True
+        >>> oc.involutivity(problems.get("planar_3r_xy"), samples=200).exact
+        False
     """
     samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
     require_kind("problem", problem, Problem)
@@ -158,6 +166,13 @@ def lie_bracket(f: ca.SX, g: ca.SX, q: ca.SX) -> ca.SX:
 
     Source:
         Standard; sign as in [L2012].
+
+    Example:
+        >>> import casadi as ca
+        >>> import orthocas as oc
+        >>> q = ca.SX.sym("q", 2)
+        >>> oc.lie_bracket(ca.vertcat(1, 0), ca.vertcat(0, q[0]), q)
+        SX([0, 1])
     """
     require_shape("q", q.shape, (None, 1))
     require_shape("f", f.shape, q.shape)

@@ -66,6 +66,14 @@ class Metric:
 
         Raises:
             ShapeError: if A is not (n, n).
+
+        Example:
+            >>> import casadi as ca
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+            >>> metric = oc.Metric.custom(robot, "stiff elbow", lambda q: ca.diag(ca.vertcat(1, 2 + ca.cos(q[1]))))
+            >>> oc.Problem(robot, oc.Task.position(robot, "x"), metric).metric.name
+            'stiff elbow'
         """
         q = ca.SX.sym("q", robot.n)
         A = expression_of("metric", function, q)

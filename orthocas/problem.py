@@ -33,6 +33,14 @@ class Problem(Shown):
         DomainError: if the domain leaves the joint limits.
         MetricError: if a constant metric is not SPD, or a joint moves no mass under "inertia" (metrics that depend on q
             are checked by `check` and on every sample).
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+        >>> task = oc.Task.position(robot, "xy")
+        >>> problem = oc.Problem(robot, task, metric="inertia", domain=oc.Box([0.6, 0.8, 0.8], 0.4))
+        >>> problem.n, problem.m, problem.r
+        (3, 2, 1)
     """
 
     robot: Robot
@@ -124,6 +132,12 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
     Raises:
         MetricError: if A is not symmetric positive definite at a sample.
         SingularTaskError: if J_x loses rank at every sample, or is not finite at one.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> oc.check(problems.get("planar_3r_xy")).singular_share
+        0.0
     """
     require_kind("problem", problem, Problem)
     points = sample_uniform(problem.domain, samples, seed)

@@ -135,6 +135,14 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
         chart: the chart.
         samples: number of samples N.
         seed: seed of the samples.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> report = oc.evaluate(chart, samples=2000)
+        >>> 85 < report.task_angle.mean < 95, report.folded_samples
+        (True, 0)
     """
     require_kind("chart", chart, Chart)
     samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)

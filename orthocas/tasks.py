@@ -47,7 +47,15 @@ class Task(Shown):
 
     @classmethod
     def position(cls, robot: Robot, axes: str = "xyz") -> Self:
-        """Position of the tip along some world axes [m], for example axes="xy"."""
+        """Position of the tip along some world axes [m], for example axes="xy".
+
+        Example:
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+            >>> task = oc.Task.position(robot, "xy")
+            >>> task.m, task.labels, task.units
+            (2, ('x', 'y'), ('m', 'm'))
+        """
         if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
             raise InvalidValueError("axes", repr(axes), "different letters out of 'xyz'")
         rows = ["xyz".index(a) for a in axes]
@@ -126,6 +134,14 @@ class Task(Shown):
 
         Raises:
             ShapeError: if x is not a column, or labels or units do not have one entry per component.
+
+        Example:
+            >>> import casadi as ca
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+            >>> reach = oc.Task.custom(robot, "reach", lambda q: 2 * ca.cos(q[1] / 2), labels=["distance"], units=["m"])
+            >>> reach.m, reach.labels
+            (1, ('distance',))
         """
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)

@@ -62,6 +62,21 @@ def compare(
     Raises:
         InvalidValueError: if the grid is empty, or two of its parametrisations or solvers have the same name.
         ChartFileError: if the folder for charts cannot be written.
+
+    Example:
+        >>> from concurrent.futures import ThreadPoolExecutor
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> with ThreadPoolExecutor(1) as executor:
+        ...     comparison = oc.compare(
+        ...         problems.get("planar_3r_xy"),
+        ...         [oc.Linear(), oc.Polynomial(degree=2)],
+        ...         samples=200,
+        ...         held_out=1000,
+        ...         executor=executor,
+        ...     )
+        >>> [result.parametrisation for result in comparison.results]
+        ['linear', 'polynomial:2']
     """
     require_kind("problem", problem, Problem)
     count, loss = require_count("seeds", seeds), Weights.of(weights)

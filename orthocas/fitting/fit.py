@@ -27,7 +27,15 @@ _FIRST_SAMPLES = 1000  # tag of the samples that scale coordinates, apart from t
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Shown):
-    """A fitted chart and how it came about."""
+    """A fitted chart and how it came about.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> fit = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300)
+        >>> [stage.label for stage in fit.stages], fit.idle_joints
+        (['polynomial:2'], ())
+    """
 
     chart: Chart
     stages: tuple[Stage, ...]
@@ -95,6 +103,15 @@ def fit(
         InvalidValueError, SolveError: if settings do not fit together, or the loss is not finite.
         InfeasibleError: if max_mutual_deg cannot be met.
         CheckpointError: if the checkpoint is damaged, or belongs to another fit.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> fit = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300)
+        >>> fit.status.value
+        'converged'
+        >>> fit.chart.xi([0.6, 0.8, 0.8]).shape
+        (1,)
     """
     start = time.perf_counter()
     wanted = Polynomial(degree=4) if parametrisation is None else parametrisation

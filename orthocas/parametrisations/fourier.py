@@ -22,6 +22,12 @@ class Fourier:
 
     Args:
         degree: total degree, >= 1.
+
+    Example:
+        >>> import orthocas as oc
+        >>> fourier = oc.Fourier(degree=2)
+        >>> fourier.label, fourier.term_count(3)
+        ('fourier:2', 24)
     """
 
     degree: int

@@ -39,6 +39,14 @@ class Given:
 
         Raises:
             ShapeError: if xi is not a column.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> direction = oc.Given.from_function("hand direction", 3, lambda q: q[0] + q[1] + q[2])
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), direction).chart
+            >>> chart.labels
+            ('x', 'y', 'xi1')
         """
         q = ca.SX.sym("q", n)
         xi = expression_of(f"coordinates '{name}'", function, q)

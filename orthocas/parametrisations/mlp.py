@@ -22,6 +22,15 @@ class MLP:
 
     Args:
         hidden: widths of the hidden layers, each >= 1.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems, solvers
+        >>> network = oc.MLP(hidden=(6, 6))
+        >>> solver = solvers.LBFGS(max_iterations=5)
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), network, solver, samples=100).chart
+        >>> chart.coordinates.label, chart.coordinates.size
+        ('mlp:6x6', 91)
     """
 
     hidden: tuple[int, ...] = (64, 64)

@@ -21,6 +21,12 @@ class Polynomial:
 
     Args:
         degree: total degree, >= 1.
+
+    Example:
+        >>> import orthocas as oc
+        >>> polynomial = oc.Polynomial(degree=4)
+        >>> polynomial.label, polynomial.term_count(7)
+        ('polynomial:4', 329)
     """
 
     degree: int

@@ -40,6 +40,16 @@ def register(name: str, kind: type[Parametrisation], parse: Callable[[str], Para
 
     Raises:
         InvalidValueError: if the name belongs to another class, or the class is not a dataclass.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> import orthocas as oc
+        >>> @dataclass(frozen=True)
+        ... class Cubic(oc.Polynomial):
+        ...     degree: int = 3
+        >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
+        >>> oc.parametrisations.parse_parametrisation("cubic")
+        Cubic(degree=3)
     """
     known = _REGISTERED.get(name)
     if known is not None and known.kind is not kind:

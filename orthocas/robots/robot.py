@@ -31,6 +31,18 @@ class Robot(Shown):
 
     Methods take CasADi columns (n, 1), SX or MX, and return the same kind; or NumPy, one state (n,) or a set
     (N, n), and return NumPy. Positions in rad or m, velocities in rad/s or m/s, forces in N m or N.
+
+    Example:
+        >>> import casadi as ca
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+        >>> robot.tip_position([0.0, np.pi / 2])[:2].round(3).tolist()
+        [1.0, 1.0]
+        >>> robot.mass_matrix(np.zeros((5, 2))).shape  # a set of 5 joint positions
+        (5, 2, 2)
+        >>> robot.gravity(ca.SX.sym("q", 2)).shape  # an expression
+        (2, 1)
     """
 
     def __init__(self, tree: KinematicTree, homes: Mapping[str, ArrayLike] | None = None) -> None:

@@ -16,6 +16,24 @@ def register(term: LossTerm) -> None:
     Raises:
         UnknownNameError: if samples cannot tell what it needs.
         InvalidValueError: if the name belongs to another term.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> @dataclass(frozen=True)
+        ... class FirstJoint:  # the coordinates should not depend on joint 1
+        ...     name: str = "first joint"
+        ...     data: tuple[str, ...] = ()
+        ...     hinge: bool = False
+        ...
+        ...     def residuals(self, coordinate_jacobian, data, sizes):
+        ...         return coordinate_jacobian[:, 0]
+        >>> oc.register_loss_term(FirstJoint())
+        >>> weights = oc.Weights(extra={"first joint": 100.0})
+        >>> fit = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), weights=weights, samples=300)
+        >>> fit.status.value
+        'converged'
     """
     for name in term.data:
         require_sample_data(name)

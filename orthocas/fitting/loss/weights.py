@@ -26,6 +26,13 @@ class Weights:
 
     Raises:
         InvalidValueError: if a weight is negative or not finite, or no term has one.
+
+    Example:
+        >>> import orthocas as oc
+        >>> oc.Weights(mutual=300.0).by_name
+        {'task': 1000.0, 'mutual': 300.0, 'regularity': 150.0, 'length': 0.0}
+        >>> oc.Weights.of([1000.0, 1.0]).regularity
+        0.0
     """
 
     task: float = 1000.0
