@@ -28,6 +28,11 @@ def public_objects() -> dict[str, Any]:
     return {f"{package.__name__}.{name}": getattr(package, name) for package, name in names.values()}
 
 
+def can_have_docstring(part: Any) -> bool:
+    """Whether it is a module, class or function: type aliases and dictionaries are described where they stand."""
+    return inspect.ismodule(part) or inspect.isclass(part) or inspect.isroutine(part)
+
+
 def written_docstring(part: Any) -> str:
     """The docstring that somebody wrote: dataclasses without one get their signature as a text."""
     text = (part.__doc__ or "").strip()
@@ -52,7 +57,9 @@ def examples() -> tuple[doctest.DocTest, ...]:
     finder = doctest.DocTestFinder(exclude_empty=True)
     parts = {name: part for name, part in public_objects().items() if not inspect.ismodule(part)}
     tests = [test for name, part in parts.items() for test in finder.find(part, name, module=False, globs={})]
-    return tuple(test for test in tests if test.examples)
+    return tuple(
+        test for test in tests if test.examples and "._" not in test.name
+    )  # an IntEnum has those of int inside
 
 
 def test_at_least_twenty_public_names_have_an_example() -> None:
@@ -75,8 +82,9 @@ def test_a_wrong_example_would_fail() -> None:
 
 
 def test_every_public_name_has_a_docstring() -> None:
-    assert len(public_objects()) > 60
-    assert [name for name, part in public_objects().items() if not written_docstring(part)] == []
+    parts = {name: part for name, part in public_objects().items() if can_have_docstring(part)}
+    assert len(parts) > 90
+    assert [name for name, part in parts.items() if not written_docstring(part)] == []
 
 
 def test_every_public_method_has_a_docstring() -> None:
