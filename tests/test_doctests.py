@@ -57,9 +57,7 @@ def examples() -> tuple[doctest.DocTest, ...]:
     finder = doctest.DocTestFinder(exclude_empty=True)
     parts = {name: part for name, part in public_objects().items() if not inspect.ismodule(part)}
     tests = [test for name, part in parts.items() for test in finder.find(part, name, module=False, globs={})]
-    return tuple(
-        test for test in tests if test.examples and "._" not in test.name
-    )  # an IntEnum has those of int inside
+    return tuple(test for test in tests if test.examples and "._" not in test.name)  # "._": int's own, in an IntEnum
 
 
 def test_at_least_twenty_public_names_have_an_example() -> None:
