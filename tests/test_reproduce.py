@@ -178,7 +178,7 @@ def test_unknown_figures_are_listed(word: str) -> None:
 
 def test_unwritable_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(InvalidValueError, match="a writable folder"):
+    with pytest.raises(InvalidValueError, match="a folder that can be written"):
         reproduce("fig06", tmp_path / "file", True)
 
 
@@ -201,7 +201,7 @@ def test_command_prints_rows_or_json(run: Run, two_figures: list[tuple[str, bool
     ("words", "message"),
     [
         (("fig99", "--out", "new"), "unknown figure 'fig99', known: fig06, fig11, all"),
-        (("fig06", "--out", "file"), "--out is file, expected a writable folder"),
+        (("fig06", "--out", "file"), "--out is file, expected a folder that can be written"),
         (("fig06", "--out", "file/deeper"), "--out is file/deeper, expected a folder"),
         (("fig06",), "Missing option '--out'"),
     ],

@@ -58,5 +58,5 @@ def made_folder(name: str, out: str | Path) -> Path:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise InvalidValueError(name, str(folder), f"a writable folder ({error.strerror})") from None
+        raise InvalidValueError(name, str(folder), f"a folder that can be written ({error.strerror})") from None
     return folder
