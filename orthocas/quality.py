@@ -67,7 +67,7 @@ class Report(Shown):
 
     @property
     def degenerate(self) -> bool:
-        """Whether coordinates are nearly parallel, or lean into the task, on more than 1 % of the domain."""
+        """Whether coordinates are nearly parallel to each other or to the task gradients on over 1 % of the domain."""
         return self.conditioning.p01 < DEGENERATE
 
     def facts(self) -> dict[str, str]:
@@ -96,7 +96,7 @@ class Report(Shown):
             faults["left out"] = f"{share:.3%} of the domain: singular, or without a value"
         if self.degenerate:
             advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
-            faults["DEGENERATE"] = f"coordinates are nearly parallel or lean into the task: {advice}"
+            faults["DEGENERATE"] = f"coordinates are nearly parallel to each other or to the task: {advice}"
         return faults
 
     def as_dict(self) -> dict[str, Any]:

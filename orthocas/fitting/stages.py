@@ -190,7 +190,7 @@ def missed_bound(label: str, bound: float, objective: BoundedMutual, result: Sol
     found = f"{label} coordinates with mutual angles within {wanted:.4g} deg"
     if result.status is Status.INFEASIBLE:
         return InfeasibleError(
-            f"there are no {found} near, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
+            f"there are no {found} nearby, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
         )
     return SolveError(
         f"no {found} found in {result.iterations} iterations, the closest have {reached:.4g} deg: "
