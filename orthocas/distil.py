@@ -89,6 +89,16 @@ def distil(
     Raises:
         InvalidValueError: if the chart is not grown, or the parametrisation is none to fit.
         GrowError: if the grown chart has no values on its domain.
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+        >>> problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box([0.6, 0.8], 0.2))
+        >>> result = oc.distil(oc.grow(problem), oc.Polynomial(degree=3), samples=300)
+        >>> result.distilled.task_angle.std < 1.0  # [deg]; 0 before
+        True
+        >>> result.chart.function("xi").name()
+        'xi'
     """
     parametrisation = Polynomial(degree=6) if parametrisation is None else parametrisation
     if not isinstance(parametrisation, Parametrisation) or parametrisation.closed_form is not None:

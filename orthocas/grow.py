@@ -64,6 +64,16 @@ def grow(
         GrowError: if the leaf cannot be reached, closed or charted.
         MetricError: if the metric is not SPD on the domain.
         InvalidValueError: if an argument has another type, or belongs to another kind of leaf.
+
+    Example:
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+        >>> problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box([0.6, 0.8], 0.3))
+        >>> chart = oc.grow(problem)
+        >>> task_row, xi_row = chart.jacobian([0.7, 0.9])
+        >>> bool(abs(task_row @ np.linalg.solve(robot.mass_matrix([0.7, 0.9]), xi_row)) < 1e-9)
+        True
     """
     require_kind("problem", problem, Problem)
     leaf = _default_leaf(problem) if leaf is None else leaf

@@ -58,6 +58,16 @@ def generate_c(
             file of the same name that was not generated.
         ArchiveError: if the folder cannot be written.
         CompileError: if this version of CasADi writes C that is not understood.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> with TemporaryDirectory() as folder:
+        ...     generated = oc.generate_c(chart, folder, name="arm")
+        ...     sorted(path.name for path in generated.folder.iterdir())
+        ['CMakeLists.txt', 'README.md', 'arm.c', 'arm.h', 'arm.pc.in']
     """
     require_kind("chart", chart, Chart)
     if controller is not None:

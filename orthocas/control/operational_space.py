@@ -259,6 +259,14 @@ class PDPlus(_OperationalSpace):
 
     Source:
         [AS2023] eq. (35).
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> controller = oc.control.PDPlus(chart, stiffness=50.0, coupling="decoupled")
+        >>> controller.labels, controller.command
+        (('x', 'y', 'xi1'), 'torque')
     """
 
     feed_forward = True

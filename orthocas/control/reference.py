@@ -62,6 +62,13 @@ class Reference(Shown):
 
         Source:
             [AS2023] Sec. 8.
+
+        Example:
+            >>> import orthocas as oc
+            >>> reference = oc.control.Reference.steps(["x", "xi1"], [1.0, 0.0], [(0.5, {"x": 1.2})], duration=4.0)
+            >>> value, velocity, acceleration = reference.sample([0.0, 4.0])
+            >>> value.round(2).tolist()
+            [[1.0, 0.0], [1.2, 0.0]]
         """
         names, value = tuple(labels), frozen_array("start", start, (len(labels),))
         _require_number("natural_frequency", natural_frequency, above=0.0)

@@ -64,6 +64,18 @@ def simulate(
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.
         ShapeError, InvalidValueError: for what does not fit.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> problem = problems.get("planar_3r_xy")
+        >>> chart = oc.fit(problem, oc.Polynomial(degree=2), samples=300).chart
+        >>> controller = oc.control.PDPlus(chart, stiffness=50.0)
+        >>> start = chart.phi(problem.domain.centre)
+        >>> reference = oc.control.Reference.steps(chart.labels, start, [(0.1, {"x": start[0] + 0.05})], duration=0.5)
+        >>> trajectory = oc.simulate(controller, reference, problem.domain.centre)
+        >>> trajectory.outcome.value, bool(abs(trajectory.value - trajectory.reference).max() < 0.01)
+        ('complete', True)
     """
     _require_kinds(controller, reference, plant, pushes, friction, noise)
     loop = ClosedLoop(controller, plant or controller.problem.robot, friction or Friction())
