@@ -167,7 +167,7 @@ def test_points_and_pushes(run: Run) -> None:
     assert report_of(run, "pd_plus", steps="points.json")["tracking_error"]["x"] > 1e-2
     code, _, err = run("kinematic", steps="points.json")
     assert code == 2
-    assert "a velocity controller sees no forces" in err
+    assert "forces do not affect a velocity controller" in err
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_points_and_pushes(run: Run) -> None:
         (("pd_plus", "--feedback", "1"), "it belongs to kinematic, kinematic_projector"),
         (("pd_plus", "--posture-stiffness", "1"), "it belongs to projector"),
         (("projector", "--coupling", "coupled"), "it belongs to impedance, pd_plus"),
-        (("kinematic", "--mass-factor", "1.1"), "--mass-factor is 1.1, expected no such option with kinematic"),
+        (("kinematic", "--mass-factor", "1.1"), "--mass-factor is 1.1, expected no --mass-factor with kinematic"),
         (("kinematic", "--friction", "1,1"), "it belongs to impedance, pd_plus, projector"),
         (("pd_plus", "--coupling", "both"), "unknown coupling 'both', known: coupled, decoupled"),
         (("pd_plus", "--stiffness", "1,2"), "stiffness has shape (2,), expected (3,)"),
@@ -216,7 +216,7 @@ def test_mp4_without_ffmpeg_is_refused_before_the_run(run: Run, monkeypatch: pyt
     monkeypatch.setenv("PATH", "")
     code, out, err = run("pd_plus", "--animation", "mp4")
     assert (code, out) == (2, "")
-    assert "animation is mp4, expected gif, since MP4 needs ffmpeg and there is none on the PATH" in err
+    assert "animation is mp4, expected gif, because mp4 needs ffmpeg, which is not on the PATH" in err
     assert not Path("out").exists()
 
 

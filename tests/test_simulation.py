@@ -205,7 +205,7 @@ def test_noise_is_seeded_and_needs_ticks(planar_chart: oc.Chart, q0: Array) -> N
     runs = [simulate(law, still, q0, control_rate=200.0, noise=Noise(1e-3, 1e-2, seed)).q for seed in (1, 1, 2)]
     np.testing.assert_array_equal(runs[0], runs[1])
     assert 1e-6 < np.abs(runs[0] - runs[2]).max() < 1e-2
-    with pytest.raises(InvalidValueError, match="white noise needs ticks"):
+    with pytest.raises(InvalidValueError, match="white noise needs control ticks"):
         simulate(law, still, q0, noise=Noise(1e-3))
 
 
@@ -415,10 +415,10 @@ def test_bad_arguments_are_refused(
 
 def test_what_would_be_ignored_is_refused(planar_chart: oc.Chart, q0: Array) -> None:
     still = resting(planar_chart, q0, 0.5)
-    with pytest.raises(InvalidValueError, match="a velocity controller sees no forces"):
+    with pytest.raises(InvalidValueError, match="forces do not affect a velocity controller"):
         simulate(Kinematic(planar_chart), still, q0, pushes=[Push(0.0, 0.1)])
     heavy = planar_chart.problem.robot.with_scaled_masses(2.0)
-    with pytest.raises(InvalidValueError, match="a velocity controller sees no forces"):
+    with pytest.raises(InvalidValueError, match="forces do not affect a velocity controller"):
         simulate(Kinematic(planar_chart), still, q0, plant=heavy)
     with pytest.raises(InvalidValueError, match="no velocity as a state"):
         simulate(Kinematic(planar_chart), still, q0, np.zeros(3))
