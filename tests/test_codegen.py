@@ -244,7 +244,7 @@ def test_what_cannot_be_generated_is_refused(planar_x: oc.Problem, planar_chart:
         with pytest.raises(InvalidValueError, match="a C identifier"):
             oc.generate_c(planar_chart, tmp_path / "new", None, name)
     other = oc.problems.get("planar_3r_x")
-    with pytest.raises(InvalidValueError, match="one of another chart"):
+    with pytest.raises(InvalidValueError, match="of another chart"):
         oc.generate_c(planar_chart, tmp_path / "new", Projector(other, 1.0, 1.0))
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidValueError, match="expected a folder"):

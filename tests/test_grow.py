@@ -239,7 +239,7 @@ def test_bad_arguments_name_what_came() -> None:
         oc.grow("planar_2r")  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match="leaf is 3"):
         oc.grow(problem, leaf=3)  # type: ignore[arg-type]
-    with pytest.raises(InvalidValueError, match="belong to a disk"):
+    with pytest.raises(InvalidValueError, match="applies to disk leaves only"):
         oc.grow(problem, 1.0, cells=30)
     with pytest.raises(InvalidValueError, match="expected a Box"):
         oc.grow(planar_3r("euclidean"), 0.0, region="all")  # type: ignore[arg-type]
