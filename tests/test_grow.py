@@ -231,7 +231,7 @@ def test_bad_arguments_name_what_came() -> None:
         oc.grow(problem, 2.5)
     with pytest.raises(ShapeError, match="level"):
         oc.grow(problem, [1.0, 2.0])
-    with pytest.raises(GrowError, match="n = 3 joints"):
+    with pytest.raises(GrowError, match="expected n = 3 and m = 1"):
         oc.grow(problem, 1.0, leaf="disk")
     with pytest.raises(GrowError, match="r = 1"):
         oc.grow(planar_3r("euclidean"), 0.0, leaf="circle")

@@ -401,7 +401,7 @@ def test_trajectory_file_keeps_everything(planar_chart: oc.Chart, steps: Referen
         ({"pushes": [Push(0.0, 1.0, torque=[1.0])]}, ShapeError, "torque of a push"),
         ({"friction": Friction(viscous=-1.0)}, InvalidValueError, "viscous"),
         ({"step": "a"}, InvalidValueError, "step is 'a'"),
-        ({"pushes": [Push(0.5, 0.1)]}, InvalidValueError, "start of a push is 0.5, expected before the end"),
+        ({"pushes": [Push(0.5, 0.1)]}, InvalidValueError, "start of a push is 0.5, expected a time before the end"),
         ({"q_start": [2.0, 2.0, 2.0]}, UnreachableReferenceError, "the start lies outside the domain: joint 'q"),
     ],
 )
