@@ -420,7 +420,7 @@ def test_what_would_be_ignored_is_refused(planar_chart: oc.Chart, q0: Array) -> 
     heavy = planar_chart.problem.robot.with_scaled_masses(2.0)
     with pytest.raises(InvalidValueError, match="forces do not affect a velocity controller"):
         simulate(Kinematic(planar_chart), still, q0, plant=heavy)
-    with pytest.raises(InvalidValueError, match="no velocity as a state"):
+    with pytest.raises(InvalidValueError, match="velocity is not a state"):
         simulate(Kinematic(planar_chart), still, q0, np.zeros(3))
     with pytest.raises(InvalidValueError, match=r"labels of the reference is \('x', 'xi1', 'xi2'\)"):
         simulate(KinematicProjector(planar_chart.problem), still, q0)
