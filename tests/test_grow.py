@@ -247,7 +247,7 @@ def test_bad_arguments_name_what_came() -> None:
         oc.grow(problem, 1.0, leaf="linear")
     with pytest.raises(MemoryNeedError, match="cells"):
         oc.grow(planar_3r("euclidean"), 0.0, cells=100_000)
-    with pytest.raises(GrowError, match="for the shortest, expected at least"):
+    with pytest.raises(GrowError, match="along the shortest, expected at least"):
         oc.grow(planar_3r("euclidean"), 0.0, region=oc.Box([1.5, 0, 0], [0.01, 1, 1]))
     with pytest.raises(GrowError, match="singularity of the task"):
         oc.grow(problem, 0.0)  # the leaf through the saddles is no circle

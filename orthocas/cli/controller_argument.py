@@ -17,10 +17,12 @@ _CHOICES = ("coupling", "damping")  # options that are words
 
 Stiffness = Annotated[
     str | None,
-    typer.Option("--stiffness", help="One number or one per quantity; default: 2 Hz springs at the median inertia."),
+    typer.Option(
+        "--stiffness", help='"100", or "100,50,..." per quantity; default: 2 Hz springs at the median inertia.'
+    ),
 ]
 DampingRatio = Annotated[
-    str | None, typer.Option("--damping-ratio", help="One number or one per quantity; default: 0.7.")
+    str | None, typer.Option("--damping-ratio", help='"0.7", or "0.7,1,..." per quantity; default: 0.7.')
 ]
 CouplingName = Annotated[
     str | None, typer.Option("--coupling", help="coupled (default) or decoupled; for impedance and pd_plus.")
@@ -37,7 +39,7 @@ Feedback = Annotated[
     typer.Option("--feedback", help="Feedback gain [1/s]; for kinematic and kinematic_projector. Default: 0."),
 ]
 Limit = Annotated[
-    str | None, typer.Option("--limit", help="Largest torque or speed, one number or one per joint; default: none.")
+    str | None, typer.Option("--limit", help='Largest torque or speed, "50" or "50,40,..." per joint; default: none.')
 ]
 
 

@@ -27,7 +27,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
     Args:
         controller: the controller that ran.
         chart: the chart whose coordinates the run is measured in.
-        plan: the motion it was asked for.
+        plan: the motion that it was to follow.
         seen: the run in the chart's coordinates.
         seconds: computing time [s].
     """

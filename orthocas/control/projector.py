@@ -283,6 +283,6 @@ def _require_posture_within_limits(problem: Problem, reference: Reference) -> No
     if outside.size:
         k, i = outside[0]
         raise UnreachableReferenceError(
-            f"the reference asks for joint '{problem.robot.joint_names[i]}' at {postures[k, i]:.4g} "
+            f"the reference puts joint '{problem.robot.joint_names[i]}' at {postures[k, i]:.4g} "
             f"at t = {times[k]:.3g} s, expected within [{problem.robot.lower[i]:.4g}, {problem.robot.upper[i]:.4g}]"
         )

@@ -26,7 +26,7 @@ _ARRAYS = {  #: array fields and their units
     "command": "N m or N (torque), rad/s or m/s (velocity)",
     "status": "orthocas.control.ControlStatus",
     "value": "per label: m or rad for the task, the chart's unit for extra coordinates",
-    "reference": "same as value",
+    "reference": "as value",
     "reference_velocity": "value / s",
     "reference_acceleration": "value / s^2",
     "storage": "J",
@@ -129,10 +129,7 @@ class Trajectory(Shown):
         """
         damaged = TrajectoryFileError(f"{path} is truncated, damaged or not a trajectory file")
         try:
-            with (
-                open(path, "rb") as stream,
-                np.load(stream, allow_pickle=False) as file,
-            ):  # np.load leaks the handle of a bad file
+            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # np.load leaks bad handles
                 header: dict[str, Any] = json.loads(str(file["header"]))
                 arrays: dict[str, Any] = {name: file[name] for name in _ARRAYS}
             version = header["version"]
