@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
-.PHONY: demo test check lint types wheel-check bench clean
+.PHONY: demo test check fuzz lint types wheel-check bench clean
 
 demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and picture in out/
 	$(BIN)/python examples/iiwa_demo.py --out out
@@ -15,6 +15,10 @@ test: $(INSTALLED)  ## the whole test suite
 
 check: lint  ## while working: lint and the fast tests, with the slowest of them named
 	$(PYTEST) -m "not slow" --durations 5
+
+COUNT ?= 1000
+fuzz: $(INSTALLED)  ## the campaign of faults; COUNT mutants of each kind, CAMPAIGN="charts ..." for some kinds
+	cd tests && ../$(BIN)/python -m fuzz $(COUNT) $(CAMPAIGN)
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -25,7 +25,10 @@ from orthocas.control import (
 from orthocas.simulation import coupling_index
 
 STIFFNESS = 200.0  # of x [N/m], of xi [N m], and of postures [N m/rad]
-STEP = {"x": 0.1, "y": 0.1, "xi1": 0.05, "xi2": 0.03}  # [m], [rad]: small enough for the boxes of the problems
+STEPS = {  # [m], [rad]: small enough for the boxes of the problems
+    "planar_3r_x": {"x": 0.1, "xi1": -0.05, "xi2": -0.03},
+    "planar_3r_xy": {"x": 0.1, "y": 0.1, "xi1": -0.05},
+}
 PAUSE = 4.0  # [s] between steps, in which even slow springs come to rest
 WEIGHTS = (1000.0, 30.0, 150.0, 0.1)  # the last keeps gradients even (docs/derivations.md#lengths)
 
@@ -39,11 +42,13 @@ def main(quick: bool = False) -> dict[str, float]:
     found = {}
     for name in ("planar_3r_x",) if quick else ("planar_3r_x", "planar_3r_xy"):
         problem = problems.get(name)
-        chart = oc.fit(problem, oc.Polynomial(6 if quick else 8), weights=WEIGHTS).chart
+        linear = oc.fit(problem, oc.Linear()).chart
+        fitted = oc.fit(problem, oc.Polynomial(6 if quick else 8), weights=WEIGHTS, align_to=linear)
+        chart = fitted.chart  # in the order and with the signs of the linear coordinates: a step means the same motion
         labels = chart.problem.task.labels
         print(f"\n{name}: task {', '.join(labels)}; fitted {oc.evaluate(chart, 20_000).task_angle.std:.2f} deg off\n")
         print("| controller | task <- xi | xi <- task | x <-> y | xi <-> xi |\n| --- | --- | --- | --- | --- |")
-        for title, judged, law, reference in laws(chart):
+        for title, judged, law, reference in laws(chart, linear):
             run = oc.simulate(law, reference, problem.domain.centre, must_be_reachable=False)
             bad = np.flatnonzero(run.status)
             remark = f" (left the domain after {run.times[bad[0]]:.1f} s)" if bad.size else ""
@@ -54,10 +59,9 @@ def main(quick: bool = False) -> dict[str, float]:
     return found
 
 
-def laws(chart: oc.Chart) -> Iterator[tuple[str, oc.Chart, Controller, Reference]]:
-    """Title, chart for the evaluation, controller and its reference."""
+def laws(chart: oc.Chart, linear: oc.Chart) -> Iterator[tuple[str, oc.Chart, Controller, Reference]]:
+    """Title, chart for the evaluation, controller and its reference, for fitted and linear coordinates."""
     problem, q0 = chart.problem, chart.problem.domain.centre
-    linear = oc.fit(problem, oc.Linear()).chart
     for coupling in ("coupled", "decoupled"):
         yield f"PD+ {coupling}, fitted", chart, PDPlus(chart, STIFFNESS, coupling=coupling), steps(chart)
         yield f"PD+ {coupling}, linear", linear, PDPlus(linear, STIFFNESS, coupling=coupling), steps(linear)
@@ -76,7 +80,7 @@ def steps(chart: oc.Chart) -> Reference:
     changes, time = [], 0.5
     for back in (False, True):
         for k, label in enumerate(chart.labels):
-            changes.append((time, {label: start[k] + (0.0 if back else STEP[label])}))
+            changes.append((time, {label: start[k] + (0.0 if back else STEPS[chart.problem.name][label])}))
             time += PAUSE
     return Reference.steps(chart.labels, start, changes, time)
 

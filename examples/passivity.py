@@ -100,7 +100,9 @@ def run_all(arm: Arm, name: str) -> Found:
     """All runs of one controller; every controller has the same seed, so that the starts are the same."""
     rises, worst, left = [0.0], None, 0
     for controller, reference, q, dq in cases(arm, name):
-        run = oc.simulate(controller, reference, q, dq, STEP, must_be_reachable=False, tolerance=TOLERANCE)
+        run = oc.simulate(
+            controller, reference, q, dq_start=dq, step=STEP, must_be_reachable=False, tolerance=TOLERANCE
+        )
         if run.status.any():
             left += 1
             continue

@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Iterable
 
+_FEW_NAMES = 10  # names that are read at a glance, in their own order
 _MOST_NAMES = 30  # names an error lists at the most: those nearest to what came
 
 
@@ -29,12 +30,13 @@ class InvalidValueError(OrthocasError, ValueError):
 
 
 class UnknownNameError(OrthocasError, ValueError):
-    """A name that does not exist, with those that do: similar ones first."""
+    """A name that does not exist, with those that do; of many, similar ones come first."""
 
     def __init__(self, what: str, got: str, known: Iterable[str]) -> None:
         names = list(known)
-        near = difflib.get_close_matches(got, names, 3)
-        names = [*near, *(name for name in names if name not in near)]
+        if len(names) > _FEW_NAMES:
+            near = difflib.get_close_matches(got, names, 3)
+            names = [*near, *(name for name in names if name not in near)]
         if len(names) > _MOST_NAMES:
             close = difflib.get_close_matches(got, names, _MOST_NAMES, 0.0)
             names = [*close, f"and {len(names) - len(close)} more"]

@@ -1,4 +1,4 @@
-"""Figures of charts: histograms of angles as in [AS2023] Figs. 20 and 27, and leaves of the coordinates."""
+"""All figures in one place: quality and self-motion of charts, fronts of comparisons, runs of controllers."""
 
 from typing import Any
 
@@ -9,13 +9,17 @@ from matplotlib.figure import Figure
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
+from orthocas.comparing.figures import convergence_figure, front_figure
 from orthocas.quality import AngleStatistics, Report
+from orthocas.simulation.figure import trajectory_figure
+
+__all__ = ["convergence_figure", "front_figure", "quality_figure", "self_motion_figure", "trajectory_figure"]
 
 _TASK, _EXTRA = "#1f5fa8", "#d95f02"
 
 
 def quality_figure(report: Report) -> Figure:
-    """Histograms of task angles and mutual angles in degrees, with mean and standard deviation."""
+    """Histograms of task and mutual angles [deg], with mean and standard deviation, as [AS2023] Figs. 20 and 27."""
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True)
     _draw_angles(left, report.task_angle, _TASK, r"task angle $\angle(\mathrm{d}\xi_j, \nabla_A h_i)$")

@@ -31,7 +31,7 @@ def test_a_column_is_one_joint_position(name: str) -> None:
 def test_columns_are_taken_where_a_motion_starts() -> None:
     chart, q = fitted().chart, planar().domain.centre
     np.testing.assert_array_equal(chart.inverse(ca.DM(chart.phi(q)), ca.DM(q)), chart.inverse(chart.phi(q), q))
-    run = oc.simulate(impedance(), steps(), ca.DM(q), ca.DM.zeros(3), step=0.05)
+    run = oc.simulate(impedance(), steps(), ca.DM(q), dq_start=ca.DM.zeros(3), step=0.05)
     np.testing.assert_array_equal(run.q, trajectory().q)
     path = control.joint_path(chart, steps(), q)
     np.testing.assert_array_equal(control.joint_path(chart, steps(), ca.DM(q)), path)

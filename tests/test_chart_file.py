@@ -234,6 +234,14 @@ def test_any_flipped_byte_is_an_error_or_harmless(planar_fit: Fit, saved: Path) 
         np.testing.assert_array_equal(chart.phi(q), planar_fit.chart.phi(q))  # zip padding and time stamps
 
 
+def test_array_that_numpy_cannot_read_is_an_error_of_ours(saved: Path) -> None:
+    """Its checksum is right: whoever edited the file knew how."""
+    garbled, header = np.lib.format.magic(1, 0) + b"\x0b\x00{'descr': (", header_of(saved)
+    header["sha256"] = {**header["sha256"], "offset.npy": archive._digest(garbled)}  # type: ignore[dict-item]
+    with pytest.raises(ChartFileError, match="holds an array that cannot be read"):
+        oc.load(rewritten(saved, {"offset.npy": garbled, "header.json": json.dumps(header).encode()}))
+
+
 def test_edited_header_and_array_are_noticed(saved: Path) -> None:
     header = header_of(saved)
     header["problem"] = {**header["problem"], "name": "other"}  # type: ignore[dict-item]

@@ -92,6 +92,7 @@ def test_urdf_with_every_option(run: Run) -> None:
     assert info["notes"]["lambda3"] == 0
 
 
+@pytest.mark.slow
 def test_urdf_with_locked_joint_tool_home_and_half_widths(run: Run) -> None:
     path = str(robot_data("panda_description/urdf/panda.urdf"))
     words = [
@@ -127,6 +128,7 @@ def test_info_tells_limits_and_homes_of_a_robot_file(run: Run) -> None:
     assert (len(data["joints"]), data["homes"], data["effort_limits"][6]) == (7, ["default"], 12)
 
 
+@pytest.mark.slow
 def test_urdf_of_a_stretched_arm_fits_about_a_bent_posture(run: Run) -> None:
     """A command of the README: about the middle of the limits 9 % of the samples fold."""
     path = str(Path(problems.__file__).parent / "data" / "iiwa7_r800.urdf")

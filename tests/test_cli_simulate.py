@@ -91,6 +91,7 @@ def test_example_of_the_docs_end_to_end(run: Run, chart: oc.Chart) -> None:
     assert Path("out/animation.gif").stat().st_size < 3e6
 
 
+@pytest.mark.slow
 def test_rows_name_units_and_the_folder(run: Run) -> None:
     code, out, err = run("impedance", "--animation", "none")
     assert (code, err) == (0, "")

@@ -28,7 +28,7 @@ def test_table_of_controllers_shows_what_fitted_coordinates_are_good_for() -> No
     found = controllers.main(quick=True)
     fitted = found["planar_3r_x PD+ decoupled, fitted"]
     assert found["planar_3r_x PD+ coupled, linear"] < 1e-4  # the full inertia tracks in any coordinates
-    assert fitted < 0.3 * found["planar_3r_x PD+ decoupled, linear"]
+    assert fitted < 0.5 * found["planar_3r_x PD+ decoupled, linear"]  # degree 6; degree 8 has 0.07 of it
     assert fitted < found["planar_3r_x projector, A = M"] < found["planar_3r_x projector, A = I"]
 
 

@@ -51,6 +51,7 @@ def test_networks_and_fourier_series_distil() -> None:
         assert lost.distilled.conditioning.p01 > 0.8
 
 
+@pytest.mark.slow
 def test_what_is_not_grown_is_refused() -> None:
     fitted = oc.fit(problems.get("planar_3r_x"), oc.Polynomial(2)).chart
     with pytest.raises(InvalidValueError, match="expected a grown chart"):

@@ -195,6 +195,7 @@ def test_bad_weights_and_shapes_are_refused(planar_x: oc.Problem) -> None:
         task_cosines(ca.SX.ones(1, 3), ca.SX.ones(2, 4))
 
 
+@pytest.mark.slow
 def test_rank_trap_at_the_papers_weights_is_reported(iiwa: oc.Problem) -> None:
     """With lambda2 / lambda1 = 1/1000 two coordinates become nearly parallel: good task angles, no chart."""
     good = oc.evaluate(oc.fit(iiwa, oc.Polynomial(3)).chart, samples=5000)

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -70,6 +71,16 @@ def test_robot_has_the_mass_matrix_bias_and_tip_pose_of_mujoco(name: str) -> Non
         assert_close(robot.bias(q, dq), bias)
         assert_close(robot.tip_position(q), there.xpos)
         assert_close(robot.tip_rotation(q), there.xmat.reshape(3, 3))
+
+
+OTHERS = ("half_cheetah", "hopper", "inverted_double_pendulum", "inverted_pendulum", "point", "pusher", "pusher_v5")
+OTHERS += ("reacher", "swimmer", "walker2d", "walker2d_v5")
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_files_of_gymnasium_have_the_dynamics_of_mujoco(name: str) -> None:
+    """Files that nobody here wrote: default classes, capsules by fromto, armatures, total masses, slides."""
+    assert_agrees(Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / f"{name}.xml")
 
 
 def test_included_arm_beside_free_bodies_has_the_dynamics_of_mujoco() -> None:
@@ -289,6 +300,7 @@ def test_entity_bombs_are_refused_before_they_go_off(tmp_path: Path, encoding: s
         read(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [

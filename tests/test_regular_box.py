@@ -48,6 +48,7 @@ def test_singular_middle_is_left_for_a_bent_posture_inside_the_limits(name: str,
     np.testing.assert_array_equal(regular_box(robot, task).centre, problem.domain.centre)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
 def test_pose_of_the_iiwa_fits_without_folds_on_its_default_domain(metric: str) -> None:
     robot = iiwa_robot()

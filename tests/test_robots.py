@@ -417,6 +417,7 @@ def test_effort_limits_must_be_positive() -> None:
             dataclasses.replace(tree, effort_limits=np.array([1.0, bad]))
 
 
+@pytest.mark.slow
 def test_tool_moves_the_tip_as_a_transform_of_the_old_one() -> None:
     path = robot_data("panda_description/urdf/panda.urdf")
     hand = oc.Robot.from_urdf(path, "panda_hand")

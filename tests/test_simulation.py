@@ -1,5 +1,6 @@
 """Closed loops: against an independent integrator on Pinocchio's dynamics, energy books, and sampled control."""
 
+import zipfile
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -86,7 +87,7 @@ def test_accelerations_along_a_run_are_pinocchios() -> None:
     base = oc.problems.get("iiwa")
     chart = oc.fit(with_metric(base, "inertia"), oc.Polynomial(2)).chart
     q0 = base.domain.centre
-    reference = Reference.steps(chart.labels, chart.phi(q0), [(0.0, {"x": chart.phi(q0)[0] + 0.05, "xi1": 0.03})], 1.0)
+    reference = Reference.steps(chart.labels, chart.phi(q0), [(0.0, {"x": chart.phi(q0)[0] + 0.05, "xi3": 0.03})], 1.0)
     run = simulate(PDPlus(chart, 50.0), reference, q0)
     with urdf_path() as path:
         model = pin.buildModelFromUrdf(str(path))
@@ -153,7 +154,7 @@ def test_energy_books_balance_and_storage_falls(planar_chart: oc.Chart, q0: Arra
     """V(0) - V(t) is what the damping took: the closed loop is passive."""
     controller = law(planar_chart, K, 0.7, damping=damping)
     start, velocity = q0 + np.array([0.1, -0.1, 0.05]), np.array([0.5, -0.4, 0.3])
-    run = simulate(controller, resting(planar_chart, q0, 3.0), start, velocity, step=0.005, tolerance=1e-10)
+    run = simulate(controller, resting(planar_chart, q0, 3.0), start, dq_start=velocity, step=0.005, tolerance=1e-10)
     assert (run.status == ControlStatus.OK).all()
     assert np.abs(run.energy_balance).max() < 1e-5 * run.storage[0]  # Simpson's rule on 5 ms
     assert run.storage_rise < 1e-8 * run.storage[0]
@@ -325,6 +326,7 @@ def test_unreachable_reference_is_reported_before_the_run(planar_chart: oc.Chart
     assert np.isfinite(run.command).all()
 
 
+@pytest.mark.slow
 def test_interrupt_keeps_what_was_simulated(planar_chart: oc.Chart, steps: Reference, q0: Array) -> None:
     for rate in (None, 500.0):
 
@@ -388,6 +390,21 @@ def test_trajectory_file_keeps_everything(planar_chart: oc.Chart, steps: Referen
         run.save(tmp_path / "no" / "run.npz")
 
 
+def test_encrypted_and_garbled_arrays_are_damage(tmp_path: Path) -> None:
+    """NumPy raises RuntimeError for the first and TokenError for the second."""
+    file = tmp_path / "run.npz"
+    np.savez(file, header="{}")
+    whole = file.read_bytes()
+    flags = whole.index(b"PK\x01\x02") + 8
+    file.write_bytes(whole[:flags] + b"\x01" + whole[flags + 1 :])
+    with pytest.raises(TrajectoryFileError, match="not a trajectory file"):
+        Trajectory.load(file)
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("header.npy", np.lib.format.magic(1, 0) + b"\x0b\x00{'descr': (")
+    with pytest.raises(TrajectoryFileError, match="not a trajectory file"):
+        Trajectory.load(file)
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
@@ -421,7 +438,7 @@ def test_what_would_be_ignored_is_refused(planar_chart: oc.Chart, q0: Array) -> 
     with pytest.raises(InvalidValueError, match="forces do not affect a velocity controller"):
         simulate(Kinematic(planar_chart), still, q0, plant=heavy)
     with pytest.raises(InvalidValueError, match="velocity is not a state"):
-        simulate(Kinematic(planar_chart), still, q0, np.zeros(3))
+        simulate(Kinematic(planar_chart), still, q0, dq_start=np.zeros(3))
     with pytest.raises(InvalidValueError, match=r"labels of the reference is \('x', 'xi1', 'xi2'\)"):
         simulate(KinematicProjector(planar_chart.problem), still, q0)
     with pytest.raises(InvalidValueError, match="duration of a push"):

@@ -113,6 +113,7 @@ def test_moving_picture_draws_the_arm_where_it_is(planar_run: Trajectory, planar
     assert distance(final) < 60 < distance(first)
 
 
+@pytest.mark.slow
 def test_moving_picture_moves_on_both_sides_in_the_plane_and_in_space(
     planar_run: Trajectory, spatial_run: Trajectory, planar_fit: Fit, iiwa_fit: Fit
 ) -> None:

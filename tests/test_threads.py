@@ -87,6 +87,7 @@ SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 10,000 calls
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SERIES)
 def test_threads_share(name: str) -> None:
     build, count = SERIES[name]
@@ -102,7 +103,7 @@ def test_simulations_share_a_law() -> None:
     expected = numbers(simulate(impedance(), steps(), start, step=0.05, control_rate=None))
     sampled = numbers(simulate(impedance(), steps(), start, control_rate=100.0))
     law, reference = copy.deepcopy(impedance()), copy.deepcopy(steps())
-    runs = in_threads(lambda k: simulate(law, reference, start, 0 * start, 0.05, [None, 100.0][k % 2]), 16)
+    runs = in_threads(lambda k: simulate(law, reference, start, step=0.05, control_rate=[None, 100.0][k % 2]), 16)
     for k, run in enumerate(runs):
         for found, wanted in zip(numbers(run), sampled if k % 2 else expected, strict=True):
             np.testing.assert_array_equal(found, wanted)
@@ -143,6 +144,7 @@ def test_a_value_is_built_once() -> None:
     assert len(built) == 2
 
 
+@pytest.mark.slow
 def test_fits_in_threads_are_those_of_one_thread() -> None:
     def theta(k: int) -> Array:
         chart = oc.fit(planar(), [oc.Polynomial(2), oc.MLP((4,))][k % 2], samples=100).chart

@@ -48,6 +48,7 @@ def test_copies_are_equal(objects: dict[str, Any], expected: dict[str, list[Arra
         require_same(numbers(other), expected[name])
 
 
+@pytest.mark.slow
 def test_another_process_computes_the_same(objects: dict[str, Any], expected: dict[str, list[Array]]) -> None:
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         for name, found in zip(objects, pool.map(numbers, objects.values()), strict=True):

@@ -78,6 +78,7 @@ def queries(mesh: TriangleMesh) -> dict[str, Array]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["on", "near", "off", "far", "vertex", "edge"])
 def test_no_other_triangle_is_closer(leaf: TriangleMesh, kind: str) -> None:
     points = queries(leaf)[kind]

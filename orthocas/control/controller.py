@@ -100,6 +100,8 @@ class Controller(Protocol):
 class Law(Controller, Protocol):
     """A controller that can be built by name on a chart, for the command line; see `orthocas.control.registry`."""
 
+    name: ClassVar[str]
+    command: ClassVar[Command]
     options: ClassVar[tuple[str, ...]]  #: names of the settings that `on_chart` takes
 
     @classmethod

@@ -16,10 +16,9 @@ def register(law: type[Law]) -> None:
     Raises:
         InvalidValueError: if another law has that name.
     """
-    name = str(law.name)
-    if _LAWS.get(name, law) is not law:
-        raise InvalidValueError("name", repr(name), f"a free name, because {_LAWS[name].__name__} has this one")
-    _LAWS[name] = law
+    if _LAWS.get(law.name, law) is not law:
+        raise InvalidValueError("name", repr(law.name), f"a free name, because {_LAWS[law.name].__name__} has this one")
+    _LAWS[law.name] = law
 
 
 def law_names() -> tuple[str, ...]:

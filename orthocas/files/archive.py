@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -93,7 +94,7 @@ def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str
             name.removesuffix(".npy"): np.load(io.BytesIO(entries[name]), allow_pickle=False)
             for name in header["sha256"]
         }
-    except (ValueError, EOFError):
+    except (ValueError, EOFError, TokenError):
         raise kind.error(f"{source} holds an array that cannot be read") from None
     return header, arrays
 

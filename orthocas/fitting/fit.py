@@ -103,7 +103,8 @@ def fit(
     found = check(problem, seed=settings.seed)
     first = sample_problem(problem, 200, (settings.seed, _FIRST_SAMPLES))
     if settings.parametrisation.closed_form is not None:
-        idle, stages = (), ()
+        idle: tuple[int, ...] = ()
+        stages: tuple[Stage, ...] = ()
         coordinates = in_closed_form(problem, settings.parametrisation, first)
     else:
         idle = tuple(idle_joints(problem, first)[-problem.r :])

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from orthocas.chart import Chart
@@ -79,7 +80,7 @@ def aligned(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordin
     return _rearranged(coordinates, order, back)
 
 
-def _rearranged(coordinates: Coordinates, order: Array, signs: Array) -> Coordinates:
+def _rearranged(coordinates: Coordinates, order: NDArray[np.int_], signs: Array) -> Coordinates:
     """Coordinates in another order, each times a sign; families that cannot change places keep theirs.
 
     Args:

@@ -88,11 +88,13 @@ def _jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
         slopes = ca.Function("slopes", [q], [ca.densify(ca.jacobian(family.basis(q), q))])  # (K, n)
         G = slopes.map(N)(ca.DM(points.T))  # (K, n N)
         C = ca.reshape(theta, family.width, family.outputs).T
-        return ca.reshape(C @ G, family.outputs * n, N)
-    q = ca.MX.sym("q", n, N)
-    gradients = ca.Function("gradients", [q, theta], family.jacobian(q, theta)).call([ca.MX(ca.DM(points.T)), theta])
-    by_joint: list[Any] = [gradient[i, :] for i in range(n) for gradient in gradients]
-    return ca.vertcat(*by_joint)
+        linear: ca.MX = ca.reshape(C @ G, family.outputs * n, N)
+        return linear
+    place = ca.MX.sym("q", n, N)
+    gradients = ca.Function("gradients", [place, theta], family.jacobian(place, theta))
+    by_component: list[Any] = gradients.call([ca.MX(ca.DM(points.T)), theta])
+    stacked: ca.MX = ca.vertcat(*(gradient[i, :] for i in range(n) for gradient in by_component))
+    return stacked
 
 
 def _mapped(loss_of: Loss, count: int) -> ca.Function:

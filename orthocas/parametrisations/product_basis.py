@@ -25,6 +25,11 @@ class ProductFamily(BasisFamily):
     terms: tuple[Term, ...]
     one_joint_derivatives: Callable[[int], Array]  #: D of joint i, with f_i,a' = sum_b D_ab f_i,b
 
+    @property
+    def width(self) -> int:
+        """Number of terms K."""
+        return len(self.terms)
+
     def initial(self, seed: int) -> Array:
         """Random coefficients that fall with the degree, (size,)."""
         order = np.array([np.count_nonzero(term) for term in self.terms])

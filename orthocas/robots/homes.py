@@ -2,13 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
 from orthocas.checks import Array
-from orthocas.errors import RobotError
+from orthocas.robots.xml_files import read_xml
 
 States = dict[str, dict[str, float]]  #: name of a posture -> joint -> position [rad] or [m]
 _NOT_IN_THE_FILE = "qpos0"  # Pinocchio's name for the zero posture of an MJCF file
@@ -27,10 +26,7 @@ def srdf_states(urdf: str | Path) -> States:
     path = next((p for p in (urdf.parent / name, urdf.parent.parent / "srdf" / name) if p.is_file()), None)
     if path is None:
         return {}
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (OSError, ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise RobotError(f"{path} is not an SRDF file: {error}") from None
+    root = read_xml(path, "SRDF", "robot")
     states: States = {}
     for state in root.iter("group_state"):
         joints = states.setdefault(state.get("name", ""), {})

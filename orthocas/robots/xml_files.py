@@ -11,7 +11,7 @@ MOST_ELEMENTS = 200_000  #: elements of a file, and of a file with all that it i
 MOST_DEPTH = 200  #: elements inside one another
 MOST_LINKS = 1000  #: links (URDF) or bodies (MJCF) of a robot
 
-_ARTICLE = {"URDF": "a", "MJCF": "an"}
+_ARTICLE = {"URDF": "a", "MJCF": "an", "SRDF": "an"}
 
 
 def read_xml(path: str | Path, kind: str, tag: str | None = None) -> ElementTree.Element:

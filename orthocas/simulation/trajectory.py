@@ -6,6 +6,7 @@ import zlib
 from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, Self
 
 import numpy as np
@@ -17,8 +18,8 @@ from orthocas.files.atomic import published, require_writable
 from orthocas.showing import Shown, listed, number_list
 
 _VERSION = 1
-_WRONG_CONTENT = (ValueError, KeyError, TypeError, AttributeError)
-_DAMAGE = (*_WRONG_CONTENT, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+_WRONG_CONTENT = (ValueError, KeyError, TypeError, AttributeError, SyntaxError, TokenError)
+_DAMAGE = (*_WRONG_CONTENT, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 _ARRAYS = {  #: array fields and their units
     "times": "s",
     "q": "rad or m",

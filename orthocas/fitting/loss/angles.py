@@ -65,8 +65,9 @@ class TaskTerm:
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Cosines, coordinate by coordinate, over sqrt(m r), (m r, 1)."""
-        rho: ca.SX = ca.vec(task_cosines(data["unit_task_gradients"], coordinate_jacobian))
-        return (1 / (sizes.m * sizes.r)) ** 0.5 * rho
+        cosines = ca.vec(task_cosines(data["unit_task_gradients"], coordinate_jacobian))
+        rho: ca.SX = (1 / (sizes.m * sizes.r)) ** 0.5 * cosines
+        return rho
 
 
 @dataclass(frozen=True)
@@ -80,4 +81,5 @@ class MutualTerm:
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Cosines over the root of the number of pairs, (r (r - 1) / 2, 1)."""
         count = max(1, len(pairs(sizes.r)))
-        return (1 / count) ** 0.5 * mutual_cosines(coordinate_jacobian, data["metric_inverse"])
+        rho: ca.SX = (1 / count) ** 0.5 * mutual_cosines(coordinate_jacobian, data.get("metric_inverse"))
+        return rho

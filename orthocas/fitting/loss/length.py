@@ -28,4 +28,5 @@ class LengthTerm:
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Logarithms over sqrt(r), (r, 1)."""
-        return (1 / sizes.r) ** 0.5 * log_lengths(coordinate_jacobian)
+        rho: ca.SX = (1 / sizes.r) ** 0.5 * log_lengths(coordinate_jacobian)
+        return rho

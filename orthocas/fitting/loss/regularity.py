@@ -39,5 +39,6 @@ class RegularityTerm:
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """One residual, (1, 1)."""
-        volume = gradient_volume(coordinate_jacobian, data["null_basis"], data["metric_inverse"])
-        return ca.fmax(REGULAR_VOLUME - volume, 0)
+        volume = gradient_volume(coordinate_jacobian, data["null_basis"], data.get("metric_inverse"))
+        hinge: ca.SX = ca.fmax(REGULAR_VOLUME - volume, 0)
+        return hinge

@@ -56,7 +56,7 @@ class Loss:
 
     def residuals(self, coordinate_jacobian: ca.SX, data: list[ca.SX]) -> ca.SX:
         """Residuals rho of one sample, (rows, 1)."""
-        named = {"metric_inverse": None, **dict(zip(self.data, data, strict=True))}
+        named = dict(zip(self.data, data, strict=True))
         rho: ca.SX = ca.vertcat(
             *(weight**0.5 * term.residuals(coordinate_jacobian, named, self.sizes) for term, weight in self.terms)
         )
@@ -86,7 +86,7 @@ class Loss:
     def hinge_rows(self) -> range:
         """Rows of hinge terms: the last ones."""
         J, data = self.arguments()
-        named = {"metric_inverse": None, **dict(zip(self.data, data, strict=True))}
+        named = dict(zip(self.data, data, strict=True))
         counts = [term.residuals(J, named, self.sizes).shape[0] for term, _ in self.terms if not term.hinge]
         return range(sum(counts), len(self._touched))
 

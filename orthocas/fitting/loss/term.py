@@ -19,7 +19,7 @@ class Sizes:
     identity_metric: bool  #: whether A = I: then there is no A^-1 to multiply with
 
 
-Data = Mapping[str, ca.SX | None]  #: what a sample tells, by name; 'metric_inverse' is None for A = I
+Data = Mapping[str, ca.SX]  #: what a sample tells, by name; there is no 'metric_inverse' for A = I
 
 SAMPLE_DATA: dict[str, Callable[[Sizes], tuple[int, int]]] = {  #: shapes of the properties of `Samples` a term may need
     "unit_task_gradients": lambda s: (s.m, s.n),
