@@ -9,12 +9,13 @@ import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.tape import from_tape, to_tape
-from orthocas.checks import require_count, require_known
+from orthocas.checks import require_count, require_kind, require_known, require_text
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
-from orthocas.domains import Box, Domain, Torus
-from orthocas.errors import ChartFileError, OrthocasError
-from orthocas.files.archive import Kind, Stored, read_archive, write_archive
+from orthocas.domains import Box, Domain, Torus, sample_uniform
+from orthocas.errors import ChartFileError, InvalidValueError, OrthocasError
+from orthocas.files.archive import Kind, read_archive, write_archive
+from orthocas.files.npy import Stored
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
 from orthocas.parametrisations import JointSpace, parametrisation_from_data, parametrisation_to_data
@@ -24,6 +25,7 @@ from orthocas.tasks import Task
 
 CHART = Kind("chart", 1, ChartFileError)
 Notes = Mapping[str, str | float]
+_PROBES = 8  # points of the domain where a chart that is read is evaluated
 _LEAF = "leaf_"  # of the names of arrays that belong to a base leaf
 
 
@@ -48,7 +50,7 @@ def write_chart(path: str | Path, problem: Problem, coordinates: CoordinateMap, 
             "domain": problem.domain.name,
         },
         "coordinates": description,
-        "notes": dict(notes),
+        "notes": _checked_notes(notes),
     }
     write_archive(path, CHART, header, arrays)
 
@@ -66,13 +68,45 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:
         coordinates = _coordinates(problem, header["coordinates"], arrays)
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
-        return problem, coordinates, dict(header["notes"])
+        _require_finite(problem, coordinates)
+        return problem, coordinates, _checked_notes(header["notes"])
     except ChartFileError:
         raise
     except OrthocasError as error:
         raise ChartFileError(f"{path} is inconsistent: {error}") from None
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
         raise ChartFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
+
+
+def _checked_notes(notes: Notes) -> dict[str, str | float]:
+    """Notes of texts and finite numbers.
+
+    Raises:
+        InvalidValueError: for anything else.
+    """
+    require_kind("notes", notes, Mapping)
+    for name, value in notes.items():
+        require_text("name of a note", name)
+        if isinstance(value, int | float) and not np.isfinite(value):
+            raise InvalidValueError(f"note '{name}'", value, "a finite number")
+        if not isinstance(value, str | int | float):
+            raise InvalidValueError(f"note '{name}'", repr(value)[:80], "text or a number")
+    return dict(notes)
+
+
+def _require_finite(problem: Problem, coordinates: CoordinateMap) -> None:
+    """Look once at what will be evaluated. Singular points, also at the centre, are no reason to refuse a chart.
+
+    Raises:
+        InvalidValueError: if task, coordinates or their Jacobians are finite at none of a few points of the domain.
+    """
+    q = sample_uniform(problem.domain, _PROBES, 0)
+    values = {"the task": problem.task.batched(q)[0], "the Jacobian of the task": problem.task.batched_jacobian(q)[0]}
+    if isinstance(coordinates, Coordinates):  # grown ones may be NaN where their flow does not reach the leaf
+        values |= {"xi": coordinates.xi(q), "the Jacobian of xi": coordinates.jacobian(q)}
+    for what, numbers in values.items():
+        if not np.isfinite(numbers.reshape(_PROBES, -1)).all(axis=1).any():
+            raise InvalidValueError(what, f"not finite at any of {_PROBES} points of the domain", "finite numbers")
 
 
 def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:

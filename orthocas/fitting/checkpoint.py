@@ -3,10 +3,14 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from math import inf, isfinite
 from pathlib import Path
+from typing import Any
 
-from orthocas.checks import Array
-from orthocas.errors import CheckpointError
+import numpy as np
+
+from orthocas.checks import Array, as_float_array, frozen_array, require_count, require_text
+from orthocas.errors import CheckpointError, InvalidValueError, OrthocasError
 from orthocas.files.archive import Kind, read_archive, write_archive
 from orthocas.files.atomic import require_writable
 from orthocas.minimising.solver import SolveResult, Status
@@ -55,6 +59,14 @@ class Checkpoint:
         """The stage of that label if an earlier run finished it."""
         return next((stage for stage in self._stages if stage.label == label), None)
 
+    def require_fitting(self, stage: Stage, size: int) -> None:
+        """Raise CheckpointError if a finished stage does not have as many parameters as its family."""
+        if stage.parameters != size:
+            raise CheckpointError(
+                f"{self._path} is inconsistent: stage '{stage.label}' has {stage.parameters} parameters, "
+                f"expected {size}"
+            )
+
     def add(self, stage: Stage) -> None:
         """Write a finished stage; one that was interrupted is not finished."""
         if stage.result.status is Status.INTERRUPTED:
@@ -92,11 +104,12 @@ class Checkpoint:
                         "remove the file to start anew"
                     )
             self._stages = [_stage(data, arrays[f"stage_{k}"]) for k, data in enumerate(header["stages"])]
-            state = {name.removeprefix("state_"): a for name, a in arrays.items() if name.startswith("state_")}
-            self._running = (header["running"], state) if header["running"] else None
-        except (LookupError, TypeError, ValueError) as error:
-            if isinstance(error, CheckpointError):
-                raise
+            self._running = (header["running"], _state(arrays)) if header["running"] else None
+        except CheckpointError:
+            raise
+        except OrthocasError as error:
+            raise CheckpointError(f"{path} is inconsistent: {error}") from None
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise CheckpointError(f"{path} is incomplete: {type(error).__name__} {error}") from None
 
 
@@ -131,7 +144,7 @@ def _numbers(stage: Stage) -> dict[str, str | float]:
         "label": stage.label,
         "parameters": stage.parameters,
         "samples": stage.samples,
-        "value": result.value,
+        "value": result.value if isfinite(result.value) else None,  # a bound that is not kept yet
         "status": result.status.value,
         "iterations": result.iterations,
         "evaluations": result.evaluations,
@@ -139,13 +152,35 @@ def _numbers(stage: Stage) -> dict[str, str | float]:
     }
 
 
-def _stage(data: Mapping[str, float], theta: Array) -> Stage:
+def _stage(data: Mapping[str, Any], theta: Array) -> Stage:
+    """A finished stage, checked.
+
+    Raises:
+        OrthocasError, LookupError, TypeError, ValueError: if it is not one.
+    """
+    counts = {name: require_count(name, data[name], least=0) for name in ("iterations", "evaluations", "samples")}
+    parameters = require_count("parameters", data["parameters"])
     result = SolveResult(
-        theta,
-        float(data["value"]),
+        frozen_array(f"theta of stage '{data['label']}'", theta, (parameters,)),
+        inf if data["value"] is None else float(data["value"]),
         Status(data["status"]),
-        int(data["iterations"]),
-        int(data["evaluations"]),
+        counts["iterations"],
+        counts["evaluations"],
         float(data["seconds"]),
     )
-    return Stage(str(data["label"]), int(data["parameters"]), int(data["samples"]), result)
+    return Stage(require_text("label of a stage", data["label"]), parameters, counts["samples"], result)
+
+
+def _state(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """What a minimiser kept: numbers only; what they mean is its own affair.
+
+    Raises:
+        InvalidValueError: for anything but real numbers, or NaN.
+    """
+    state = {}
+    for name, array in arrays.items():
+        if name.startswith("state_"):
+            state[name.removeprefix("state_")] = as_float_array(name, array)
+            if np.isnan(array).any():
+                raise InvalidValueError(name, "NaN", "numbers")
+    return state

@@ -104,6 +104,7 @@ class StageRunner:
         label = parametrisation.label
         done = self.checkpoint.finished(label)
         if done is not None:
+            self.checkpoint.require_fitting(done, family.size)
             return done
         count = self._sample_count(family)
         self.monitor(Progress(label, 0.0, f"sampling {count} points"))
