@@ -101,7 +101,7 @@ PUSH = {"start": 1, "duration": 0.1, "force": [1, 0, 0]}
         ("[1]", "content is [1], expected an object"),
         ("null", "content is null, expected an object"),
         ('{"steps": [], "duration": NaN}', "it holds NaN, expected finite numbers"),
-        ('{"steps": [], "duration": 1, "duration": 2}', "the key 'duration' comes twice in one object"),
+        ('{"steps": [], "duration": 1, "duration": 2}', "the key 'duration' appears twice in one object"),
         ({}, "neither 'steps' nor 'points'"),
         (changed(STEPS, points=[]), "both 'steps' and 'points'"),
         (changed(STEPS, tempo=1), "the object with 'steps' has an unknown key 'tempo', known: steps, duration, start"),
@@ -131,7 +131,10 @@ PUSH = {"start": 1, "duration": 0.1, "force": [1, 0, 0]}
         (changed(STEPS, steps=[{"time": 1, "to": {"x": None}}]), "steps[0].to.x is missing"),
         (changed(STEPS, steps=[{**ONE, "to": {"x": 1}}]), "steps[0] has x in 'move' and in 'to'"),
         ({"points": []}, "points is [], expected at least one point"),
-        ({"points": [{"time": 0}]}, "points[0].time is 0.0, expected at least 0.001: the start is the point at 0"),
+        (
+            {"points": [{"time": 0}]},
+            "points[0].time is 0.0, expected at least 0.001, because the start is the point at 0",
+        ),
         ({"points": [ONE, ONE]}, "points[1].time is 1.0, expected at least 1.001"),
         (changed(STEPS, pushes=1), "pushes is 1, expected a list"),
         (changed(STEPS, pushes=[{**PUSH, "mass": 1}]), "pushes[0] has an unknown key 'mass', known: start, duration"),
@@ -160,7 +163,7 @@ def test_what_cannot_be_read_is_a_steps_file_error(chart: oc.Chart, tmp_path: Pa
         read_steps(tmp_path / "none.json", chart)
     with pytest.raises(StepsFileError, match="cannot be read, Is a directory"):
         read_steps(tmp_path, chart)
-    with pytest.raises(StepsFileError, match="not JSON, maximum recursion"):
+    with pytest.raises(StepsFileError, match="not JSON, it is nested too deep"):
         read_steps(written(tmp_path, "[" * 100_000), chart)
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(StepsFileError, match="not JSON"):

@@ -1,4 +1,4 @@
-"""Self-contained files: one zip with a JSON header and `.npy` arrays. Loading never runs code; writing is atomic."""
+"""Self-contained files: a zip of a JSON header and `.npy` arrays. Loading never runs code, and writing is atomic."""
 
 import hashlib
 import json
@@ -19,7 +19,7 @@ _HEADER, _DIGEST = "header.json", "digest.txt"
 
 @dataclass(frozen=True)
 class Kind:
-    """What a file holds, and the error that names it."""
+    """A kind of file, and the error that its readers and writers raise."""
 
     name: str  #: 'chart' or 'checkpoint'
     version: int  #: newest format version
@@ -35,10 +35,11 @@ def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], array
     """Write header and arrays to a file that appears whole or not at all.
 
     Raises:
-        ArchiveError: the kind's own, if the folder is missing or cannot be written, or a number is not finite.
+        ArchiveError: if the folder is missing or not writable, or the header holds NaN or infinity. The error is
+            `kind.error`.
     """
     require_writable(Path(path), kind.error)
-    target = Path(path).resolve()  # a link stays a link
+    target = Path(path).resolve()  # write through a symbolic link, and keep the link
     entries = {f"{name}.npy": to_npy(array) for name, array in arrays.items()}
     full = {
         "format": kind.format,
@@ -66,7 +67,8 @@ def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str
     """Read header and arrays back; entries that the header does not list are left alone.
 
     Raises:
-        ArchiveError: the kind's own, if the file is missing, truncated, foreign, edited, or from a newer version.
+        ArchiveError: if the file is missing, truncated, edited, of another format, or from a newer version. The error
+            is `kind.error`.
     """
     source = Path(path)
     with unpacking(source, kind.name, kind.error) as zipped:

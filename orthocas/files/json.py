@@ -10,7 +10,7 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """The value with arrays and tuples as lists, and numbers that are not finite as None, all the way down."""
+    """Convert arrays and tuples to lists, and numbers that are not finite to None, at all levels."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -23,7 +23,7 @@ def plain(value: Any) -> Any:
 
 
 def to_json(data: Mapping[str, Any], indent: int | None = None) -> str:
-    """One JSON object; see `plain`."""
+    """Write one JSON object. Values are converted by `plain`."""
     return json.dumps(plain(data), allow_nan=False, indent=indent)
 
 
@@ -54,7 +54,7 @@ def without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     data = dict(pairs)
     if len(data) < len(pairs):
         twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
-        raise ValueError(f"the key '{twice[:80]}' comes twice in one object, expected once")
+        raise ValueError(f"the key '{twice[:80]}' appears twice in one object, expected once")
     return data
 
 
