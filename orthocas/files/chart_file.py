@@ -8,13 +8,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.tape import from_tape, to_tape
-from orthocas.checks import require_count, require_kind, require_known, require_text
+from orthocas.casadi_tools.tape import from_tape, require_tape, to_tape
+from orthocas.checks import require_count, require_known, require_text
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.domains import Box, Domain, Torus, sample_uniform
 from orthocas.errors import ChartFileError, InvalidValueError, OrthocasError
 from orthocas.files.archive import Kind, read_archive, write_archive
+from orthocas.files.json import part
 from orthocas.files.npy import Stored
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
@@ -63,13 +64,13 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:
     """
     header, arrays = read_archive(path, CHART)
     try:
-        robot = Robot(_tree(header["robot"], arrays))
-        problem = _problem(robot, header["problem"], arrays)
-        coordinates = _coordinates(problem, header["coordinates"], arrays)
+        robot = Robot(_tree(part(header, "robot", dict), arrays))
+        problem = _problem(robot, part(header, "problem", dict), arrays)
+        coordinates = _coordinates(problem, part(header, "coordinates", dict), arrays)
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
         _require_finite(problem, coordinates)
-        return problem, coordinates, _checked_notes(header["notes"])
+        return problem, coordinates, _checked_notes(part(header, "notes", dict))
     except ChartFileError:
         raise
     except OrthocasError as error:
@@ -84,7 +85,6 @@ def _checked_notes(notes: Notes) -> dict[str, str | float]:
     Raises:
         InvalidValueError: for anything else.
     """
-    require_kind("notes", notes, Mapping)
     for name, value in notes.items():
         require_text("name of a note", name)
         if isinstance(value, int | float) and not np.isfinite(value):
@@ -122,14 +122,12 @@ def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], di
 def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> CoordinateMap:
     if "leaf" in data:
         own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
-        return GrownCoordinates(problem, leaf_from_arrays(problem, data["leaf"], own))
+        return GrownCoordinates(problem, leaf_from_arrays(problem, part(data, "leaf", str), own))
     return Coordinates(
         parametrisation_from_data(data),
         JointSpace.of(problem),
-        _idle(data["idle"], problem.n),
-        arrays["theta"],
-        arrays["offset"],
-        arrays["scale"],
+        _idle(part(data, "idle", list), problem.n),
+        *(part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
     )
 
 
@@ -142,36 +140,52 @@ def _idle(joints: list[int], n: int) -> tuple[int, ...]:
     """The idle joints, checked against the number of joints."""
     idle = tuple(require_count("idle joint", k, least=0) for k in joints)
     if len(set(idle)) != len(idle) or any(k >= n for k in idle):
-        raise ChartFileError(f"idle joints are {list(idle)}, expected different indices below {n}")
+        raise InvalidValueError("idle joints", str(idle)[:80], f"different numbers from 0 to {n - 1}")
     return idle
 
 
 def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTree:
+    names = part(data, "joint_names", list)
     numbers: dict[str, Any] = {
         name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
     }
     for name in ("effort_limits", "velocity_limits"):  # missing in older files
-        numbers.setdefault(name, np.full(len(data["joint_names"]), np.inf))
+        numbers.setdefault(name, np.full(len(names), np.inf))
     texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
-    return KinematicTree(**texts, **numbers)
+    wanted, found = {field.name for field in fields(KinematicTree)}, {*texts, *numbers}
+    if wanted != found:
+        odd = f"with {sorted(found - wanted)} and without {sorted(wanted - found)}"
+        raise InvalidValueError("robot", odd, "the fields of a KinematicTree")
+    for name in ("joint_kinds", "parents"):
+        part(data, name, list)
+    return KinematicTree(**texts | numbers)
 
 
 def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
-    require_known("domain", data["domain"], ("box", "torus"))
-    box = Box(arrays["domain_centre"], arrays["domain_half_width"])
+    require_known("domain", part(data, "domain", str), ("box", "torus"))
+    box = Box(part(arrays, "domain_centre", np.ndarray), part(arrays, "domain_half_width", np.ndarray))
     domain: Domain = Torus(robot.n) if data["domain"] == "torus" else box
-    return Problem(robot, _task(robot, data["task"]), _metric(robot, data["metric"]), domain, data["name"])
+    return Problem(
+        robot,
+        _task(robot, part(data, "task", dict)),
+        _metric(robot, part(data, "metric", dict)),
+        domain,
+        part(data, "name", str),
+    )
 
 
 def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
-    if recipe["kind"] == "custom":
-        labels, units = recipe["labels"], recipe.get("units", ())  # older files have no units
-        return Task.custom(robot, recipe["name"], lambda q: from_tape(recipe["tape"], q), labels, units)
+    if part(recipe, "kind", str) == "custom":
+        labels = part(recipe, "labels", list)
+        units = part(recipe, "units", list) if "units" in recipe else ()  # older files have none
+        require_tape(part(recipe, "tape", dict), robot.n)
+        return Task.custom(robot, part(recipe, "name", str), lambda q: from_tape(recipe["tape"], q), labels, units)
     return Task.from_recipe(robot, recipe)
 
 
 def _metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:
-    if recipe["kind"] == "custom":
+    if part(recipe, "kind", str) == "custom":
+        require_tape(part(recipe, "tape", dict), robot.n)
         name = recipe.get("name", "custom")  # older files have no name
         return Metric.custom(robot, name, lambda q: from_tape(recipe["tape"], q))
     return Metric.from_spec(robot, recipe["matrix"] if recipe["kind"] == "constant" else recipe["kind"])

@@ -4,9 +4,14 @@ import json
 import math
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+from orthocas.checks import require_kind
+from orthocas.errors import InvalidValueError
+
+T = TypeVar("T")
 
 
 def plain(value: Any) -> Any:
@@ -43,6 +48,19 @@ def from_strict_json(text: str | bytes) -> Any:
     except RecursionError:
         raise ValueError("it is nested too deep") from None
     return data
+
+
+def part(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
+    """A field of data that were read.
+
+    Raises:
+        InvalidValueError: if it is missing, or of another kind.
+    """
+    if name not in data:
+        raise InvalidValueError(f"field '{name}'", "missing", f"a {kind.__name__}")
+    require_kind(f"field '{name}'", data[name], kind)
+    value: T = data[name]
+    return value
 
 
 def without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

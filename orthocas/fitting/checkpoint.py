@@ -17,6 +17,10 @@ from orthocas.minimising.solver import SolveResult, Status
 from orthocas.minimising.watch import State
 
 CHECKPOINT = Kind("checkpoint", 1, CheckpointError)
+_NUMBERS = ("iterations", "evaluations", "seconds", "damping", "stretch")
+_VECTORS = ("best_theta", "theta", "mean", "square")
+_BEST = "best_value"  # of the loss
+_MOST = 1e15  # of counts, seconds, damping and stretch
 _SECONDS = 30.0  # least time between two writes of a running stage
 
 
@@ -60,13 +64,21 @@ class Checkpoint:
         """The stage with this label, if an earlier run finished it."""
         return next((stage for stage in self._stages if stage.label == label), None)
 
-    def require_fitting(self, stage: Stage, size: int) -> None:
-        """Raise CheckpointError if a finished stage does not have as many parameters as its family."""
-        if stage.parameters != size:
-            raise CheckpointError(
-                f"{self._path} is inconsistent: stage '{stage.label}' has {stage.parameters} parameters, "
-                f"expected {size}"
-            )
+    def require_fitting(self, label: str, size: int) -> None:
+        """Raise CheckpointError unless what is kept of a stage belongs to a family with that many parameters."""
+        done = self.finished(label)
+        if done is not None and done.parameters != size:
+            raise self._inconsistent(f"stage '{label}' has {done.parameters} parameters, expected {size}")
+        for name, value in (self._running[1] if self._running and self._running[0] == label else {}).items():
+            if name in _VECTORS and (value.shape != (size,) or not np.isfinite(value).all()):
+                raise self._inconsistent(f"{name} has shape {value.shape}, expected ({size},) with finite entries")
+            if name in _NUMBERS and (value.shape != () or not 0 <= value < _MOST):
+                raise self._inconsistent(f"{name} is {np.ravel(value)[:3].tolist()}, expected one number >= 0")
+            if name == _BEST and value.shape != ():
+                raise self._inconsistent(f"{name} has shape {value.shape}, expected one number")
+
+    def _inconsistent(self, reason: str) -> CheckpointError:
+        return CheckpointError(f"{self._path} is inconsistent: {reason}")
 
     def add(self, stage: Stage) -> None:
         """Write a finished stage. Interrupted stages are not finished."""

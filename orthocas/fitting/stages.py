@@ -102,9 +102,9 @@ class StageRunner:
             SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
         """
         label = parametrisation.label
+        self.checkpoint.require_fitting(label, family.size)
         done = self.checkpoint.finished(label)
         if done is not None:
-            self.checkpoint.require_fitting(done, family.size)
             return done
         count = self._sample_count(family)
         self.monitor(Progress(label, 0.0, f"sampling {count} points"))

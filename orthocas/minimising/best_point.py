@@ -6,14 +6,9 @@ from collections.abc import Callable
 import numpy as np
 
 from orthocas.checks import Array
-from orthocas.errors import CheckpointError
 from orthocas.minimising.objective import Objective
 from orthocas.minimising.solver import SolveResult, Status
 from orthocas.minimising.watch import State, Watch
-
-_NUMBERS = ("best_value", "iterations", "evaluations", "seconds", "damping", "stretch")
-_VECTORS = ("best_theta", "theta", "mean", "square")
-_MOST = 1e15  # of counts, seconds, damping and stretch
 
 
 class BestPoint:
@@ -23,16 +18,12 @@ class BestPoint:
         objective: the function to minimise.
         theta0: start of a new run.
         watch: monitor and keeper. If the keeper holds the state of an earlier run, the run resumes from it.
-
-    Raises:
-        CheckpointError: if that state belongs to another objective.
     """
 
     def __init__(self, objective: Objective, theta0: Array, watch: Watch) -> None:
         self.objective, self.watch = objective, watch
         self.restored = watch.keeper.restored()
         kept: State = self.restored or {}
-        _require_fitting(kept, theta0.shape)
         self.theta = np.array(kept.get("best_theta", theta0), dtype=float)
         self.value = float(kept.get("best_value", np.inf))
         self.iterations = int(kept.get("iterations", 0))
@@ -99,17 +90,3 @@ class BestPoint:
             **state,
         }
         return {name: np.array(value, dtype=float) for name, value in numbers.items()}
-
-
-def _require_fitting(kept: State, shape: tuple[int, ...]) -> None:
-    """Raise CheckpointError unless counts are numbers >= 0, and vectors fit parameters of that shape."""
-    for name in _NUMBERS:
-        value = kept.get(name, np.zeros(()))
-        if value.shape != () or not (name == "best_value" or 0 <= value < _MOST):
-            raise CheckpointError(
-                f"{name} in the checkpoint is {np.ravel(value)[:3].tolist()}, expected one number >= 0"
-            )
-    for name in _VECTORS:
-        value = kept.get(name, np.zeros(shape))
-        if value.shape != shape or not np.isfinite(value).all():
-            raise CheckpointError(f"{name} in the checkpoint has shape {value.shape}, expected {shape}, all finite")

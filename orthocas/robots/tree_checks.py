@@ -7,7 +7,7 @@ import numpy as np
 from orthocas.checks import Array, require_text
 from orthocas.errors import InvalidValueError, RobotError
 
-MOST_JOINTS = 200  #: the work for a mass matrix grows with their square
+MOST_JOINTS = 150  #: the work for a mass matrix grows with their square
 _LARGEST = 1e30  # larger numbers overflow in products
 _NOT_TURNED = 1e-6  # |R R^T - 1| of a rotation in single precision
 _SYMMETRIC = 1e-6  # of the largest entry

@@ -9,7 +9,8 @@ from typing import Self
 import numpy as np
 from scipy.integrate import cumulative_simpson
 
-from orthocas.checks import Array, as_float_array, require_known, require_shape, require_text
+from orthocas.checks import Array, as_float_array, frozen_indices, require_known, require_shape, require_text
+from orthocas.control.status import ControlStatus
 from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
 from orthocas.files.atomic import published, require_writable
 from orthocas.showing import Shown, listed, number_list
@@ -75,8 +76,10 @@ class Trajectory(Shown):
         N, n, k = len(self.times), len(self.joint_names), len(self.labels)
         for name in _ARRAYS:
             array = as_float_array(name, getattr(self, name))
+            object.__setattr__(self, name, array)
             width = n if name in _OF_JOINTS else k
             require_shape(name, array.shape, (N,) if name in _SINGLE else (N, width))
+        object.__setattr__(self, "status", frozen_indices("status", self.status, (N,), len(ControlStatus)))
         if N == 0 or not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
             raise InvalidValueError("times", "empty or not increasing", "increasing instants, at least one")
 
