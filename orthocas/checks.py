@@ -12,6 +12,7 @@ from orthocas.errors import InvalidValueError, MemoryNeedError, ShapeError, Unkn
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+_LONGEST_TEXT = 500  # characters of a name
 _REAL = "biuf"  # NumPy's kinds of numbers: bool, int, unsigned, float
 _NO_NUMBER = (str, bytes, complex, type(None))  # rejected although NumPy converts them
 
@@ -24,8 +25,8 @@ def require_shape(name: str, got: tuple[int, ...], want: tuple[int | None, ...])
 
 def require_known(what: str, name: str, known: Collection[str]) -> None:
     """Raise UnknownNameError unless `name` is in `known`."""
-    if name not in known:
-        raise UnknownNameError(what, name, known)
+    if not isinstance(name, str) or name not in known:
+        raise UnknownNameError(what, str(name), known)
 
 
 def require_count(name: str, value: int, least: int = 1) -> int:
@@ -33,6 +34,13 @@ def require_count(name: str, value: int, least: int = 1) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise InvalidValueError(name, value, f"a whole number >= {least}")
     return int(value)
+
+
+def require_text(name: str, value: str) -> str:
+    """The value; raises InvalidValueError unless it is text of 1 to 500 characters that can be printed on one line."""
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= _LONGEST_TEXT:
+        raise InvalidValueError(name, repr(value)[:80], f"printable text of 1 to {_LONGEST_TEXT} characters")
+    return value
 
 
 def require_memory(what: str, needed: float) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocas.checks import Array, require_kind, require_shape
+from orthocas.checks import Array, require_kind, require_shape, require_text
 from orthocas.domains import Domain, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
 from orthocas.metrics import Metric, MetricSpec, metric_matrices
@@ -77,7 +77,7 @@ class Problem(Shown):
             ("task", task),
             ("metric", metric),
             ("domain", domain),
-            ("name", str(name)),
+            ("name", require_text("name of a problem", str(name))),
         ):
             object.__setattr__(self, key, value)
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.user_expression import expression_of
-from orthocas.checks import require_kind
+from orthocas.checks import require_kind, require_text
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots import Robot
 from orthocas.robots.spatial import rotation_matrix
@@ -135,6 +135,7 @@ class Task(Shown):
 
         Raises:
             ShapeError: if x is not a column, or labels or units do not have one entry per component.
+            InvalidValueError: if the function fails, or a name cannot be printed on one line.
 
         Example:
             >>> import casadi as ca
@@ -145,6 +146,7 @@ class Task(Shown):
             (1, ('distance',))
         """
         require_kind("robot", robot, Robot)
+        require_text("name of a task", str(name))
         q = ca.SX.sym("q", robot.n)
         x = expression_of(f"task '{name}'", function, q)
         if x.shape[1] != 1 or x.shape[0] == 0:
@@ -154,6 +156,8 @@ class Task(Shown):
         for argument, texts in (("labels", labels), ("units", units)):
             if len(texts) != x.shape[0]:
                 raise ShapeError(argument, (len(texts),), (x.shape[0],))
+            for text in texts:
+                require_text(f"an entry of {argument}", text or "none")
         recipe = {"kind": "custom", "name": str(name), "labels": labels, "units": units}
         return cls(robot, str(name), labels, units, dense_function("h", [q], [x]), recipe)
 

@@ -163,7 +163,7 @@ def test_what_cannot_be_read_is_a_steps_file_error(chart: oc.Chart, tmp_path: Pa
         read_steps(tmp_path / "none.json", chart)
     with pytest.raises(StepsFileError, match="cannot be read, Is a directory"):
         read_steps(tmp_path, chart)
-    with pytest.raises(StepsFileError, match="not JSON, maximum recursion"):
+    with pytest.raises(StepsFileError, match="not JSON, it is nested too deep"):
         read_steps(written(tmp_path, "[" * 100_000), chart)
     (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(StepsFileError, match="not JSON"):

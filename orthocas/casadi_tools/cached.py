@@ -51,3 +51,18 @@ class cached_property(Generic[T]):  # noqa: N801  (takes the place of the one in
                 store[self._name] = self._build(instance)
             value: T = store[self._name]
             return value
+
+
+class BuiltOnUse(Generic[T]):
+    """Values by name, each built on first use, once for all threads. A `cached_property` should hold it."""
+
+    def __init__(self, build: Callable[[str], T]) -> None:
+        self._build = build
+        self._values: dict[str, T] = {}
+
+    def __getitem__(self, name: str) -> T:
+        if name not in self._values:
+            with _building:
+                if name not in self._values:
+                    self._values[name] = self._build(name)
+        return self._values[name]

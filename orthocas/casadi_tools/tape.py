@@ -10,8 +10,10 @@ from typing import Any, TypeVar
 
 import casadi as ca
 
-from orthocas.errors import OrthocasError
+from orthocas.checks import require_count
+from orthocas.errors import InvalidValueError, OrthocasError
 
+_LARGEST = 1e300  # constants: infinity and NaN are none
 Tape = dict[str, Any]
 Entry = TypeVar("Entry", ca.SX, ca.MX)
 
@@ -95,22 +97,60 @@ def to_tape(function: ca.Function) -> Tape:
     return {"rows": rows, "columns": columns, "steps": steps}
 
 
-def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
-    """Rebuild the expression of a tape at q.
+def require_tape(tape: Tape, inputs: int) -> None:
+    """Check a tape that comes from a file, before anything is built.
 
     Raises:
-        KeyError, IndexError, TypeError, ValueError: if the tape is malformed. The caller names the file.
+        InvalidValueError: if it is not a tape of an expression of that many inputs; the step to blame is named.
     """
+    keys = tape.keys() if isinstance(tape, dict) else ()
+    if set(keys) != {"rows", "columns", "steps"} or not isinstance(tape["steps"], list | tuple):
+        raise InvalidValueError("tape", f"an object with {sorted(keys)[:5]}", "one with rows, columns and steps")
+    rows, columns = require_count("rows of a tape", tape["rows"]), require_count("columns of a tape", tape["columns"])
+    written: set[int] = set()
+    results: set[int] = set()
+    for k, step in enumerate(tape["steps"]):
+        if not _makes_sense(step, inputs, written):
+            raise InvalidValueError(f"step {k} of a tape", repr(step)[:80], "a known operation on earlier results")
+        (results if step[0] == "output" else written).add(step[1])
+    if len(results) != rows * columns or results != set(range(len(results))):
+        raise InvalidValueError("number of outputs of a tape", len(results), f"{rows} rows times {columns} columns")
+
+
+def _makes_sense(step: Any, inputs: int, written: set[int]) -> bool:
+    """Whether a step is [operation, place of the result, what it needs ...]."""
+    if not isinstance(step, list | tuple) or len(step) < 3 or not isinstance(step[0], str) or not _is_index(step[1]):
+        return False
+    name, _, *of = step
+    if name == "const":
+        return len(of) == 1 and isinstance(of[0], int | float) and abs(of[0]) <= _LARGEST
+    if name == "input":
+        return len(of) == 1 and _is_index(of[0]) and of[0] < inputs
+    needs = 2 if name in _BINARY else 1
+    return (
+        (name in _UNARY or name in _BINARY or name == "output")
+        and len(of) == needs
+        and all(_is_index(place) and place in written for place in of)
+    )
+
+
+def _is_index(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
+    """Rebuild the expression of a tape at q (n, 1).
+
+    Raises:
+        InvalidValueError: if it is no tape for n inputs.
+    """
+    require_tape(tape, q.shape[0])
     entries = replay(tape, [q[i] for i in range(q.shape[0])])
-    return ca.reshape(ca.vertcat(*entries), int(tape["rows"]), int(tape["columns"]))
+    return ca.reshape(ca.vertcat(*entries), tape["rows"], tape["columns"])
 
 
 def replay(tape: Tape, inputs: Sequence[Entry]) -> list[Entry]:
-    """Evaluate a tape at the entries of its input. Returns the entries of its output, column by column.
-
-    Raises:
-        KeyError, IndexError, TypeError, ValueError: if the tape is malformed.
-    """
+    """The entries of a checked tape's output, column by column, for the entries of its input."""
     work: dict[int, Any] = {}
     result: dict[int, Any] = {}
     zero = 0 * inputs[0]  # gives constants the shape of the entries
@@ -118,8 +158,6 @@ def replay(tape: Tape, inputs: Sequence[Entry]) -> list[Entry]:
         if name == "const":
             work[into] = zero + float(of[0])
         elif name == "input":
-            if not 0 <= of[0] < len(inputs):
-                raise IndexError(f"input {of[0]} of {len(inputs)}")
             work[into] = inputs[of[0]]
         elif name == "output":
             result[into] = work[of[0]]
@@ -127,4 +165,4 @@ def replay(tape: Tape, inputs: Sequence[Entry]) -> list[Entry]:
             work[into] = _UNARY[name](work[of[0]])
         else:
             work[into] = _BINARY[name](work[of[0]], work[of[1]])
-    return [result[k] for k in range(int(tape["rows"]) * int(tape["columns"]))]
+    return [result[k] for k in range(tape["rows"] * tape["columns"])]

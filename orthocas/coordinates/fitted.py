@@ -10,10 +10,10 @@ from orthocas.casadi_tools.batch import Batched, dense_function, evaluate_column
 from orthocas.casadi_tools.blas_graph import NumpyGraph
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
-from orthocas.checks import Array, frozen_array
+from orthocas.checks import Array, frozen_array, require_shape
 from orthocas.coordinates.point_functions import point_functions
 from orthocas.parametrisations import Family, JointSpace, Parametrisation
-from orthocas.parametrisations.family import Expression
+from orthocas.parametrisations.family import Expression, GradedParametrisation
 
 _COLUMNS = 256  # samples side by side in graphs of matrices
 
@@ -35,6 +35,9 @@ class Coordinates:
 
     def __post_init__(self) -> None:
         fitted = len(self.offset)
+        if isinstance(self.parametrisation, GradedParametrisation):  # before a basis is built that may be enormous
+            terms = self.parametrisation.term_count(len(self.active)) if fitted else 0
+            require_shape("theta", np.shape(self.theta), (fitted * terms,))
         size = self.family.size if fitted else 0
         object.__setattr__(self, "theta", frozen_array("theta", self.theta, (size,)))
         object.__setattr__(self, "offset", frozen_array("offset", self.offset, (fitted,)))

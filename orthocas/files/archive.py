@@ -1,26 +1,20 @@
 """Self-contained files: a zip of a JSON header and `.npy` arrays. Loading never runs code, and writing is atomic."""
 
 import hashlib
-import io
 import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from orthocas.errors import ArchiveError
 from orthocas.files.atomic import published, require_writable
-
-Stored = NDArray[Any]  #: an array in a file, of floats or integers
+from orthocas.files.json import from_strict_json
+from orthocas.files.npy import Stored, from_npy, to_npy
+from orthocas.files.zips import Unpacker, unpacking
 
 _HEADER, _DIGEST = "header.json", "digest.txt"
-_PACKED = zipfile.ZIP_DEFLATED
-_LARGEST_FILE = 2**32  # bytes that a file may unpack to
 
 
 @dataclass(frozen=True)
@@ -41,18 +35,22 @@ def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], array
     """Write header and arrays to a file that appears whole or not at all.
 
     Raises:
-        ArchiveError: if the folder is missing or not writable. The error is `kind.error`.
+        ArchiveError: if the folder is missing or not writable, or the header holds NaN or infinity. The error is
+            `kind.error`.
     """
     require_writable(Path(path), kind.error)
     target = Path(path).resolve()  # write through a symbolic link, and keep the link
-    entries = {f"{name}.npy": _npy_bytes(array) for name, array in arrays.items()}
+    entries = {f"{name}.npy": to_npy(array) for name, array in arrays.items()}
     full = {
         "format": kind.format,
         "version": kind.version,
         **header,
         "sha256": {k: _digest(v) for k, v in entries.items()},
     }
-    text = json.dumps(full, indent=1).encode()
+    try:
+        text = json.dumps(full, indent=1, allow_nan=False).encode()
+    except ValueError:
+        raise kind.error(f"cannot write {target}: its header would hold NaN or infinity") from None
     entries = {_HEADER: text, _DIGEST: _digest(text).encode(), **entries}
     try:
         with (
@@ -66,62 +64,51 @@ def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], array
 
 
 def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str, Stored]]:
-    """Read header and arrays back.
+    """Read header and arrays back; entries that the header does not list are left alone.
 
     Raises:
         ArchiveError: if the file is missing, truncated, edited, of another format, or from a newer version. The error
             is `kind.error`.
     """
     source = Path(path)
-    try:
-        with zipfile.ZipFile(source) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > _LARGEST_FILE:
-                raise kind.error(
-                    f"{source} unpacks to more than {_LARGEST_FILE / 2**30:.0f} GiB, expected a {kind.name} file"
-                )
-            entries = {name: archive.read(name) for name in archive.namelist()}
-    except FileNotFoundError:
-        raise kind.error(f"{kind.name} file {source} does not exist") from None
-    except OSError as error:
-        raise kind.error(f"cannot read {kind.name} file {source}: {error.strerror}") from None
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError):
-        raise kind.error(f"{source} is truncated, damaged or not a {kind.name} file") from None
-    header = _read_header(source, kind, entries)
-    for name, digest in header["sha256"].items():
-        if name not in entries or _digest(entries[name]) != digest:
-            raise kind.error(f"{source} has been edited: entry {name} does not match its checksum")
-    try:
-        arrays = {
-            name.removesuffix(".npy"): np.load(io.BytesIO(entries[name]), allow_pickle=False)
-            for name in header["sha256"]
-        }
-    except (ValueError, EOFError, TokenError):
-        raise kind.error(f"{source} contains an array that cannot be read") from None
+    with unpacking(source, kind.name, kind.error) as zipped:
+        text = zipped.read(_HEADER)
+        header = _checked_header(source, kind, text)
+        if zipped.sizes.get(_DIGEST) != len(_digest(b"")) or zipped.read(_DIGEST) != _digest(text).encode():
+            raise kind.error(f"{source} has been edited: its header does not match its checksum")
+        zipped.require_room(list(header["sha256"]))
+        arrays = {name.removesuffix(".npy"): _array(zipped, name, digest) for name, digest in header["sha256"].items()}
     return header, arrays
 
 
-def _read_header(source: Path, kind: Kind, entries: Mapping[str, bytes]) -> dict[str, Any]:
-    """Check format, version and checksum before the rest of the header is used."""
+def _array(zipped: Unpacker, name: str, digest: str) -> Stored:
+    """An entry that matches its checksum, as an array."""
+    content = zipped.read(name)
+    if _digest(content) != digest:
+        raise zipped.error(f"{zipped.source} has been edited: entry {name} does not match its checksum")
     try:
-        header = json.loads(entries[_HEADER])
-        name, version, sums = header["format"], int(header["version"]), dict(header["sha256"])
-    except (KeyError, ValueError, TypeError, OverflowError, RecursionError):
-        raise kind.error(f"{source} is not an orthocas {kind.name} file") from None
+        return from_npy(content)
+    except ValueError as error:
+        raise zipped.error(f"{zipped.source} holds an array that cannot be read: {name}, {error}") from None
+
+
+def _checked_header(source: Path, kind: Kind, text: bytes) -> dict[str, Any]:
+    """Check format and version before anything else is believed."""
+    try:
+        header = from_strict_json(text)
+    except ValueError as error:
+        raise kind.error(f"{source} is not an orthocas {kind.name} file: {error}") from None
+    sums = header.get("sha256") if isinstance(header, dict) else None
+    if not isinstance(sums, dict) or not {"format", "version"} <= header.keys():
+        raise kind.error(f"{source} is not an orthocas {kind.name} file")
+    name, version = header["format"], header["version"]
     if name != kind.format:
         raise kind.error(f"{source} has format '{name}', expected '{kind.format}'")
-    if version < 1:
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise kind.error(f"{source} has format version {version}, expected 1 to {kind.version}")
     if version > kind.version:
         raise kind.error(f"{source} has format version {version}, this orthocas reads up to {kind.version}: upgrade")
-    if entries.get(_DIGEST, b"").decode(errors="replace") != _digest(entries[_HEADER]):
-        raise kind.error(f"{source} has been edited: its header does not match its checksum")
-    return {**header, "sha256": sums}
-
-
-def _npy_bytes(array: Stored) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, np.asarray(array), allow_pickle=False)
-    return buffer.getvalue()
+    return dict(header)
 
 
 def _digest(content: bytes) -> str:

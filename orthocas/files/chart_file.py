@@ -8,13 +8,15 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.tape import from_tape, to_tape
-from orthocas.checks import require_count, require_known
+from orthocas.casadi_tools.tape import from_tape, require_tape, to_tape
+from orthocas.checks import require_count, require_known, require_text
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
-from orthocas.domains import Box, Domain, Torus
-from orthocas.errors import ChartFileError, OrthocasError
-from orthocas.files.archive import Kind, Stored, read_archive, write_archive
+from orthocas.domains import Box, Domain, Torus, sample_uniform
+from orthocas.errors import ChartFileError, InvalidValueError, OrthocasError
+from orthocas.files.archive import Kind, read_archive, write_archive
+from orthocas.files.json import part
+from orthocas.files.npy import Stored
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
 from orthocas.parametrisations import JointSpace, parametrisation_from_data, parametrisation_to_data
@@ -24,6 +26,7 @@ from orthocas.tasks import Task
 
 CHART = Kind("chart", 1, ChartFileError)
 Notes = Mapping[str, str | float]
+_PROBES = 8  # points of the domain where a chart that is read is evaluated
 _LEAF = "leaf_"  # prefix of the names of arrays that belong to a base leaf
 
 
@@ -48,7 +51,7 @@ def write_chart(path: str | Path, problem: Problem, coordinates: CoordinateMap, 
             "domain": problem.domain.name,
         },
         "coordinates": description,
-        "notes": dict(notes),
+        "notes": _checked_notes(notes),
     }
     write_archive(path, CHART, header, arrays)
 
@@ -61,18 +64,49 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:
     """
     header, arrays = read_archive(path, CHART)
     try:
-        robot = Robot(_tree(header["robot"], arrays))
-        problem = _problem(robot, header["problem"], arrays)
-        coordinates = _coordinates(problem, header["coordinates"], arrays)
+        robot = Robot(_tree(part(header, "robot", dict), arrays))
+        problem = _problem(robot, part(header, "problem", dict), arrays)
+        coordinates = _coordinates(problem, part(header, "coordinates", dict), arrays)
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
-        return problem, coordinates, dict(header["notes"])
+        _require_finite(problem, coordinates)
+        return problem, coordinates, _checked_notes(part(header, "notes", dict))
     except ChartFileError:
         raise
     except OrthocasError as error:
         raise ChartFileError(f"{path} is inconsistent: {error}") from None
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
         raise ChartFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
+
+
+def _checked_notes(notes: Notes) -> dict[str, str | float]:
+    """Notes of texts and finite numbers.
+
+    Raises:
+        InvalidValueError: for anything else.
+    """
+    for name, value in notes.items():
+        require_text("name of a note", name)
+        if isinstance(value, int | float) and not np.isfinite(value):
+            raise InvalidValueError(f"note '{name}'", value, "a finite number")
+        if not isinstance(value, str | int | float):
+            raise InvalidValueError(f"note '{name}'", repr(value)[:80], "text or a number")
+    return dict(notes)
+
+
+def _require_finite(problem: Problem, coordinates: CoordinateMap) -> None:
+    """Look once at what will be evaluated. Singular points, also at the centre, are no reason to refuse a chart.
+
+    Raises:
+        InvalidValueError: if task, coordinates or their Jacobians are finite at none of a few points of the domain.
+    """
+    q = sample_uniform(problem.domain, _PROBES, 0)
+    values = {"the task": problem.task.batched(q)[0], "the Jacobian of the task": problem.task.batched_jacobian(q)[0]}
+    if isinstance(coordinates, Coordinates):  # grown ones may be NaN where their flow does not reach the leaf
+        values |= {"xi": coordinates.xi(q), "the Jacobian of xi": coordinates.jacobian(q)}
+    for what, numbers in values.items():
+        if not np.isfinite(numbers.reshape(_PROBES, -1)).all(axis=1).any():
+            raise InvalidValueError(what, f"not finite at any of {_PROBES} points of the domain", "finite numbers")
 
 
 def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
@@ -88,14 +122,12 @@ def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], di
 def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> CoordinateMap:
     if "leaf" in data:
         own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
-        return GrownCoordinates(problem, leaf_from_arrays(problem, data["leaf"], own))
+        return GrownCoordinates(problem, leaf_from_arrays(problem, part(data, "leaf", str), own))
     return Coordinates(
         parametrisation_from_data(data),
         JointSpace.of(problem),
-        _idle(data["idle"], problem.n),
-        arrays["theta"],
-        arrays["offset"],
-        arrays["scale"],
+        _idle(part(data, "idle", list), problem.n),
+        *(part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
     )
 
 
@@ -108,36 +140,52 @@ def _idle(joints: list[int], n: int) -> tuple[int, ...]:
     """The idle joints, checked against the number of joints."""
     idle = tuple(require_count("idle joint", k, least=0) for k in joints)
     if len(set(idle)) != len(idle) or any(k >= n for k in idle):
-        raise ChartFileError(f"idle joints are {list(idle)}, expected different indices below {n}")
+        raise InvalidValueError("idle joints", str(idle)[:80], f"different numbers from 0 to {n - 1}")
     return idle
 
 
 def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTree:
+    names = part(data, "joint_names", list)
     numbers: dict[str, Any] = {
         name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
     }
     for name in ("effort_limits", "velocity_limits"):  # missing in older files
-        numbers.setdefault(name, np.full(len(data["joint_names"]), np.inf))
+        numbers.setdefault(name, np.full(len(names), np.inf))
     texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
-    return KinematicTree(**texts, **numbers)
+    wanted, found = {field.name for field in fields(KinematicTree)}, {*texts, *numbers}
+    if wanted != found:
+        odd = f"with {sorted(found - wanted)} and without {sorted(wanted - found)}"
+        raise InvalidValueError("robot", odd, "the fields of a KinematicTree")
+    for name in ("joint_kinds", "parents"):
+        part(data, name, list)
+    return KinematicTree(**texts | numbers)
 
 
 def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
-    require_known("domain", data["domain"], ("box", "torus"))
-    box = Box(arrays["domain_centre"], arrays["domain_half_width"])
+    require_known("domain", part(data, "domain", str), ("box", "torus"))
+    box = Box(part(arrays, "domain_centre", np.ndarray), part(arrays, "domain_half_width", np.ndarray))
     domain: Domain = Torus(robot.n) if data["domain"] == "torus" else box
-    return Problem(robot, _task(robot, data["task"]), _metric(robot, data["metric"]), domain, data["name"])
+    return Problem(
+        robot,
+        _task(robot, part(data, "task", dict)),
+        _metric(robot, part(data, "metric", dict)),
+        domain,
+        part(data, "name", str),
+    )
 
 
 def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
-    if recipe["kind"] == "custom":
-        labels, units = recipe["labels"], recipe.get("units", ())  # older files have no units
-        return Task.custom(robot, recipe["name"], lambda q: from_tape(recipe["tape"], q), labels, units)
+    if part(recipe, "kind", str) == "custom":
+        labels = part(recipe, "labels", list)
+        units = part(recipe, "units", list) if "units" in recipe else ()  # older files have none
+        require_tape(part(recipe, "tape", dict), robot.n)
+        return Task.custom(robot, part(recipe, "name", str), lambda q: from_tape(recipe["tape"], q), labels, units)
     return Task.from_recipe(robot, recipe)
 
 
 def _metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:
-    if recipe["kind"] == "custom":
+    if part(recipe, "kind", str) == "custom":
+        require_tape(part(recipe, "tape", dict), robot.n)
         name = recipe.get("name", "custom")  # older files have no name
         return Metric.custom(robot, name, lambda q: from_tape(recipe["tape"], q))
     return Metric.from_spec(robot, recipe["matrix"] if recipe["kind"] == "constant" else recipe["kind"])

@@ -2,10 +2,16 @@
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+from orthocas.checks import require_kind
+from orthocas.errors import InvalidValueError
+
+T = TypeVar("T")
 
 
 def plain(value: Any) -> Any:
@@ -24,3 +30,58 @@ def plain(value: Any) -> Any:
 def to_json(data: Mapping[str, Any], indent: int | None = None) -> str:
     """Write one JSON object. Values are converted by `plain`."""
     return json.dumps(plain(data), allow_nan=False, indent=indent)
+
+
+def from_strict_json(text: str | bytes) -> Any:
+    """Data of a file that programs wrote: finite numbers, no key twice, no halves of surrogate pairs.
+
+    Raises:
+        ValueError: in one line, for everything else.
+    """
+    try:
+        data = json.loads(text, parse_constant=_refused, parse_float=_finite, object_pairs_hook=without_doubles)
+        json.dumps(data, ensure_ascii=False).encode()
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{error.msg} (line {error.lineno}, column {error.colno})") from None
+    except UnicodeError:
+        raise ValueError("it holds half a surrogate pair or is not UTF-8") from None
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+    return data
+
+
+def part(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
+    """A field of data that were read.
+
+    Raises:
+        InvalidValueError: if it is missing, or of another kind.
+    """
+    if name not in data:
+        raise InvalidValueError(f"field '{name}'", "missing", f"a {kind.__name__}")
+    require_kind(f"field '{name}'", data[name], kind)
+    value: T = data[name]
+    return value
+
+
+def without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON.
+
+    Raises:
+        ValueError: if a key comes twice.
+    """
+    data = dict(pairs)
+    if len(data) < len(pairs):
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key '{twice[:80]}' appears twice in one object, expected once")
+    return data
+
+
+def _refused(text: str) -> None:
+    raise ValueError(f"it holds {text}, expected finite numbers")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        _refused(text[:80])
+    return value

@@ -3,16 +3,24 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from math import inf, isfinite
 from pathlib import Path
+from typing import Any
 
-from orthocas.checks import Array
-from orthocas.errors import CheckpointError
+import numpy as np
+
+from orthocas.checks import Array, as_float_array, frozen_array, require_count, require_text
+from orthocas.errors import CheckpointError, InvalidValueError, OrthocasError
 from orthocas.files.archive import Kind, read_archive, write_archive
 from orthocas.files.atomic import require_writable
 from orthocas.minimising.solver import SolveResult, Status
 from orthocas.minimising.watch import State
 
 CHECKPOINT = Kind("checkpoint", 1, CheckpointError)
+_NUMBERS = ("iterations", "evaluations", "seconds", "damping", "stretch")
+_VECTORS = ("best_theta", "theta", "mean", "square")
+_BEST = "best_value"  # of the loss
+_MOST = 1e15  # of counts, seconds, damping and stretch
 _SECONDS = 30.0  # least time between two writes of a running stage
 
 
@@ -56,6 +64,22 @@ class Checkpoint:
         """The stage with this label, if an earlier run finished it."""
         return next((stage for stage in self._stages if stage.label == label), None)
 
+    def require_fitting(self, label: str, size: int) -> None:
+        """Raise CheckpointError unless what is kept of a stage belongs to a family with that many parameters."""
+        done = self.finished(label)
+        if done is not None and done.parameters != size:
+            raise self._inconsistent(f"stage '{label}' has {done.parameters} parameters, expected {size}")
+        for name, value in (self._running[1] if self._running and self._running[0] == label else {}).items():
+            if name in _VECTORS and (value.shape != (size,) or not np.isfinite(value).all()):
+                raise self._inconsistent(f"{name} has shape {value.shape}, expected ({size},) with finite entries")
+            if name in _NUMBERS and (value.shape != () or not 0 <= value < _MOST):
+                raise self._inconsistent(f"{name} is {np.ravel(value)[:3].tolist()}, expected one number >= 0")
+            if name == _BEST and value.shape != ():
+                raise self._inconsistent(f"{name} has shape {value.shape}, expected one number")
+
+    def _inconsistent(self, reason: str) -> CheckpointError:
+        return CheckpointError(f"{self._path} is inconsistent: {reason}")
+
     def add(self, stage: Stage) -> None:
         """Write a finished stage. Interrupted stages are not finished."""
         if stage.result.status is Status.INTERRUPTED:
@@ -93,11 +117,12 @@ class Checkpoint:
                         "remove the file to start again"
                     )
             self._stages = [_stage(data, arrays[f"stage_{k}"]) for k, data in enumerate(header["stages"])]
-            state = {name.removeprefix("state_"): a for name, a in arrays.items() if name.startswith("state_")}
-            self._running = (header["running"], state) if header["running"] else None
-        except (LookupError, TypeError, ValueError) as error:
-            if isinstance(error, CheckpointError):
-                raise
+            self._running = (header["running"], _state(arrays)) if header["running"] else None
+        except CheckpointError:
+            raise
+        except OrthocasError as error:
+            raise CheckpointError(f"{path} is inconsistent: {error}") from None
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise CheckpointError(f"{path} is incomplete: {type(error).__name__} {error}") from None
 
 
@@ -126,13 +151,13 @@ class StageKeeper:
             self._newest, self._last = None, time.monotonic()
 
 
-def _numbers(stage: Stage) -> dict[str, str | float]:
+def _numbers(stage: Stage) -> dict[str, str | float | None]:
     result = stage.result
     return {
         "label": stage.label,
         "parameters": stage.parameters,
         "samples": stage.samples,
-        "value": result.value,
+        "value": result.value if isfinite(result.value) else None,  # a bound that is not kept yet
         "status": result.status.value,
         "iterations": result.iterations,
         "evaluations": result.evaluations,
@@ -140,13 +165,35 @@ def _numbers(stage: Stage) -> dict[str, str | float]:
     }
 
 
-def _stage(data: Mapping[str, float], theta: Array) -> Stage:
+def _stage(data: Mapping[str, Any], theta: Array) -> Stage:
+    """A finished stage, checked.
+
+    Raises:
+        OrthocasError, LookupError, TypeError, ValueError: if it is not one.
+    """
+    counts = {name: require_count(name, data[name], least=0) for name in ("iterations", "evaluations", "samples")}
+    parameters = require_count("parameters", data["parameters"])
     result = SolveResult(
-        theta,
-        float(data["value"]),
+        frozen_array(f"theta of stage '{data['label']}'", theta, (parameters,)),
+        inf if data["value"] is None else float(data["value"]),
         Status(data["status"]),
-        int(data["iterations"]),
-        int(data["evaluations"]),
+        counts["iterations"],
+        counts["evaluations"],
         float(data["seconds"]),
     )
-    return Stage(str(data["label"]), int(data["parameters"]), int(data["samples"]), result)
+    return Stage(require_text("label of a stage", data["label"]), parameters, counts["samples"], result)
+
+
+def _state(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """What a minimiser kept: numbers only; what they mean is its own affair.
+
+    Raises:
+        InvalidValueError: for anything but real numbers, or NaN.
+    """
+    state = {}
+    for name, array in arrays.items():
+        if name.startswith("state_"):
+            state[name.removeprefix("state_")] = as_float_array(name, array)
+            if np.isnan(array).any():
+                raise InvalidValueError(name, "NaN", "numbers")
+    return state

@@ -102,6 +102,7 @@ class StageRunner:
             SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
         """
         label = parametrisation.label
+        self.checkpoint.require_fitting(label, family.size)
         done = self.checkpoint.finished(label)
         if done is not None:
             return done

@@ -9,9 +9,9 @@ import numpy as np
 
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.casadi_tools.cached import cached_property
-from orthocas.casadi_tools.tape import Tape, replay, to_tape
+from orthocas.casadi_tools.tape import Tape, replay, require_tape, to_tape
 from orthocas.casadi_tools.user_expression import expression_of
-from orthocas.checks import Array, require_shape
+from orthocas.checks import Array, require_count, require_shape, require_text
 from orthocas.parametrisations.family import ClosedForm, Expression, JointSpace, component_gradients
 
 if TYPE_CHECKING:
@@ -26,12 +26,19 @@ class Given:
         label: a name for reports.
         n: number of joints.
         tape: the expression as plain data; see `orthocas.casadi_tools.tape`.
+
+    Raises:
+        InvalidValueError: if the tape is malformed.
     """
 
     label: str
     n: int
     tape: Tape = field(repr=False)
     linear: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        require_text("label of given coordinates", self.label)
+        require_tape(self.tape, require_count("n", self.n))
 
     @classmethod
     def from_function(cls, name: str, n: int, function: Callable[[ca.SX], ca.SX] | ca.Function) -> "Given":
@@ -68,7 +75,7 @@ class Given:
             ShapeError: if the number of coordinates is not `outputs`, or the number of joints differs.
         """
         require_shape(f"q of coordinates '{self.label}'", (self.n,), (space.n,))
-        require_shape(f"coordinates '{self.label}'", (int(self.tape["rows"]), 1), (outputs, 1))
+        require_shape(f"coordinates '{self.label}'", (self.tape["rows"], self.tape["columns"]), (outputs, 1))
         return GivenFamily(self, outputs)
 
 

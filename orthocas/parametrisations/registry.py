@@ -3,10 +3,10 @@
 import json
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any
 
-from orthocas.checks import require_known
+from orthocas.checks import require_kind, require_known
 from orthocas.errors import InvalidValueError, NotSavableWarning
 from orthocas.parametrisations.family import Parametrisation
 from orthocas.parametrisations.fourier import Fourier
@@ -107,7 +107,12 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
     """
     kinds = {known.kind.__name__: known.kind for known in _REGISTERED.values()}
     require_known("parametrisation", data["parametrisation"], kinds)
-    return kinds[data["parametrisation"]](**data["settings"])
+    kind, settings = kinds[data["parametrisation"]], data["settings"]
+    require_kind("settings", settings, dict)
+    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    if not settings.keys() <= known:
+        raise InvalidValueError(f"settings of {kind.__name__}", sorted(settings), f"some of {sorted(known)}")
+    return kind(**settings)
 
 
 def parse_parametrisation(label: str) -> Parametrisation:

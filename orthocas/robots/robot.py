@@ -1,6 +1,6 @@
 """The robot: names, limits, kinematics and dynamics, for SX, MX and NumPy."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.casadi_tools.cached import cached_property
+from orthocas.casadi_tools.cached import BuiltOnUse, cached_property
 from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_known
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
@@ -235,45 +235,21 @@ class Robot(Shown):
         Raises:
             UnknownNameError: if there is no such function.
         """
-        require_known("robot function", name, self._functions)
+        require_known("robot function", name, _FUNCTIONS)
         return self._functions[name]
 
     @cached_property
-    def _batched(self) -> dict[str, Batched]:
-        return {name: Batched(function) for name, function in self._functions.items()}
+    def _batched(self) -> BuiltOnUse[Batched]:
+        return BuiltOnUse(lambda name: Batched(self._functions[name]))
 
     @cached_property
-    def _functions(self) -> dict[str, ca.Function]:
-        tree = self.tree
-        q, dq, ddq = (ca.SX.sym(name, self.n) for name in ("q", "dq", "ddq"))
-        R, p = kinematics.tip_pose(tree, q)
-        static = {
-            "mass_matrix": dynamics.mass_matrix(tree, q),
-            "gravity": dynamics.bias(tree, q, ca.SX(self.n, 1), tree.gravity),
-            "tip_position": p,
-            "tip_rotation": R,
-            "tip_jacobian": kinematics.tip_jacobian(tree, q),
-            "joint_points": kinematics.joint_points(tree, q),
-        }
-        return {
-            **{name: dense_function(name, [q], [output], ["q"]) for name, output in static.items()},
-            "bias": dense_function("bias", [q, dq], [dynamics.bias(tree, q, dq, tree.gravity)], ["q", "dq"]),
-            "inverse_dynamics": dense_function(
-                "inverse_dynamics",
-                [q, dq, ddq],
-                [dynamics.inverse_dynamics(tree, q, dq, ddq, tree.gravity)],
-                ["q", "dq", "ddq"],
-            ),
-            "forward_dynamics": dense_function(
-                "forward_dynamics",
-                [q, dq, ddq],
-                [dynamics.forward_dynamics(tree, q, dq, ddq, tree.gravity)],
-                ["q", "dq", "tau"],
-            ),
-            "coriolis_product": dense_function(
-                "coriolis_product", [q, dq, ddq], [dynamics.coriolis_product(tree, q, dq, ddq)], ["q", "v", "w"]
-            ),
-        }
+    def _functions(self) -> BuiltOnUse[ca.Function]:
+        return BuiltOnUse(self._built_function)
+
+    def _built_function(self, name: str) -> ca.Function:
+        names, expression = _FUNCTIONS[name]
+        arguments = [ca.SX.sym(argument, self.n) for argument in names]
+        return dense_function(name, arguments, [expression(self.tree, *arguments)], names)
 
     def _call(self, name: str, *arguments: Any) -> Any:
         """Call a function with CasADi or NumPy arguments, and return the same kind."""
@@ -292,4 +268,22 @@ class Robot(Shown):
         return result[0] if all(single for _, single in sets) else result
 
 
+_FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {  # arguments and expressions
+    "mass_matrix": (("q",), dynamics.mass_matrix),
+    "gravity": (("q",), lambda tree, q: dynamics.bias(tree, q, ca.SX(tree.n, 1), tree.gravity)),
+    "tip_position": (("q",), lambda tree, q: kinematics.tip_pose(tree, q)[1]),
+    "tip_rotation": (("q",), lambda tree, q: kinematics.tip_pose(tree, q)[0]),
+    "tip_jacobian": (("q",), kinematics.tip_jacobian),
+    "joint_points": (("q",), kinematics.joint_points),
+    "bias": (("q", "dq"), lambda tree, q, dq: dynamics.bias(tree, q, dq, tree.gravity)),
+    "inverse_dynamics": (
+        ("q", "dq", "ddq"),
+        lambda tree, q, dq, ddq: dynamics.inverse_dynamics(tree, q, dq, ddq, tree.gravity),
+    ),
+    "forward_dynamics": (
+        ("q", "dq", "tau"),
+        lambda tree, q, dq, tau: dynamics.forward_dynamics(tree, q, dq, tau, tree.gravity),
+    ),
+    "coriolis_product": (("q", "v", "w"), dynamics.coriolis_product),
+}
 _MATRICES = ("mass_matrix", "tip_rotation", "tip_jacobian")

@@ -49,7 +49,8 @@ def rotation_matrix(name: str, value: ArrayLike) -> Array:
         ShapeError, InvalidValueError: if it is not a rotation matrix.
     """
     rotation = frozen_array(name, value, (3, 3))
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
+    bounded = np.abs(rotation).max() < 2  # products of larger numbers may overflow
+    if not bounded or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
         raise InvalidValueError(name, rotation.tolist(), "a rotation matrix")
     return rotation
 

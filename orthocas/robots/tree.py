@@ -5,8 +5,17 @@ from typing import Literal
 
 import numpy as np
 
-from orthocas.checks import Array, frozen_array, require_known, require_shape
-from orthocas.errors import InvalidValueError, RobotError
+from orthocas.checks import Array, as_float_array, frozen_array, require_known, require_shape, require_text
+from orthocas.errors import RobotError
+from orthocas.robots.tree_checks import (
+    MOST_JOINTS,
+    require_body,
+    require_bounded,
+    require_index,
+    require_joint_names,
+    require_limits,
+    require_rotation,
+)
 
 JointKind = Literal["revolute", "prismatic"]
 REVOLUTE_ROOM = np.pi / 4  #: [rad] on either side of a default posture, as the hypercube of [AS2023] Sec. 9
@@ -21,6 +30,9 @@ class KinematicTree:
     Body frames are rotated so that every joint axis is the body's z axis. Joint i places its body at
     `rotations[i] Rz(q_i), translations[i]` (revolute) or `rotations[i], translations[i] + q_i rotations[i] z`
     (prismatic) in the parent body's frame.
+
+    Raises:
+        ShapeError, InvalidValueError, UnknownNameError, RobotError: for numbers and names that no robot has.
     """
 
     joint_names: tuple[str, ...]
@@ -46,6 +58,8 @@ class KinematicTree:
         n = self.n
         if n == 0:
             raise RobotError("the robot has no movable joint, expected at least one")
+        if n > MOST_JOINTS:
+            raise RobotError(f"the robot has {n} movable joints, expected at most {MOST_JOINTS}")
         shapes: dict[str, tuple[int, ...]] = {
             "rotations": (n, 3, 3),
             "translations": (n, 3),
@@ -59,32 +73,28 @@ class KinematicTree:
         }
         for name, shape in shapes.items():
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+            require_bounded(name, getattr(self, name))
         for name in ("lower", "upper", "effort_limits", "velocity_limits"):  # these may be infinite
-            limits = np.array(getattr(self, name), dtype=float)
+            limits = as_float_array(name, getattr(self, name)).copy()
             require_shape(name, limits.shape, (n,))
             limits.setflags(write=False)
             object.__setattr__(self, name, limits)
         self._require_sense()
 
     def _require_sense(self) -> None:
-        """Check lengths, limits, masses and the order of bodies."""
+        """Check names, kinds, limits, the order of bodies, rotations and inertias."""
         require_shape("joint_kinds", (len(self.joint_kinds),), (self.n,))
         require_shape("parents", (len(self.parents),), (self.n,))
+        require_joint_names(self.joint_names)
+        require_text("tip_name", self.tip_name)
         for i, name in enumerate(self.joint_names):
             require_known("joint kind", self.joint_kinds[i], JOINT_KINDS)
-            if not -1 <= self.parents[i] < i:
-                raise InvalidValueError(f"parents[{i}]", self.parents[i], f"an index from -1 to {i - 1}")
-            if not self.lower[i] <= self.upper[i]:
-                raise RobotError(
-                    f"joint '{name}' has limits [{self.lower[i]:g}, {self.upper[i]:g}], expected lower <= upper"
-                )
-            for what, limit in (("effort", self.effort_limits[i]), ("velocity", self.velocity_limits[i])):
-                if not limit > 0:
-                    raise RobotError(f"joint '{name}' has the {what} limit {limit:g}, expected a number > 0")
-            if self.masses[i] < 0:
-                raise RobotError(f"the body moved by joint '{name}' has mass {self.masses[i]:g} kg, expected >= 0")
-        if not -1 <= self.tip_parent < self.n:
-            raise InvalidValueError("tip_parent", self.tip_parent, f"an index from -1 to {self.n - 1}")
+            require_index(f"parents[{i}]", self.parents[i], i - 1)
+            require_limits(name, self.lower[i], self.upper[i], self.effort_limits[i], self.velocity_limits[i])
+            require_body(name, self.masses[i], self.inertias[i], self.armatures[i])
+            require_rotation(f"rotations[{i}]", self.rotations[i])
+        require_index("tip_parent", self.tip_parent, self.n - 1)
+        require_rotation("tip_rotation", self.tip_rotation)
 
     @property
     def n(self) -> int:

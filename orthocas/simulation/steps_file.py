@@ -14,6 +14,7 @@ from orthocas.errors import OrthocasError, StepsFileError
 from orthocas.simulation.disturbances import Push
 from orthocas.simulation.strict_json import Reader
 
+_MOST_INSTANTS = 1e6
 _SHORTEST = 1e-3  # time between points, and length of a run or a push [s]
 _WITH_STEPS = ("steps", "duration", "start", "natural_frequency", "damping_ratio", "pushes")
 _WITH_POINTS = ("points", "start", "pushes")
@@ -50,6 +51,11 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
         q_start = reader.numbers(data["start"], "start", chart.n)
     try:
         reference = (_steps if has_steps else _points)(reader, data, chart.labels, chart.phi(q_start))
+        instants = reference.duration / reference.spacing
+        if instants > _MOST_INSTANTS:
+            raise reader.fault(
+                f"the run needs {instants:.3g} instants to show every swing, expected at most {_MOST_INSTANTS:g}"
+            )
         pushes = _pushes(reader, data.get("pushes", []), chart.n, reference.duration)
     except StepsFileError:
         raise

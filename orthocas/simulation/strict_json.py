@@ -11,7 +11,9 @@ import numpy as np
 
 from orthocas.checks import Array
 from orthocas.errors import StepsFileError
+from orthocas.files.json import from_strict_json
 
+_LARGEST_FILE = 2**23  # bytes
 _LARGEST = 1e6  # larger numbers are mistakes and would overflow later
 _LONGEST = 80  # most characters of the input that an error repeats
 
@@ -25,21 +27,18 @@ class Reader:
     def parsed(self) -> object:
         """The data of the file. NaN and duplicate keys are errors."""
         try:
-            text = self.path.read_text(encoding="utf-8-sig")
-            return json.loads(text, parse_constant=self._refused_constant, object_pairs_hook=self._without_doubles)
-        except StepsFileError:
-            raise
-        except json.JSONDecodeError as error:
-            raise self.fault(
-                f"truncated or not JSON, {error.msg} (line {error.lineno}, column {error.colno})"
-            ) from None
-        except (
-            RecursionError,
-            ValueError,
-        ) as error:  # nested too deeply, not text, or a number with thousands of digits
-            raise self.fault(f"not JSON, {str(error)[:_LONGEST]}") from None
+            with self.path.open("rb") as stream:
+                content = stream.read(_LARGEST_FILE + 1)
         except OSError as error:
             raise self.fault(f"cannot be read, {error.strerror}") from None
+        except ValueError as error:  # a path with a zero
+            raise self.fault(f"cannot be read, {error}") from None
+        if len(content) > _LARGEST_FILE:
+            raise self.fault(f"larger than {_LARGEST_FILE / 2**20:.0f} MiB, no steps file")
+        try:
+            return from_strict_json(content.decode("utf-8-sig"))
+        except ValueError as error:  # also bytes that are no text
+            raise self.fault(f"truncated or not JSON, {str(error)[:_LONGEST]}") from None
 
     def fault(self, text: str) -> StepsFileError:
         """An error that names the file."""
@@ -84,14 +83,3 @@ class Reader:
         if len(items) != length:
             raise self.wrong(where, items, f"a list of {length} numbers")
         return np.array([self.number(item, f"{where}[{i}]") for i, item in enumerate(items)])
-
-    def _refused_constant(self, text: str) -> None:
-        raise self.fault(f"it holds {text}, expected finite numbers")
-
-    def _without_doubles(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        data = dict(pairs)
-        if len(data) < len(pairs):
-            keys = [key for key, _ in pairs]
-            twice = next(key for key in keys if keys.count(key) > 1)
-            raise self.fault(f"the key '{twice[:_LONGEST]}' appears twice in one object, expected once")
-        return data

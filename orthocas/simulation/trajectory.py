@@ -1,25 +1,22 @@
 """The result of a simulation: arrays over time with names and units, stored in NPZ files."""
 
 import json
-import zipfile
-import zlib
 from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
-from tokenize import TokenError
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from scipy.integrate import cumulative_simpson
 
-from orthocas.checks import Array
-from orthocas.errors import TrajectoryFileError
+from orthocas.checks import Array, as_float_array, frozen_indices, require_known, require_shape, require_text
+from orthocas.control.status import ControlStatus
+from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
 from orthocas.files.atomic import published, require_writable
 from orthocas.showing import Shown, listed, number_list
+from orthocas.simulation.run_file import read_run_file
 
 _VERSION = 1
-_WRONG_CONTENT = (ValueError, KeyError, TypeError, AttributeError, SyntaxError, TokenError)
-_DAMAGE = (*_WRONG_CONTENT, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 _ARRAYS = {  #: array fields and their units
     "times": "s",
     "q": "rad or m",
@@ -33,6 +30,8 @@ _ARRAYS = {  #: array fields and their units
     "storage": "J",
     "dissipated_power": "W",
 }
+_SINGLE = ("times", "status", "storage", "dissipated_power")  #: one number at each instant
+_OF_JOINTS = ("q", "dq", "command")  #: one number for every joint; the others for every label
 
 
 class Outcome(Enum):
@@ -66,6 +65,23 @@ class Trajectory(Shown):
     reference_acceleration: Array  #: (N, k)
     storage: Array  #: (N,) V [J]; NaN for velocity controllers
     dissipated_power: Array  #: (N,) dissipated by the controller's damping [W]; NaN for velocity controllers
+
+    def __post_init__(self) -> None:
+        require_known("kind of command", self.kind, ("torque", "velocity"))
+        for what, names in (("labels", self.labels), ("joint_names", self.joint_names)):
+            for name in names:
+                require_text(f"an entry of {what}", name)
+            if len(set(names)) < len(names) or not names:
+                raise InvalidValueError(what, names, "different names, at least one")
+        N, n, k = len(self.times), len(self.joint_names), len(self.labels)
+        for name in _ARRAYS:
+            array = as_float_array(name, getattr(self, name))
+            object.__setattr__(self, name, array)
+            width = n if name in _OF_JOINTS else k
+            require_shape(name, array.shape, (N,) if name in _SINGLE else (N, width))
+        object.__setattr__(self, "status", frozen_indices("status", self.status, (N,), len(ControlStatus)))
+        if N == 0 or not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
+            raise InvalidValueError("times", "empty or not increasing", "increasing instants, at least one")
 
     @property
     def energy_balance(self) -> Array:
@@ -128,30 +144,20 @@ class Trajectory(Shown):
         Raises:
             TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
         """
-        damaged = TrajectoryFileError(f"{path} is truncated, damaged or not a trajectory file")
+        header, arrays = read_run_file(Path(path), _VERSION, tuple(_ARRAYS))
         try:
-            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # np.load leaks bad handles
-                header: dict[str, Any] = json.loads(str(file["header"]))
-                arrays: dict[str, Any] = {name: file[name] for name in _ARRAYS}
-            version = header["version"]
-        except FileNotFoundError:
-            raise TrajectoryFileError(f"trajectory file {path} does not exist") from None
-        except _DAMAGE:
-            raise damaged from None
-        if version != _VERSION:
-            raise TrajectoryFileError(f"{path} has version {version}, this orthocas reads {_VERSION}")
-        try:
-            labels, joint_names = tuple(header["labels"]), tuple(header["joint_names"])
-            outcome = Outcome(header["outcome"])
-            run = cls(header["controller"], header["kind"], outcome, labels, joint_names, **arrays)
-        except _DAMAGE:
-            raise damaged from None
-        if run.q.shape != (len(run.times), len(run.joint_names)) or run.value.shape != (
-            len(run.times),
-            len(run.labels),
-        ):
-            raise damaged
-        return run
+            return cls(
+                controller=require_text("controller", header["controller"]),
+                kind=header["kind"],
+                outcome=Outcome(header["outcome"]),
+                labels=tuple(header["labels"]),
+                joint_names=tuple(header["joint_names"]),
+                **arrays,
+            )
+        except OrthocasError as error:
+            raise TrajectoryFileError(f"{path} is inconsistent: {error}") from None
+        except (LookupError, TypeError, ValueError) as error:
+            raise TrajectoryFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
 
 
 assert set(_ARRAYS) < {field.name for field in fields(Trajectory)}

@@ -11,7 +11,7 @@ from types import FrameType
 
 from orthocas.errors import OrthocasError
 
-SECONDS = 10.0  #: for one mutant
+SECONDS = 10.0  #: of processor time for one mutant; other work on the machine does not count
 MEMORY = 2**30  #: bytes that a child may take beyond what it has after its imports
 _LONGEST = 2000  # characters of an error
 
@@ -65,7 +65,7 @@ def _in_one_child(campaign: str, judge: Judge, seeds: list[int], seconds: float)
     findings = []
     for done, seed in enumerate(seeds, start=1):
         try:
-            waited = here.poll(seconds + 60 if done == 1 else 2 * seconds)  # the first waits for imports too
+            waited = here.poll(5 * seconds + (60 if done == 1 else 0))  # the first waits for imports too
             what = here.recv() if waited else "hangs where Python cannot interrupt it"
         except EOFError:
             child.join()
@@ -85,9 +85,9 @@ def _work(judge: Judge, seeds: list[int], seconds: float, answers: Connection) -
     """In the child: one answer for every seed."""
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     _limit_memory(used + MEMORY)
-    signal.signal(signal.SIGALRM, _time_is_up)
+    signal.signal(signal.SIGPROF, _time_is_up)
     for seed in seeds:
-        signal.setitimer(signal.ITIMER_REAL, seconds)
+        signal.setitimer(signal.ITIMER_PROF, seconds)
         try:
             answer = judge(seed)
         except _TimeIsUp:
@@ -95,7 +95,7 @@ def _work(judge: Judge, seeds: list[int], seconds: float, answers: Connection) -
         except BaseException as error:
             answer = f"the judge failed: {type(error).__name__}: {str(error)[:200]}"
         finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.setitimer(signal.ITIMER_PROF, 0)
         answers.send(answer)
 
 
