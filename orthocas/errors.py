@@ -4,11 +4,23 @@ import difflib
 from collections.abc import Iterable
 
 _FEW_NAMES = 10  # names that are read at a glance, in their own order
+_LONGEST = 1500  # characters of a message
 _MOST_NAMES = 30  # names an error lists at the most: those nearest to what came
 
 
+def one_line(text: str) -> str:
+    """Text of others on one line of bounded length; what is not printable (control and bidi characters) as escapes."""
+    line = " ".join(text.split())
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
+
+
 class OrthocasError(Exception):
-    """Base of every error raised on purpose."""
+    """Base of every error raised on purpose; its message is one printable line, whatever files and users wrote."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class NotSavableWarning(UserWarning):

@@ -3,5 +3,8 @@
 from collections.abc import Callable
 
 from fuzz.child import Finding
+from fuzz.robots import robots
 
-CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {}
+CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
+    "robots": robots,
+}
