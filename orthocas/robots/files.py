@@ -116,8 +116,10 @@ def _text(notes: IO[bytes]) -> str:
 
 
 def _without_joints(model: pin.Model, ids: list[int], position: Array) -> pin.Model:
-    """The model with joints fixed at a position. Pinocchio finds joints by name among all frames, so others get names
-    of their own meanwhile: bodies, sites and joints may share one.
+    """The model with joints fixed at a position.
+
+    Pinocchio finds joints by name among all frames, so others get names of their own meanwhile: bodies, sites and
+    joints may share one.
 
     Raises:
         RobotError: if a joint has the name of Pinocchio's world.

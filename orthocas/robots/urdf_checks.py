@@ -34,7 +34,7 @@ def _require_tree(path: str | Path, root: ElementTree.Element) -> None:
     children: dict[str, list[str]] = {}
     for _, parent, child in joints:
         children.setdefault(parent, []).append(child)
-    carried = {child for _, _, child in joints}
+    carried = {child for _, _, child in joints if child}
     waiting = [link.get("name", "") for link in root.findall("link") if link.get("name", "") not in carried]
     reached = set(waiting)
     while waiting:
@@ -44,8 +44,8 @@ def _require_tree(path: str | Path, root: ElementTree.Element) -> None:
     for joint, parent, child in joints:
         if parent in carried and parent not in reached:
             raise RobotError(
-                f"{path}: joint '{joint.get('name')}' hangs from link '{parent}' to link '{child}' in a loop of joints, "
-                f"expected a tree of links"
+                f"{path}: joint '{joint.get('name')}' hangs from link '{parent}' to link '{child}' "
+                "in a loop of joints, expected a tree of links"
             )
 
 
