@@ -2,9 +2,11 @@
 
 from collections.abc import Callable
 
+from fuzz.calls import calls
 from fuzz.child import Finding
 from fuzz.robots import robots
 
 CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
+    "calls": calls,
     "robots": robots,
 }
