@@ -1,7 +1,8 @@
 """Time to the quality of the paper's network (task 2.06, mutual 3.44 deg): our fit against PyTorch, in one run.
 
-Both split off the idle joint and use the same weights. Schedules of the peer: the fastest of a search over batch (32 to
-1000), steps and learning rate (5e-3 to 3e-2) on the same machine; ours: fewer samples than the default, the same code.
+Both split off the idle joint (a joint that does not move the task) and use the same weights. The schedules of the peer
+are the fastest of a search over batch (32 to 1000), steps and learning rate (5e-3 to 3e-2) on the same machine. Our fit
+uses fewer samples than the default, and the same code.
 """
 
 from concurrent.futures import ProcessPoolExecutor
@@ -31,7 +32,7 @@ SCHEDULES = tuple(
 
 
 def our_seconds(seed: int) -> float:
-    """Time of our fit, infinite if it does not get there."""
+    """Time of our fit; infinite if it does not reach the quality."""
     problem = problems.get("iiwa")
     oc.fit(problem, oc.Polynomial(1))  # first calls load libraries
     fit = oc.fit(problem, oc.Polynomial(4), GaussNewton(tolerance=1e-2), WEIGHTS, SAMPLES, seed)
@@ -41,7 +42,7 @@ def our_seconds(seed: int) -> float:
 
 
 def peer_seconds(settings: PeerSettings, seed: int) -> float:
-    """Time of the peer's training, infinite if it does not get there."""
+    """Time of the peer's training; infinite if it does not reach the quality."""
     problem = problems.get("iiwa")
     train(problem, PeerSettings(steps=2, batch=settings.batch))
     result = train(problem, settings, seed)
@@ -50,9 +51,9 @@ def peer_seconds(settings: PeerSettings, seed: int) -> float:
 
 
 def main(runs: int = 5) -> dict[str, float]:
-    """Median seconds of each over runs that take turns, every run in a process of its own.
+    """Median seconds of both over alternating runs, each in its own process.
 
-    The peer's are those of its fastest schedule that gets there.
+    The result of the peer is that of its fastest schedule that reaches the quality.
     """
     ours: list[float] = []
     peer: dict[PeerSettings, list[float]] = {settings: [] for settings in SCHEDULES}

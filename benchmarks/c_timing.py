@@ -1,4 +1,4 @@
-"""Compile CasADi functions to a shared library and time them in C, several functions in one process."""
+"""Compiles CasADi functions to a shared library and times them in C, several functions in one process."""
 
 import ctypes
 import re
@@ -16,7 +16,7 @@ _HARNESS = r"""
 #include <time.h>
 #include <stddef.h>
 typedef int (*function)(const double**, double**, long long*, double*, int);
-/* nanoseconds a call, over `calls` calls on `states` input sets laid out one after the other */
+/* nanoseconds per call, over `calls` calls on `states` consecutive input sets */
 double time_calls(function f, const double* inputs, int n_in, const int* sizes, int states, double** out,
                   long long* iw, double* w, long calls) {
   struct timespec a, b;
@@ -41,14 +41,14 @@ def nanoseconds_per_call(
     calls: int = 100_000,
     sources: Mapping[str, str] | None = None,
 ) -> dict[str, float]:
-    """Median time of each function over rounds that take turns, compiled together with gcc -O3 -march=native.
+    """Median time of each function over alternating rounds, compiled together with gcc -O3 -march=native.
 
-    All functions take the same inputs; they are fed with 64 random states. The C code is CasADi's, but for those with
-    `sources` of their own, with the same interface.
+    All functions take the same inputs, 64 random states. CasADi generates the C code, except for functions with their
+    own code in `sources`, which has the same interface.
     """
     compiler = shutil.which("gcc") or shutil.which("cc")
     if compiler is None:
-        raise RuntimeError("no C compiler found, expected gcc or cc on the path")
+        raise RuntimeError("no C compiler found, expected gcc or cc on the PATH")
     first = next(iter(functions.values()))
     sizes = np.array([first.numel_in(i) for i in range(first.n_in())], dtype=np.int32)
     inputs = np.random.default_rng(0).uniform(-1, 1, (64, int(sizes.sum())))

@@ -1,4 +1,4 @@
-"""What the choices behind a fit are worth, and how far one number can be trusted: 7-DoF arm, degree 4 unless said."""
+"""Effect of the choices behind a fit, and the spread of the results: 7-DoF arm, degree 4 unless stated otherwise."""
 
 from itertools import product
 from unittest.mock import patch
@@ -17,7 +17,7 @@ HEADER = (
 
 
 def row(name: str, degree: int = 4, fit_seeds: tuple[int, ...] = (0, 1, 2), **settings: tuple[float, ...]) -> str:
-    """Range over fit seeds and held-out seeds 1, 2, 3."""
+    """Range of each figure over fit seeds and held-out seeds 1, 2, 3."""
     problem = problems.get("iiwa")
     charts = [oc.fit(problem, oc.Polynomial(degree), seed=seed, **settings).chart for seed in fit_seeds]  # type: ignore[arg-type]
     reports = [oc.evaluate(chart, 100_000, seed) for chart, seed in product(charts, (1, 2, 3))]

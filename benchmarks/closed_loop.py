@@ -1,8 +1,8 @@
-"""Seconds for 10 s of closed loop: SUNDIALS against SciPy on the same functions, continuous and at 1 kHz (2 min).
+"""Computing time for 10 s of closed loop: SUNDIALS against SciPy on the same functions, continuous and 1 kHz (2 min).
 
-The peer is solve_ivp (LSODA, the multi-step method of SciPy, same tolerance) on the controller and the robot as CasADi
-functions, restarted at every step of the reference. Both start with functions built; the check of the reference and the
-energy books are part of ours. Errors are distances from a run at tolerance 1e-12.
+The peer is solve_ivp (LSODA, SciPy's multi-step method, same tolerance) on the CasADi functions of controller and
+robot, restarted at every step of the reference. Functions are built before the clock starts. Our times include the
+check of the reference and the energy balance. Errors are distances from a run at tolerance 1e-12.
 """
 
 import argparse
@@ -32,7 +32,7 @@ def chart_of(name: str, degree: int) -> oc.Chart:
 
 
 def interleaved(chart: oc.Chart) -> Reference:
-    """Steps in x and xi1, there and back."""
+    """Steps in x and xi1, forth and back."""
     start = chart.phi(chart.problem.domain.centre)
     changes = [(1.0, {"x": start[0] + 0.015}), (3.0, {"xi1": 0.02}), (5.0, {"x": start[0]}), (7.0, {"xi1": 0.0})]
     return Reference.steps(chart.labels, start, changes, DURATION)
@@ -56,7 +56,7 @@ def by_scipy(law: PDPlus, reference: Reference) -> Array:
 
 
 def timed(work: Callable[[], Array], rounds: int) -> tuple[float, Array]:
-    """Median seconds, and what came out."""
+    """Median seconds, and the result."""
     seconds = []
     for _ in range(rounds):
         start = time.perf_counter()
@@ -66,7 +66,7 @@ def timed(work: Callable[[], Array], rounds: int) -> tuple[float, Array]:
 
 
 def runs(law: PDPlus, reference: Reference, q0: Array) -> dict[str, Callable[[], Array]]:
-    """Each returns the joint positions at the end."""
+    """The runs to time; each returns the joint positions at the end."""
     return {
         "continuous": lambda: oc.simulate(law, reference, q0).q[-1],
         "sampled at 1 kHz": lambda: oc.simulate(law, reference, q0, control_rate=1000.0).q[-1],
@@ -75,7 +75,7 @@ def runs(law: PDPlus, reference: Reference, q0: Array) -> dict[str, Callable[[],
 
 
 def main(quick: bool = False) -> dict[str, float]:
-    """Print a table; seconds of 10 s, and errors [rad], by arm and kind of run."""
+    """Print a table; return seconds for 10 s and errors [rad] by arm and kind of run."""
     found = {}
     rounds = 1 if quick else 5
     print("| arm | run | seconds for 10 s | ratio to continuous | error of q at the end |")

@@ -1,4 +1,4 @@
-"""Would a C compiler help the fits? Loss and slopes of one sample, 7-DoF arm: compiled against replayed on columns."""
+"""Would a C compiler speed up fits? Loss and slopes of a sample of the 7-DoF arm: compiled against replayed columns."""
 
 import time
 from statistics import median
@@ -15,7 +15,7 @@ BLOCKS = 16
 
 
 def main(rounds: int = 9) -> dict[str, float]:
-    """Nanoseconds a sample of both."""
+    """Nanoseconds per sample of both."""
     loss = Loss.of(Sizes(n=7, m=3, r=4, identity_metric=True), Weights.of((1000.0, 30.0)).by_name)
     J, data = loss.arguments()
     value = ca.sumsqr(loss.residuals(J, data)) / 2
@@ -33,4 +33,4 @@ def main(rounds: int = 9) -> dict[str, float]:
 
 if __name__ == "__main__":
     for name, value in main().items():
-        print(f"{name}: {value:.0f} ns a sample")
+        print(f"{name}: {value:.0f} ns per sample")

@@ -1,7 +1,7 @@
 """Control ticks in generated C: median and worst of 100,000 calls, compile time, size; peers in one process (2 min).
 
-Compiled with gcc -O2, as a user would. The peer is the projector controller, generated the same way. The plain loop
-only multiplies for some microseconds: its worst time is what the machine does to any program.
+The code is compiled with gcc -O2, as a user would do. The peer is the projector controller, generated the same way. The
+plain loop only multiplies for some microseconds, so its worst time shows the effect of the machine on any program.
 """
 
 import argparse
@@ -41,7 +41,9 @@ def laws(quick: bool) -> Iterator[tuple[str, oc.Chart, Controller]]:
             yield f"impedance decoupled, {title}", chart, Impedance(chart, 50.0, coupling="decoupled")
             yield f"kinematic, {title}", chart, Kinematic(chart)
             yield "projector, A = M", chart, Projector(inertial, 50.0, 10.0)
-    for widths in () if quick else ((64, 64), (1024, 512)):  # the last as in the paper; time does not ask for quality
+    for widths in (
+        () if quick else ((64, 64), (1024, 512))
+    ):  # the last as in the paper; the time does not depend on the quality
         network = oc.fit(inertial, oc.MLP(widths), samples=300, solver=oc.solvers.LBFGS(max_iterations=3)).chart
         title = network.coordinates.label
         yield f"impedance decoupled, {title}", network, Impedance(network, 50.0, coupling="decoupled")
@@ -49,7 +51,7 @@ def laws(quick: bool) -> Iterator[tuple[str, oc.Chart, Controller]]:
 
 
 def main(quick: bool = False) -> dict[str, dict[str, float]]:
-    """Print a table; by title: microseconds (median, 99 %, worst, slowest state at its best), seconds and KiB."""
+    """Print a table; return microseconds (median, 99 %, worst, best of the slowest state), seconds and KiB by title."""
     found: dict[str, dict[str, float]] = {}
     cases = []
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Mass matrix and bias of the 7-DoF arm in compiled C: ours against adam-robotics, and Pinocchio's C++ from Python."""
+"""Mass matrix and bias of the 7-DoF arm in compiled C: ours against adam-robotics and Pinocchio's C++ from Python."""
 
 import tempfile
 import time
@@ -16,7 +16,7 @@ from orthocas.problems import iiwa
 
 
 def main() -> dict[str, float]:
-    """Nanoseconds per call, median of 9 rounds that take turns in one process."""
+    """Nanoseconds per call, median of 9 alternating rounds in one process."""
     robot = iiwa.robot()
     q, dq = ca.SX.sym("q", robot.n), ca.SX.sym("dq", robot.n)
     ours = [robot.function("mass_matrix")(q), robot.function("bias")(q, dq)]
@@ -44,7 +44,7 @@ def main() -> dict[str, float]:
 
 
 def _generated(folder: Path) -> str:
-    """C that calls what users get from `orthocas codegen`: mass matrix, bias and gravity, with a status."""
+    """C that calls the functions of `orthocas codegen`: mass matrix, bias and gravity, with a status."""
     chart = oc.fit(iiwa.iiwa(), oc.Linear()).chart
     generated = oc.generate_c(chart, folder, None, "arm")
     return f"""

@@ -1,4 +1,4 @@
-"""Quality and time of fits on the named problems and on two arms straight from their URDFs."""
+"""Quality and time of fits on the named problems and on two arms directly from their URDFs."""
 
 import argparse
 from importlib.metadata import files
@@ -29,7 +29,7 @@ HEADER = (
 
 
 def build(name: str) -> oc.Problem:
-    """A named problem, or a robot of example-robot-data with its hand position as task and the default box."""
+    """A named problem, or a robot of example-robot-data with its hand position as the task and the default box."""
     if name in problems.names():
         return problems.get(name)
     file, tip = ROBOTS[name]
@@ -51,7 +51,7 @@ def row(name: str, label: str, runs: int, samples: int) -> str:
 
 
 def main(quick: bool = False) -> list[str]:
-    """All rows; quick: low degrees, one run, few samples."""
+    """All rows; `quick` uses low degrees, one run and few samples."""
     cases = [("iiwa", "polynomial:2"), ("planar_3r_xy", "polynomial:2")] if quick else CASES
     return [row(name, label, 1 if quick else 3, 2_000 if quick else 100_000) for name, label in cases]
 

@@ -1,7 +1,7 @@
-"""Loss and gradient against PyTorch (CPU) doing the same mathematics, in one run: networks and bases of the 7-DoF arm.
+"""Loss and gradient against PyTorch (CPU) with the same mathematics, in one run: networks and bases of the 7-DoF arm.
 
-n = 7, m = 3, r = 4, no joint split off, lambda = (1000, 30). Implementations take turns, medians of several rounds;
-values and gradients are checked to agree before any clock starts.
+n = 7, m = 3, r = 4, no joint split off, lambda = (1000, 30). The implementations alternate, and the results are medians
+of several rounds. Values and gradients are checked to agree before the clock starts.
 """
 
 import argparse
@@ -29,14 +29,14 @@ BASES = ((oc.Polynomial(3), 4000), (oc.Polynomial(4), 8000), (oc.Fourier(2), 400
 
 
 def main(quick: bool = False) -> list[str]:
-    """All rows; quick: small sizes, one round."""
+    """All rows; `quick` uses small sizes and one round."""
     rounds = 1 if quick else 9
     rows = [network_row(*case, rounds) for case in ((((8, 8), 100),) if quick else CASES)]
     return rows + [basis_row(*case, rounds) for case in (((oc.Polynomial(2), 100),) if quick else BASES)]
 
 
 def network_row(hidden: tuple[int, ...], samples: int, rounds: int) -> str:
-    """One network."""
+    """The row of one network."""
     problem = problems.get("iiwa")
     family = oc.MLP(hidden).family(JointSpace.of(problem), problem.r)
     drawn, theta = sample_problem(problem, samples, 0), family.initial(0)
@@ -56,7 +56,7 @@ def network_row(hidden: tuple[int, ...], samples: int, rounds: int) -> str:
 
 
 def basis_row(parametrisation: oc.Polynomial | oc.Fourier, samples: int, rounds: int) -> str:
-    """One basis, its gradients sampled before the clock starts for both."""
+    """The row of one basis, with its gradients sampled before the clock starts for both."""
     problem = problems.get("iiwa")
     family = parametrisation.family(JointSpace.of(problem), problem.r)
     assert isinstance(family, LinearFamily)
@@ -73,7 +73,7 @@ def basis_row(parametrisation: oc.Polynomial | oc.Fourier, samples: int, rounds:
 
 
 def _times(steps: dict[str, Step], rounds: int) -> dict[str, float]:
-    """Median milliseconds of each; all must agree first."""
+    """Median milliseconds of each step, after a check that all agree."""
     value, gradient = steps["ours"]()
     for name, step in steps.items():
         tolerance = 1e-3 if "32" in name else 1e-9
@@ -83,7 +83,7 @@ def _times(steps: dict[str, Step], rounds: int) -> dict[str, float]:
     seconds: dict[str, list[float]] = {name: [] for name in steps}
     for _ in range(rounds):
         for name, step in steps.items():
-            step()  # threads and caches are its own again
+            step()  # warms up its threads and caches again
             start = time.perf_counter()
             for _ in range(3):
                 step()

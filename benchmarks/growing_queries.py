@@ -1,6 +1,6 @@
-"""Growing against SciPy: seconds of one query of planar 3R, and of 100,000 of Figs. 13 and 15 (1 min).
+"""Growing against SciPy: time of one query of planar 3R, and of 100,000 queries of Figs. 13 and 15 (1 min).
 
-The peer is what the paper describes: equation (23) by Runge-Kutta 45, stopped when q changes by less than 1e-6 between
+The peer is the method of the paper: equation (23) by Runge-Kutta 45, stopped when q changes by less than 1e-6 between
 two steps. Errors are distances from the same flow at tolerance 1e-13.
 """
 
@@ -30,21 +30,21 @@ def planar_3r(metric: str) -> oc.Problem:
 
 
 def closed_form(q: Array) -> Array:
-    """Rate of (23) for x0 = 0 and A = I, written by hand."""
+    """Right-hand side of (23) for x0 = 0 and A = I, written by hand."""
     angles = np.cumsum(q)
     return np.asarray(np.cos(angles).sum() * np.cumsum(np.sin(angles)[::-1])[::-1])
 
 
 def robot_functions(problem: oc.Problem) -> Rate:
-    """The same by the functions of a robot, as one would write it for any arm."""
+    """The same with the functions of a robot, as a user would write it for any arm."""
     h, J = problem.task.function, problem.task.jacobian_function
     return lambda q: -float(h(q)) * np.asarray(J(q))[0]
 
 
 def paper_query(rate: Rate, start: Array, change: float, tolerance: float) -> Array:
-    """Equation (23) by SciPy until q changes by less than `change` in a step.
+    """Integrate equation (23) with SciPy until q changes by less than `change` in a step.
 
-    At looser tolerances than 1e-6 the steps stay at the limit of stability, and the rule is hardly ever met.
+    At tolerances looser than 1e-6, the steps stay at the limit of stability, and the rule is hardly ever met.
     """
     solver = RK45(lambda t, q: rate(q), 0.0, start, np.inf, rtol=tolerance, atol=tolerance)
     while solver.status == "running":
@@ -56,7 +56,7 @@ def paper_query(rate: Rate, start: Array, change: float, tolerance: float) -> Ar
 
 
 def timed(work: Callable[[], Array], count: int) -> tuple[float, Array]:
-    """Microseconds per query and what came out."""
+    """Microseconds per query, and the result."""
     start = time.perf_counter()
     result = work()
     return 1e6 * (time.perf_counter() - start) / count, result
@@ -94,7 +94,7 @@ def flows(metric: str, quick: bool) -> dict[str, tuple[float, Array]]:
 
 
 def chart_seconds(chart: oc.Chart, count: int) -> float:
-    """Seconds of xi at so many random points, chart and graphs ready."""
+    """Seconds to evaluate xi at `count` random points, with chart and graphs ready."""
     domain = chart.problem.domain
     points = domain.centre + domain.half_width * np.random.default_rng(0).uniform(-1, 1, (count, chart.n))
     chart.xi(points[:600])
@@ -104,11 +104,11 @@ def chart_seconds(chart: oc.Chart, count: int) -> float:
 
 
 def main(quick: bool = False) -> dict[str, float]:
-    """Print tables; return their figures."""
+    """Print tables, and return their figures."""
     found: dict[str, float] = {}
     for metric in ("euclidean", "inertia"):
         rows = flows(metric, quick)
-        print(f"| planar 3R, x0 = 0, {metric} | us a query | times ours | error median | 99 % | max |")
+        print(f"| planar 3R, x0 = 0, {metric} | us per query | times ours | error median | 99 % | max |")
         print("| --- | --- | --- | --- | --- | --- |")
         for name, (microseconds, error) in rows.items():
             ratio = microseconds / rows["ours"][0]

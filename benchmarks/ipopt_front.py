@@ -1,8 +1,9 @@
 """Is any point of Ipopt's front dominated by Gauss-Newton's? 7-DoF arm at degree 3, and planar_3r_xy.
 
-Gauss-Newton walks the front by lambda2 (without the regularity term, as the constrained form), Ipopt by the bound on
-the mutual angles that Gauss-Newton reached. A point is dominated by p per cent if a point of the other front is better
-by p per cent in one figure and not worse in the other. planar_3r_xy has one extra coordinate: its front is one point.
+Gauss-Newton traces the front by lambda2, without the regularity term, as in the constrained form. Ipopt traces it with
+the mutual angles that Gauss-Newton reached as bounds. A point is dominated by p per cent if a point of the other front
+is better by p per cent in one figure and not worse in the other. planar_3r_xy has one extra coordinate, so its front is
+one point.
 """
 
 import argparse
@@ -25,13 +26,13 @@ def point(report: Report) -> Point:
 
 
 def domination(ours: Point, other: Point) -> float:
-    """By how much another point dominates ours: its largest advantage if it is nowhere worse, else 0."""
+    """Domination of our point by another: its largest advantage if it is worse in no figure, otherwise 0."""
     advantages = [a / b - 1 for a, b in zip(ours, other, strict=True)]
     return max(advantages) if min(advantages) >= 0 else 0.0
 
 
 def fronts(degree: int, lambda2: tuple[float, ...], held_out: int) -> tuple[list[Point], list[Point]]:
-    """Gauss-Newton's front by lambda2 and Ipopt's by bounds."""
+    """The front of Gauss-Newton by lambda2, and the front of Ipopt by bounds."""
     problem, basis = problems.get("iiwa"), oc.Polynomial(degree)
     fits = [oc.fit(problem, basis, weights=(1000.0, value)) for value in lambda2]
     gauss_newton = [point(oc.evaluate(fit.chart, held_out)) for fit in fits]
@@ -41,7 +42,7 @@ def fronts(degree: int, lambda2: tuple[float, ...], held_out: int) -> tuple[list
 
 
 def main(quick: bool = False) -> dict[str, float]:
-    """Print both fronts and return the largest domination of an Ipopt point; quick: degree 2, two points."""
+    """Print both fronts, and return the largest domination of an Ipopt point; `quick` uses degree 2 and two points."""
     held_out = 2_000 if quick else 100_000
     gauss_newton, ipopt = fronts(2 if quick else 3, LAMBDA2[2:4] if quick else LAMBDA2, held_out)
     print("| Gauss-Newton: task, mutual [deg] | Ipopt at its mutual bound: task, mutual [deg] |\n| --- | --- |")

@@ -1,4 +1,4 @@
-"""What the length term costs and buys: task angle and unevenness of gradients against lambda4 (1 min)."""
+"""Cost and benefit of the length term: task angle and spread of gradient lengths against lambda4 (1 min)."""
 
 import argparse
 
@@ -9,7 +9,7 @@ CASES = (("planar_3r_x", 6), ("planar_3r_x", 8), ("iiwa", 4))
 
 
 def main(quick: bool = False) -> dict[str, oc.Report]:
-    """Print a row for each problem, degree and weight; reports on held-out samples."""
+    """Print a row for each problem, degree and weight; return the reports on held-out samples."""
     found = {}
     print("| problem | degree | lambda4 | task std [deg] | longest over shortest gradient |\n|" + " --- |" * 5)
     for name, degree in (("planar_3r_x", 4),) if quick else CASES:

@@ -1,4 +1,4 @@
-"""Seconds for a disk chart of a planar 3R leaf: surface, harmonic map, closest points; bare calls of libigl beside."""
+"""Time of a disk chart of a planar 3R leaf: surface, harmonic map, closest points; compared with bare libigl."""
 
 import argparse
 import time
@@ -16,7 +16,7 @@ HEADER = (
     "| triangles | surface [s] | harmonic map [s] | closest points [s] | libigl: harmonic map [s] "
     "| libigl: closest points [s] |\n| --- | --- | --- | --- | --- | --- |"
 )
-OFF_SURFACE = 0.01  # [rad], standard deviation of the queries around the mesh
+OFF_SURFACE = 0.01  # standard deviation of the queries from the mesh [rad]
 
 
 def leaf(cells: int) -> TriangleMesh:
@@ -30,7 +30,7 @@ def leaf(cells: int) -> TriangleMesh:
 
 
 def seconds(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Wall time and result."""
+    """Wall time in seconds, and the result."""
     start = time.perf_counter()
     result = work()
     return time.perf_counter() - start, result
@@ -58,7 +58,7 @@ def row(cells: int, queries: int = 100_000) -> str:
 
 
 def main(quick: bool = False) -> list[str]:
-    """Rows for grids of 60 to 300 cells; quick: one of 20 cells."""
+    """Rows for grids of 60 to 300 cells; `quick` uses one grid of 20 cells."""
     return [row(20, 1_000)] if quick else [row(cells) for cells in (60, 100, 150, 204, 300)]
 
 

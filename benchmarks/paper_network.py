@@ -1,7 +1,7 @@
 """The paper's own network and schedule on this machine: 1024 x 512, 200 epochs x 50 steps of 200 fresh samples.
 
-Adam with a learning rate of 1e-3 that falls to zero (the paper prints none), with the paper's weights and with
-lambda2 = 30. The joint that the task does not feel is split off, as in every fit here.
+Adam uses a learning rate of 1e-3 that falls to zero (the paper does not state one), once with the paper's weights and
+once with lambda2 = 30. The idle joint, which does not move the task, is split off as in every fit here.
 """
 
 import argparse
@@ -17,7 +17,7 @@ WEIGHTS = ((1000.0, 1.0), (1000.0, 30.0), (1000.0, 30.0, 150.0))
 
 
 def row(weights: tuple[float, ...], quick: bool) -> str:
-    """Train once, judge on held-out samples."""
+    """Train once, and evaluate on held-out samples."""
     network = oc.MLP((16, 8)) if quick else oc.MLP((1024, 512))
     solver = solvers.Adam(epochs=2) if quick else solvers.Adam()
     fit = oc.fit(problems.get("iiwa"), network, solver, weights=weights)  # type: ignore[arg-type]
@@ -30,7 +30,7 @@ def row(weights: tuple[float, ...], quick: bool) -> str:
 
 
 def main(quick: bool = False) -> list[str]:
-    """One row for every weighting; quick: a small network and two epochs."""
+    """One row per choice of weights; `quick` uses a small network and two epochs."""
     return [row(weights, quick) for weights in WEIGHTS]
 
 

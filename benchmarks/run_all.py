@@ -1,4 +1,4 @@
-"""Run every benchmark one after the other (about an hour on 2 cores); docs/performance.md holds the results."""
+"""Runs every benchmark in turn (about an hour on 2 cores). The results are in docs/performance.md."""
 
 import subprocess
 import sys

@@ -15,7 +15,7 @@ HEADER = (
 
 
 def row(problem: oc.Problem, degree: int, samples: int | None = None) -> str:
-    """Fit once and print the cost."""
+    """Fit once, and print the cost."""
     fit = oc.fit(problem, oc.Polynomial(degree), samples=samples)
     report = oc.evaluate(fit.chart, 10_000)
     last = fit.stages[-1]
@@ -27,7 +27,7 @@ def row(problem: oc.Problem, degree: int, samples: int | None = None) -> str:
 
 
 def planar(n: int) -> oc.Problem:
-    """An n-joint planar arm, tip position, A = I, bent so that the task is regular."""
+    """A planar arm with n joints, tip position and A = I, bent so that the task is regular."""
     robot = oc.Robot.planar([1.0] * n, [1.0] * n)
     box = oc.Box(np.concatenate([[0.6], np.full(n - 1, 2.0 / n)]), np.pi / 8)
     return oc.Problem(robot, oc.Task.position(robot, "xy"), domain=box, name=f"planar_{n}r")

@@ -1,6 +1,7 @@
-"""How much the result depends on the start: 20 seeds of samples and random starts for every solver, 7-DoF arm.
+"""Dependence of the result on the start: 20 seeds of samples and random starts for every solver, 7-DoF arm.
 
-Spread is (largest - smallest) / median over the seeds, of held-out figures; all fits are judged on the same samples.
+The spread is (largest - smallest) / median of held-out figures over the seeds. All fits are evaluated on the same
+samples.
 """
 
 import argparse
@@ -25,7 +26,7 @@ CASES: tuple[tuple[oc.Polynomial | oc.MLP, Sequence[Solver]], ...] = (
 
 
 def row(found: Comparison) -> str:
-    """One parametrisation and solver."""
+    """The row of one parametrisation and solver."""
     (summary,) = found.summaries()
     good = [result for result in found.results if not result.failed]
     task, mutual = sorted(r.task_std_deg for r in good), sorted(r.mutual_std_deg for r in good)
@@ -37,7 +38,7 @@ def row(found: Comparison) -> str:
 
 
 def main(quick: bool = False) -> None:
-    """Print the table row by row; quick: two seeds of a small fit."""
+    """Print the table row by row; `quick` uses two seeds of a small fit."""
     print(HEADER)
     problem = problems.get("iiwa")
     for parametrisation, minimisers in CASES[:1] if quick else CASES:

@@ -1,7 +1,7 @@
-"""Loss and gradient in PyTorch, doing the same mathematics as ours: the peer of `benchmarks/gradients.py`.
+"""Loss and gradient in PyTorch with the same mathematics as ours: the peer of `benchmarks/gradients.py`.
 
-Networks get their J_xi by forward tangents, one per joint, or by reverse gradients, one per coordinate (as ours); bases
-linear in their parameters get the same sampled basis gradients as ours.
+J_xi of a network comes from forward tangents, one per joint, or from reverse gradients, one per coordinate (as in our
+code). Bases that are linear in their parameters use the same sampled basis gradients as our code.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ WEIGHTS = (1000.0, 30.0)
 def network_step(
     hidden: tuple[int, ...], theta: Array, q: Array, g: Array, r: int, dtype: torch.dtype, mode: str
 ) -> Step:
-    """Loss and gradient of a network of two hidden layers; mode 'forward' or 'reverse'."""
+    """Loss and gradient of a network with two hidden layers; `mode` is 'forward' or 'reverse'."""
     n = q.shape[1]
     layers = _layers(theta, [2 * n, *hidden, r], dtype)
     points, gradients = torch.tensor(q, dtype=dtype), torch.tensor(g, dtype=dtype)
@@ -31,7 +31,9 @@ def network_step(
             p.grad = None
         loss = _loss(jacobian(layers, points), gradients)
         loss.backward()
-        slopes = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]  # the last bias has none
+        slopes = [
+            torch.zeros_like(p) if p.grad is None else p.grad for p in parameters
+        ]  # the last bias has no gradient
         flat = [slope.T.ravel() if slope.ndim == 2 else slope for slope in slopes]
         return loss.item(), torch.cat(flat).numpy().astype(float)
 
@@ -54,7 +56,7 @@ def basis_step(C: Array, G: Array, g: Array, dtype: torch.dtype) -> Step:
 
 
 def _layers(theta: Array, widths: list[int], dtype: torch.dtype) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Weights and biases in the order of our theta, matrices column by column."""
+    """Weights and biases in the order of our theta, with matrices column by column."""
     layers, start = [], 0
     for width, out in pairwise(widths):
         W = theta[start : start + out * width].reshape(width, out).T

@@ -1,8 +1,8 @@
 """The strongest peer we know for fitting: a PyTorch MLP trained with Adam, on the same problem and loss.
 
-float32, fresh uniform samples in every step, cosine learning rate, all cores. It gets the same help as our own fit:
-the idle joint is split off, so it fits three coordinates of six joints; and its samples, with the task gradients, are
-made before its clock starts (ours makes them while the clock runs).
+It uses float32, fresh uniform samples in every step, a cosine learning rate and all cores. It has the same advantages
+as our own fit: the idle joint (which does not move the task) is split off, so it fits three coordinates of six joints.
+Its samples and task gradients are computed before its clock starts; our fit computes them while the clock runs.
 """
 
 import math
@@ -30,7 +30,7 @@ class PeerSettings:
 
 @dataclass(frozen=True)
 class PeerResult:
-    """Standard deviations over all angles, the exact coordinate included as in the paper, and training seconds."""
+    """Standard deviations over all angles, including the exact coordinate as in the paper, and training seconds."""
 
     task_std_deg: float
     mutual_std_deg: float
@@ -38,7 +38,7 @@ class PeerResult:
 
 
 def train(problem: Problem, settings: PeerSettings, seed: int = 0, held_out: int = 20_000) -> PeerResult:
-    """Train once and judge on held-out samples."""
+    """Train once, and evaluate on held-out samples."""
     torch.manual_seed(seed)
     joints, r = list(range(problem.n - 1)), problem.r - 1
     widths = [2 * len(joints), settings.hidden, settings.hidden, r]
@@ -90,7 +90,7 @@ def _cosines(layers: list[torch.nn.Linear], q: torch.Tensor, g: torch.Tensor) ->
 
 
 def _std_with_idle(cosines: torch.Tensor, angles_per_sample: int) -> float:
-    """Standard deviation of the angles when the exact coordinate's right angles are counted too."""
+    """Standard deviation of the angles, with the right angles of the exact coordinate counted too."""
     deviation = torch.rad2deg(torch.arccos(cosines.clamp(-1, 1))) - 90
     padded = deviation.reshape(len(deviation), -1)
     missing = angles_per_sample - padded.shape[1]

@@ -1,16 +1,17 @@
-"""Whether the conclusions of [AS2023] Sec. 8 hang on choices that the paper does not print (1 min).
+"""Do the conclusions of [AS2023] Sec. 8 depend on choices that the paper does not state? (1 min).
 
-Figs. 22 to 26 and 30 are drawn with one stiffness, one damping ratio, one set of lengths and steps. Here these change,
-and the three conclusions are measured again for each choice:
+Figs. 22 to 26 and 30 use one stiffness, one damping ratio, one set of lengths and one set of steps. This example varies
+these choices, and measures the three conclusions again for each of them:
 
-1. fitted coordinates couple less than linear ones: coupling index x <- xi, PD+, at both bases of Fig. 24;
-2. the error of fitted coordinates matters less than curvature and Coriolis terms: largest unwanted task acceleration,
-   error (38) over the smaller one of the other two, feedback only;
-3. x and y couple more with each other than xi with them: largest excursion of x or y while the other is stepped, over
-   that while xi is stepped, task (x, y), without and with feed-forward.
+1. Fitted coordinates couple less than linear ones. Measure: coupling index x <- xi with PD+, at both bases of Fig. 24.
+2. The error of fitted coordinates matters less than curvature and Coriolis terms. Measure: largest unwanted task
+   acceleration from the error (38), divided by the smaller one of the other two, feedback only.
+3. x and y couple more with each other than with xi. Measure: largest deviation of x or y while the other is stepped,
+   divided by the deviation while xi is stepped, for the task (x, y), with and without feed-forward.
 
-The first two hold for all choices; the third for all but one without feed-forward, and for none with it: the controller
-of the task knows the inertia between x and y, and what is left there is smaller than what xi disturbs.
+The first two hold for all choices. Without feed-forward, the third holds for all choices but one. With feed-forward, it
+holds for none, because the task controller knows the inertia between x and y, and the remaining disturbance there is
+smaller than that from xi.
 """
 
 import argparse
@@ -44,26 +45,26 @@ from orthocas.reproduce.planar_loop import (
 
 @dataclass(frozen=True)
 class Choice:
-    """What the paper leaves open; defaults are those of the figures."""
+    """The choices that the paper leaves open; the defaults are those of the figures."""
 
     name: str
     stiffness: tuple[float, float, float] = 3 * (STIFFNESS,)
     damping_ratio: float = DAMPING_RATIO
     damping: DampingDesign = "square_root"
     lengths: tuple[float, ...] = LENGTHS
-    steps: float = 1.0  #: times those of the figures
-    places: tuple[Place, Place, Place] = (GENTLE, STRONG, FOLDED)  #: bases, and boxes that hold the motion
+    steps: float = 1.0  #: size of the steps relative to the figures
+    places: tuple[Place, Place, Place] = (GENTLE, STRONG, FOLDED)  #: bases, and boxes around the motion
 
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured for one choice."""
+    """The measurements for one choice."""
 
     choice: Choice
-    linear: tuple[float, float]  #: coupling x <- xi at the base of low and of high curvature [m]
-    fitted: tuple[float, float]  #: the same, fitted
-    error_share: float  #: error (38) over the smaller one of curvature and Coriolis terms
-    mutual_feedback: float  #: excursion of x or y by the other, over that by xi, feedback only
+    linear: tuple[float, float]  #: coupling x <- xi at the bases of low and high curvature [m]
+    fitted: tuple[float, float]  #: the same for fitted coordinates
+    error_share: float  #: error (38) divided by the smaller one of curvature and Coriolis terms
+    mutual_feedback: float  #: deviation of x or y due to the other, divided by that due to xi, feedback only
     mutual_feed_forward: float  #: the same with feed-forward
     not_ok: float  #: largest share of fallbacks in any run with fitted coordinates
 
@@ -73,7 +74,11 @@ _GENTLE = Place(2.8, -1.9, (-0.25, -0.4, -0.8), (0.3, 0.45, 0.6))  # for links o
 _STRONG = Place(2.58, 1.95, (-0.12, -0.25, -1.2), (0.5, 0.3, 0.15))
 _FOLDED = Place(1.2, -2.9, (-0.5, -0.12, -0.1), (0.1, 0.8, 0.9))
 SHORT = (_GENTLE, _STRONG, _FOLDED)
-MIXED = (30.0, 100.0, 300.0)  #: the two designs of D agree if K and Z are the same for all coordinates of a set
+MIXED = (
+    30.0,
+    100.0,
+    300.0,
+)  #: unequal, because both designs of D agree if K and Z are the same for all coordinates of a set
 CHOICES = (
     Choice("figures"),
     Choice("K = 25", stiffness=(25.0, 25.0, 25.0)),
@@ -120,7 +125,7 @@ def main(quick: bool = False) -> dict[str, float]:
 
 
 def measured(choice: Choice, quick: bool) -> Row:
-    """Run everything for one choice."""
+    """Run all measurements for one choice."""
     gentle, strong, folded = zip((INTERLEAVED, ALL_OF_X, ALL_OF_XY), choice.places, strict=True)
     fitted = [run(choice, "fitted", "x", *which, True, quick) for which in (gentle, strong)]
     linear = [run(choice, "linear", "x", *which, True, quick) for which in (gentle, strong)]
@@ -139,7 +144,7 @@ def measured(choice: Choice, quick: bool) -> Row:
 
 
 def run(choice: Choice, kind: str, axes: Axes, moves: Moves, place: Place, feed_forward: bool, quick: bool) -> Run:
-    """One run of a figure, with the settings of a choice; steps in x and y go with the size of the arm."""
+    """One run of a figure with the settings of a choice; steps in x and y scale with the size of the arm."""
     arm = Arm(choice.lengths)
     metres = choice.steps * sum(choice.lengths) / sum(LENGTHS)
     scaled = tuple(
@@ -162,7 +167,7 @@ def from_xi(done: Run) -> float:
 
 
 def mutual_over_xi(done: Run) -> float:
-    """Largest excursion of x and y while the other is stepped, over their largest while xi is."""
+    """Largest deviation of x and y while the other is stepped, divided by their largest while xi is stepped."""
     sizes = np.array([max(abs(values)) for values in np.diff(done.reference.targets, axis=0).T])
     excursions = done.coupling.index * sizes
     return float(max(excursions[0, 1], excursions[1, 0]) / max(excursions[:2, 2]))
@@ -171,14 +176,14 @@ def mutual_over_xi(done: Run) -> float:
 def named_problem(quick: bool) -> float:
     """Coupling index x <- xi1 of planar_3r_x with the settings of the figures, for steps of 0.1 from its centre."""
     problem = problems.get("planar_3r_x")
-    even = oc.Weights(length=0.1)  # gradients of even length: a step of 0.1 means as much for every coordinate
+    even = oc.Weights(length=0.1)  # even gradient lengths give a step of 0.1 the same meaning for every coordinate
     fitted = oc.fit(problem, oc.Polynomial(8), weights=even, samples=2000 if quick else None).chart
     moves: Moves = ({"x": 0.1}, {"xi1": 0.1}, {"x": 0.0}, {"xi1": 0.0})
     return from_xi(follow(fitted, problem.domain.centre, moves))
 
 
 def table(rows: list[Row]) -> Iterator[str]:
-    """The numbers, one line a choice."""
+    """The numbers, one line per choice."""
     yield "                       x <- xi, low curvature  x <- xi, high curvature  error    x, y over xi"
     yield "choice                 linear  fitted  ratio   linear  fitted  ratio    share    feedback  feed-forward"
     for row in rows:

@@ -1,7 +1,7 @@
-"""Which parametrisation, which solver: the named problems, and the 7-DoF arm with a pose task against the SEW angle.
+"""Which parametrisation and solver? The named problems, and the 7-DoF arm with a pose task against the SEW angle.
 
-Every fit runs in a process of its own with one thread; all together take about 6 minutes on 2 cores (quick: one small
-grid, 10 s). Writes a front and a convergence picture, a CSV and a JSON for every problem.
+Every fit runs in its own process with one thread. All fits together take about 6 minutes on 2 cores (quick: one small
+grid, 10 s). The example writes a front and a convergence picture, a CSV and a JSON for every problem.
 """
 
 import argparse
@@ -38,7 +38,7 @@ NETWORKS: dict[str, Parametrisations] = {
 
 
 def build(name: str) -> oc.Problem:
-    """A named problem, or the 7-DoF arm with the pose of its flange as the task: one extra coordinate."""
+    """A named problem, or the 7-DoF arm with its flange pose as the task, which leaves one extra coordinate."""
     if name != "iiwa_pose":
         return problems.get(name)
     base = problems.get("iiwa")
@@ -47,7 +47,7 @@ def build(name: str) -> oc.Problem:
 
 
 def compared(name: str, charts: Path, quick: bool, monitor: Monitor) -> Comparison:
-    """Bases with every solver, networks with those that can."""
+    """Compare bases with every solver, and networks with the solvers that can fit them."""
     problem = build(name)
     if quick:
         return oc.compare(problem, BASES[name][:2], samples=200, held_out=2_000, monitor=monitor)

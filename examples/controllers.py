@@ -1,8 +1,8 @@
-"""Every controller on the same steps: how much a commanded coordinate disturbs the others (30 s).
+"""Every controller on the same steps: how much does a commanded coordinate disturb the others? (30 s).
 
-The arms are planar_3r_x (exact coordinates exist) and planar_3r_xy (they do not), the steps interleaved as in Sec. 8 of
-the paper. Projectors get the posture that means the same motion. The coupling index is the largest excursion of a
-coordinate from its reference while only another is commanded, over the commanded step.
+The arms are planar_3r_x (exact coordinates exist) and planar_3r_xy (they do not), with interleaved steps as in Sec. 8
+of the paper. Projectors follow the posture of the same motion. The coupling index is the largest deviation of a
+coordinate from its reference while only another is commanded, divided by the commanded step.
 """
 
 import argparse
@@ -25,11 +25,11 @@ from orthocas.control import (
 from orthocas.simulation import coupling_index
 
 STIFFNESS = 200.0  # of x [N/m], of xi [N m], and of postures [N m/rad]
-STEPS = {  # [m], [rad]: what the boxes of the problems have room for
+STEPS = {  # [m], [rad]: small enough for the boxes of the problems
     "planar_3r_x": {"x": 0.1, "xi1": -0.05, "xi2": -0.03},
     "planar_3r_xy": {"x": 0.1, "y": 0.1, "xi1": -0.05},
 }
-PAUSE = 4.0  # [s] between steps: also slow springs have come to rest
+PAUSE = 4.0  # [s] between steps, in which even slow springs come to rest
 WEIGHTS = (1000.0, 30.0, 150.0, 0.1)  # the last keeps gradients even (docs/derivations.md#lengths)
 
 
@@ -60,7 +60,7 @@ def main(quick: bool = False) -> dict[str, float]:
 
 
 def laws(chart: oc.Chart, linear: oc.Chart) -> Iterator[tuple[str, oc.Chart, Controller, Reference]]:
-    """Title, chart to judge by, controller and its reference; for fitted and linear coordinates."""
+    """Title, chart for the evaluation, controller and its reference, for fitted and linear coordinates."""
     problem, q0 = chart.problem, chart.problem.domain.centre
     for coupling in ("coupled", "decoupled"):
         yield f"PD+ {coupling}, fitted", chart, PDPlus(chart, STIFFNESS, coupling=coupling), steps(chart)
@@ -75,7 +75,7 @@ def laws(chart: oc.Chart, linear: oc.Chart) -> Iterator[tuple[str, oc.Chart, Con
 
 
 def steps(chart: oc.Chart) -> Reference:
-    """One coordinate after the other, there and back, interleaved."""
+    """Steps of one coordinate after the other, forth and back, interleaved."""
     start = chart.phi(chart.problem.domain.centre)
     changes, time = [], 0.5
     for back in (False, True):

@@ -1,8 +1,8 @@
-"""The 7-DoF arm repeats a closed tool path 50 times: where are its joints after each cycle? (10 s).
+"""The 7-DoF arm repeats a closed tool path 50 times. Where are its joints after each cycle? (10 s).
 
-Pseudo-inverse control knows velocities only, and the joints drift away although the tool returns. With constant xi_d
-the same tool pose means the same joints: what is left is the error of the integration, which falls with its tolerance,
-and which a small feedback keeps from growing.
+Pseudo-inverse control uses velocities only, so the joints drift although the tool returns. With constant xi_d, the same
+tool pose gives the same joint positions. Only the integration error remains. It falls with the tolerance, and a small
+feedback keeps it from growing.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import orthocas as oc
 from orthocas.control import Kinematic, KinematicProjector, Reference
 from orthocas.simulation import Trajectory
 
-RADIUS, PERIOD, POINTS = 0.1, 4.0, 16  # of the circle in a horizontal plane [m], [s], points of its spline
+RADIUS, PERIOD, POINTS = 0.1, 4.0, 16  # horizontal circle: radius [m], period [s], points of its spline
 CYCLES = 50
 FEEDBACK = 1.0  # Lambda of the run with feedback [1/s]
 TIGHT, LOOSE = 1e-10, 1e-8  # tolerances of CVODES
@@ -25,7 +25,7 @@ TIGHT, LOOSE = 1e-10, 1e-8  # tolerances of CVODES
 
 @dataclass(frozen=True)
 class Case:
-    """A controller with a tolerance, and how it is drawn."""
+    """A controller with a tolerance, and its line style."""
 
     name: str
     law: Kinematic | KinematicProjector
@@ -35,7 +35,7 @@ class Case:
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
-    """Run all cases, draw drift and postures.
+    """Run all cases, and draw drift and postures.
 
     Args:
         out: folder for the picture.
@@ -75,7 +75,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
 
 
 def repeat(case: Case, chart: oc.Chart, cycles: int) -> Trajectory:
-    """The tool runs along the circle, from rest to rest in every cycle."""
+    """Move the tool around the circle, from rest to rest in every cycle."""
     start = chart.problem.domain.centre
     share = np.linspace(0, 1, POINTS, endpoint=False)
     angle = 2 * np.pi * np.append((share**3 * (10 - 15 * share + 6 * share**2) + np.arange(cycles)[:, None]), cycles)
@@ -93,24 +93,24 @@ def drift(run: Trajectory, cycles: int) -> np.ndarray:
 
 
 def draw_drifts(axes: Axes, cases: list[Case], drifts: list[np.ndarray]) -> None:
-    """Drift over cycles, on a logarithmic axis."""
+    """Draw the drift over cycles on a logarithmic axis."""
     for case, away in zip(cases, drifts, strict=True):
         label = f"{case.name.replace('xi', 'ξ').removesuffix(', loose')}, tolerance {case.tolerance:.0e}"
         axes.plot(np.arange(1, len(away) + 1), away, case.style, color=case.colour, label=label)
     axes.set_yscale("log")
     axes.set_ylim(1e-10, 1e1)
     axes.set_xlabel("cycles")
-    axes.set_ylabel("joints away from their start, norm [rad]")
+    axes.set_ylabel("joint distance from the start, norm [rad]")
     axes.set_title("joint positions after each cycle", fontsize=10)
     axes.legend(fontsize=8, loc="center right", bbox_to_anchor=(1.0, 0.66))
     axes.grid(alpha=0.3)
 
 
 def draw_postures(axes: Axes, chart: oc.Chart, case: Case, run: Trajectory, cycles: int) -> None:
-    """The arm from above at the end of some cycles, later ones stronger, and the path of the tool."""
+    """Draw the arm from above at the end of some cycles, later ones darker, and the tool path."""
     shown = np.unique(np.linspace(0, cycles, 6).round())
     arms = chart.problem.robot.joint_points(run.q[np.searchsorted(run.times, PERIOD * shown - 1e-6)])
-    axes.plot(*run.value[:, :2].T, color="0.6", linewidth=1, label="path of the tool")
+    axes.plot(*run.value[:, :2].T, color="0.6", linewidth=1, label="tool path")
     axes.plot(*arms[0, :, :2].T, "-o", color="#222222", linewidth=2.5, markersize=5, label="arm at the start")
     for strength, points in zip(np.linspace(0.4, 1, len(arms) - 1), arms[1:], strict=True):
         axes.plot(points[:, 0], points[:, 1], "-o", color=case.colour, alpha=strength, linewidth=1.2, markersize=2.5)

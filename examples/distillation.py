@@ -1,7 +1,7 @@
-"""Grown coordinates as closed expressions: what is lost, for both metrics and several families (1 min).
+"""The loss of accuracy when closed expressions replace grown coordinates, for two metrics and several families (1 min).
 
-The task is the x of a planar arm with three joints, on the box of `planar_3r_x`. For A = I nearly nothing is lost; for
-A = M part of the box flows past saddles of the task on its way to the base leaf, where exact coordinates are steep.
+The task is x of a planar arm with three joints, on the box of `planar_3r_x`. For A = I, almost nothing is lost. For
+A = M, part of the box flows past saddles of the task on its way to the base leaf; exact coordinates are steep there.
 """
 
 import argparse

@@ -1,7 +1,8 @@
 """Task angle against mutual angle by lambda2, and the price of a chart without folds by lambda3 (60 s).
 
-The left panel is the front of the 7-DoF arm for polynomial degrees 3 and 4 beside the paper's network; colours show
-where the coordinates get close to parallel (the rank trap). The right panel raises the regularity weight lambda3.
+The left panel shows the front of the 7-DoF arm for polynomial degrees 3 and 4, with the paper's network to compare;
+colours show where coordinates become nearly parallel (the rank trap). The right panel raises the regularity weight
+lambda3.
 """
 
 import argparse
@@ -25,10 +26,10 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
 
     Args:
         out: folder for the picture.
-        quick: degree 2 and three points a curve.
+        quick: degree 2 and three points per curve.
 
     Returns:
-        Some numbers of the picture: task std [deg] at the ends of the front, conditioning at the ends of lambda3.
+        Numbers of the picture: task std [deg] at the ends of the front, conditioning at both ends of lambda3.
     """
     out.mkdir(parents=True, exist_ok=True)
     problem, samples = problems.get("iiwa"), 5_000 if quick else 100_000
@@ -85,7 +86,7 @@ def _draw_regularity(axes: Axes, degree: int, lambda3: tuple[float, ...], report
     axes.plot(places, [r.conditioning.p01 for r in reports], "o-", color="#1f5fa8", label="conditioning, 1 % quantile")
     axes.plot(places, [r.conditioning.min for r in reports], "s-", color="#7570b3", label="conditioning, minimum")
     axes.set_xticks(places, [f"{v:g}\n{r.folded_samples}" for v, r in zip(lambda3, reports, strict=True)])
-    axes.set_xlabel(r"$\lambda_3$, and below it the number of folded samples")
+    axes.set_xlabel(r"$\lambda_3$, with the number of folded samples below")
     axes.set_ylabel("conditioning")
     axes.set_ylim(0, 1)
     axes.set_title(rf"price of a chart without folds, degree {degree}, $\lambda_2 = 30$", fontsize=10)

@@ -1,4 +1,4 @@
-"""The pictures of docs/gallery.md: every figure of the paper that is drawn again, in the size of a page (2 min)."""
+"""The pictures of docs/gallery.md: every reproduced figure of the paper, at page size (2 min)."""
 
 import argparse
 from pathlib import Path
@@ -11,7 +11,7 @@ WIDTH = 1100  #: pixels, enough for a page
 
 
 def main(out: Path, name: str = "all", quick: bool = False) -> dict[str, dict[str, float]]:
-    """Draw figures and shrink the pictures.
+    """Draw figures, and shrink the pictures.
 
     Args:
         out: folder for pictures, numbers and meshes.
@@ -29,7 +29,7 @@ def main(out: Path, name: str = "all", quick: bool = False) -> dict[str, dict[st
 
 
 def shrink(path: Path) -> None:
-    """Make a picture at most WIDTH pixels wide, with all its colours."""
+    """Shrink a picture to at most WIDTH pixels, and keep all its colours."""
     with Image.open(path) as picture:
         small = picture.convert("RGB")
     small.thumbnail((WIDTH, 10 * WIDTH))

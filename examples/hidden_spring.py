@@ -1,9 +1,9 @@
-"""A posture spring hides behind a projector, then discharges; a spring in xi does not (3 s).
+"""A posture spring hides behind a projector and then discharges; a spring in xi does not (3 s).
 
-The arm and both springs are those of Fig. 2 (`orthocas reproduce fig02`). At 1 s both controllers are asked for a
-posture half a turn along the self-motion curve, at 8 s for a tip 0.1 m nearer to the base. The projector lets nothing
-through of the torque of the posture spring, which stays loaded until the small motion of the tip frees it. The spring
-of impedance control in the chart has no such minimum: it is loaded while the arm is on its way, and then relaxes.
+The arm and both springs are those of Fig. 2 (`orthocas reproduce fig02`). At 1 s, both controllers receive a target
+posture half a turn along the self-motion curve; at 8 s, a tip target 0.1 m nearer to the base. The projector cancels
+the torque of the posture spring, which stays loaded until the small motion of the tip frees it. The spring of impedance
+control in the chart has no such minimum: it is loaded while the arm moves, and then relaxes.
 """
 
 import argparse
@@ -20,18 +20,18 @@ from orthocas.simulation import Trajectory
 
 TASK_STIFFNESS = 500.0  # [N/m]
 POSTURE_AT, TIP_AT, DURATION = 1.0, 8.0, 16.0  # [s]
-NEARER = 0.5  # distance of the tip from the base in the end [m]
-NATURAL_FREQUENCY = 2.0  # of the low pass [rad/s]
+NEARER = 0.5  # final distance of the tip from the base [m]
+NATURAL_FREQUENCY = 2.0  # of the low-pass filter [rad/s]
 COLOURS = {"projector": "#d95f02", "impedance": "#1b9e77"}
 TITLES = {"projector": "posture spring behind a projector", "impedance": "spring in ξ, impedance control"}
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
-    """Run both controllers, draw energy, speed and postures.
+    """Run both controllers, and draw energy, speed and postures.
 
     Args:
         out: folder for the picture.
-        quick: coarser steps in time.
+        quick: coarser time steps.
 
     Returns:
         Energies in the springs [J], torques [N m] just before the tip moves, and peak joint speeds [rad/s].
@@ -66,7 +66,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
 
 
 def projected(spring: HiddenSpring, quick: bool) -> Trajectory:
-    """Classical null-space impedance: the posture spring is asked for the goal."""
+    """Classical null-space impedance control, with the goal as the target of the posture spring."""
     controller = Projector(spring.problem, TASK_STIFFNESS, POSTURE_STIFFNESS)
     labels = controller.labels
     start = np.concatenate([spring.chart.task(spring.start), spring.start])
@@ -75,7 +75,7 @@ def projected(spring: HiddenSpring, quick: bool) -> Trajectory:
 
 
 def geodetic(spring: HiddenSpring, quick: bool) -> Trajectory:
-    """Impedance control in the chart: xi is asked for its value at the goal."""
+    """Impedance control in the chart, with the value of xi at the goal as its target."""
     controller = Impedance(spring.chart, (TASK_STIFFNESS, TASK_STIFFNESS, XI_STIFFNESS))
     posture = {"xi1": float(spring.chart.xi(spring.goal)[0])}
     return run(controller, steps(controller.labels, spring.chart.phi(spring.start), posture), spring, quick)
@@ -88,12 +88,12 @@ def steps(labels: tuple[str, ...], start: np.ndarray, posture: dict[str, float])
 
 
 def run(controller: Projector | Impedance, reference: Reference, spring: HiddenSpring, quick: bool) -> Trajectory:
-    """The closed loop, from rest."""
+    """Simulate the closed loop from rest."""
     return oc.simulate(controller, reference, spring.start, step=0.05 if quick else 0.01)
 
 
 def draw(spring: HiddenSpring, runs: dict[str, Trajectory], energies: dict[str, np.ndarray]) -> Figure:
-    """Energy and speed over time, and the arm before and after the tip moves."""
+    """Draw energy and speed over time, and the arm before and after the tip moves."""
     figure = Figure(figsize=(10.5, 5.4), layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=(1.7, 1, 1))
     energy, speed = (figure.add_subplot(grid[row, 0]) for row in range(2))
@@ -119,7 +119,7 @@ def draw(spring: HiddenSpring, runs: dict[str, Trajectory], energies: dict[str, 
 
 
 def draw_arm(axes: Axes, spring: HiddenSpring, found: Trajectory, begin: float, end: float, colour: str) -> None:
-    """The arm every half second, later ones darker, and the last one thick."""
+    """Draw the arm every half second, later postures darker and the last one thick."""
     instants = np.arange(begin, end + 1e-9, 0.5)
     q = found.q[np.minimum(np.searchsorted(found.times, instants - 1e-9), len(found.times) - 1)]
     arms = spring.problem.robot.joint_points(q)[:, :, :2]

@@ -1,4 +1,4 @@
-"""The main job: four extra coordinates for the 7-DoF arm, their quality, a chart file and two pictures (10 s).
+"""The main use case: four extra coordinates for the 7-DoF arm, their quality, a chart file and two pictures (10 s).
 
 Run by `make demo`. Reproduces [AS2023] Sec. 9 and Fig. 27 with polynomials instead of a network.
 """
@@ -15,7 +15,7 @@ PAPER = {"task": 2.06, "mutual": 3.44, "minutes": 100.64}
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
-    """Fit, judge, save.
+    """Fit, evaluate and save.
 
     Args:
         out: folder for chart and pictures.

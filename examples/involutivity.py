@@ -1,10 +1,10 @@
-"""How orthogonal coordinates can be, told without a fit: the involutivity defect against angles of fits (60 s).
+"""How orthogonal can coordinates be? The involutivity defect predicts the angles of fits without a fit (60 s).
 
-The left panel compares the angle that `oc.involutivity` expects, defect times size of the domain without a fitted
-constant, with the held-out angle of fits. The right panel raises the degree: where exact coordinates exist the angle
-falls on and on, elsewhere it stays where the defect says (its fits hardly ask for mutual angles). Angles are root mean
-square deviations from 90 degrees between coordinate gradients and an orthonormal basis of the task gradients, both in
-the metric A.
+The left panel compares the held-out angle of fits with the angle that `oc.involutivity` expects: the defect times the
+size of the domain, without a fitted constant. The right panel raises the degree. Where exact coordinates exist, the
+angle keeps falling; elsewhere it settles where the defect predicts. (Mutual angles have almost no weight in these
+fits.) Angles are root mean square deviations from 90 degrees between coordinate gradients and an orthonormal basis of
+the task gradients, both in the metric A.
 """
 
 import argparse
@@ -35,17 +35,17 @@ COLOURS = {
     "panda, xyz": "#e7298a",
     "ur10, xyz": "#00a6c8",
 }
-DATA = {  # of the package example-robot-data: file, tip, centre of the box [rad]
+DATA = {  # robots of the package example-robot-data: file, tip, centre of the box [rad]
     "panda": ("panda_description/urdf/panda.urdf", "panda_hand", (0, -0.5, 0, -2, 0, 1.5, 0.7)),
     "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0", (0, -1.2, 1.5, -0.3, 0.5, 0)),
 }
 DEGREES = range(1, 7)
-TASK_FIRST = (1000.0, 0.01, 150.0)  # weights that hardly ask for mutual angles, which are not the question here
+TASK_FIRST = (1000.0, 0.01, 150.0)  # weights that almost ignore mutual angles, which do not matter here
 
 
 @dataclass(frozen=True)
 class Case:
-    """A problem, and the degree of the polynomials fitted to it."""
+    """A problem, and the degree of the polynomials that are fitted to it."""
 
     name: str
     problem: oc.Problem
@@ -54,16 +54,16 @@ class Case:
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured for one case."""
+    """The measurements for one case."""
 
     case: Case
     found: oc.Involutivity
-    angle: float  #: held out, in the metric [deg]
+    angle: float  #: on held-out samples, in the metric [deg]
     task_std: float  #: standard deviation as `oc.evaluate` reports it [deg]
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
-    """Fit, print a table, draw both panels.
+    """Fit, print a table and draw both panels.
 
     Args:
         out: folder for the picture.
@@ -108,7 +108,7 @@ def iiwa_cases() -> Iterator[Case]:
     for kind in ("position:yz", "position:xy", "position:xyz", "pose"):
         task = oc.Task.named(base.robot, kind, base.domain.centre)
         for metric in METRICS:
-            degree = 4 if kind == "position:xy" and metric == "euclidean" else 3  # cubics are too poor there
+            degree = 4 if kind == "position:xy" and metric == "euclidean" else 3  # degree 3 is too low for this case
             for half_width in (0.05, 0.2, 0.4) if kind == "pose" else (0.05, 0.2, np.pi / 4):
                 box = oc.Box(base.domain.centre, half_width)
                 name = f"iiwa, {kind.removeprefix('position:')}"
@@ -145,7 +145,7 @@ def angle_in_metric(chart: oc.Chart, samples: int, seed: int = 1) -> float:
 
 
 def sweep(axes: str, metric: str, quick: bool) -> list[Row]:
-    """The planar arm in a box of half-width 0.2, degree by degree."""
+    """The planar arm in a box of half-width 0.2, for rising degrees."""
     robot, box = problems.get("planar_3r_xy").robot, oc.Box((0.6, 0.8, 0.8), 0.2)
     problem = oc.Problem(robot, oc.Task.position(robot, axes), metric, box)
     degrees = DEGREES[:5:2] if quick else DEGREES
@@ -153,7 +153,7 @@ def sweep(axes: str, metric: str, quick: bool) -> list[Row]:
 
 
 def table(rows: list[Row]) -> list[str]:
-    """The numbers, one line a case."""
+    """The numbers, one line per case."""
     lines = ["problem        A  half-width  deg  mean defect  expected  angle in A  ratio  task std (evaluate)"]
     for row in rows:
         problem, found = row.case.problem, row.found
@@ -166,7 +166,7 @@ def table(rows: list[Row]) -> list[str]:
 
 
 def draw_angles(axes: Axes, rows: list[Row]) -> None:
-    """Expected against measured angles."""
+    """Draw expected against measured angles."""
     low, high = 0.02, 30.0
     line = np.array([low, high])
     axes.fill_between(line, line / 2, line * 2, color="0.92", zorder=0)
@@ -194,16 +194,16 @@ def draw_angles(axes: Axes, rows: list[Row]) -> None:
     axes.set_aspect("equal")
     axes.set_xlabel("expected from the involutivity defect [deg]")
     axes.set_ylabel("angle of the fit, held out [deg]")
-    axes.set_title("task angle off 90°: expected, and reached", fontsize=10)
+    axes.set_title("deviation of the task angle from 90°: expected and reached", fontsize=10)
     axes.grid(alpha=0.3)
 
 
 def draw_sweeps(axes: Axes, sweeps: dict[tuple[str, str], list[Row]]) -> None:
-    """Angles by degree, with what is expected where exact coordinates do not exist."""
+    """Draw angles by degree, with the expected angle where exact coordinates do not exist."""
     for (task, metric), rows in sweeps.items():
         colour = "#d95f02" if task == "xy" else "#1f5fa8"
         marker, style = ("o", "-") if metric == "euclidean" else ("s", "--")
-        label = f"task {task}, A = {METRICS[metric]}" + (" (exact exist)" if rows[0].found.exact else "")
+        label = f"task {task}, A = {METRICS[metric]}" + (" (exact solution exists)" if rows[0].found.exact else "")
         degrees = [row.case.degree for row in rows]
         axes.plot(degrees, [row.angle for row in rows], style, marker=marker, color=colour, markersize=5, label=label)
         if not rows[0].found.exact:

@@ -1,8 +1,8 @@
 """A Panda from its URDF: PD+ at 1 kHz with gravity and torque limits; the elbow moves, the hand stays (20 s).
 
-Fits coordinates for the position of the hand with A = M, then commands steps in every xi while x is to rest, and a step
-in x at the end. The decoupled law relies on orthogonal coordinates, the coupled one does not. The URDF is the one of
-the package example-robot-data.
+The example fits coordinates for the hand position with A = M, then commands steps in every xi while x stays constant,
+and finally a step in x. The decoupled law relies on orthogonal coordinates, the coupled law does not. The URDF comes
+from the package example-robot-data.
 """
 
 import argparse
@@ -18,8 +18,8 @@ from orthocas.simulation import Noise, Trajectory
 
 READY = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)  # [rad]
 HALF_WIDTH = (0.6, 0.6, 0.6, 0.6, 0.8, 0.6, 1.2)  # [rad]; with A = M the light wrist moves most
-TORQUE_LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # [N m], of the manufacturer
-STIFFNESS = (400.0, 400.0, 400.0, 20.0, 20.0, 20.0, 20.0)  # [N/m], then [N m] as the xi are in radians
+TORQUE_LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # [N m], from the manufacturer
+STIFFNESS = (400.0, 400.0, 400.0, 20.0, 20.0, 20.0, 20.0)  # [N/m], then [N m] because the xi are in radians
 STEPS = (
     (0.5, {"xi3": 0.22}),
     (2.5, {"xi3": 0.0}),
@@ -30,20 +30,20 @@ STEPS = (
     (12.5, {"xi4": 0.2}),
     (14.5, {"xi4": 0.0}),
 )
-HELD = 16.5  # [s] until here the hand is to rest
+HELD = 16.5  # [s] until this time, the hand is to stay at rest
 RATE = 1000.0  # [Hz]
 ELBOW = 4  # of `Robot.joint_points`: the origin of joint 4
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
-    """Fit, run both laws, save a picture.
+    """Fit, run both laws and save a picture.
 
     Args:
         out: folder for the picture.
-        quick: a rougher chart and shorter run.
+        quick: a coarser chart and a shorter run.
 
     Returns:
-        Quality of the chart, how far the hand strayed and the elbow moved [m], largest torque as a share of its limit.
+        Quality of the chart, deviation of the hand and motion of the elbow [m], largest torque as a share of its limit.
     """
     out.mkdir(parents=True, exist_ok=True)
     chart = panda_chart(degree=2 if quick else 3)
@@ -64,28 +64,28 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
 
 
 def panda_chart(degree: int) -> oc.Chart:
-    """Coordinates for the position of the hand, A = M, on a box about the ready posture."""
+    """Coordinates for the hand position with A = M, on a box around the ready posture."""
     robot = oc.Robot.from_urdf(_urdf(), tip="panda_hand", locked={"panda_finger_joint1": 0.0})
     problem = oc.Problem(robot, oc.Task.position(robot), "inertia", oc.Box(READY, HALF_WIDTH), "panda")
     return oc.fit(problem, oc.Polynomial(degree), weights=(1000, 30, 150, 1)).chart
 
 
 def reference(chart: oc.Chart, quick: bool) -> Reference:
-    """Steps in xi with the hand at rest, then one in x."""
+    """Steps in xi with the hand at rest, then a step in x."""
     start = chart.phi(READY)
     steps = STEPS[:1] if quick else (*STEPS, (HELD, {"x": start[0] - 0.06}))
     return Reference.steps(chart.labels, start, steps, 1.5 if quick else HELD + 2.0)
 
 
 def displacements(robot: oc.Robot, run: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of hand and elbow from where they started, two (N,) [m]."""
+    """Distances of hand and elbow from their starts, (N,) each [m]."""
     points = robot.joint_points(run.q)
     hand, elbow = (np.linalg.norm(points[:, k] - points[0, k], axis=1) for k in (-1, ELBOW))
     return hand, elbow
 
 
 def figure(chart: oc.Chart, runs: dict[str, Trajectory]) -> Figure:
-    """Coordinates, hand and elbow, torques."""
+    """Draw coordinates, hand and elbow, and torques."""
     picture = Figure(figsize=(8.0, 7.2), layout="constrained")
     rows = picture.subplots(3, 1, sharex=True)
     run = runs["decoupled"]

@@ -1,13 +1,13 @@
 """Passivity: the energy of robot and springs along random runs, with coordinates and with projectors (1 min).
 
-V is kinetic energy and the energy in all springs, at constant references. Impedance control in a chart gives
-dV/dt = -dq^T J^T D J dq, so V never rises if D is positive semi-definite, however good the chart is, and whether the
-inertia is taken coupled or decoupled. The paper's damping (29) is not always positive, so D is the other design here. A
-projector P cuts the torque tau_q of the posture spring, but the spring is stretched by all of dq: dV/dt gains
-tau_q^T (P - I) dq, which has any sign, and V rises.
+V is the kinetic energy plus the energy in all springs, at constant references. Impedance control in a chart gives
+dV/dt = -dq^T J^T D J dq. So V never rises if D is positive semi-definite, whatever the quality of the chart, and with
+coupled or decoupled inertia. The paper's damping (29) can be indefinite, so D is the other design here. A projector P
+removes part of the torque tau_q of the posture spring, but all of dq stretches the spring. This adds
+tau_q^T (P - I) dq to dV/dt, which can have either sign, and V rises.
 
-Every run has its own start, velocity, stiffness and reference: a task value of one posture, and the coordinates (or the
-joints) of another one.
+Every run has its own start, velocity, stiffness and reference. The reference combines the task value of one posture
+with the coordinates (or joint positions) of another.
 """
 
 import argparse
@@ -26,8 +26,8 @@ from orthocas.simulation import Trajectory
 
 DURATION, STEP = 3.0, 0.01  # [s]
 TOLERANCE = 1e-10  # of CVODES
-RISE = 1e-8  # of V at the start, that counts: V differs by some 1e-9 from runs at a tolerance of 1e-12
-NEAR, AWAY, SPEED = 0.2, 0.1, 0.2  # starts from the centre [rad], targets from the start [rad], start [rad/s]
+RISE = 1e-8  # smallest rise that counts, relative to V(0); V differs by some 1e-9 from runs at tolerance 1e-12
+NEAR, AWAY, SPEED = 0.2, 0.1, 0.2  # start from the centre [rad], target from the start [rad], start speed [rad/s]
 EVEN = (1000.0, 30.0, 150.0, 1.0)  # weights of the fit, with gradients of even lengths
 STYLES = {
     "impedance, coupled": ("#1b9e77", "-"),
@@ -39,7 +39,7 @@ STYLES = {
 
 @dataclass(frozen=True)
 class Arm:
-    """A chart, and from where to draw the stiffness, evenly in its logarithm."""
+    """A chart, and ranges of stiffness, drawn uniformly in the logarithm."""
 
     name: str
     chart: oc.Chart
@@ -51,23 +51,23 @@ class Arm:
 
 @dataclass(frozen=True)
 class Found:
-    """What the runs of one controller gave."""
+    """The results of all runs of one controller."""
 
-    rises: np.ndarray  #: largest rise of V over V(0), of the runs that stayed in the domain
-    left: int  #: runs that left the domain, where the controller only holds gravity
+    rises: np.ndarray  #: largest rise of V divided by V(0), for the runs that stayed in the domain
+    left: int  #: number of runs that left the domain, where the controller only compensates gravity
     worst: Trajectory  #: the run with the largest rise
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
-    """Run all, draw energies of one run and the rises of all.
+    """Run all cases, and draw the energy of one run and the rises of all runs.
 
     Args:
         out: folder for the picture.
         quick: few runs of the planar arm only.
 
     Returns:
-        Runs with a rise, the largest rise over V(0), and runs that left the domain, by arm and controller; and for how
-        many of the stiffnesses the damping (29) is not positive somewhere in the domain.
+        Runs with a rise, the largest rise over V(0) and runs that left the domain, by arm and controller; and the
+        number of stiffnesses for which the damping (29) is indefinite somewhere in the domain.
     """
     out.mkdir(parents=True, exist_ok=True)
     arms = [planar(3)] if quick else [planar(100), iiwa(4)]
@@ -83,7 +83,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
 
 
 def planar(runs: int) -> Arm:
-    """The planar arm with three joints, task x, in a box that is wide enough for swings of the light wrist."""
+    """The planar arm with three joints and task x, in a box wide enough for oscillations of the light wrist."""
     known = oc.problems.get("planar_3r_x")
     problem = oc.Problem(known.robot, known.task, "inertia", oc.Box((0.6, 0.9, 1.0), (0.7, 0.85, 1.4)))
     chart = oc.fit(problem, oc.Polynomial(4), weights=EVEN).chart
@@ -97,7 +97,7 @@ def iiwa(runs: int) -> Arm:
 
 
 def run_all(arm: Arm, name: str) -> Found:
-    """All runs of one controller; the same seed for each, so that they start alike."""
+    """All runs of one controller; every controller has the same seed, so that the starts are the same."""
     rises, worst, left = [0.0], None, 0
     for controller, reference, q, dq in cases(arm, name):
         run = oc.simulate(
@@ -139,7 +139,7 @@ def cases(arm: Arm, name: str) -> Iterator[tuple[Impedance | Projector, Referenc
 
 
 def indefinite(arm: Arm) -> float:
-    """How many of the stiffnesses of coupled impedance control make the damping (29) negative somewhere."""
+    """Number of stiffnesses of coupled impedance control for which the damping (29) is indefinite somewhere."""
     drawn = (controller.stiffness for controller, *_ in cases(arm, "impedance, coupled"))
     checks = [Impedance(arm.chart, stiffness).check_damping(100) for stiffness in drawn]
     return float(sum(check.smallest_eigenvalue < 0 for check in checks))
@@ -156,7 +156,7 @@ def numbers(found: Found) -> dict[str, float]:
 
 
 def draw_worst(axes: Axes, arm: Arm, found: dict[str, Found]) -> None:
-    """V over time of each controller's worst run."""
+    """Draw V over time for the worst run of each controller."""
     for name, row in found.items():
         colour, style = STYLES[name]
         axes.plot(row.worst.times, row.worst.storage / row.worst.storage[0], style, color=colour, label=name)
@@ -169,7 +169,7 @@ def draw_worst(axes: Axes, arm: Arm, found: dict[str, Found]) -> None:
 
 
 def draw_rises(axes: Axes, found: dict[str, Found]) -> None:
-    """Rises of all runs in order of size; those below what counts lie on the axis."""
+    """Draw the rises of all runs in order of size; rises too small to count lie on the axis."""
     for name, row in found.items():
         colour, style = STYLES[name]
         shown = np.sort(np.maximum(row.rises, RISE))[::-1]

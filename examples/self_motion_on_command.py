@@ -1,8 +1,9 @@
-"""Self-motion on command: the tool of the 7-DoF arm holds still while each xi goes through steps (30 s).
+"""Self-motion on command: the tool of the 7-DoF arm holds still while each xi follows steps (30 s).
 
-Each xi goes up, down and back, with steps that move the joints by some 0.4 rad. Velocity control with A = I keeps the
-tool where it is, up to the integration. So does coupled PD+ on the dynamics, in any chart: it uses the full inertia in
-the coordinates. Decoupled PD+ relies on condition (5) in the metric M, and the tool moves as far as the chart is off.
+Each xi goes up, down and back, with steps that move the joints by about 0.4 rad. Velocity control with A = I keeps the
+tool in place, up to integration errors. So does coupled PD+ on the full dynamics, in any chart, because it uses the
+full inertia in the coordinates. Decoupled PD+ relies on condition (5) in the metric M, so the tool moves by as much as
+the chart violates it.
 """
 
 import argparse
@@ -19,9 +20,9 @@ from orthocas.control import Kinematic, PDPlus, Reference
 from orthocas.control.operational_space import Coupling
 from orthocas.simulation import Trajectory
 
-MOTION = 0.4  # of the joint that moves most, per step [rad]
-FIRST, PAUSE, REST = 0.5, 1.5, 2.0  # time of the first step, between two, and more after the last one [s]
-BANDWIDTH = 15.0  # of PD+: K = BANDWIDTH^2 times the inertia of each coordinate at the start [rad/s]
+MOTION = 0.4  # motion of the joint that moves most, per step [rad]
+FIRST, PAUSE, REST = 0.5, 1.5, 2.0  # time of the first step, between steps, and extra time after the last step [s]
+BANDWIDTH = 15.0  # of PD+ [rad/s]: K = BANDWIDTH^2 times the inertia of each coordinate at the start
 TOLERANCE = 1e-10
 EVEN = (1000.0, 30.0, 150.0, 1.0)  # weights of the fit with A = M, with gradients of even lengths
 COLOURS = ("#1f5fa8", "#d95f02", "#1b9e77", "#7570b3")
@@ -29,7 +30,7 @@ COLOURS = ("#1f5fa8", "#d95f02", "#1b9e77", "#7570b3")
 
 @dataclass(frozen=True)
 class Case:
-    """A chart and what follows the steps in it."""
+    """A chart, and the controller that follows the steps in it."""
 
     name: str
     chart: oc.Chart
@@ -37,15 +38,15 @@ class Case:
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
-    """Run all cases, draw postures, coordinates and how far the tool moves.
+    """Run all cases, and draw postures, coordinates and the motion of the tool.
 
     Args:
         out: folder for the picture.
         quick: a coarser chart, and no chart with A = M.
 
     Returns:
-        How far the tool moves [m], how far the joints move and end from their start [rad], by case; and the angles of
-        the charts [deg].
+        Motion of the tool [m], motion of the joints and their final distance from the start [rad], by case; and the
+        task angles of the charts [deg].
     """
     out.mkdir(parents=True, exist_ok=True)
     problem = oc.problems.get("iiwa")
@@ -81,7 +82,7 @@ def pd_plus(metric: str, chart: oc.Chart, coupling: Coupling) -> Case:
 
 
 def steps(chart: oc.Chart) -> Reference:
-    """Each xi up, down and back, while everything else stays."""
+    """Steps of each xi up, down and back, with all other targets constant."""
     q = chart.problem.domain.centre
     start, columns = chart.phi(q), np.linalg.inv(chart.jacobian(q))[:, chart.m :]
     sizes = MOTION / np.abs(columns).max(axis=0)
@@ -91,18 +92,18 @@ def steps(chart: oc.Chart) -> Reference:
 
 
 def follow(case: Case) -> Trajectory:
-    """The closed loop, from rest in the middle of the domain; the status of the run tells if it stays inside."""
+    """Simulate from rest at the centre of the domain; the status of the run tells whether it stays inside."""
     start = case.chart.problem.domain.centre
     return oc.simulate(case.law, steps(case.chart), start, must_be_reachable=False, tolerance=TOLERANCE)
 
 
 def tool_motion(case: Case, run: Trajectory) -> np.ndarray:
-    """Distance of the tool from where it started, (N,) [m]."""
+    """Distance of the tool from its start, (N,) [m]."""
     return np.asarray(np.linalg.norm(run.value[:, : case.chart.m] - run.value[0, : case.chart.m], axis=1))
 
 
 def draw(cases: list[Case], runs: list[Trajectory]) -> Figure:
-    """Postures at the ends of the steps, coordinates over time, and how far the tool moves."""
+    """Draw postures at the ends of the steps, coordinates over time, and the motion of the tool."""
     figure = Figure(figsize=(10.5, 7.4), layout="constrained")
     halves: Any = figure.subfigures(2, 1, height_ratios=(1, 1.15))
     top, bottom = halves
@@ -115,7 +116,7 @@ def draw(cases: list[Case], runs: list[Trajectory]) -> Figure:
 
 
 def draw_postures(axes: Any, chart: oc.Chart, run: Trajectory, k: int) -> None:
-    """The arm when xi_k is up, down and back, seen from the front."""
+    """Draw the arm with xi_k up, down and back, seen from the front."""
     ends = FIRST + PAUSE * np.arange(3 * k + 1, 3 * k + 4)
     arms = chart.problem.robot.joint_points(run.q[np.searchsorted(run.times, ends - 1e-6)])
     for points, strength, width in zip(arms, (0.9, 0.45, 1.0), (1.8, 1.8, 1.0), strict=True):
@@ -137,12 +138,12 @@ def draw_postures(axes: Any, chart: oc.Chart, run: Trajectory, k: int) -> None:
 
 
 def draw_coordinates(axes: Axes, chart: oc.Chart, run: Trajectory) -> None:
-    """Coordinates over time; all at zero at the start."""
+    """Draw coordinates over time, relative to their values at the start."""
     for k, (values, colour) in enumerate(zip(run.value[:, chart.m :].T, COLOURS, strict=True)):
         axes.plot(run.times, values - values[0], color=colour, label=rf"$\xi_{k + 1}$")
     axes.set_xlabel("time [s]")
-    axes.set_ylabel("coordinates, from the start [1]")
-    axes.set_title("what is commanded: velocity control, A = I", fontsize=10)
+    axes.set_ylabel("coordinates relative to the start [1]")
+    axes.set_title("commanded motion: velocity control, A = I", fontsize=10)
     axes.legend(fontsize=8, loc="upper right", ncols=4)
     axes.set_ylim(-0.6, 0.75)
     axes.grid(alpha=0.3)
@@ -150,7 +151,7 @@ def draw_coordinates(axes: Axes, chart: oc.Chart, run: Trajectory) -> None:
 
 
 def draw_tool(axes: Axes, cases: list[Case], runs: list[Trajectory]) -> None:
-    """How far the tool moves, on a logarithmic axis."""
+    """Draw the distance of the tool from its start, on a logarithmic axis."""
     for case, run, colour in zip(cases, runs, ("#1b9e77", "#1f5fa8", "#d95f02", "#7570b3"), strict=False):
         away = tool_motion(case, run)
         axes.plot(run.times[1:], np.maximum(away[1:], 1e-13), color=colour, label=f"{case.name}: {away.max():.1e} m")
@@ -158,8 +159,8 @@ def draw_tool(axes: Axes, cases: list[Case], runs: list[Trajectory]) -> None:
     axes.set_ylim(1e-13, 1e2)
     axes.set_yticks(10.0 ** np.arange(-12, 0, 2))
     axes.set_xlabel("time [s]")
-    axes.set_ylabel("tool away from its start [m]")
-    axes.set_title("what the tool does", fontsize=10)
+    axes.set_ylabel("tool distance from its start [m]")
+    axes.set_title("motion of the tool", fontsize=10)
     axes.legend(fontsize=7, loc="upper center", ncols=2, columnspacing=1)
     axes.grid(alpha=0.3)
     axes.margins(x=0)

@@ -5,7 +5,7 @@ from pathlib import Path as _Path
 from typing import TYPE_CHECKING
 
 # In a checkout, problems/ and solvers/ lie beside this folder, not inside it. Looking one level up keeps
-# `orthocas.problems` importable there, whether or not an installed copy exists; a wheel does not take this line.
+# `orthocas.problems` importable there, whether or not an installed copy exists; a wheel does not run this line.
 if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
@@ -86,12 +86,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """Load figures when they are wanted: they need matplotlib, which takes half a second to import."""
+    """Import `plotting` on first use: it needs matplotlib, which takes half a second to import."""
     if name == "plotting":
         return _import_module("orthocas.plotting")
     raise AttributeError(f"module 'orthocas' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:
-    """What users use; modules of the machinery are found by their full names."""
+    """The public names; internal modules are imported by their full names."""
     return [*__all__, "__version__"]

@@ -1,4 +1,4 @@
-"""`python -m orthocas`."""
+"""Run the command line with `python -m orthocas`."""
 
 from orthocas.cli import main
 

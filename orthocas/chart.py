@@ -25,16 +25,28 @@ from orthocas.showing import Shown, listed
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
-_SINGULAR = 1e-8  # ratio of singular values of J where the inverse map is given up
+_SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Chart(Shown):
-    """A problem with coordinates xi(q) found for it ([AS2023] eq. (27)), fitted or grown.
+    """A problem and its fitted or grown coordinates xi(q) ([AS2023] eq. (27)).
 
-    Joint positions are one (n,), a column (n, 1), or a set (N, n), [rad] or [m]; xi, task, phi and jacobian also take a
-    CasADi column (n, 1), SX or MX, and give an expression. Grown coordinates are NaN at points from where their flow
-    does not reach the charted part of the base leaf.
+    Methods take one joint position (n,), a column (n, 1), or a set (N, n), [rad] or [m]. The methods xi, task, phi and
+    jacobian also take a CasADi column (n, 1), SX or MX, and return an expression. Grown coordinates are NaN at points
+    from which the flow does not reach the charted part of the base leaf.
+
+    Example:
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> chart.labels
+        ('x', 'y', 'xi1')
+        >>> q = np.array([0.7, 0.9, 0.6])
+        >>> phi = chart.phi(q)
+        >>> np.allclose(chart.inverse(phi, q_start=[0.6, 0.8, 0.8]), q)
+        True
     """
 
     problem: Problem
@@ -46,7 +58,7 @@ class Chart(Shown):
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
 
     def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
-        """Pickled and copied as what it was made of, with notes as a plain mapping: a read-only one can be neither."""
+        """Pickle and copy the fields, with the notes as a plain dict: a read-only mapping supports neither."""
         parts = {part.name: getattr(self, part.name) for part in fields(self)}
         return type(self), tuple((parts | {"notes": dict(self.notes)}).values())
 
@@ -86,7 +98,7 @@ class Chart(Shown):
         return (*self.problem.task.labels, *(f"xi{k + 1}" for k in range(self.r)))
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        """A graph of this chart's functions in the form that runs fast: scalar code, or as it is with networks."""
+        """The fast form of a graph of this chart's functions: scalar code, or the graph itself for networks."""
         matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.as_matrices
         return graph if matrices else scalar_code(graph)
 
@@ -137,19 +149,20 @@ class Chart(Shown):
         return J[0] if single else J
 
     def inverse(self, phi: ArrayLike, q_start: ArrayLike, tolerance: float = 1e-9) -> Array:
-        """Joint positions q with phi(q) = phi: by Newton's method with line search from q_start, or along the flow.
+        """Solve phi(q) = phi for q: fitted charts by Newton's method with line search, grown ones along the flow.
 
         Args:
-            phi: wanted values, (n,) or (N, n).
-            q_start: where to start, (n,), or (N, n) with one start per row of phi. For grown coordinates it tells which
-                whole turns are wanted, and which sheet of a linear leaf.
-            tolerance: largest remaining |phi(q) - phi|.
+            phi: target values, (n,) or (N, n).
+            q_start: initial guess (n,), or (N, n) with one guess per row of phi. For grown coordinates it selects the
+                number of full turns and the sheet of a linear leaf.
+            tolerance: largest residual |phi(q) - phi|.
 
         Returns:
-            q, (n,) or (N, n). It may lie outside the domain: `orthocas.contains` tells.
+            q, (n,) or (N, n). It may lie outside the domain; check with `orthocas.contains`.
 
         Raises:
-            InverseError: if there is no solution near the start, or J becomes singular on the way (rows named).
+            InverseError: if there is no solution near q_start, or J becomes singular on the way. The message names the
+                rows.
         """
         targets, single = as_point_set("phi", phi, self.n)
         starts, _ = as_point_set("q_start", q_start, self.n)
@@ -165,13 +178,14 @@ class Chart(Shown):
         return solutions[0] if single else solutions
 
     def function(self, name: str) -> ca.Function:
-        """The CasADi function behind a method: xi, phi, jacobian (n, n), task, task_jacobian; q is (n, 1).
+        """The CasADi function behind a method: xi, phi, jacobian, task, task_jacobian or second_derivative.
 
-        second_derivative is d^2 phi(q)[v, w] = (d/ds) J(q + s v) w, (n, 1), of q, v, w: with v = dq it is dJ/dt w.
+        The input q is a column (n, 1). second_derivative takes q, v, w (n, 1) and returns d^2 phi(q)[v, w] =
+        (d/ds) J(q + s v) w, (n, 1). For v = dq this is dJ/dt w.
 
         Raises:
             UnknownNameError: if there is no such function.
-            NoExpressionError: if the coordinates are grown; `orthocas.distil` fits an expression to them.
+            NoExpressionError: if the coordinates are grown. `orthocas.distil` fits an expression to them.
         """
         require_known("chart function", name, FUNCTIONS)
         if name == "task":
@@ -179,7 +193,7 @@ class Chart(Shown):
         return self.problem.task.jacobian_function if name == "task_jacobian" else self._functions[name]
 
     def _expression(self, name: str, q: Any) -> Any:
-        """A function at a CasADi column (n, 1)."""
+        """Evaluate a function at a CasADi column (n, 1)."""
         require_shape("q", q.shape, (self.n, 1))
         return self.function(name)(q)
 
@@ -193,7 +207,7 @@ class Chart(Shown):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a chart file; never runs code.
+        """Read a chart file. Loading never runs code from the file.
 
         Raises:
             ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
@@ -228,8 +242,8 @@ class Chart(Shown):
         return ca.rootfinder("inverse", "newton", equations, options)
 
     def _solve(self, q_start: Array, phi: Array) -> Array:
-        """One solution, with scratch memory of its own: threads that call a rootfinder itself share one, and crash."""
-        with deferred():  # Ctrl-C inside comes out as a RuntimeError, or not at all
+        """One solution, with its own scratch memory: threads that share the memory of a rootfinder crash."""
+        with deferred():  # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
             try:
                 solution: Array = evaluate_columns(self._rootfinder, 1, q_start[None], phi[None])[0][0]
                 return solution
@@ -248,20 +262,20 @@ class Chart(Shown):
         if bad.size:
             rows = f"rows {bad[:5].tolist()}" if len(targets) > 1 else "phi"
             raise InverseError(
-                f"no q with phi(q) = phi found near q_start for {rows}: error {error[bad].max():.3g}, "
-                f"expected <= {tolerance:.1g}; the value may be out of reach or the way to it singular"
+                f"no q with phi(q) = phi found near q_start for {rows}: error is {error[bad].max():.3g}, "
+                f"expected <= {tolerance:.1g}. The target may be out of reach, or the path to it singular"
             )
         values = np.linalg.svd(self.jacobian(safe), compute_uv=False)
         singular = np.flatnonzero(values[:, -1] < _SINGULAR * values[:, 0])
         if singular.size:
-            raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}, q is not unique there")
+            raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}: q is not unique there")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GrownChart(Chart):
-    """A chart with grown coordinates, apart from `function` with the interface of fitted ones.
+    """A chart with grown coordinates. It has the interface of a fitted chart except for `function`.
 
-    `coordinates` tells more: its base `leaf`, and where points meet it (`pull`), with a status for each.
+    `coordinates.leaf` is the base leaf. `coordinates.pull` gives the point of it that each q flows to, with a status.
     """
 
     coordinates: GrownCoordinates
@@ -273,7 +287,21 @@ class GrownChart(Chart):
 
 
 def load(path: str | Path) -> Chart:
-    """Read a chart file; see `Chart.load`. A grown chart comes back as a `GrownChart`."""
+    """Read a chart file; see `Chart.load`. A grown chart comes back as a `GrownChart`.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "arm.orthocas"
+        ...     chart.save(path)
+        ...     again = oc.load(path)
+        >>> bool((again.xi([0.7, 0.9, 0.6]) == chart.xi([0.7, 0.9, 0.6])).all())
+        True
+    """
     chart = Chart.load(path)
     if isinstance(chart.coordinates, GrownCoordinates):
         return GrownChart(chart.problem, chart.coordinates, chart.notes)

@@ -12,42 +12,42 @@ from orthocas.errors import InvalidValueError, MemoryNeedError, ShapeError, Unkn
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-_REAL = "biuf"  # kinds of NumPy's numbers
-_NO_NUMBER = (str, bytes, complex, type(None))  # though NumPy converts them
+_REAL = "biuf"  # NumPy's kinds of numbers: bool, int, unsigned, float
+_NO_NUMBER = (str, bytes, complex, type(None))  # rejected although NumPy converts them
 
 
 def require_shape(name: str, got: tuple[int, ...], want: tuple[int | None, ...]) -> None:
-    """Raise ShapeError unless got fits want, where None stands for any length."""
+    """Raise ShapeError unless `got` matches `want`, where None stands for any length."""
     if len(got) != len(want) or any(w is not None and g != w for g, w in zip(got, want, strict=True)):
         raise ShapeError(name, got, want)
 
 
 def require_known(what: str, name: str, known: Collection[str]) -> None:
-    """Raise UnknownNameError unless name is one of known."""
+    """Raise UnknownNameError unless `name` is in `known`."""
     if name not in known:
         raise UnknownNameError(what, name, known)
 
 
 def require_count(name: str, value: int, least: int = 1) -> int:
-    """The value as a Python int; raises InvalidValueError unless it is a whole number >= least."""
+    """Return the value as a Python int. Raise InvalidValueError unless it is a whole number >= least."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise InvalidValueError(name, value, f"a whole number >= {least}")
     return int(value)
 
 
 def require_memory(what: str, needed: float) -> None:
-    """Raise MemoryNeedError if that many bytes are more than 80 % of this machine's memory."""
+    """Raise MemoryNeedError if `needed` [bytes] exceeds 80 % of this machine's memory."""
     available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if needed > 0.8 * available:
         raise MemoryNeedError(what, needed, available)
 
 
 def frozen_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
-    """Copy to a read-only float array of the given shape with finite entries.
+    """Copy to a read-only float array of the given shape, with finite entries.
 
     Raises:
         ShapeError: if the shape differs.
-        InvalidValueError: if it is not numeric, or holds NaN or infinity.
+        InvalidValueError: if the value is not numeric, or contains NaN or infinity.
     """
     array = as_float_array(name, value)
     require_shape(name, array.shape, shape)
@@ -60,11 +60,11 @@ def frozen_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> 
 def frozen_indices(name: str, value: ArrayLike, shape: tuple[int | None, ...], count: int) -> Indices:
     """Copy to a read-only integer array of the given shape with entries from 0 to count - 1.
 
-    Whole numbers kept as floats are accepted: chart files of early versions hold such indices.
+    Whole numbers stored as floats are accepted: chart files of early versions contain such indices.
 
     Raises:
         ShapeError: if the shape differs.
-        InvalidValueError: if an entry is not a whole number, or not from 0 to count - 1.
+        InvalidValueError: if an entry is not a whole number from 0 to count - 1.
     """
     numbers = as_float_array(name, value)  # exact up to 2^53
     require_shape(name, numbers.shape, shape)
@@ -80,7 +80,7 @@ def as_float_array(name: str, value: Any) -> Array:
     """Convert to a float array.
 
     Raises:
-        InvalidValueError: for anything but real numbers: text (also "1.0"), complex numbers, None, expressions.
+        InvalidValueError: if the value is not real numbers: text (even "1.0"), complex numbers, None, expressions.
     """
     try:
         array = np.asarray(value)
@@ -93,7 +93,7 @@ def as_float_array(name: str, value: Any) -> Array:
 
 
 def require_finite(name: str, array: Array) -> None:
-    """Raise InvalidValueError, with the place of the first bad entry, unless all entries are finite."""
+    """Raise InvalidValueError, with the index of the first bad entry, unless all entries are finite."""
     bad = np.argwhere(~np.isfinite(array))
     if bad.size:
         place = tuple(int(i) for i in bad[0])
@@ -101,7 +101,7 @@ def require_finite(name: str, array: Array) -> None:
 
 
 def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
-    """One point or a set (N, n) as a set (N, n), and whether it was one point.
+    """Convert one point or a set of points to a set (N, n), and tell whether it was one point.
 
     A point is (n,), or a column (n, 1), such as a `casadi.DM`; for n = 1 a column is a set.
 
@@ -124,7 +124,7 @@ def as_point(name: str, value: ArrayLike, n: int) -> Array:
     """One point, (n,) or a column (n, 1), as a read-only copy (n,).
 
     Raises:
-        ShapeError, InvalidValueError: as `as_point_set`, and for a set.
+        ShapeError, InvalidValueError: as `as_point_set`. A set of points raises ShapeError.
     """
     points, single = as_point_set(name, value, n)
     if not single:
@@ -133,13 +133,13 @@ def as_point(name: str, value: ArrayLike, n: int) -> Array:
 
 
 def require_kind(name: str, value: object, kind: type) -> None:
-    """Raise InvalidValueError unless value is an instance of the class."""
+    """Raise InvalidValueError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
         plain = isinstance(value, str | int | float | None)
         raise InvalidValueError(name, repr(value)[:80] if plain else f"a {type(value).__name__}", f"a {kind.__name__}")
 
 
 def require_at_least(name: str, value: float, least: float) -> None:
-    """Raise InvalidValueError unless value is a finite number >= least."""
+    """Raise InvalidValueError unless `value` is a finite number >= least."""
     if not least <= value < float("inf"):
         raise InvalidValueError(name, value, f"a finite number >= {least:g}")

@@ -1,4 +1,4 @@
-"""Regions of joint space that coordinates are fitted and judged on, with seeded uniform sampling."""
+"""Domains: the regions of joint space on which charts are fitted and evaluated, with seeded sampling."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
@@ -11,12 +11,12 @@ from orthocas.errors import DomainError, InvalidValueError, ShapeError
 from orthocas.robots import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
 
-_WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes and overflow later
+_WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes, and overflow later
 
 
 @runtime_checkable
 class Domain(Protocol):
-    """A box in joint space; a torus is the box of whole turns."""
+    """A box in joint space. A torus is the box of full turns."""
 
     @property
     def name(self) -> str:
@@ -30,7 +30,7 @@ class Domain(Protocol):
 
     @property
     def half_width(self) -> Array:
-        """Half edge lengths, (n,), > 0."""
+        """Half of the edge lengths, (n,), > 0."""
         ...
 
     def contains(self, q: ArrayLike) -> Any:
@@ -45,6 +45,14 @@ class Box:
     Args:
         centre: (n,) [rad] or [m].
         half_width: (n,) or one number for all joints, > 0 [rad] or [m].
+
+    Example:
+        >>> import orthocas as oc
+        >>> box = oc.Box([0.0, 1.0], 0.5)
+        >>> box.half_width.tolist()
+        [0.5, 0.5]
+        >>> box.contains([[0.2, 1.4], [1.0, 1.0]]).tolist()
+        [True, False]
     """
 
     centre: Array
@@ -92,7 +100,13 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Torus:
-    """Whole turns of n revolute joints, sampled on (-pi, pi]."""
+    """Full turns of n revolute joints, sampled on (-pi, pi].
+
+    Example:
+        >>> import orthocas as oc
+        >>> oc.Torus(2).half_width.round(3).tolist()
+        [3.142, 3.142]
+    """
 
     n: int
     name: str = "torus"
@@ -108,16 +122,16 @@ class Torus:
 
     @property
     def half_width(self) -> Array:
-        """Pi for every joint, (n,)."""
+        """pi for every joint, (n,)."""
         return np.full(self.n, np.pi)
 
     def contains(self, q: ArrayLike) -> Any:
-        """Whether points (n,) or (N, n) lie on the torus, as all angles do: a bool, or (N,)."""
+        """Whether points (n,) or (N, n) lie on the torus: a bool, or (N,). All finite angles do."""
         return contains(self, q)
 
 
 def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
-    """Points drawn uniformly from the domain, (samples, n)."""
+    """Draw points uniformly from the domain, (samples, n)."""
     require_count("samples", samples)
     _require_seed(seed)
     unit = np.random.default_rng(seed).uniform(-1.0, 1.0, (samples, len(domain.centre)))
@@ -126,13 +140,14 @@ def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) ->
 
 
 def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
-    """Points that fill the domain more evenly than random ones, (samples, n); any part of the sequence does.
+    """Draw points that fill the domain more evenly than random points, (samples, n).
 
-    The additive recurrence frac(shift + k alpha), alpha_j = g^-j with g the root of g^(n+1) = g + 1, with a random
-    shift: uniform in distribution, and a better mean over the domain than independent points give.
+    They follow the additive recurrence frac(shift + k alpha), alpha_j = g^-j, with g the root of g^(n+1) = g + 1 and a
+    random shift. Each point is uniformly distributed, and every part of the sequence is even. Means over the domain
+    converge faster than with independent points.
 
     Source:
-        M. Roberts, docs/references.md [R2018]; the use for training is ours.
+        M. Roberts, docs/references.md [R2018]. The use for training is ours.
     """
     require_count("samples", samples)
     _require_seed(seed)
@@ -147,20 +162,20 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
 
 
 def contains(domain: Domain, q: ArrayLike) -> Array:
-    """Whether points (n,) or (N, n) lie in the domain; angles of a torus always do."""
+    """Whether points (n,) or (N, n) lie in the domain. Finite angles always lie on a torus."""
     points, single = as_point_set("q", q, len(domain.centre))
     inside: Array = np.all(np.abs(points - domain.centre) <= reach(domain), axis=1)
     return inside[0] if single else inside
 
 
 def borders(domain: Domain) -> tuple[Array, Array]:
-    """Lowest and highest joint positions, (n,) each; infinite for a torus, which has no borders."""
+    """Lowest and highest joint positions, (n,) each. They are infinite for a torus, which has no borders."""
     half_width = np.inf if isinstance(domain, Torus) else domain.half_width
     return domain.centre - half_width, domain.centre + half_width
 
 
 def reach(domain: Domain) -> Array:
-    """Distance from the centre that is still inside, (n,): the borders are, whichever way they are rounded."""
+    """Largest distance from the centre that counts as inside, (n,), with slack for rounding at the borders."""
     lower, upper = borders(domain)
     slack = 1e-12 * domain.half_width + 4 * np.finfo(float).eps * np.abs(domain.centre)
     values: Array = (upper - lower) / 2 + slack
@@ -170,14 +185,14 @@ def reach(domain: Domain) -> Array:
 def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: ArrayLike | None = None) -> Box:
     """A box inside the joint limits.
 
-    The centre is the middle of the limits (0, or the value next to 0, where there are none). Half-widths are pi/4 for
-    revolute and 0.25 m for prismatic joints, less where the limits are nearer.
+    The centre is the middle of the limits. For a joint without both limits it is 0, or the allowed value nearest to 0.
+    Half-widths are pi/4 for revolute and 0.25 m for prismatic joints, or less where the limits are closer.
 
     Args:
         robot: the robot.
         centre: another centre (n,).
-        half_width: another half-width (n,), or one for all joints; not shortened, so that it fails where it leaves the
-            limits.
+        half_width: another half-width (n,), or one for all joints. It is not clipped, so a `Problem` rejects a box that
+            leaves the limits.
     """
     middle = robot.tree.middle if centre is None else frozen_array("centre", centre, (robot.n,))
     if half_width is not None:
@@ -189,7 +204,7 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: Array
 
 
 def default_half_width(robot: Robot, centre: Array) -> Array:
-    """Half-widths of default boxes about centres (n,) or (N, n), same shape; <= 0 at a joint limit and beyond."""
+    """Half-widths of default boxes around centres (n,) or (N, n), same shape; <= 0 at or beyond a joint limit."""
     room = np.minimum(centre - robot.lower, robot.upper - centre)
     widths: Array = np.minimum(_wanted_half_width(robot), room)
     return widths
@@ -199,8 +214,9 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
     """Check a domain against a robot.
 
     Raises:
-        ShapeError: if it has another number of joints.
-        DomainError: if it leaves the joint limits (the joint is named), or is a torus with a prismatic joint.
+        ShapeError: if the domain has another number of joints.
+        DomainError: if the domain leaves the joint limits, or is a torus and a joint is prismatic. The message names
+            the joint.
     """
     if len(domain.centre) != robot.n:
         raise ShapeError("domain", (len(domain.centre),), (robot.n,))
@@ -208,7 +224,7 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
         name = robot.joint_names[robot.tree.prismatic.index(True)]
         raise DomainError(f"joint '{name}' is prismatic, expected a Box domain instead of a Torus")
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
-    slack = 1e-9 * domain.half_width  # decimal limits in a URDF do not add up exactly
+    slack = 1e-9 * domain.half_width  # limits in a URDF are decimal, so sums are not exact
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
     if outside.size:
         _raise_outside(robot, int(outside[0]), low, high)

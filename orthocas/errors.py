@@ -1,15 +1,15 @@
-"""Every error orthocas raises on purpose: one line that names what came and what was wanted."""
+"""The errors that orthocas raises on purpose. Each message is one line: what was given, and what was expected."""
 
 import difflib
 from collections.abc import Iterable
 
 _FEW_NAMES = 10  # names that are read at a glance, in their own order
 _LONGEST = 1500  # characters of a message
-_MOST_NAMES = 30  # names an error lists at the most: those nearest to what came
+_MOST_NAMES = 30  # the most names that a message lists: those closest to the given name
 
 
 def one_line(text: str) -> str:
-    """Text of others on one line of bounded length; what is not printable (control and bidi characters) as escapes."""
+    """The text on one line of bounded length, with escapes for control and bidi characters."""
     line = " ".join(text.split())
     if not line.isprintable():
         line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
@@ -17,14 +17,14 @@ def one_line(text: str) -> str:
 
 
 class OrthocasError(Exception):
-    """Base of every error raised on purpose; its message is one printable line, whatever files and users wrote."""
+    """Base class of all errors that orthocas raises on purpose. The message is one printable line."""
 
     def __str__(self) -> str:
         return one_line(super().__str__())
 
 
 class NotSavableWarning(UserWarning):
-    """Coordinates that are about to be fitted cannot be saved in a chart file."""
+    """A chart file cannot store the coordinates that a fit is about to compute."""
 
 
 class ShapeError(OrthocasError, ValueError):
@@ -42,7 +42,7 @@ class InvalidValueError(OrthocasError, ValueError):
 
 
 class UnknownNameError(OrthocasError, ValueError):
-    """A name that does not exist, with those that do; of many, similar ones come first."""
+    """A name does not exist. The message lists the known names; of many, the most similar come first."""
 
     def __init__(self, what: str, got: str, known: Iterable[str]) -> None:
         names = list(known)
@@ -56,7 +56,7 @@ class UnknownNameError(OrthocasError, ValueError):
 
 
 class RobotError(OrthocasError, ValueError):
-    """A robot description cannot be read, or holds a joint that orthocas cannot handle."""
+    """A robot description cannot be read, or contains a joint that orthocas does not support."""
 
 
 class DomainError(OrthocasError, ValueError):
@@ -99,7 +99,7 @@ class NotADiskError(OrthocasError, ValueError):
 
 
 class FoldedMapError(OrthocasError, ValueError):
-    """A map of a mesh to the plane turns triangles over."""
+    """A map of a mesh to the plane flips triangles."""
 
     def __init__(self, folded: int, triangles: int) -> None:
         super().__init__(f"the map folds {folded} of {triangles} triangles, expected 0: improve the mesh (more cells)")
@@ -110,56 +110,56 @@ class SolveError(OrthocasError, RuntimeError):
 
 
 class SimulationError(OrthocasError, RuntimeError):
-    """An integrator gave up in the middle of a closed loop."""
+    """An integrator failed during a closed-loop simulation."""
 
 
 class CompileError(OrthocasError, RuntimeError):
-    """Generated C cannot be compiled here."""
+    """The generated C code cannot be compiled on this machine."""
 
 
 class ProofError(OrthocasError, RuntimeError):
-    """Compiled C does not do what the Python it came from does."""
+    """The compiled C code disagrees with the Python function that it was generated from."""
 
 
 class InfeasibleError(SolveError):
-    """Constraints of a fit cannot be met."""
+    """The constraints of a fit cannot be met."""
 
 
 class InverseError(OrthocasError, RuntimeError):
-    """The inverse map q(x, xi) has no solution near its start, or meets a singular Jacobian."""
+    """The inverse map q(x, xi) has no solution near its initial guess, or meets a singular Jacobian."""
 
 
 class ArchiveError(OrthocasError, ValueError):
-    """A file of ours cannot be written, or read back."""
+    """A file written by orthocas cannot be written or read."""
 
 
 class CheckpointError(ArchiveError):
-    """A checkpoint is damaged, foreign, or belongs to another fit."""
+    """A checkpoint is damaged, is not a checkpoint, or belongs to another fit."""
 
 
 class TrajectoryFileError(ArchiveError):
-    """A trajectory file is missing, damaged, foreign or too new."""
+    """A trajectory file is missing, damaged, not a trajectory file, or from a newer version."""
 
 
 class ChartFileError(ArchiveError):
-    """A chart file is missing, truncated, foreign, edited or too new."""
+    """A chart file is missing, truncated, edited, not a chart file, or from a newer version."""
 
 
 class StepsFileError(OrthocasError, ValueError):
-    """A steps file is missing, is no JSON, or asks for what makes no sense."""
+    """A steps file is missing, is not valid JSON, or contains invalid steps."""
 
 
 class UnreachableReferenceError(OrthocasError, ValueError):
-    """A reference asks for what the robot cannot do inside the domain."""
+    """A reference leaves what the robot can reach inside the domain."""
 
 
 class GrowError(OrthocasError, ValueError):
-    """Coordinates cannot be grown as asked."""
+    """Coordinates cannot be grown with the given arguments."""
 
 
 class NotInvolutiveError(GrowError):
-    """The task gradients are not involutive: what would grow depends on the path."""
+    """The task gradients are not involutive, so grown coordinates would depend on the path."""
 
 
 class NoExpressionError(OrthocasError, TypeError):
-    """A chart has no closed expression in CasADi."""
+    """A chart has no closed-form CasADi expression."""

@@ -1,4 +1,4 @@
-"""Growing a chart: choose a base leaf, chart it, and carry its coordinates along the task gradients."""
+"""Grows a chart: chooses a base leaf, charts it, and carries its coordinates along the task gradients."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,7 +26,7 @@ from orthocas.growing.linear_leaf import linear_leaf
 from orthocas.involutivity import involutivity
 from orthocas.problem import Problem, check
 
-_PROBES = 1000  # samples of the domain that are pulled to see where a leaf has to reach
+_PROBES = 1000  # samples of the domain that are pulled to the leaf to find the extent that it needs
 _FEWEST_CELLS = 10  # along the longest edge of a region
 _MARGIN = 1.15  # of that region
 
@@ -39,31 +39,44 @@ def grow(
     region: Box | None = None,
     cells: int | None = None,
 ) -> GrownChart:
-    """Exact coordinates, J_x A^-1 J_xi^T = 0, carried from a base leaf along the task gradients ([AS2023] Sec. 5).
+    """Grow exact coordinates, J_x A^-1 J_xi^T = 0, from a base leaf along the task gradients ([AS2023] Sec. 5).
+
+    A leaf is a set of joint positions with the same task value. The flow along the task gradients pulls every joint
+    position to a point of the base leaf, and gives it the coordinates of that point.
 
     Args:
-        problem: with m = 1, or with a task whose gradients are involutive in the metric.
-        level: task value x0 of the base leaf, a number or (m,); default that of the origin.
-        leaf: how the base leaf is charted. "linear": xi0 = N^T (q - origin), any n. "circle": by arc length, scaled to
-            (-pi, pi], for a closed leaf with r = 1. "disk": by a harmonic map of a triangle mesh onto the unit disk,
+        problem: a problem with m = 1, or with task gradients that are involutive in the metric.
+        level: task value x0 of the base leaf, a number or (m,); default the task value of the origin.
+        leaf: how to chart the base leaf. "linear": xi0 = N^T (q - origin), for any n. "circle": by arc length, scaled
+            to (-pi, pi], for a closed leaf with r = 1. "disk": by a harmonic map of a triangle mesh onto the unit disk,
             for n = 3, m = 1. Default: "circle" for r = 1 on a torus, "disk" for n = 3 and m = 1, otherwise "linear".
-        origin: joint position (n,) whose end on the leaf is the origin of "linear" and "circle"; default the centre of
-            the domain, or, if the flow from there is singular, a point of the domain from where it is not.
-        region: only for "disk", the box whose part of the leaf is charted; default a box around all that the domain is
-            pulled to, and whole turns of joints that make them in the domain.
-        cells: only for "disk", number of mesh cells along the longest edge of the region, default 60.
+        origin: joint position (n,) that is pulled to the origin of a "linear" or "circle" leaf; default the centre of
+            the domain, or another point of the domain if the flow from the centre is singular.
+        region: for "disk" only, the box that bounds the charted part of the leaf; default a box around all points that
+            the domain is pulled to, with a whole turn for every joint that turns fully in the domain.
+        cells: for "disk" only, number of mesh cells along the longest edge of the region; default 60.
 
     Returns:
-        The chart. Values are NaN where a flow runs into a singularity or ends outside the chart of the leaf:
-        `chart.coordinates.pull(points).status` tells.
+        The chart. Its values are NaN where a flow runs into a singularity or ends outside the chart of the leaf;
+        `chart.coordinates.pull(points).status` tells which.
 
     Raises:
         NotInvolutiveError: if m >= 2 and the task gradients are not involutive, so that the result would depend on
             the path.
-        NotADiskError: if that part of the leaf is no disk; says what it is.
-        GrowError: if the leaf cannot be reached, closed or charted.
+        NotADiskError: if the part of the leaf in the region is not a disk; the message says what it is.
+        GrowError: if the flow does not reach the leaf, or the leaf does not close or cannot be charted.
         MetricError: if the metric is not SPD on the domain.
-        InvalidValueError: if an argument has another type, or belongs to another kind of leaf.
+        InvalidValueError: if an argument has the wrong type, or belongs to another kind of leaf.
+
+    Example:
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+        >>> problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box([0.6, 0.8], 0.3))
+        >>> chart = oc.grow(problem)
+        >>> task_row, xi_row = chart.jacobian([0.7, 0.9])
+        >>> bool(abs(task_row @ np.linalg.solve(robot.mass_matrix([0.7, 0.9]), xi_row)) < 1e-9)
+        True
     """
     require_kind("problem", problem, Problem)
     leaf = _default_leaf(problem) if leaf is None else leaf
@@ -96,7 +109,7 @@ def require_involutive(problem: Problem) -> None:
     if not found.exact:
         raise NotInvolutiveError(
             f"the gradients of task '{problem.task.name}' are not involutive (defect mean {found.mean:.3g}, "
-            f"max {found.max:.3g}): coordinates grown along them would depend on the path; fit them with orthocas.fit"
+            f"max {found.max:.3g}): grown coordinates would depend on the path, so use orthocas.fit instead"
         )
 
 
@@ -107,9 +120,10 @@ def _default_leaf(problem: Problem) -> str:
 
 
 def _require_fitting_options(leaf: str, region: Box | None, cells: int | None) -> None:
-    """Refuse options that would be ignored, or mean nothing."""
-    if leaf != "disk" and (region is not None or cells is not None):
-        raise InvalidValueError("region or cells", f"given for a {leaf} leaf", "none, they belong to a disk")
+    """Raise InvalidValueError for options that would be ignored or make no sense."""
+    for name, value in (("region", region), ("cells", cells)):
+        if leaf != "disk" and value is not None:
+            raise InvalidValueError(name, value, f"None for a {leaf} leaf, because {name} applies to disk leaves only")
     if region is not None and not isinstance(region, Box):
         raise InvalidValueError("region", repr(region), "a Box")
     if cells is not None:
@@ -124,10 +138,10 @@ def _leaf_chart(
     start = _start(problem, x0, origin)
     if leaf == "linear":
         if isinstance(problem.domain, Torus):
-            raise GrowError("a linear chart is not periodic: take a Box domain, or another leaf")
+            raise GrowError("a linear leaf is not periodic and the domain is a torus: use a Box domain or another leaf")
         return linear_leaf(problem, start)
     if problem.r != 1:
-        raise GrowError(f"a circle chart is for r = 1, got r = {problem.r}")
+        raise GrowError(f"the problem has r = {problem.r} extra coordinates, expected r = 1 for a circle leaf")
     return circle_leaf(problem, x0, start)
 
 
@@ -155,10 +169,10 @@ def _start(problem: Problem, x0: Array, origin: Array | None) -> Array:
 
 
 def _region(problem: Problem, x0: Array) -> Box:
-    """A box that holds the part of the leaf that the domain is pulled to."""
+    """A box around the part of the leaf that the domain is pulled to."""
     domain = problem.domain
     whole = (domain.half_width >= np.pi - 1e-9) & turning_joints(problem)
-    if whole.sum() > 1:  # the domain is cut open there, as in [AS2023] Sec. 5.2
+    if whole.sum() > 1:  # cut the domain open, as in [AS2023] Sec. 5.2
         return Box(domain.centre, domain.half_width)
     pulled = TaskFlow(problem).pull(sample_evenly(domain, _PROBES, 0), x0)
     if not pulled.reached.any():

@@ -1,4 +1,4 @@
-"""Whether exact orthogonal coordinates exist for a task, and how far it is from having them."""
+"""Involutivity: whether exact orthogonal coordinates exist for a task, and if not, how close one can get."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -13,9 +13,9 @@ from orthocas.errors import SingularTaskError
 from orthocas.problem import NEAR_SINGULAR, Problem, check, relative_singular_values
 from orthocas.showing import Shown, number_list
 
-_ROUNDING = 1e-7  # defects below this share of the terms they are differences of are zero
-_STRAIGHT = 1e-12  # [rad]; task gradients that turn less than this over the domain do not turn
-_LARGE = 20.0  # [deg]; expected angles beyond this are not predicted by the first order
+_ROUNDING = 1e-7  # a defect below this share of the terms that cancel in it counts as zero
+_STRAIGHT = 1e-12  # [rad]; task gradients that turn by less over the domain count as constant
+_LARGE = 20.0  # [deg]; larger expected angles are beyond the first-order estimate
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,25 +28,25 @@ class Involutivity(Shown):
     p99: float  #: 99 % quantile
     max: float
     worst_point: tuple[float, ...]  #: the sampled joint position with the largest d [rad] or [m]
-    expected_angle_deg: float  #: estimate of the root mean square task angle off 90 degrees of good coordinates
-    exact: bool  #: whether d = 0, up to rounding, at all samples: exact coordinates exist around regular points
+    expected_angle_deg: float  #: estimated RMS deviation of task angles from 90 degrees, for good coordinates
+    exact: bool  #: whether d = 0 up to rounding at all samples: exact coordinates exist near regular points
     samples: int
     seed: int
-    singular_samples: int  #: left out: relative singular value of J_x below NEAR_SINGULAR
+    singular_samples: int  #: samples left out: relative singular value of J_x below NEAR_SINGULAR
 
     @property
     def verdict(self) -> str:
-        """One sentence in words."""
+        """The result in one sentence."""
         if self.exact:
             return "exact orthogonal coordinates exist locally: the task gradients span an involutive distribution"
         angle = f"about {self.expected_angle_deg:.2g}" if self.expected_angle_deg < _LARGE else f"more than {_LARGE:g}"
         return (
-            f"coordinates can only be as orthogonal as possible: mean involutivity defect {self.mean:.3g}, "
+            f"no exact orthogonal coordinates exist: the mean involutivity defect is {self.mean:.3g}, "
             f"expect task angles {angle} degrees off 90 in the metric on this domain"
         )
 
     def facts(self) -> dict[str, str]:
-        """The verdict and the numbers behind it."""
+        """The verdict and its numbers."""
         return {
             "involutivity": "exact coordinates exist" if self.exact else "no exact coordinates",
             "verdict": self.verdict,
@@ -65,27 +65,35 @@ class Involutivity(Shown):
 def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involutivity:
     """Whether span{grad_A h_i} is involutive, which decides whether exact coordinates exist ([AS2023] Theorem 1).
 
-    d(q) = sqrt(sum_{a<b} |P [e_a, e_b]|_A^2) for an A-orthonormal basis e_1..e_m of the span and P = I - J^#A J_x. It
-    does not depend on the choice of task coordinates, and is 0 for m = 1. Its unit is one over a length in the metric:
-    1/rad for A = I and revolute joints, 1/(sqrt(kg) m) for A = M. It counts as zero below 1e-7 of the terms it is a
-    difference of.
+    The defect is d(q) = sqrt(sum_{a<b} |P [e_a, e_b]|_A^2) for an A-orthonormal basis e_1..e_m of the span and
+    P = I - J^#A J_x. It does not depend on the choice of task coordinates, and is 0 for m = 1. Its unit is the inverse
+    of a length in the metric: 1/rad for A = I and revolute joints, 1/(sqrt(kg) m) for A = M. A defect below 1e-7 of the
+    terms that cancel in it counts as zero.
 
-    The expected angle is d times the size of the domain along the span, without a fitted constant: to first order
-    in that size, the root mean square deviation from right angles, in the metric, between the gradients of quadratic
+    The expected angle is d times the size of the domain along the span, without a fitted constant. To first order in
+    that size it is the root mean square deviation from right angles, in the metric, between the gradients of quadratic
     coordinates and an A-orthonormal basis of the task gradients. Rich families come within a factor of two
-    (examples/involutivity.py). Exact coordinates exist locally: closed self-motion manifolds have none as a whole.
+    (examples/involutivity.py). Exact coordinates exist only locally: none covers a closed self-motion manifold.
 
     Args:
         problem: robot, task, metric and domain.
         samples: number of uniform samples of the domain.
-        seed: their seed.
+        seed: seed of the samples.
 
     Raises:
         SingularTaskError: if the task is singular at all samples, or not twice differentiable at one.
         MetricError: if A is not symmetric positive definite at a sample.
 
     Source:
-        Theorem: [AS2023] Sec. 3. Defect, and expected angle: ours, docs/derivations.md#involutivity.
+        Theorem: [AS2023] Sec. 3. Defect and expected angle: ours, docs/derivations.md#involutivity.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> oc.involutivity(problems.get("planar_3r_x"), samples=200).exact
+        True
+        >>> oc.involutivity(problems.get("planar_3r_xy"), samples=200).exact
+        False
     """
     samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
     require_kind("problem", problem, Problem)
@@ -116,7 +124,7 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
 
 
 def _regular_points(problem: Problem, samples: int, seed: int) -> Array:
-    """Uniform samples of the domain without those that `check` counts as near-singular."""
+    """Uniform samples of the domain, without the near-singular ones."""
     check(problem, samples, seed)
     points = sample_uniform(problem.domain, samples, seed)
     regular = relative_singular_values(problem, points) >= NEAR_SINGULAR
@@ -128,13 +136,13 @@ def _regular_points(problem: Problem, samples: int, seed: int) -> Array:
 def _squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
     """Sum over pairs of |T(e_a, e_b)|_A^2 / (k_a + k_b) [rad^2], (N,).
 
-    Here the basis is turned within the span such that it also diagonalises C^-1, C = diag(half_width^2 / 3) the
+    The basis is rotated within the span so that it also diagonalises C^-1, where C = diag(half_width^2 / 3) is the
     covariance of the domain, and k_a = e_a^T C^-1 e_a.
 
     Args:
         T: P [e_a, e_b] in coordinates where A = I, (N, n, m, m).
         basis: columns e_1..e_m, (N, n, m).
-        half_width: of the domain, (n,).
+        half_width: half-widths of the domain, (n,).
     """
     k, V = np.linalg.eigh(basis.transpose(0, 2, 1) @ (3 / half_width[:, None] ** 2 * basis))
     turned = V.transpose(0, 2, 1)[:, None] @ T @ V[:, None]
@@ -146,7 +154,7 @@ def _squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
 def lie_bracket(f: ca.SX, g: ca.SX, q: ca.SX) -> ca.SX:
     """Lie bracket [f, g] = (dg/dq) f - (df/dq) g of two vector fields, (n, 1).
 
-    Flowing along f, g, -f, -g for a short time t each ends at q + t^2 [f, g] + O(t^3).
+    A flow along f, g, -f and -g, for a short time t each, ends at q + t^2 [f, g] + O(t^3).
 
     Args:
         f: vector field, an expression in q, (n, 1).
@@ -157,7 +165,14 @@ def lie_bracket(f: ca.SX, g: ca.SX, q: ca.SX) -> ca.SX:
         ShapeError: if a field does not have the shape of q.
 
     Source:
-        Standard; sign as in [L2012].
+        Standard definition, with the sign of [L2012].
+
+    Example:
+        >>> import casadi as ca
+        >>> import orthocas as oc
+        >>> q = ca.SX.sym("q", 2)
+        >>> oc.lie_bracket(ca.vertcat(1, 0), ca.vertcat(0, q[0]), q)
+        SX([0, 1])
     """
     require_shape("q", q.shape, (None, 1))
     require_shape("f", f.shape, q.shape)
@@ -177,15 +192,15 @@ class TaskBrackets:
     basis: ca.SX  #: columns e_1..e_m, (n, m)
     across: ca.SX  #: U T(e_a, e_b) with T(e_a, e_b) = P [e_a, e_b] in column a m + b, (n, m m)
     defect: ca.SX  #: d = sqrt(sum_{a<b} |T(e_a, e_b)|_A^2)
-    size: ca.SX  #: root sum of squares of the terms whose differences are the brackets: what rounding of d scales with
+    size: ca.SX  #: root sum of squares of the terms that cancel in the brackets: the scale of rounding in d
 
     @classmethod
     def of(cls, problem: Problem) -> "TaskBrackets":
-        """Build the expressions; they are NaN where J_x loses rank.
+        """Build the expressions. They are NaN where J_x loses rank.
 
         With A = U^T U and the QR factors U^-T J_x^T = O R, the basis is E = U^-1 O = G R^-1, G = A^-1 J_x^T. Brackets
-        across the span depend on the values of the fields only, so R counts as constant: the derivative of e_b along
-        e_a is that of G along e_a, times column b of R^-1. P v becomes (I - O O^T) U v.
+        across the span depend only on the values of the fields, so R can be treated as constant: the derivative of e_b
+        along e_a is that of G along e_a, times column b of R^-1. In these terms P v is (I - O O^T) U v.
         """
         q, m = ca.SX.sym("q", problem.n), problem.m
         J = problem.task.jacobian_function(q)
@@ -201,9 +216,9 @@ class TaskBrackets:
         return cls(q, basis, across, ca.sqrt(ca.sumsqr(across) / 2), ca.sqrt(sum(terms, ca.SX(0))))
 
     def defect_function(self) -> ca.Function:
-        """Q (n, 1) -> d (1, 1)."""
+        """q (n, 1) -> d (1, 1)."""
         return dense_function("involutivity_defect", [self.q], [self.defect])
 
     def tensor_function(self) -> ca.Function:
-        """Q (n, 1) -> across (n, m m), size (1, 1), basis (n, m)."""
+        """q (n, 1) -> across (n, m m), size (1, 1), basis (n, m)."""
         return dense_function("task_brackets", [self.q], [self.across, self.size, self.basis])

@@ -1,4 +1,4 @@
-"""Metrics A(q) on joint space: what "orthogonal" means."""
+"""Metrics A(q) on joint space. They define what "orthogonal" means."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,15 +17,15 @@ from orthocas.robots import Robot
 from orthocas.robots.pinocchio_model import remedy
 
 METRIC_KINDS = ("euclidean", "inertia")
-MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` makes a metric of
-_SINGULAR = 1e-12  # eigenvalue, relative to the largest entry, that counts as none
+MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` accepts
+_SINGULAR = 1e-12  # eigenvalue, relative to the largest entry, that counts as zero
 
 
 @dataclass(frozen=True, eq=False)
 class Metric:
     """A symmetric positive definite A(q), (n, n). Use `from_spec` or `custom` to build one."""
 
-    name: str  #: euclidean, inertia, constant, custom, or the name of a custom one
+    name: str  #: euclidean, inertia, constant, custom, or a name of your own
     function: ca.Function  #: q (n, 1) -> A (n, n), dense, SX
     recipe: dict[str, Any] = field(repr=False)  #: plain data for chart files
 
@@ -34,9 +34,10 @@ class Metric:
         """Build from "euclidean", "inertia", a constant matrix (n, n), or a map q -> A(q) on SX.
 
         Raises:
-            UnknownNameError: if a name is unknown.
+            UnknownNameError: if the name is unknown.
             ShapeError: if A is not (n, n).
-            MetricError: if a constant A is not symmetric positive definite, or M(q) never is (a joint is named).
+            MetricError: if a constant A is not symmetric positive definite, or M(q) is singular everywhere. The message
+                names the joint.
         """
         q = ca.SX.sym("q", robot.n)
         if isinstance(spec, str):
@@ -57,7 +58,7 @@ class Metric:
 
     @classmethod
     def custom(cls, robot: Robot, name: str, function: Callable[[ca.SX], ca.SX] | ca.Function) -> Self:
-        """Any metric of elementary operations that CasADi can express.
+        """A metric of your own, as a CasADi expression.
 
         Args:
             robot: the robot.
@@ -66,6 +67,14 @@ class Metric:
 
         Raises:
             ShapeError: if A is not (n, n).
+
+        Example:
+            >>> import casadi as ca
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+            >>> metric = oc.Metric.custom(robot, "stiff elbow", lambda q: ca.diag(ca.vertcat(1, 2 + ca.cos(q[1]))))
+            >>> oc.Problem(robot, oc.Task.position(robot, "x"), metric).metric.name
+            'stiff elbow'
         """
         q = ca.SX.sym("q", robot.n)
         A = expression_of("metric", function, q)
@@ -75,7 +84,7 @@ class Metric:
 
     @cached_property
     def batched(self) -> Batched:
-        """A at many points."""
+        """Evaluates A at many points."""
         return Batched(self.function)
 
     @property
@@ -85,7 +94,7 @@ class Metric:
 
 
 def metric_matrices(metric: Metric, points: Array) -> Array:
-    """A at points (N, n), (N, n, n), checked to be symmetric positive definite."""
+    """A at points (N, n), as an array (N, n, n). Each matrix is checked to be symmetric positive definite."""
     n = points.shape[1]
     if metric.is_identity:
         return np.broadcast_to(np.eye(n), (len(points), n, n))
@@ -95,7 +104,7 @@ def metric_matrices(metric: Metric, points: Array) -> Array:
 
 
 def require_spd(matrices: Array, points: Array) -> None:
-    """Raise MetricError unless all matrices (N, n, n) are symmetric positive definite; names the worst point."""
+    """Raise MetricError, with the worst point, unless all matrices (N, n, n) are symmetric positive definite."""
     size = np.abs(matrices).max(axis=(1, 2))
     if not np.isfinite(size).all():
         at = points[np.flatnonzero(~np.isfinite(size))[0]]
@@ -119,12 +128,12 @@ def require_spd(matrices: Array, points: Array) -> None:
 
 
 def _require_mass(robot: Robot) -> None:
-    """Raise MetricError, with the joint to blame, if M(q) is singular at each of a few postures."""
+    """Raise MetricError, with the name of the joint, if M(q) is singular at several postures."""
     M = robot.mass_matrix(np.random.default_rng(0).uniform(-1, 1, (4, robot.n)))
     values, vectors = np.linalg.eigh(M)
     if np.all(values[:, 0] <= _SINGULAR * np.abs(M).max(axis=(1, 2))):
         joint = robot.joint_names[int(np.argmax(np.abs(vectors[0, :, 0])))]
         raise MetricError(
-            f"joint '{joint}' moves no mass and M(q) is singular, expected mass or armature for the metric inertia: "
+            f"joint '{joint}' moves no mass, so M(q) is singular, expected mass or armature for the inertia metric: "
             f"give the joint's link a mass in the robot file, or {remedy(joint)}"
         )

@@ -30,7 +30,7 @@ def quality_figure(report: Report) -> Figure:
 
 
 def self_motion_figure(chart: Chart, postures: int = 9, reach: float = 0.4) -> Figure:
-    """The arm while one extra coordinate sweeps and task and other coordinates are held; one panel per coordinate.
+    """The self-motions of the arm: each panel sweeps one coordinate and holds the task and the others.
 
     Args:
         chart: the chart; the sweep starts at the centre of its domain.
@@ -56,7 +56,7 @@ def self_motion_figure(chart: Chart, postures: int = 9, reach: float = 0.4) -> F
 
 
 def _draw_angles(axes: Axes, angles: AngleStatistics, colour: str, label: str) -> None:
-    first = 3  # groups of five bins, such that a right angle lies in the middle of its group
+    first = 3  # groups of five bins, so that 90 degrees lies in the middle of its group
     counts = angles.histogram[first:-3].reshape(-1, 5).sum(axis=1)
     edges = (first - 0.5) / 10 + 0.5 * np.arange(len(counts) + 1)
     axes.stairs(counts / max(counts.sum(), 1) / 0.5, edges, fill=True, color=colour, alpha=0.85)
@@ -68,7 +68,7 @@ def _draw_angles(axes: Axes, angles: AngleStatistics, colour: str, label: str) -
 
 
 def _sweep(chart: Chart, j: int, values: Array) -> Array:
-    """Joint positions along xi_j with everything else held, each found from its neighbour, from the middle outwards."""
+    """Joint positions along xi_j with all else held. Each is solved from its neighbour, from the middle outwards."""
     centre = chart.problem.domain.centre
     base = chart.phi(centre)
     found = np.empty((len(values), chart.n))
@@ -84,7 +84,7 @@ def _sweep(chart: Chart, j: int, values: Array) -> Array:
 
 
 def _equal_axes(axes: Any, points: Array) -> None:
-    """Same scale on all three axes, around the points; a planar arm is seen from above."""
+    """Use the same scale on all three axes, around the points. A planar arm is drawn from above."""
     low, high = points.min(axis=0), points.max(axis=0)
     half = (high - low).max() / 2 * 1.05
     for name, middle in zip("xyz", (low + high) / 2, strict=True):

@@ -23,16 +23,24 @@ class Problem(Shown):
 
     Args:
         robot: the robot.
-        task: a task of that robot, m < n. Where it lacks a reference orientation, that at the domain's centre is taken.
+        task: a task of that robot, m < n. If it lacks a reference orientation, the one at the domain's centre is used.
         metric: "euclidean", "inertia", a constant SPD matrix (n, n), a map q -> A(q) on SX, or a Metric.
-        domain: Box or Torus inside the joint limits; default `regular_box(robot, task)`: away from singular postures.
+        domain: Box or Torus inside the joint limits. Default: `regular_box(robot, task)`, away from singular postures.
         name: for reports.
 
     Raises:
         NotRedundantError: if m >= n.
         DomainError: if the domain leaves the joint limits.
-        MetricError: if a constant metric is not SPD, or a joint moves no mass under "inertia" (metrics that depend on q
-            are checked by `check` and on every sample).
+        MetricError: if a constant metric is not SPD, or a joint moves no mass under "inertia". Metrics that depend on q
+            are checked by `check`, and later at every sample.
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+        >>> task = oc.Task.position(robot, "xy")
+        >>> problem = oc.Problem(robot, task, metric="inertia", domain=oc.Box([0.6, 0.8, 0.8], 0.4))
+        >>> problem.n, problem.m, problem.r
+        (3, 2, 1)
     """
 
     robot: Robot
@@ -103,12 +111,12 @@ class Problem(Shown):
 
 @dataclass(frozen=True)
 class ProblemCheck:
-    """What `check` found on its samples."""
+    """The result of `check`."""
 
     samples: int
-    singular_samples: int  #: near-singular ones: relative singular value of J_x below NEAR_SINGULAR
+    singular_samples: int  #: samples with a relative singular value of J_x below NEAR_SINGULAR
     smallest_singular_value: float  #: of J_x with each row divided by its root mean square length
-    most_singular_point: tuple[float, ...]  #: the joint position where that happens [rad] or [m]
+    most_singular_point: tuple[float, ...]  #: joint position of the smallest singular value [rad] or [m]
 
     @property
     def singular_share(self) -> float:
@@ -119,11 +127,17 @@ class ProblemCheck:
 def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
     """Check the metric (SPD) and the rank of J_x on uniform samples of the domain.
 
-    Rows of J_x are divided by their root mean square length over the domain first, so that units do not matter.
+    Each row of J_x is first divided by its root mean square length over the domain, so that units do not matter.
 
     Raises:
         MetricError: if A is not symmetric positive definite at a sample.
         SingularTaskError: if J_x loses rank at every sample, or is not finite at one.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> oc.check(problems.get("planar_3r_xy")).singular_share
+        0.0
     """
     require_kind("problem", problem, Problem)
     points = sample_uniform(problem.domain, samples, seed)
@@ -158,7 +172,7 @@ def relative_singular_values(problem: Problem, points: Array) -> Array:
 
 
 def task_jacobians(problem: Problem, points: Array) -> Array:
-    """J_x at points (N, n), (N, m, n).
+    """J_x at points (N, n), as an array (N, m, n).
 
     Raises:
         SingularTaskError: if J_x is not finite at a point (for example polar coordinates at the origin).

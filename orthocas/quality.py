@@ -1,4 +1,4 @@
-"""How good a chart is: angles and conditioning on held-out samples ([AS2023] Figs. 20 and 27, and ours)."""
+"""The quality of a chart: angles and conditioning on held-out samples ([AS2023] Figs. 20 and 27, and ours)."""
 
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -16,12 +16,12 @@ from orthocas.showing import Shown
 
 DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
 _CHUNK = 5000
-_BIN_EDGES = np.linspace(-0.05, 180.05, 1802)  # a right angle lies in the middle of its bin
+_BIN_EDGES = np.linspace(-0.05, 180.05, 1802)  # 90 degrees lies in the middle of its bin
 
 
 @dataclass(frozen=True, eq=False)
 class AngleStatistics:
-    """Angles between gradients over all samples and pairs, in degrees; 90 is perfect. NaN if there are no pairs."""
+    """Angles between gradients over all samples and pairs, in degrees. 90 is perfect; NaN if there are no pairs."""
 
     mean: float
     std: float
@@ -30,7 +30,7 @@ class AngleStatistics:
 
     @classmethod
     def of_cosines(cls, cosines: Array) -> "AngleStatistics":
-        """Statistics of arccos, in degrees."""
+        """Statistics of the angles arccos(cosines), in degrees."""
         angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).ravel()
         counts = np.histogram(angles, _BIN_EDGES)[0].astype(float)
         if angles.size == 0:
@@ -40,7 +40,7 @@ class AngleStatistics:
 
 @dataclass(frozen=True)
 class Conditioning:
-    """Smallest singular value of [A-orthonormal task basis; unit coordinate gradients]: 1 perfect, 0 degenerate."""
+    """Smallest singular value of [A-orthonormal task basis; unit coordinate gradients]: 1 is perfect, 0 degenerate."""
 
     min: float
     p01: float  #: 1 % quantile
@@ -61,17 +61,17 @@ class Report(Shown):
     mutual_angle: AngleStatistics
     conditioning: Conditioning
     worst_point: tuple[float, ...]  #: the sampled joint position with the smallest conditioning
-    singular_samples: int  #: samples left out because a gradient vanishes there, or a grown coordinate has no value
-    length_ratio: float  #: longest over shortest gradient of a coordinate, 99 % over 1 % quantile, the worst one's
-    folded_samples: int  #: samples where det J has not the sign it has at most samples: the chart has folded over
+    singular_samples: int  #: samples left out: a gradient vanishes, or a grown coordinate has no value
+    length_ratio: float  #: 99 % over 1 % quantile of the gradient length, for the worst coordinate
+    folded_samples: int  #: samples where det J has the opposite sign of most samples: the chart folds over
 
     @property
     def degenerate(self) -> bool:
-        """Whether coordinates are nearly parallel, or lean into the task, on more than 1 % of the domain."""
+        """Whether coordinates are nearly parallel to each other or to the task gradients on over 1 % of the domain."""
         return self.conditioning.p01 < DEGENERATE
 
     def facts(self) -> dict[str, str]:
-        """Angles, conditioning and lengths, and what is wrong with the chart, if anything is."""
+        """Angles, conditioning, lengths, and the faults of the chart if there are any."""
         task, mutual, values = self.task_angle, self.mutual_angle, self.conditioning
         facts = {
             "problem": f"n = {self.n} joints, m = {self.m} task, r = {self.r} extra, metric {self.metric}",
@@ -96,11 +96,11 @@ class Report(Shown):
             faults["left out"] = f"{share:.3%} of the domain: singular, or without a value"
         if self.degenerate:
             advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
-            faults["DEGENERATE"] = f"coordinates are nearly parallel or lean into the task: {advice}"
+            faults["DEGENERATE"] = f"coordinates are nearly parallel to each other or to the task: {advice}"
         return faults
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON; NaN becomes None."""
+        """Plain data for JSON. NaN becomes None."""
 
         def angle(s: AngleStatistics) -> dict[str, float]:
             return {"mean": s.mean, "std": s.std, "max": s.max}
@@ -125,16 +125,24 @@ class Report(Shown):
 
 
 def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
-    """Judge a chart on uniform samples of its domain, with a seed other than the fit's.
+    """Measure the quality of a chart on uniform samples of its domain. Use another seed than that of the fit.
 
-    Angles are those of [AS2023] eq. (24): between each dxi_j and grad_A h_i, over all m r pairs, and between
-    the coordinates, over all r (r - 1) / 2 pairs. The conditioning is taken in coordinates where A is the identity,
-    so it does not depend on the task's own conditioning or units.
+    The angles are those of [AS2023] eq. (24): between each dxi_j and grad_A h_i, over all m r pairs, and between the
+    coordinates, over all r (r - 1) / 2 pairs. The conditioning is computed in coordinates where A is the identity, so
+    it does not depend on the task's own conditioning or units.
 
     Args:
         chart: the chart.
         samples: number of samples N.
         seed: seed of the samples.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> report = oc.evaluate(chart, samples=2000)
+        >>> 85 < report.task_angle.mean < 95, report.folded_samples
+        (True, 0)
     """
     require_kind("chart", chart, Chart)
     samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
@@ -144,7 +152,7 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
     task, mutual, smallest, signs, lengths, kept = (np.concatenate([part[i] for part in parts]) for i in range(6))
     if len(kept) == 0:
         raise SingularTaskError(
-            f"a gradient vanishes, or a coordinate has no value, at all {samples} samples: nothing to evaluate"
+            f"a gradient vanishes, or a coordinate has no value, at all {samples} samples of the domain"
         )
     worst = int(np.argmin(smallest))
     short, long = np.quantile(lengths, [0.01, 0.99], axis=0)
@@ -166,15 +174,15 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
 
 
 def _judge(chart: Chart, points: Array) -> tuple[Array, ...]:
-    """What is to be known at each point that is kept.
+    """The quantities of each point that is kept.
 
-    Task cosines (N, m, r), mutual cosines (N, pairs), smallest singular values (N,), signs of det J (N,), lengths of
-    the coordinate gradients (N, r), and the points (N, n).
+    They are task cosines (N, m, r), mutual cosines (N, pairs), smallest singular values (N,), signs of det J (N,),
+    lengths of the coordinate gradients (N, r), and the points (N, n).
     """
     samples = samples_at(chart.problem, points)
     J = chart.coordinates.jacobian(samples.points)
     lengths = np.linalg.norm(J, axis=2)
-    alive = lengths.min(axis=1) > 0  # false for NaN too: grown coordinates have no value there
+    alive = lengths.min(axis=1) > 0  # also false for NaN, where grown coordinates have no value
     samples, J, lengths = samples[alive], J[alive], lengths[alive]
     raised = samples.raised(J)
     task = samples.unit_task_gradients @ (J / lengths[:, :, None]).transpose(0, 2, 1)
@@ -186,7 +194,7 @@ def _judge(chart: Chart, points: Array) -> tuple[Array, ...]:
 
 
 def _smallest_singular_values(samples: Samples, J: Array, raised: Array) -> Array:
-    """From the Gram matrix of task basis and unit gradients in the metric: [[I, E v], [v^T E^T, v^T A^-1 v]]."""
+    """Roots of the smallest eigenvalues of the Gram matrix [[I, E v], [v^T E^T, v^T A^-1 v]], (N,)."""
     unit = 1 / np.sqrt(np.einsum("sjn,sjn->sj", J, raised))[:, :, None]
     basis = samples.task_basis
     leaning = basis @ (J * unit).transpose(0, 2, 1)  # (N, m, r)

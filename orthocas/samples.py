@@ -1,4 +1,4 @@
-"""Sample sets of a problem: everything the loss needs that does not depend on the coordinates."""
+"""Sample sets of a problem: the data of the loss that do not depend on the coordinates."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from orthocas.problem import Problem, task_jacobians
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Samples:
-    """N joint positions with their task gradients and metrics; samples with a vanishing gradient are left out."""
+    """N joint positions with their task gradients and metrics. Samples with a vanishing gradient are left out."""
 
     points: Array  #: q, (N, n)
     task_jacobian: Array  #: J_x, (N, m, n)
@@ -34,7 +34,7 @@ class Samples:
         return Samples(self.points[part], self.task_jacobian[part], inverse)
 
     def restricted_to(self, joints: list[int]) -> "Samples":
-        """Only some joints; the metric must not couple them to the others."""
+        """The samples of some joints only. The metric must not couple them to the others."""
         inverse = None if self.metric_inverse is None else self.metric_inverse[:, joints][:, :, joints]
         return Samples(self.points[:, joints], self.task_jacobian[:, :, joints], inverse)
 
@@ -55,10 +55,10 @@ class Samples:
         """An A-orthonormal basis e_1..e_m of span{grad_A h_i}, (N, m, n)."""
         gradients = self.raised(self.task_jacobian)
         gram = gradients @ self.task_jacobian.transpose(0, 2, 1)
-        scale = np.sqrt(np.einsum("sii->si", gram))  # rows of unit length first: units do not matter
+        scale = np.sqrt(np.einsum("sii->si", gram))  # normalise rows first, so that units do not matter
         gram = gram / scale[:, :, None] / scale[:, None, :]
         values, vectors = np.linalg.eigh(gram)
-        values = np.maximum(values, 1e-14)  # singular samples stay finite
+        values = np.maximum(values, 1e-14)  # keeps singular samples finite
         whitening = (vectors / np.sqrt(values)[:, None, :]).transpose(0, 2, 1)
         basis: Array = whitening @ (gradients / scale[:, :, None])
         return basis
@@ -76,16 +76,16 @@ class Samples:
         return Z
 
     def orientation(self, coordinate_jacobians: Array) -> float:
-        """Sign +1 or -1, at most samples, of the volume that gradients J_xi, (N, r, n), span across the task."""
+        """Sign (+1 or -1), at most of the samples, of the volume that J_xi (N, r, n) spans across the task."""
         return 1.0 if np.median(np.linalg.det(coordinate_jacobians @ self.null_basis)) >= 0 else -1.0
 
     def described(self, names: Iterable[str], orientation: float | None) -> list[Array]:
-        """What a loss needs to know of every sample: properties by name, (N, rows, columns) or (N, rows) each.
+        """The data of every sample that a loss needs, by name: arrays (N, rows, columns) or (N, rows).
 
         Args:
             names: see `orthocas.fitting.loss.term.SAMPLE_DATA`.
-            orientation: of the coordinates, as `orientation` gives it for those a fit starts from: the null basis is
-                turned like them, so that the volume of their gradients is positive.
+            orientation: result of `orientation` for the coordinates that a fit starts from. The null basis is oriented
+                like them, so that the volume of their gradients is positive.
         """
         found: dict[str, Array] = {name: getattr(self, name) for name in names}
         if "null_basis" in found:
@@ -95,11 +95,11 @@ class Samples:
         return list(found.values())
 
 
-Draw = Callable[[int, tuple[int, ...]], Samples]  #: a number of fresh samples of a problem, by seed
+Draw = Callable[[int, tuple[int, ...]], Samples]  #: draws a number of fresh samples of a problem, with a seed
 
 
 def even_parts(samples: Samples, count: int) -> Iterator[Samples]:
-    """Samples in `count` parts of nearly the same size: some may have been left out where a gradient vanishes."""
+    """Split samples into `count` parts of nearly equal size. Sizes differ if samples were left out."""
     edges = np.linspace(0, len(samples), count + 1).astype(int)
     for start, stop in pairwise(edges):
         yield samples[int(start) : int(stop)]

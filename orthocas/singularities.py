@@ -1,4 +1,4 @@
-"""Where grown coordinates must break: singular points of a task, and what xi does there."""
+"""Singular points of a task, where grown coordinates must break, and the behaviour of xi there."""
 
 from dataclasses import dataclass, field
 
@@ -17,8 +17,8 @@ from orthocas.metrics import metric_matrices
 from orthocas.problem import Problem, task_jacobians
 
 _NEWTON_STEPS = 40
-_FLAT = 1e-10  # |J_x| of a singular point, relative to its root mean square
-_SAME = 1e-6  # distance of two that are one
+_FLAT = 1e-10  # largest |J_x| of a singular point, relative to its root mean square
+_SAME = 1e-6  # singular points closer than this are one point
 _STARTS = 500
 
 
@@ -29,34 +29,34 @@ class SingularPoint:
     point: Array  #: (n,)
     kind: str  #: maximum, minimum or saddle
     task_value: float
-    curvatures: Array  #: eigenvalues of A^-1 d^2h/dq^2, rising, (n,)
+    curvatures: Array  #: eigenvalues of A^-1 d^2h/dq^2 in ascending order, (n,)
     directions: Array = field(repr=False)  #: their eigenvectors as columns, A-orthonormal, (n, n)
 
 
 @dataclass(frozen=True)
 class Jump:
-    """What a grown coordinate on a circle does at a singular point."""
+    """The jump of a grown coordinate on a circle at a singular point."""
 
     singular_point: SingularPoint
     values: tuple[float, float]  #: limits of xi on the two sides of a saddle, or smallest and largest at an extremum
-    size: float  #: between them, along the circle [rad]; at an extremum all values meet, and this is the full turn
+    size: float  #: distance between them along the circle [rad]; a full turn at an extremum, where all values meet
 
 
 def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...]:
-    """Isolated singular points of a task with m = 1 in the domain, by Newton's method on grad h = 0 from 500 starts.
+    """Isolated singular points in the domain of a task with m = 1, by Newton's method on grad h = 0 from 500 starts.
 
-    Angles are given within half a turn of the domain's centre; points that differ by whole turns count once.
+    Angles lie within half a turn of the domain's centre. Points that differ by whole turns count once.
 
     Args:
-        problem: with m = 1.
-        seed: of the starts.
+        problem: a problem with m = 1.
+        seed: seed of the starts.
 
     Raises:
         GrowError: if m > 1.
     """
     require_kind("problem", problem, Problem)
     if problem.m != 1:
-        raise GrowError(f"singular points are found for m = 1 tasks, got m = {problem.m}")
+        raise GrowError(f"the task has m = {problem.m} components, expected m = 1 to find singular points")
     hessian = _hessian(problem)
     q = sample_evenly(problem.domain, _STARTS, seed)
     size = np.sqrt((task_jacobians(problem, q) ** 2).sum(axis=(1, 2)).mean())
@@ -64,7 +64,7 @@ def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...
         J = task_jacobians(problem, q)
         step = np.linalg.pinv(hessian(q)[0].reshape(-1, problem.n, problem.n)) @ J.transpose(0, 2, 1)
         q = q - step[:, :, 0]
-    turns = np.floor((q - problem.domain.centre) / (2 * np.pi) + 0.5 - _SAME)  # half a turn counts as +pi
+    turns = np.floor((q - problem.domain.centre) / (2 * np.pi) + 0.5 - _SAME)  # an angle of half a turn becomes +pi
     q = q - 2 * np.pi * turns * turning_joints(problem)
     flat = np.abs(task_jacobians(problem, q)).max(axis=(1, 2)) < _FLAT * size
     found = _distinct(q[flat & contains(problem.domain, q)])
@@ -74,20 +74,20 @@ def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...
 def jumps(chart: Chart, radius: float = 0.02) -> tuple[Jump, ...]:
     """Discontinuities of a grown coordinate with r = 1 on a circle, at the singular points of its task.
 
-    Flow lines that pass a saddle on its two sides reach the leaf at different points: beyond the saddle xi jumps across
-    the line that flows into it. At an extremum all flow lines, and so all values of a circle around it, meet.
+    Flow lines that pass a saddle on its two sides reach the leaf at different points. Beyond the saddle, xi therefore
+    jumps across the line that flows into it. At an extremum all flow lines meet, and with them all values of xi.
 
     Args:
-        chart: n = 2, m = 1, grown from a circle.
-        radius: distance from a saddle where the two sides are taken [rad].
+        chart: a chart with n = 2 and m = 1, grown from a circle.
+        radius: distance from a saddle at which xi is evaluated on its two sides [rad].
 
     Raises:
-        GrowError: if the chart is not grown from a circle for n = 2.
+        GrowError: if the chart is not grown from a circle, or n is not 2.
     """
     require_kind("chart", chart, Chart)
     grown = chart.coordinates
     if not isinstance(grown, GrownCoordinates) or grown.leaf.kind != "circle" or chart.n != 2:
-        raise GrowError("jumps are found for charts with n = 2 that are grown from a circle")
+        raise GrowError("jumps are defined only for charts with n = 2 that are grown from a circle")
     return tuple(_jump(chart, singular, grown.leaf.level[0], radius) for singular in singular_points(chart.problem))
 
 
@@ -119,7 +119,7 @@ def _classified(problem: Problem, point: Array, hessian: Batched) -> SingularPoi
 
 
 def _distinct(points: Array) -> Array:
-    """One of each group of equal points, sorted."""
+    """One point from each group of equal points, sorted."""
     kept: list[int] = []
     if len(points):
         groups = cKDTree(points).query_ball_point(points, _SAME)

@@ -1,4 +1,4 @@
-"""Tasks x = h(q): what the robot is to do, with m < n numbers."""
+"""Tasks x = h(q): m < n numbers that describe what the robot does."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,30 +32,38 @@ TASK_KINDS = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Task(Shown):
-    """A task map h of a robot. Use the class methods to build one.
+    """The task map h of a robot. Use the class methods to build one.
 
-    Orientation, pose and axis tasks compare the tip with a reference. Where none is given, `Problem` takes the tip's
-    orientation at the centre of its domain; the task alone takes the one in the middle of the joint limits.
+    Orientation, pose and axis tasks compare the tip with a reference orientation. If none is given, `Problem` uses the
+    tip's orientation at the centre of its domain, and the task itself uses that in the middle of the joint limits.
     """
 
     robot: Robot
     name: str
     labels: tuple[str, ...]  #: names of the components of x
-    units: tuple[str, ...]  #: of the components: "m", "rad", or "" where it is unknown
+    units: tuple[str, ...]  #: units of the components: "m", "rad", or "" if unknown
     function: ca.Function  #: q (n, 1) -> x (m, 1), dense, SX
     recipe: dict[str, Any]  #: plain data that `from_recipe` turns into the same task
 
     @classmethod
     def position(cls, robot: Robot, axes: str = "xyz") -> Self:
-        """Position of the tip along some world axes [m], for example axes="xy"."""
+        """Position of the tip along the given world axes [m], for example axes="xy".
+
+        Example:
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+            >>> task = oc.Task.position(robot, "xy")
+            >>> task.m, task.labels, task.units
+            (2, ('x', 'y'), ('m', 'm'))
+        """
         if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
-            raise InvalidValueError("axes", repr(axes), "different letters out of 'xyz'")
+            raise InvalidValueError("axes", repr(axes), "different letters of 'xyz'")
         rows = ["xyz".index(a) for a in axes]
         return cls._of_tip(robot, f"position:{axes}", tuple(axes), ("m",) * len(rows), lambda R, p: p[rows])
 
     @classmethod
     def polar(cls, robot: Robot) -> Self:
-        """Radius [m] and angle [rad] of the tip in the x-y plane: the same task as axes="xy" in other coordinates."""
+        """Radius [m] and angle [rad] of the tip in the x-y plane: axes="xy" in polar coordinates."""
         return cls._of_tip(
             robot,
             "polar",
@@ -68,11 +76,11 @@ class Task(Shown):
     def orientation(cls, robot: Robot, reference: ArrayLike | None = None) -> Self:
         """Orientation of the tip, x = 2 sin(angle / 2) axis of the rotation from a reference to the tip, (3,).
 
-        Near the reference x is the rotation vector [rad]; it is smooth except half a turn away.
+        Near the reference, x is the rotation vector [rad]. It is smooth except half a turn away from the reference.
 
         Args:
             robot: the robot.
-            reference: reference rotation (3, 3) in the world; default the tip's at the centre of the problem's domain.
+            reference: reference rotation (3, 3) in the world. Default: the tip's at the centre of the problem's domain.
         """
         return cls._turned(robot, TipTurn(False, None), reference)
 
@@ -83,16 +91,17 @@ class Task(Shown):
 
     @classmethod
     def axis(cls, robot: Robot, axis: str = "z", reference: ArrayLike | None = None) -> Self:
-        """Direction of one axis of the tip, (2,): where it points, whatever the turn about it.
+        """Direction of one axis of the tip, (2,). It does not depend on the rotation about that axis.
 
-        With d the axis in a frame whose own axis is the reference direction, x = (d_i, d_j) sqrt(2 / (1 + d_axis)) has
-        the length 2 sin(angle / 2) of the angle between the two: [rad] near the reference, smooth except half a turn
-        away. The frame is the tip's at the centre of the problem's domain, or any about the direction that is given.
+        Let d be the axis, expressed in a frame whose own axis is the reference direction. Then
+        x = (d_i, d_j) sqrt(2 / (1 + d_axis)) has the length 2 sin(angle / 2), where angle lies between axis and
+        reference. Near the reference, x is in [rad]. It is smooth except half a turn away. The frame is that of the tip
+        at the centre of the problem's domain, or some frame about the given direction.
 
         Args:
             robot: the robot.
             axis: "x", "y" or "z" of the tip frame.
-            reference: direction (3,) in the world, of any length; default the axis at the centre of the domain.
+            reference: direction (3,) in the world, of any length. Default: the axis at the centre of the domain.
 
         Source:
             Lambert's azimuthal equal-area map of the sphere of directions.
@@ -115,17 +124,25 @@ class Task(Shown):
         labels: Sequence[str] = (),
         units: Sequence[str] = (),
     ) -> Self:
-        """Any task of elementary operations that CasADi can express.
+        """A task of your own, as a CasADi expression.
 
         Args:
             robot: the robot.
             name: a name for reports.
             function: maps an SX column q (n, 1) to x (m, 1).
             labels: names of the components.
-            units: of the components, for pictures and reports, for example "m" or "rad"; default unknown.
+            units: units of the components for figures and reports, for example "m" or "rad". Default: unknown.
 
         Raises:
             ShapeError: if x is not a column, or labels or units do not have one entry per component.
+
+        Example:
+            >>> import casadi as ca
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+            >>> reach = oc.Task.custom(robot, "reach", lambda q: 2 * ca.cos(q[1] / 2), labels=["distance"], units=["m"])
+            >>> reach.m, reach.labels
+            (1, ('distance',))
         """
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
@@ -142,12 +159,12 @@ class Task(Shown):
 
     @classmethod
     def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> Self:
-        """A task from its short name: position, position:xy, polar, orientation, pose, axis, axis:x, position+axis.
+        """A task by its short name: position, position:xy, polar, orientation, pose, axis, axis:x, position+axis.
 
         Args:
             robot: the robot.
             kind: the short name.
-            q_reference: posture (n,) whose tip orientation is the reference of orientation, pose and axis tasks.
+            q_reference: posture (n,) that defines the reference of orientation, pose and axis tasks.
         """
         if kind == "position" or kind.startswith("position:"):
             return cls.position(robot, kind.partition(":")[2] or "xyz")
@@ -159,7 +176,7 @@ class Task(Shown):
 
     @classmethod
     def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> Self:
-        """The task of a robot that `recipe` describes; for every task but a custom one."""
+        """The task of a robot that `recipe` describes. Custom tasks have no such recipe."""
         turn = TipTurn.of_kind(recipe["kind"])
         return cls.named(robot, recipe["kind"]) if turn is None else cls._turned(robot, turn, recipe["reference"])
 
@@ -169,7 +186,7 @@ class Task(Shown):
         return TipTurn.of_kind(self.recipe["kind"]) is not None and "reference" not in self.recipe
 
     def with_reference_at(self, q: ArrayLike) -> Self:
-        """The task with the tip's orientation at q (n,) as its reference; the same task if it lacks none."""
+        """The task with the tip's orientation at q (n,) as its reference, or the task itself if it has one already."""
         return self.named(self.robot, self.recipe["kind"], q) if self.lacks_reference else self
 
     @property
@@ -183,20 +200,20 @@ class Task(Shown):
 
     @cached_property
     def jacobian_function(self) -> ca.Function:
-        """Q (n, 1) -> J_x = dh/dq (m, n), by automatic differentiation."""
+        """q (n, 1) -> J_x = dh/dq (m, n), by automatic differentiation."""
         q = ca.SX.sym("q", self.robot.n)
         return dense_function("task_jacobian", [q], [ca.jacobian(self.function(q), q)])
 
     @cached_property
     def second_derivative_function(self) -> ca.Function:
-        """Q, v, w (n, 1) -> d^2 h(q)[v, w] = (d/ds) J_x(q + s v) w, (m, 1)."""
+        """q, v, w (n, 1) -> d^2 h(q)[v, w] = (d/ds) J_x(q + s v) w, (m, 1)."""
         q, v, w = (ca.SX.sym(name, self.robot.n) for name in ("q", "v", "w"))
         second = ca.jtimes(ca.jtimes(self.function(q), q, w), q, v)
         return dense_function("task_second_derivative", [q, v, w], [second], ["q", "v", "w"])
 
     @cached_property
     def centred_jacobian_function(self) -> ca.Function:
-        """Q, centre (n, 1) -> J_x at q (m, n), with a reference that nobody gave taken at the centre."""
+        """q, centre (n, 1) -> J_x at q (m, n). A missing reference is taken at the centre."""
         q, centre = (ca.SX.sym(name, self.robot.n) for name in ("q", "centre"))
         x, turn = self.function(q), TipTurn.of_kind(self.recipe["kind"])
         if turn is not None and self.lacks_reference:
@@ -206,17 +223,17 @@ class Task(Shown):
 
     @cached_property
     def batched(self) -> Batched:
-        """H at many points."""
+        """Evaluates h at many points."""
         return Batched(self.function)
 
     @cached_property
     def batched_jacobian(self) -> Batched:
-        """J_x at many points."""
+        """Evaluates J_x at many points."""
         return Batched(self.jacobian_function)
 
     @classmethod
     def _turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None) -> Self:
-        """A task of the tip's turn away from a reference rotation (3, 3), or from the default if there is none."""
+        """A task of the tip's rotation from a reference (3, 3), or from the default if it is None."""
         if reference is None:
             base, extra = robot.tip_rotation(robot.tree.middle), {}
         else:

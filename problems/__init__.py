@@ -1,4 +1,4 @@
-"""Named problems with their data."""
+"""Named problems and their data."""
 
 from orthocas.problems.registry import get, names
 

@@ -16,17 +16,17 @@ HALF_WIDTH = np.pi / 4  #: [rad]
 
 
 def urdf_path() -> AbstractContextManager[Path]:
-    """The arm's URDF as a file, for as long as the context lasts."""
+    """The path of the arm's URDF file, valid while the context is open."""
     return as_file(files("orthocas.problems") / "data" / "iiwa7_r800.urdf")
 
 
 def robot() -> Robot:
-    """The arm, tip at the flange (link_ee)."""
+    """The arm with its tip at the flange (link_ee)."""
     with urdf_path() as path:
         return Robot.from_urdf(path, tip="link_ee")
 
 
 def iiwa() -> Problem:
-    """Seven joints, flange position, A = I, hyper-cube of edge pi/2 about q0."""
+    """Seven joints, flange position, A = I, hypercube with edges of pi/2 around q0."""
     arm = robot()
     return Problem(arm, Task.position(arm), "euclidean", Box(CENTRE, HALF_WIDTH), "iiwa")

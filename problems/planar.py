@@ -1,4 +1,4 @@
-"""The planar arms of [AS2023] (Fig. 5): links of 1 m and 3 kg, mass spread uniformly (lengths are ours)."""
+"""The planar arms of [AS2023] (Fig. 5): links of 1 m and 3 kg with uniform mass (lengths are ours)."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ def _arm(joints: int) -> Robot:
 def planar_2r() -> Problem:
     """Two joints, task x of the tip, A = I, whole torus ([AS2023] Sec. 6.1).
 
-    Self-motion manifolds are circles here, so no smooth coordinate is good everywhere: expect bad regions near the
+    Self-motion manifolds are circles here, so no smooth coordinate is good everywhere. Expect bad regions near the
     singularities of the task.
     """
     robot = _arm(2)
@@ -25,12 +25,12 @@ def planar_2r() -> Problem:
 
 
 def planar_3r_x() -> Problem:
-    """Three joints, task x of the tip, A = M: exact coordinates exist. A box away from singularities (ours)."""
+    """Three joints, task x of the tip, A = M. Exact coordinates exist. The box avoids singularities (ours)."""
     robot = _arm(3)
     return Problem(robot, Task.position(robot, "x"), "inertia", _BENT, "planar_3r_x")
 
 
 def planar_3r_xy() -> Problem:
-    """Three joints, task (x, y) of the tip, A = M: exact coordinates do not exist. Box as for planar_3r_x (ours)."""
+    """Three joints, task (x, y) of the tip, A = M. No exact coordinates exist. Same box as planar_3r_x (ours)."""
     robot = _arm(3)
     return Problem(robot, Task.position(robot, "xy"), "inertia", _BENT, "planar_3r_xy")

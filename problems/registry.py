@@ -1,4 +1,4 @@
-"""Named problems by name."""
+"""The registry of named problems."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
 
 
 def names() -> tuple[str, ...]:
-    """Names of all problems."""
+    """Names of all named problems."""
     return tuple(PROBLEMS)
 
 

@@ -20,10 +20,10 @@ SOLVERS: dict[str, type[GaussNewton] | type[LBFGS] | type[Ipopt] | type[Adam] | 
 
 
 def get(name: str) -> Solver:
-    """A solver with its default settings, by name.
+    """The solver with a name, with its default settings.
 
     Raises:
-        UnknownNameError: if there is no such solver.
+        UnknownNameError: if no solver has that name.
     """
     require_known("solver", name, SOLVERS)
     return SOLVERS[name]()

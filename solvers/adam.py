@@ -1,4 +1,4 @@
-"""Adam on fresh samples, as the paper trains its network ([AS2023] Sec. 6)."""
+"""Adam on fresh samples, the method that trains the paper's network ([AS2023] Sec. 6)."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -17,16 +17,17 @@ _MOMENT, _SQUARE, _SMALL = 0.9, 0.999, 1e-8  # the usual constants of [KB2015]
 
 @dataclass(frozen=True)
 class Adam:
-    """Adam [KB2015]: steps along the mean gradient over the root of its mean square, on new samples every time.
+    """Adam [KB2015]: steps along the mean gradient divided by the root of its mean square, with new samples each time.
 
-    After every epoch the loss on the fixed samples is taken, and the best point so far kept. The learning rate falls to
-    zero along half a cosine; with that, the last epochs are the best ones. Objectives without samples are taken whole.
+    After every epoch, the loss on the fixed samples is evaluated and the best point so far is kept. The learning rate
+    falls to zero along half a cosine, which makes the last epochs the best ones. Objectives without samples are used as
+    a whole.
 
     Args:
-        epochs: number of epochs; the paper's network took 200.
-        steps: steps in an epoch; the paper's 50.
-        batch: fresh samples in every step; the paper's 200.
-        learning_rate: of the first step (the paper does not print it).
+        epochs: number of epochs; 200 in the paper.
+        steps: steps per epoch; 50 in the paper.
+        batch: fresh samples per step; 200 in the paper.
+        learning_rate: learning rate of the first step (the paper does not state it).
     """
 
     epochs: int = 200
@@ -41,11 +42,11 @@ class Adam:
         require_at_least("learning_rate", self.learning_rate, 1e-300)
 
     def coarser(self) -> "Adam":
-        """A quarter of the epochs."""
+        """The same solver with a quarter of the epochs."""
         return replace(self, epochs=max(1, self.epochs // 4))
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
-        """Minimise from theta0; the planned number of epochs ends with status ITERATION_LIMIT."""
+        """Minimise from theta0. A run of all planned epochs has the status ITERATION_LIMIT."""
         run = _Run(self, objective, theta0, watch)
         return run.best.run(run.iterate)
 
@@ -77,13 +78,13 @@ class _Run:
         return Status.ITERATION_LIMIT
 
     def _parts(self, epoch: int) -> Iterable[Objective]:
-        """The objectives of the steps of an epoch."""
+        """The objectives for the steps of an epoch."""
         if isinstance(self.objective, SampledObjective):
             return self.objective.batches(self.settings.batch, self.settings.steps, (epoch,))
         return repeat(self.objective, self.settings.steps)
 
     def _step(self, gradient: Array, k: int) -> None:
-        """Step k = 0, 1, ... of all epochs."""
+        """Take step k = 0, 1, ..., counted over all epochs."""
         total = self.settings.epochs * self.settings.steps
         rate = self.settings.learning_rate * 0.5 * (1 + np.cos(np.pi * k / total))
         self.mean += (1 - _MOMENT) * (gradient - self.mean)
@@ -92,7 +93,7 @@ class _Run:
         self.theta = self.theta - rate / (1 - _MOMENT ** (k + 1)) * self.mean / unbiased
 
     def _judge(self) -> bool:
-        """Take the loss on the fixed samples; whether it is finite."""
+        """Evaluate the loss on the fixed samples, and return whether it is finite."""
         value = self.objective.value(self.theta)
         self.best.evaluations += 1
         self.best.offer(self.theta, value)

@@ -1,4 +1,4 @@
-"""CasADi nodes around NumPy functions, for the solvers that CasADi brings."""
+"""CasADi nodes around NumPy functions, for the solvers that come with CasADi."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,19 +11,19 @@ from orthocas.checks import Array
 
 
 class ArrayNode(ca.Callback):
-    """A function of columns whose outputs NumPy computes.
+    """A function of columns whose outputs are computed in NumPy.
 
-    An exception, Ctrl-C included, cannot pass through the solver's own code: it is kept in `error`, the evaluation
-    fails, and all later ones do too, so that the solver soon gives up.
+    Exceptions, Ctrl-C included, cannot pass through the code of the solver. The node keeps an exception in `error` and
+    fails this evaluation and all later ones, so that the solver soon gives up.
 
     Args:
-        name: of the function.
+        name: name of the function.
         rows: length of each input column.
         shapes: shape of each output.
-        compute: maps arrays (rows,) to one array for each output.
-        options: of the CasADi function.
-        jacobian: derivative of the one output with respect to the one input, where a solver asks for it.
-        forward: the same in one direction, as a function of input and direction; then no dense Jacobian is built.
+        compute: maps arrays (rows,) to one array per output.
+        options: options of the CasADi function.
+        jacobian: derivative of the single output with respect to the single input, for solvers that need it.
+        forward: directional derivative, as a function of input and direction; avoids a dense Jacobian.
     """
 
     def __init__(
@@ -59,11 +59,11 @@ class ArrayNode(ca.Callback):
         return ca.Sparsity.dense(*self._shapes[i])
 
     def has_eval_buffer(self) -> bool:
-        """Buffers, so that nothing is copied twice."""
+        """Whether to use buffers; they avoid a second copy."""
         return True
 
     def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
-        """Evaluate; 1 tells CasADi that it failed."""
+        """Evaluate the outputs; the return value 1 tells CasADi that the evaluation failed."""
         if self.error is not None:
             return 1
         try:
@@ -78,7 +78,7 @@ class ArrayNode(ca.Callback):
         return 0
 
     def _array(self, i: int, memory: Any) -> Array:
-        """Input i; CasADi passes nothing for zeros."""
+        """Input i as an array; CasADi passes None for zeros."""
         return np.zeros(self._rows[i]) if memory is None else np.frombuffer(memory).copy()
 
     def has_jacobian(self) -> bool:
@@ -88,7 +88,7 @@ class ArrayNode(ca.Callback):
     def get_jacobian(
         self, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
     ) -> ca.Function:
-        """The derivative, in CasADi's form: inputs and an unused output come in."""
+        """The derivative in CasADi's form, as a function of the inputs and an unused output."""
         if self._jacobian is None:
             raise NotImplementedError(name)
         inputs = [ca.MX.sym("x", rows) for rows in self._rows]
@@ -96,13 +96,13 @@ class ArrayNode(ca.Callback):
         return ca.Function(name, [*inputs, unused], [self._jacobian(*inputs)], list(inames), list(onames), dict(opts))
 
     def has_forward(self, nfwd: int) -> bool:
-        """Whether there is a derivative in a direction."""
+        """Whether a directional derivative was given."""
         return self._forward is not None and nfwd == 1
 
     def get_forward(
         self, nfwd: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
     ) -> ca.Function:
-        """The derivative in a direction, in CasADi's form: input, an unused output and the direction come in."""
+        """The directional derivative in CasADi's form, as a function of input, an unused output and direction."""
         if self._forward is None:
             raise NotImplementedError(name)
         x, unused, direction = (ca.MX.sym(letter, self._rows[0]) for letter in "xyd")
@@ -110,14 +110,14 @@ class ArrayNode(ca.Callback):
         return ca.Function(name, [x, unused, direction], outputs, list(inames), list(onames), dict(opts))
 
     def has_jac_sparsity(self, oind: int, iind: int) -> bool:
-        """Whether to say something about the Jacobian without building it."""
+        """Whether the sparsity of the Jacobian is known without building the Jacobian."""
         return self._forward is not None
 
     def get_jac_sparsity(self, oind: int, iind: int, symmetric: bool) -> ca.Sparsity:
-        """Nothing: a Krylov method asks for products with the Jacobian only."""
+        """An empty pattern, because a Krylov method uses only products with the Jacobian."""
         return ca.Sparsity(self._shapes[oind][0], self._rows[iind])
 
     def reraise(self) -> None:
-        """Raise the exception that stopped an evaluation, if there was one."""
+        """Raise the exception that stopped an evaluation, if any."""
         if self.error is not None:
             raise self.error

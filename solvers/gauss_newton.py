@@ -16,13 +16,13 @@ _MAX_REJECTIONS = 10
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Levenberg-Marquardt: (H + mu diag H) step = -gradient, mu down after a good step, up after a bad one.
+    """Levenberg-Marquardt: (H + mu diag H) step = -gradient; mu falls after a good step and rises after a bad one.
 
-    The scale of each coordinate does not change the loss; damping takes care of these flat directions.
+    The loss does not depend on the scale of each coordinate. Damping takes care of these flat directions.
 
     Args:
         max_iterations: largest number of accepted steps.
-        tolerance: stop when a step lowers the loss by less than this share.
+        tolerance: stop when a step reduces the loss by less than this fraction.
     """
 
     max_iterations: int = 100
@@ -34,14 +34,15 @@ class GaussNewton:
         require_at_least("tolerance", self.tolerance, 0)
 
     def coarser(self) -> "GaussNewton":
-        """At most 10 iterations, and done when a step gains less than half a per cent."""
+        """The same solver with at most 10 iterations, which stops when a step gains less than half a per cent."""
         return replace(self, max_iterations=min(10, self.max_iterations), tolerance=max(5e-3, self.tolerance))
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
         """Minimise from theta0.
 
         Raises:
-            InvalidValueError: if the objective has no normal equations (a parametrisation not linear in theta).
+            InvalidValueError: if the objective has no normal equations because the parametrisation is not linear in
+                theta.
         """
         if not isinstance(objective, LeastSquaresObjective):
             raise InvalidValueError(
@@ -71,13 +72,15 @@ class _Run:
             if not self._step(gradient, H):
                 return Status.STALLED if np.any(gradient) else Status.CONVERGED
             best.next_iteration(self.settings.max_iterations, damping=self.damping)
-            cautious = self.damping > damping  # a step after rejections is short: its small gain says little
+            cautious = (
+                self.damping > damping
+            )  # a step after rejections is short, so its small gain does not mean convergence
             if not cautious and before - best.value <= self.settings.tolerance * before:
                 return Status.CONVERGED
         return Status.ITERATION_LIMIT
 
     def _step(self, gradient: Array, H: Array) -> bool:
-        """Try steps with growing damping until the loss falls; whether it did."""
+        """Try steps with growing damping until the loss falls, and return whether it fell."""
         diagonal = H.diagonal()
         scale = np.maximum(diagonal, 1e-3 * diagonal.mean())
         for _ in range(_MAX_REJECTIONS):

@@ -1,4 +1,4 @@
-"""Gradient flow theta' = -grad L, integrated by SUNDIALS CVODES until it hardly falls any more."""
+"""Gradient flow theta' = -grad L, integrated by SUNDIALS CVODES until the loss hardly falls any more."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,20 +15,20 @@ from orthocas.minimising.watch import UNWATCHED, Watch
 from orthocas.solvers.array_node import ArrayNode
 
 _DIFFERENCE = 1e-7  # step of finite differences, relative to theta
-_FIRST = 1e-3  # first stretch of time, in units of |theta0| / |grad L|
+_FIRST = 1e-3  # first time interval, in units of |theta0| / |grad L|
 
 
 @dataclass(frozen=True)
 class GradientFlow:
-    """The path of steepest descent itself: slow, but it goes where gradient descent with tiny steps would go.
+    """Follows the path of steepest descent: slow, but with the same limit as gradient descent with tiny steps.
 
-    Time is cut into stretches, each twice as long as the one before. The flow is stiff, so CVODES takes implicit BDF
-    steps: with the Gauss-Newton matrix as Jacobian where the objective has one, with a Krylov method and finite
-    differences of the gradient otherwise.
+    Time is divided into intervals, each twice as long as the previous one. The flow is stiff, so CVODES takes implicit
+    BDF steps. Their Jacobian is the Gauss-Newton matrix if the objective has one; otherwise a Krylov method uses finite
+    differences of the gradient.
 
     Args:
-        max_iterations: largest number of stretches.
-        tolerance: stationary when the loss falls by less than this share in a stretch.
+        max_iterations: largest number of intervals.
+        tolerance: stop when the loss falls by less than this fraction in an interval.
         accuracy: relative tolerance of the integration.
     """
 
@@ -43,11 +43,11 @@ class GradientFlow:
         require_at_least("accuracy", self.accuracy, 1e-14)
 
     def coarser(self) -> "GradientFlow":
-        """Stationary already at ten times the tolerance."""
+        """The same solver with ten times the tolerance."""
         return replace(self, tolerance=10 * self.tolerance)
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
-        """Flow from theta0."""
+        """Follow the flow from theta0."""
         run = _Run(self, objective, theta0, watch)
         return run.best.run(run.iterate)
 
@@ -88,7 +88,7 @@ class _Run:
         return Status.ITERATION_LIMIT
 
     def _advance(self, integrator: ca.Function, node: ArrayNode) -> bool:
-        """Follow the flow for one stretch; whether the integrator got to its end."""
+        """Follow the flow for one interval, and return whether the integrator reached the end."""
         try:
             with deferred():
                 end = integrator(x0=self.theta, p=self.stretch)["xf"]

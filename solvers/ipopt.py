@@ -1,4 +1,4 @@
-"""Ipopt through CasADi's nlpsol: interior points, with exact Hessians where there are some, and with constraints."""
+"""Ipopt through CasADi's nlpsol: an interior-point method with constraints, and exact Hessians where available."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,8 +15,8 @@ from orthocas.minimising.watch import UNWATCHED, Watch
 from orthocas.solvers.array_node import ArrayNode
 
 _EXACT = 1500  # largest number of parameters for exact, dense Hessians
-_BARRIER = 1e-4  # starts are good: a stronger barrier would push away from them, into worse minima
-_FEASIBLE = 1e-6  # violation of constraints that counts as none
+_BARRIER = 1e-4  # starts are good; a stronger barrier would push away from them into worse minima
+_FEASIBLE = 1e-6  # constraint violations up to this size count as zero
 _STATUS = {
     "Solve_Succeeded": Status.CONVERGED,
     "Solved_To_Acceptable_Level": Status.CONVERGED,
@@ -29,14 +29,14 @@ _STATUS = {
 
 @dataclass(frozen=True)
 class Ipopt:
-    """Primal-dual interior points [WB2006]: Newton steps on the Lagrangian with a filter line search.
+    """Primal-dual interior-point method [WB2006]: Newton steps on the Lagrangian with a filter line search.
 
-    The Hessian is exact for objectives that have one and up to 1,500 parameters, of limited memory otherwise. A
-    restored run starts from the best point.
+    The Hessian is exact if the objective provides one and has up to 1,500 parameters; otherwise it is a limited-memory
+    approximation. A restored run starts from the best point.
 
     Args:
         max_iterations: largest number of iterations.
-        tolerance: on the scaled optimality conditions.
+        tolerance: tolerance on the scaled optimality conditions.
     """
 
     max_iterations: int = 300
@@ -48,16 +48,16 @@ class Ipopt:
         require_at_least("tolerance", self.tolerance, 1e-300)
 
     def coarser(self) -> "Ipopt":
-        """A quarter of the iterations and a looser tolerance."""
+        """The same solver with a quarter of the iterations and a looser tolerance."""
         return replace(self, max_iterations=max(1, self.max_iterations // 4), tolerance=max(1e-3, self.tolerance))
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
-        """Minimise from theta0, subject to the objective's constraints if it has some."""
+        """Minimise from theta0, subject to the objective's constraints if it has any."""
         return _Run(self, objective, theta0, watch).result()
 
 
 class _Run:
-    """One minimisation: CasADi functions around the objective, and what they find."""
+    """One minimisation: CasADi functions around the objective, and their results."""
 
     def __init__(self, settings: Ipopt, objective: Objective, theta0: Array, watch: Watch) -> None:
         self.settings, self.objective = settings, objective
@@ -69,12 +69,12 @@ class _Run:
         self._constraints_at: tuple[bytes, Array, Array] | None = None
         self._count = 0
         self._current = self.best.theta
-        if self.best.restored and not self.best.found:  # killed before a point kept the constraints
+        if self.best.restored and not self.best.found:  # killed before any point met the constraints
             self._current = np.array(self.best.restored["theta"], dtype=float)
         self._least = np.inf, self._current  # violation of the constraints
 
     def result(self) -> SolveResult:
-        """Minimise; without a point that keeps the constraints, theta is the one that comes closest."""
+        """Minimise. If no point meets the constraints, theta is the point with the smallest violation."""
         start = {"x0": ca.DM(self._current)}
         if self.constrained:
             start |= {name: ca.DM(bound) for name, bound in zip(("lbg", "ubg"), self.constrained.bounds, strict=True)}
@@ -148,7 +148,7 @@ class _Run:
         return node
 
     def _evaluate(self, theta: Array) -> tuple[float, Array]:
-        """Value and gradient; Ipopt asks for both at the same point, one after the other."""
+        """Value and gradient; cached, because Ipopt asks for them one after the other at the same point."""
         key = theta.tobytes()
         if self._at is None or self._at[0] != key:
             value, gradient = self.objective.value_and_gradient(theta)
@@ -162,7 +162,7 @@ class _Run:
         return self._at[1], self._at[2]
 
     def _constraints(self, theta: Array) -> tuple[Array, Array]:
-        """Values and Jacobian; asked for several times at the same point."""
+        """Values and Jacobian; cached, because Ipopt asks for them several times at the same point."""
         assert self.constrained is not None
         key = theta.tobytes()
         if self._constraints_at is None or self._constraints_at[0] != key:
@@ -170,7 +170,7 @@ class _Run:
         return self._constraints_at[1], self._constraints_at[2]
 
     def _violation(self, theta: Array) -> float:
-        """By how much the worst constraint is broken; 0 if there are none."""
+        """Largest constraint violation; 0 without constraints."""
         if self.constrained is None:
             return 0.0
         lower, upper = self.constrained.bounds
@@ -184,7 +184,7 @@ class _Run:
         return [factor[0] * self.objective.hessian(theta)]
 
     def _watcher(self) -> ca.Callback:
-        """Called by Ipopt at the start and after every iteration; an error stops it."""
+        """A callback that Ipopt calls at the start and after every iteration; an error stops Ipopt."""
         rows = [ca.nlpsol_out(i) for i in range(ca.nlpsol_n_out())]
         lengths = {"x": self.size, "f": 1, "g": self._rows(), "lam_x": self.size, "lam_g": self._rows()}
         node = ArrayNode("watch", [lengths.get(name, 0) for name in rows], [(1, 1)], self._iterated)

@@ -13,11 +13,11 @@ from orthocas.minimising.watch import UNWATCHED, Watch
 
 @dataclass(frozen=True)
 class LBFGS:
-    """L-BFGS-B of SciPy without bounds. A restored run starts with an empty memory.
+    """SciPy's L-BFGS-B without bounds. A restored run starts with an empty memory.
 
     Args:
         max_iterations: largest number of iterations.
-        tolerance: stop when an iteration lowers the loss by less than this share.
+        tolerance: stop when an iteration reduces the loss by less than this fraction.
         memory: number of stored correction pairs.
     """
 
@@ -32,7 +32,7 @@ class LBFGS:
         require_at_least("tolerance", self.tolerance, 0)
 
     def coarser(self) -> "LBFGS":
-        """A quarter of the iterations."""
+        """The same solver with a quarter of the iterations."""
         return replace(self, max_iterations=max(1, self.max_iterations // 4))
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:

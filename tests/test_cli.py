@@ -189,7 +189,7 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["fit", "x\n" * 300], "unknown problem 'x"),
         (["info", PANDA, "--tip", "panda"], "panda_hand"),
         (["fit", "iiwa", "--samples", "0"], "samples is 0"),
-        (["fit", "iiwa", "--samples", "many"], "'many' came, expected a whole number"),
+        (["fit", "iiwa", "--samples", "many"], "received 'many', expected a whole number"),
         (["fit", "iiwa", "--half-width", "wide"], "--half-width is ['wide'], expected an array of numbers"),
         (["fit", "iiwa", "--half-width", "0.4,0.1"], "half_width has shape (2,), expected (7,)"),
         (["fit", "iiwa", "--lock", "joint_3=0"], "--lock is joint_3=0, expected no lock for the named problem 'iiwa'"),

@@ -168,18 +168,21 @@ def test_points_and_pushes(run: Run) -> None:
     assert report_of(run, "pd_plus", steps="points.json")["tracking_error"]["x"] > 1e-2
     code, _, err = run("kinematic", steps="points.json")
     assert code == 2
-    assert "a velocity controller sees no forces" in err
+    assert "forces do not affect a velocity controller" in err
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (("pid",), "unknown controller 'pid', known: impedance, pd_plus, kinematic, projector, kinematic_projector"),
-        (("kinematic", "--stiffness", "1"), "--stiffness is 1, expected no such option with kinematic: it belongs to"),
+        (
+            ("kinematic", "--stiffness", "1"),
+            "expected no --stiffness with kinematic, because it belongs to",
+        ),
         (("pd_plus", "--feedback", "1"), "it belongs to kinematic, kinematic_projector"),
         (("pd_plus", "--posture-stiffness", "1"), "it belongs to projector"),
         (("projector", "--coupling", "coupled"), "it belongs to impedance, pd_plus"),
-        (("kinematic", "--mass-factor", "1.1"), "--mass-factor is 1.1, expected no such option with kinematic"),
+        (("kinematic", "--mass-factor", "1.1"), "--mass-factor is 1.1, expected no --mass-factor with kinematic"),
         (("kinematic", "--friction", "1,1"), "it belongs to impedance, pd_plus, projector"),
         (("pd_plus", "--coupling", "both"), "unknown coupling 'both', known: coupled, decoupled"),
         (("pd_plus", "--stiffness", "1,2"), "stiffness has shape (2,), expected (3,)"),
@@ -188,10 +191,10 @@ def test_points_and_pushes(run: Run) -> None:
         (("pd_plus", "--limit", "0"), "limit[0] is 0.0, expected positive numbers"),
         (("kinematic_projector", "--feedback", "1,2"), "feedback (task, then joints) has shape (2,), expected (4,)"),
         (("pd_plus", "--rate", "0"), "control_rate is 0.0, expected a finite number > 0"),
-        (("pd_plus", "--noise", "1,1"), "--noise is 1,1, expected none without --rate"),
+        (("pd_plus", "--noise", "1,1"), "--noise is 1,1, expected no noise without --rate"),
         (("pd_plus", "--noise", "1", "--rate", "100"), "--noise is '1', expected two numbers"),
         (("kinematic", "--noise", "1,1", "--rate", "100"), "kinematic measures no velocity"),
-        (("pd_plus", "--seed", "1"), "--seed is 1, expected none without --noise"),
+        (("pd_plus", "--seed", "1"), "--seed is 1, expected no seed without --noise"),
         (("pd_plus", "--friction", "-1,0"), "viscous[0] is -1.0"),
         (("pd_plus", "--mass-factor", "0"), "factor is 0.0, expected numbers > 0"),
         (("pd_plus", "--animation", "webp"), "unknown animation format 'webp', known: gif, mp4"),
@@ -214,7 +217,7 @@ def test_mp4_without_ffmpeg_is_refused_before_the_run(run: Run, monkeypatch: pyt
     monkeypatch.setenv("PATH", "")
     code, out, err = run("pd_plus", "--animation", "mp4")
     assert (code, out) == (2, "")
-    assert "animation is mp4, expected gif, since MP4 needs ffmpeg and there is none on the PATH" in err
+    assert "animation is mp4, expected gif, because mp4 needs ffmpeg, which is not on the PATH" in err
     assert not Path("out").exists()
 
 
@@ -257,7 +260,7 @@ def test_ctrl_c_in_the_run_keeps_what_was_simulated(run: Run, monkeypatch: pytes
     monkeypatch.setattr(command, "terminal_monitor", interrupting("simulate"))
     code, out, err = run("pd_plus", "--json")
     assert code == 130
-    assert "interrupted: what was simulated is written, without an animation" in err
+    assert "interrupted: the run so far is saved, without an animation" in err
     assert written() == FILES
     report = json.loads(out)
     assert report["outcome"] == "interrupted"
@@ -298,7 +301,7 @@ def test_a_run_that_diverges_is_written_and_said(run: Run) -> None:
     code, out, err = run("impedance", "--stiffness", "1e14", "--animation", "none")
     assert code == 1
     assert "diverged" in out
-    assert "the integrator gave up at t = 0.1 s, what came before is written" in err
+    assert "the integrator gave up at t = 0.1 s, the run so far is saved" in err
     assert written() == FILES
 
 
@@ -312,7 +315,10 @@ def test_a_fallback_is_said_with_time_and_reason(run: Run) -> None:
     first = int(np.argmax(trajectory.status != 0))
     assert fallback["since"] == trajectory.times[first] > 0
     assert fallback["share"] == np.mean(trajectory.status != 0)
-    assert f"at t = {fallback['since']:.4g} s the arm left the domain: the controller gave the torque of gravity" in err
+    assert (
+        f"at t = {fallback['since']:.4g} s the arm left the domain: the controller commanded only the gravity torque"
+        in err
+    )
     assert (report["energy"], report["coupling_index"]) == (None, None)
 
 

@@ -244,7 +244,7 @@ def test_what_cannot_be_generated_is_refused(planar_x: oc.Problem, planar_chart:
         with pytest.raises(InvalidValueError, match="a C identifier"):
             oc.generate_c(planar_chart, tmp_path / "new", None, name)
     other = oc.problems.get("planar_3r_x")
-    with pytest.raises(InvalidValueError, match="one of another chart"):
+    with pytest.raises(InvalidValueError, match="of another chart"):
         oc.generate_c(planar_chart, tmp_path / "new", Projector(other, 1.0, 1.0))
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidValueError, match="expected a folder"):
@@ -265,8 +265,8 @@ def test_command_writes_checks_and_refuses(planar_fit: Fit, run: Run) -> None:
     assert code == 0
     assert "lines of C99" in out
     for words, message in (
-        (["--controller", "none", "--limit", "3"], "a controller, for options that belong to one"),
-        (["--controller", "kinematic", "--stiffness", "3"], "no such option with kinematic"),
+        (["--controller", "none", "--limit", "3"], "a controller, because a controller option was given"),
+        (["--controller", "kinematic", "--stiffness", "3"], "no --stiffness with kinematic"),
         (["--controller", "spring"], "unknown controller 'spring'"),
         (["--controller", "pd_plus", "--name", "a b"], "a C identifier"),
     ):

@@ -62,5 +62,5 @@ def test_what_is_not_grown_is_refused() -> None:
         oc.distil(grown(), oc.Polynomial(2), solver=solvers.LBFGS())
     with pytest.raises(MemoryNeedError):
         oc.distil(grown(), oc.Polynomial(90))
-    with pytest.raises(InvalidValueError, match="one that is fitted"):
+    with pytest.raises(InvalidValueError, match="a parametrisation that can be fitted"):
         oc.distil(grown(), oc.Linear())

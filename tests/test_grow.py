@@ -231,7 +231,7 @@ def test_bad_arguments_name_what_came() -> None:
         oc.grow(problem, 2.5)
     with pytest.raises(ShapeError, match="level"):
         oc.grow(problem, [1.0, 2.0])
-    with pytest.raises(GrowError, match="n = 3 joints"):
+    with pytest.raises(GrowError, match="expected n = 3 and m = 1"):
         oc.grow(problem, 1.0, leaf="disk")
     with pytest.raises(GrowError, match="r = 1"):
         oc.grow(planar_3r("euclidean"), 0.0, leaf="circle")
@@ -239,7 +239,7 @@ def test_bad_arguments_name_what_came() -> None:
         oc.grow("planar_2r")  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match="leaf is 3"):
         oc.grow(problem, leaf=3)  # type: ignore[arg-type]
-    with pytest.raises(InvalidValueError, match="belong to a disk"):
+    with pytest.raises(InvalidValueError, match="applies to disk leaves only"):
         oc.grow(problem, 1.0, cells=30)
     with pytest.raises(InvalidValueError, match="expected a Box"):
         oc.grow(planar_3r("euclidean"), 0.0, region="all")  # type: ignore[arg-type]
@@ -247,7 +247,7 @@ def test_bad_arguments_name_what_came() -> None:
         oc.grow(problem, 1.0, leaf="linear")
     with pytest.raises(MemoryNeedError, match="cells"):
         oc.grow(planar_3r("euclidean"), 0.0, cells=100_000)
-    with pytest.raises(GrowError, match="for the shortest, expected at least"):
+    with pytest.raises(GrowError, match="along the shortest, expected at least"):
         oc.grow(planar_3r("euclidean"), 0.0, region=oc.Box([1.5, 0, 0], [0.01, 1, 1]))
     with pytest.raises(GrowError, match="singularity of the task"):
         oc.grow(problem, 0.0)  # the leaf through the saddles is no circle

@@ -135,5 +135,5 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(ShapeError, match="values"):
         solve_dirichlet(mesh, np.arange(6), np.zeros((5, 2)))
     apart = TriangleMesh(np.vstack([np.eye(3), np.eye(3) + 5]), np.arange(6).reshape(2, 3))
-    with pytest.raises(InvalidValueError, match="fixed is 3 vertices, expected at least one in each part"):
+    with pytest.raises(InvalidValueError, match="fixed is 3 vertices, expected at least one in each component"):
         solve_dirichlet(apart, np.arange(3), np.zeros((3, 1)))

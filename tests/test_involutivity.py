@@ -269,7 +269,7 @@ def test_planar_arm_with_two_components_has_no_exact_coordinates(planar_xy: oc.P
     assert found.singular_samples == 0
     np.testing.assert_allclose(np.array(found.function(found.worst_point)).item(), found.max, rtol=1e-12)
     assert found.verdict == (
-        f"coordinates can only be as orthogonal as possible: mean involutivity defect {found.mean:.3g}, "
+        f"no exact orthogonal coordinates exist: the mean involutivity defect is {found.mean:.3g}, "
         f"expect task angles about {found.expected_angle_deg:.2g} degrees off 90 in the metric on this domain"
     )
     data = json.loads(json.dumps(found.as_dict(), allow_nan=False))

@@ -227,7 +227,9 @@ def test_floating_base_on_the_way_is_locked_by_zero(tmp_path: Path) -> None:
     )
     with pytest.raises(RobotError, match=r"'root' .*6 degrees of freedom.*locked=\{'root': 0.0\} or --lock root=0"):
         oc.Robot.from_file(path, "hand")
-    with pytest.raises(RobotError, match="locked position of joint 'root' is 0.5, expected 0: .*neutral position only"):
+    with pytest.raises(
+        RobotError, match="locked position of joint 'root' is 0.5, expected 0: .*only be locked at its neutral"
+    ):
         oc.Robot.from_file(path, "hand", {"root": 0.5})
     robot = oc.Robot.from_file(path, "hand", {"root": 0.0})
     assert robot.joint_names == ("j1", "j2")

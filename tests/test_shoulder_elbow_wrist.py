@@ -202,7 +202,7 @@ def test_axes_that_do_not_meet_are_named_with_their_distance() -> None:
     iiwa = iiwa_robot()
     apart = iiwa.tree.translations.copy()
     apart[2, 2] += 0.03  # axis 3 slides along axis 2
-    with pytest.raises(RobotError, match="'A1' and 'A3' meet that of 'A2' in points 0.03 m apart, expected one point"):
+    with pytest.raises(RobotError, match="'A1' and 'A3' meet that of 'A2' at points 0.03 m apart, expected one point"):
         sew_angle(changed(iiwa, translations=apart), "stereographic")
     apart = iiwa.tree.translations.copy()
     apart[5] += 0.02 * np.cross(iiwa.tree.rotations[5][:, 2], Z)  # across axes 5 and 6

@@ -189,7 +189,7 @@ def test_formats_that_cannot_be_made_are_refused(
 ) -> None:
     monkeypatch.setenv("PATH", "")
     problem = planar_fit.chart.problem
-    with pytest.raises(InvalidValueError, match="MP4 needs ffmpeg and there is none on the PATH"):
+    with pytest.raises(InvalidValueError, match="mp4 needs ffmpeg, which is not on the PATH"):
         save_animation(tmp_path / "a.mp4", planar_run, problem)
     with pytest.raises(UnknownNameError, match="unknown animation format 'webm', known: gif, mp4"):
         save_animation(tmp_path / "a.webm", planar_run, problem)

@@ -1,8 +1,9 @@
 /*
- * A 1 kHz loop around a generated controller, with a histogram of how long its ticks take and how late they start.
+ * A 1 kHz loop around a generated controller, with histograms of the computing time and the lateness of its ticks.
  *
- * Generate the library with the name `arm` (docs/c_controller.md). The robot is a stand-in: forward dynamics with the
- * library's own mass matrix and bias, one semi-implicit Euler step a tick. Replace `read_robot` and `write_robot`.
+ * Generate the library with the name `arm` (docs/c_controller.md). A simulation replaces the robot: forward dynamics
+ * with the library's own mass matrix and bias, one semi-implicit Euler step per tick. For your robot, replace
+ * `read_robot` and `write_robot`.
  */
 #define _POSIX_C_SOURCE 199309L
 
@@ -15,26 +16,26 @@
 #include "arm.h"
 
 #if !ARM_COMMANDS_TORQUE || ARM_REFERENCE != ARM_JOINTS
-#error "generate impedance or pd_plus: this loop sends torques, and its reference is all coordinates of the chart"
+#error "generate impedance or pd_plus, because this loop sends torques and its reference holds all chart coordinates"
 #endif
 
 #define N ARM_JOINTS
 #define PERIOD 0.001 /* [s] */
-#define BINS 24      /* of the histogram, each twice as wide as the one before */
+#define BINS 24      /* of the histogram, each twice as wide as the previous one */
 
 typedef struct {
   double q[N];
   double dq[N];
 } robot_state;
 
-static robot_state robot; /* the stand-in */
+static robot_state robot; /* of the simulation */
 
 static void read_robot(double q[N], double dq[N]) {
   memcpy(q, robot.q, sizeof robot.q);
   memcpy(dq, robot.dq, sizeof robot.dq);
 }
 
-/* Solve M x = b for symmetric positive definite M by Gauss' method; both are overwritten, b by x. */
+/* Solve M x = b for symmetric positive definite M by Gaussian elimination. Overwrites M, and b with x. */
 static void solve(double M[N * N], double b[N]) {
   int i, j, k;
   for (k = 0; k < N; ++k)
@@ -94,7 +95,7 @@ static void print_histogram(const char *title, const long counts[BINS]) {
 
 int main(int argc, char **argv) {
   const long ticks = argc > 1 ? atol(argv[1]) : 5000;
-  const int paced = !(argc > 2 && strcmp(argv[2], "--free") == 0); /* --free: as fast as it goes */
+  const int paced = !(argc > 2 && strcmp(argv[2], "--free") == 0); /* --free: as fast as possible */
   long computing[BINS] = {0}, late[BINS] = {0}, statuses[4] = {0}, tick;
   double q[N], dq[N], torque[N], phi[N], start_phi[N], jacobian[N * N], error = 0.0, begin;
   arm_reference reference;
@@ -104,7 +105,7 @@ int main(int argc, char **argv) {
     fprintf(stderr, "usage: %s [TICKS >= 1] [--free]\n", argv[0]);
     return 2;
   }
-  for (i = 0; i < N; ++i) /* the middle of the domain, or a bent arm if there are no borders */
+  for (i = 0; i < N; ++i) /* start at the centre of the domain, or with a bent arm if it has no bounds */
     robot.q[i] = isfinite(arm_domain_lower[i]) ? 0.5 * (arm_domain_lower[i] + arm_domain_upper[i]) : 0.6;
   arm_chart(robot.q, start_phi, jacobian);
   memset(&reference, 0, sizeof reference);
@@ -114,7 +115,7 @@ int main(int argc, char **argv) {
     if (paced) sleep_until(begin + time);
     started = now();
     read_robot(q, dq);
-    /* Wave along the first extra coordinate; the task stays where it is. */
+    /* Oscillate along the first extra coordinate, with a constant task value. */
     for (i = 0; i < N; ++i) reference.value[i] = start_phi[i];
     reference.value[ARM_TASK] += 0.02 * (1.0 - cos(2.0 * time));
     reference.velocity[ARM_TASK] = 0.04 * sin(2.0 * time);

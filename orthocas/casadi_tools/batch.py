@@ -1,6 +1,6 @@
-"""Evaluation of CasADi functions on whole sample sets, without copies through DM.
+"""Evaluate CasADi functions on whole sample sets, without copies through DM.
 
-NumPy sample sets are (N, n); a stack of matrices is (N, rows, columns).
+A NumPy sample set is (N, n), a stack of matrices is (N, rows, columns).
 """
 
 import os
@@ -14,19 +14,19 @@ import numpy as np
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 
-_CHUNKS = (1, 64, 512)  # samples evaluated in one call: the smallest that holds the set, or the largest
-_THREADED = 512  # chunks of this size are worth starting threads for
+_CHUNKS = (1, 64, 512)  # samples in one call: the smallest number that holds the set, or the largest
+_THREADED = 512  # from this chunk size on, starting threads pays off
 
 
 def _threads() -> int:
-    """All cores this process may use, or what OMP_NUM_THREADS says, as other libraries do."""
+    """Number of cores this process may use, or OMP_NUM_THREADS if it is set, as in other libraries."""
     wanted = os.environ.get("OMP_NUM_THREADS", "")
     if wanted.isdigit() and int(wanted) > 0:
         return int(wanted)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-THREADS = _threads()  #: of the mapped functions of this process
+THREADS = _threads()  #: threads that mapped functions of this process use
 
 
 def dense_function(
@@ -34,7 +34,7 @@ def dense_function(
 ) -> ca.Function:
     """A CasADi function, SX or MX, whose outputs have no structural zeros, as `Batched` needs.
 
-    Its first output is called `out`; a single input is called `q` unless `input_names` says otherwise.
+    The first output is called `out`. A single input is called `q` unless `input_names` is given.
     """
     names = list(input_names) or (["q"] if len(inputs) == 1 else [f"i{k}" for k in range(len(inputs))])
     results = ["out", *(f"out{k}" for k in range(1, len(outputs)))]
@@ -43,9 +43,9 @@ def dense_function(
 
 @dataclass(frozen=True)
 class Batched:
-    """A function of one sample, to be called with N samples.
+    """A function of one sample that is called with N samples.
 
-    Takes one array per input, (N, rows) for a column or (N, rows, columns) for a matrix, and returns one array per
+    It takes one array per input, (N, rows) for a column or (N, rows, columns) for a matrix, and returns one array per
     output in the same form. Inputs and outputs are dense.
     """
 
@@ -62,11 +62,11 @@ class Batched:
 
 
 def evaluate_columns(function: ca.Function, chunk: int, *arguments: Array) -> list[Array]:
-    """As `Batched`, for a function that itself takes `chunk` samples side by side as columns."""
+    """Like `Batched`, for a function that takes `chunk` samples side by side as columns."""
     N = len(arguments[0])
     arguments = tuple(_column_major(a) for a in arguments)
     buffer: Any
-    buffer, run = function.buffer()  # the stub of set_arg and set_res asks for a size, the method takes none
+    buffer, run = function.buffer()  # Any: the stubs of set_arg and set_res ask for a size, the methods take none
     inputs = [np.empty((chunk, *a.shape[1:])) for a in arguments]
     shapes = [function.size_out(i) for i in range(function.n_out())]
     outputs = [np.empty((chunk, columns // chunk, rows)) for rows, columns in shapes]
@@ -88,10 +88,10 @@ def evaluate_columns(function: ca.Function, chunk: int, *arguments: Array) -> li
 
 
 def _column_major(array: Array) -> Array:
-    """CasADi stores matrices column by column, so one sample's (rows, columns) goes in transposed."""
+    """Transpose each sample's matrix (rows, columns): CasADi stores matrices column by column."""
     return array if array.ndim == 2 else array.transpose(0, 2, 1)
 
 
 def _row_major(result: Array) -> Array:
-    """Undo the transposition; a single column becomes a vector."""
+    """Undo the transposition. A single column becomes a vector."""
     return result[:, 0, :] if result.shape[1] == 1 else result.transpose(0, 2, 1)

@@ -1,7 +1,7 @@
-"""Dense MX graphs at BLAS speed: matrix products and tanh of a finished graph handed to NumPy.
+"""Dense MX graphs at BLAS speed: NumPy evaluates the matrix products and tanh of a finished graph.
 
-CasADi multiplies dense matrices with a triple loop, and differentiation drops any other choice of kernel. So the graph,
-derivatives included, is built by CasADi as usual and rewritten last.
+CasADi multiplies dense matrices with a triple loop, and differentiation drops any other choice of kernel. So CasADi
+builds the whole graph, derivatives included, and the products are replaced at the end.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from orthocas.checks import Array
 
 
 class NumpyNode(ca.Callback):
-    """A node of an MX graph that NumPy evaluates in place; it has no derivatives of its own."""
+    """A node of an MX graph that NumPy evaluates in place. It has no derivatives."""
 
     def __init__(self, name: str, inputs: Sequence[tuple[int, int]], output: tuple[int, int]) -> None:
         ca.Callback.__init__(self)
@@ -24,11 +24,11 @@ class NumpyNode(ca.Callback):
         self.construct(name, {})
 
     def get_n_in(self) -> int:
-        """Number of matrices that come in."""
+        """Number of input matrices."""
         return len(self._inputs)
 
     def get_n_out(self) -> int:
-        """One matrix goes out."""
+        """One output matrix."""
         return 1
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
@@ -40,17 +40,17 @@ class NumpyNode(ca.Callback):
         return ca.Sparsity.dense(*self._output)
 
     def has_eval_buffer(self) -> bool:
-        """Buffers, so that nothing is copied."""
+        """Tell CasADi to pass buffers, so that nothing is copied."""
         return True
 
     def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
-        """Evaluate; CasADi stores columns one after the other, so NumPy sees transposed matrices."""
+        """Evaluate the node. CasADi stores matrices column by column, so NumPy sees them transposed."""
         inputs = [np.frombuffer(memory).reshape(shape[::-1]) for memory, shape in zip(arg, self._inputs, strict=True)]
         self.compute(inputs, np.frombuffer(res[0]).reshape(self._output[::-1]))
         return 0
 
     def compute(self, transposed: list[Array], result: Array) -> None:
-        """Write the transposed output for transposed inputs."""
+        """Write the transposed output, given the transposed inputs."""
         raise NotImplementedError
 
 
@@ -74,7 +74,7 @@ class Tanh(NumpyNode):
         NumpyNode.__init__(self, "tanh", [shape], shape)
 
     def compute(self, transposed: list[Array], result: Array) -> None:
-        """Entry by entry, vectorised."""
+        """Evaluate tanh of all entries."""
         np.tanh(transposed[0], out=result)
 
 
@@ -82,24 +82,24 @@ class NumpyGraph:
     """A CasADi function of MX symbols whose dense products and tanh NumPy evaluates.
 
     Args:
-        name: of the function.
+        name: name of the function.
         inputs: MX symbols.
-        outputs: expressions of them, derivatives included.
+        outputs: expressions of these symbols; derivatives are allowed.
 
     Attributes:
-        function: the function; it lives as long as this object, which owns its nodes.
+        function: the CasADi function. It is valid as long as this object lives, which owns its nodes.
     """
 
     def __init__(self, name: str, inputs: Sequence[ca.MX], outputs: Sequence[ca.MX]) -> None:
         self._nodes: list[NumpyNode] = []
-        with deferred():  # CasADi asks nodes for their shapes, and would swallow Ctrl-C there
+        with deferred():  # CasADi calls the nodes for their shapes, and would swallow Ctrl-C there
             self.function = ca.Function(name, list(inputs), self._rewritten(inputs, ca.cse(list(outputs))))
         self._memory = local()
 
     def __call__(self, *inputs: Array) -> list[Array]:
-        """Evaluate without copies: matrices come and go transposed, contiguous, and of the right size.
+        """Evaluate without copies. Inputs and outputs are transposed matrices, contiguous and of the right size.
 
-        Large graphs need large scratch memory, which every thread keeps from call to call.
+        Large graphs need large scratch memory. Every thread keeps its own from call to call.
         """
         if not hasattr(self._memory, "buffer"):
             self._memory.buffer, self._memory.evaluate = self.function.buffer()
@@ -114,7 +114,7 @@ class NumpyGraph:
         return results
 
     def _rewritten(self, inputs: Sequence[ca.MX], outputs: list[ca.MX]) -> list[ca.MX]:
-        """Cut the graph at its heavy nodes, then sew the pieces together with NumPy's nodes in between."""
+        """Cut the graph at its expensive nodes, and join the pieces with NumPy's nodes in between."""
         plain = ca.Function("plain", list(inputs), outputs)
         heavy = [
             plain.instruction_MX(k)
@@ -134,7 +134,7 @@ class NumpyGraph:
         return list(rewritten)
 
     def _replacement(self, node: ca.MX, operands: list[ca.MX], flips: list[bool]) -> ca.MX:
-        """NumPy's node for a product z + x y (operands z, x, y) or for tanh."""
+        """The NumPy node for a product z + x y (operands z, x, y) or for tanh."""
         new: NumpyNode
         if node.op() == ca.OP_TANH:
             new = Tanh(node.shape)

@@ -1,7 +1,7 @@
-"""Values that an object builds on first use: once for all threads, and left behind when the object travels.
+"""Values that an object builds on first use: once for all threads, and never pickled or copied with the object.
 
 CasADi functions with nodes in Python, buffers and compiled libraries can be neither pickled nor copied. They follow
-from the object's own data, so a copy builds its own when it needs them.
+from the object's data, so a copy builds its own when needed.
 """
 
 from collections.abc import Callable
@@ -11,18 +11,18 @@ from typing import Any, Generic, Self, TypeVar, overload
 T = TypeVar("T")
 
 _PLACE = "_built"
-_building = RLock()  # one for all: what is built asks for other built values, in any order
+_building = RLock()  # one lock for all: values are built from other cached values, in any order
 
 
 class _Store(dict[str, Any]):
-    """Built values of one object; pickled and deep-copied as an empty one."""
+    """The cached values of one object. It is pickled and deep-copied as an empty store."""
 
     def __reduce__(self) -> tuple[type["_Store"], tuple[()]]:
         return _Store, ()
 
 
 class cached_property(Generic[T]):  # noqa: N801  (takes the place of the one in functools)
-    """As `functools.cached_property`, but safe with threads in every version of Python, and never pickled or copied."""
+    """Like `functools.cached_property`, but thread-safe in every version of Python, and never pickled or copied."""
 
     def __init__(self, build: Callable[[Any], T]) -> None:
         self._build, self._name = build, build.__name__
@@ -44,7 +44,7 @@ class cached_property(Generic[T]):  # noqa: N801  (takes the place of the one in
         return self._once(instance)
 
     def _once(self, instance: object) -> T:
-        """The value, built by the first thread that comes; the others wait for it."""
+        """The value. The first thread builds it while the others wait."""
         with _building:
             store = instance.__dict__.setdefault(_PLACE, _Store())
             if self._name not in store:

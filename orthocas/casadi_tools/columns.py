@@ -1,10 +1,10 @@
-"""SX functions of one sample, replayed on blocks of samples: every operation acts on a whole column of them (ours).
+"""SX functions of one sample, replayed on blocks of samples: every operation acts on a column of samples (ours).
 
-CasADi's interpreter takes a few nanoseconds an operation, whatever it works on. On columns of 256 samples that cost is
-shared, and elementary operations run at the speed of the memory close by.
+CasADi's interpreter spends a few nanoseconds per operation, whatever its operands. Columns of 256 samples share that
+cost, and elementary operations run at the speed of the cache.
 
-A blocked array is (B, entries, c): B blocks of c samples; the entries of a matrix are those of its columns, one after
-the other. The last block is filled up with copies of the first sample.
+A blocked array is (B, entries, c): B blocks of c samples. The entries of a matrix are listed column by column. The last
+block is padded with copies of the first sample.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ COLUMNS = 256  #: samples in a block
 
 
 def blocked(stack: Array) -> Array:
-    """Entries of samples (N, rows, columns) or (N, rows), in blocks."""
+    """Arrange samples (N, rows, columns) or (N, rows) in blocks (B, entries, c)."""
     flat = (stack.transpose(0, 2, 1) if stack.ndim == 3 else stack).reshape(len(stack), -1)
     blocks = -(-len(flat) // COLUMNS)
     filled = np.concatenate([flat, np.repeat(flat[:1], blocks * COLUMNS - len(flat), axis=0)])
@@ -31,17 +31,17 @@ def blocked(stack: Array) -> Array:
 
 
 def shares(samples: int) -> Array:
-    """Weights of a mean over N samples in blocks, (B, c): 1 / N, and 0 for the copies."""
+    """Weights of a mean over N samples in blocks, (B, c): 1 / N for samples, 0 for the padding."""
     blocks = -(-samples // COLUMNS)
     return np.where(np.arange(blocks * COLUMNS) < samples, 1 / samples, 0.0).reshape(blocks, COLUMNS)
 
 
 def by_sample(blocks: Array, samples: int, every: int = 1) -> Array:
-    """Matrices of blocked samples (B, columns, rows, c), one after the other, (N, rows, columns).
+    """Matrices (N, rows, columns) of the samples in blocks (B, columns, rows, c).
 
     Args:
         blocks: entries of matrices, column by column.
-        samples: number N of samples without the copies.
+        samples: number N of samples, without the padding.
         every: take only every second, third, ... sample.
     """
     stack = blocks.transpose(0, 3, 2, 1).reshape(-1, blocks.shape[2], blocks.shape[1])
@@ -52,14 +52,14 @@ class ColumnFunction:
     """A dense SX function of one sample, for blocked arrays.
 
     Args:
-        function: any number of inputs and outputs, matrices.
+        function: a function with any number of matrix inputs and outputs.
     """
 
     def __init__(self, function: ca.Function) -> None:
         self._function = function
 
     def __call__(self, *arguments: Array) -> list[Array]:
-        """Outputs (B, entries, c) for inputs (B, entries, c), contiguous; threads share the blocks."""
+        """Outputs (B, entries, c) for contiguous inputs (B, entries, c). Threads share the blocks."""
         parts = max(1, min(THREADS, len(arguments[0])))
         # CasADi lets go of Python's lock while it evaluates. It must not build in a thread: its own lock against
         # Python's is a deadlock.
@@ -72,8 +72,8 @@ class ColumnFunction:
         return [np.concatenate(outputs) for outputs in zip(*results, strict=True)]
 
     def on_one_block(self) -> Callable[..., list[Array]]:
-        """A function of contiguous inputs (entries, c) with its own scratch memory; outputs (entries, c)."""
-        buffer: Any  # the stub of set_arg and set_res asks for a size, the method takes none
+        """A function of contiguous inputs (entries, c) with its own scratch memory. It returns (entries, c)."""
+        buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
         buffer, evaluate = self._on_block.buffer()
         shapes = [(self._function.numel_out(i), COLUMNS) for i in range(self._function.n_out())]
 
@@ -102,7 +102,7 @@ class ColumnFunction:
 
     @cached_property
     def tape(self) -> Tape:
-        """All entries of the outputs as one column, from all entries of the inputs as one column."""
+        """The tape that maps all entries of the inputs, as one column, to all entries of the outputs, as one column."""
         shapes = [self._function.size_in(i) for i in range(self._function.n_in())]
         column = ca.SX.sym("x", sum(rows * columns for rows, columns in shapes))
         parts, start = [], 0
@@ -115,6 +115,6 @@ class ColumnFunction:
 
 
 def _of_blocks(run: Callable[..., list[Array]], *arguments: Array) -> list[Array]:
-    """Outputs for some blocks, in one thread."""
+    """Evaluate some blocks in one thread."""
     blocks = [run(*block) for block in zip(*arguments, strict=True)]
     return [np.stack(outputs) for outputs in zip(*blocks, strict=True)]

@@ -1,7 +1,7 @@
-"""Ctrl-C while compiled code runs: noted there, raised where Python can handle it.
+"""Ctrl-C while compiled code runs: recorded at once, and raised where Python can handle it.
 
-An exception cannot pass through CasADi's own code: it comes out as another one, or is lost. So SIGINT only leaves a
-note while that code runs, and becomes KeyboardInterrupt when it has returned, or earlier where `check` is called.
+An exception cannot pass through CasADi's compiled code: it comes out as another exception, or is lost. So while that
+code runs, SIGINT is only recorded. KeyboardInterrupt is raised when the code returns, or earlier by `check`.
 """
 
 import signal
@@ -15,7 +15,7 @@ _notes: list[threading.Event] = []  # one for every `deferred` of the main threa
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Hold Ctrl-C back until the end of the block. Other threads never get it, so nothing is done there."""
+    """Hold Ctrl-C back until the end of the block. Only the main thread receives it, so other threads do nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -32,12 +32,12 @@ def deferred() -> Iterator[None]:
         _notes.remove(note)
         signal.signal(signal.SIGINT, before)
         if note.is_set():
-            for outer in _notes:  # compiled code around this one may not pass the exception on
+            for outer in _notes:  # compiled code further out may lose the exception
                 outer.set()
-            raise KeyboardInterrupt  # also instead of what compiled code made of it
+            raise KeyboardInterrupt  # also replaces the exception that compiled code made of it
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt if Ctrl-C is being held back; for code that compiled code calls."""
+    """Raise KeyboardInterrupt if Ctrl-C is being held back. For Python code that compiled code calls."""
     if threading.current_thread() is threading.main_thread() and any(note.is_set() for note in _notes):
         raise KeyboardInterrupt

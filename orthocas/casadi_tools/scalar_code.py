@@ -1,4 +1,4 @@
-"""Graphs of matrix operations and calls as plain scalar operations: several times faster for small systems."""
+"""Expand graphs of matrix operations and calls into scalar operations: several times faster for small systems."""
 
 import casadi as ca
 
@@ -6,8 +6,8 @@ from orthocas.casadi_tools.interrupts import deferred
 
 
 def scalar_code(function: ca.Function) -> ca.Function:
-    """The function as scalar operations with common parts shared, or itself if it holds what has none (networks)."""
-    with deferred():  # expand makes a RuntimeError of Ctrl-C
+    """Expand a function into scalar operations. One that cannot be expanded (a network) is returned as it is."""
+    with deferred():  # `expand` turns Ctrl-C into a RuntimeError
         try:
             flat = function.expand()
         except RuntimeError:

@@ -1,8 +1,8 @@
-"""CasADi SX expressions as plain data, so that files can hold custom expressions without running code.
+"""CasADi SX expressions as plain data: files store custom expressions, and loading them runs no code.
 
-A tape is a list of steps over numbered work slots. Only elementary operations exist: loading one rebuilds an
-expression and can do nothing else. The entries it is rebuilt at may be scalars, or whole rows of an MX matrix: then the
-expression of one sample becomes that of all samples side by side.
+A tape is a list of steps on numbered work slots. The steps are elementary operations, so replaying a tape can only
+rebuild an expression. Its inputs may be scalars or whole rows of an MX matrix. With rows, the expression of one sample
+becomes that of all samples side by side.
 """
 
 from collections.abc import Callable, Sequence
@@ -75,14 +75,14 @@ def to_tape(function: ca.Function) -> Tape:
     """Write an SX function of one column and one output as a tape.
 
     Raises:
-        OrthocasError: if it uses an operation that tapes do not know.
+        OrthocasError: if the function uses an operation that tapes do not support.
     """
     rows, columns = function.size_out(0)
     steps: list[list[Any]] = []
     for k in range(function.n_instructions()):
         operation = function.instruction_id(k)
         if operation not in _NAMES:
-            raise OrthocasError(f"custom expression uses CasADi operation {operation}, which chart files cannot hold")
+            raise OrthocasError(f"custom expression uses CasADi operation {operation}, which chart files cannot store")
         name, into, of = _NAMES[operation], function.instruction_output(k), function.instruction_input(k)
         if name == "const":
             steps.append([name, into[0], function.instruction_constant(k)])
@@ -99,21 +99,21 @@ def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
     """Rebuild the expression of a tape at q.
 
     Raises:
-        KeyError, IndexError, TypeError, ValueError: if the tape is malformed (the caller names the file).
+        KeyError, IndexError, TypeError, ValueError: if the tape is malformed. The caller names the file.
     """
     entries = replay(tape, [q[i] for i in range(q.shape[0])])
     return ca.reshape(ca.vertcat(*entries), int(tape["rows"]), int(tape["columns"]))
 
 
 def replay(tape: Tape, inputs: Sequence[Entry]) -> list[Entry]:
-    """The entries of a tape's output, column by column, for the entries of its input.
+    """Evaluate a tape at the entries of its input. Returns the entries of its output, column by column.
 
     Raises:
         KeyError, IndexError, TypeError, ValueError: if the tape is malformed.
     """
     work: dict[int, Any] = {}
     result: dict[int, Any] = {}
-    zero = 0 * inputs[0]  # constants take the shape of the entries
+    zero = 0 * inputs[0]  # gives constants the shape of the entries
     for name, into, *of in tape["steps"]:
         if name == "const":
             work[into] = zero + float(of[0])

@@ -1,4 +1,4 @@
-"""Users' own maps of q, checked where they come in."""
+"""Expressions from user-defined functions of q, checked on the way in."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from orthocas.errors import InvalidValueError
 
 
 def expression_of(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function, q: ca.SX) -> ca.SX:
-    """The SX expression that a user's function makes of q.
+    """The SX expression that a user's function returns for q.
 
     Raises:
         InvalidValueError: if the function fails on q, does not return an SX expression, or uses other symbols.

@@ -29,9 +29,9 @@ _NONE = "none"
 
 def codegen(
     chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
-    controller: Annotated[str, typer.Option("--controller", help=f"{', '.join(CONTROLLERS)} or {_NONE}.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder for the library's source.")],
-    name: Annotated[str | None, typer.Option("--name", help="Prefix of all C names; default from the chart.")] = None,
+    controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)} or {_NONE}.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the generated library.")],
+    name: Annotated[str | None, typer.Option("--name", help="Prefix of all C names; default: from the chart.")] = None,
     stiffness: Stiffness = None,
     damping_ratio: DampingRatio = None,
     coupling: CouplingName = None,
@@ -39,7 +39,9 @@ def codegen(
     posture_stiffness: PostureStiffness = None,
     feedback: Feedback = None,
     limit: Limit = None,
-    check: Annotated[bool, typer.Option("--check", help="Compile, and compare with Python on 1000 states.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Compile the C and compare it with Python on 1000 states.")
+    ] = False,
     json: AsJson = False,
 ) -> None:
     """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
@@ -47,10 +49,10 @@ def codegen(
     if controller != _NONE:
         require_options(controller, options)
     elif options != ControllerOptions() or limit is not None:
-        raise InvalidValueError("--controller", _NONE, "a controller, for options that belong to one")
+        raise InvalidValueError("--controller", _NONE, "a controller, because a controller option was given")
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         loaded = Chart.load(chart)
-        loaded.function("xi")  # refuses grown charts
+        loaded.function("xi")  # raises for grown charts
         law = None if controller == _NONE else build_controller(controller, loaded, options, limit)
         generated = generate_c(loaded, out, law, name)
     proof = check_c(generated, loaded, law) if check else None
@@ -77,7 +79,7 @@ def _report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:
 def _rows(report: dict[str, Any]) -> dict[str, str]:
     rows = {
         "library": f"{report['name']}: {report['lines']} lines of C99, {report['source']}",
-        "stack": f"{report['stack_bytes']} bytes at most for a call",
+        "stack": f"{report['stack_bytes']} bytes at most per call",
     }
     if differences := report["relative_differences"]:
         worst = max(differences, key=differences.get)

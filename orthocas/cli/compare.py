@@ -39,26 +39,33 @@ def compare(
     task: TaskName = None,
     metric: MetricName = None,
     param: Annotated[
-        list[str] | None, typer.Option("--param", help="A parametrisation; repeat for more. Default: a small choice.")
+        list[str] | None, typer.Option("--param", help="Parametrisation; repeat for more. Default: a small selection.")
     ] = None,
     solver: Annotated[
-        list[str] | None, typer.Option("--solver", help="A solver; repeat for more. Default: what suits each.")
+        list[str] | None, typer.Option("--solver", help="Solver; repeat for more. Default: one that suits each.")
     ] = None,
-    seeds: Annotated[int, typer.Option("--seeds", parser=whole_number, help="Number of seeds of every fit.")] = 1,
+    seeds: Annotated[int, typer.Option("--seeds", parser=whole_number, help="Number of seeds per fit.")] = 1,
     centre: CentreText = None,
     home: HomeName = None,
     half_width: HalfWidth = None,
     samples: Annotated[
-        int | None, typer.Option("--samples", parser=whole_number, help="Training samples; default by size.")
+        int | None,
+        typer.Option(
+            "--samples", parser=whole_number, help="Number of training samples; default: from the problem size."
+        ),
     ] = None,
     held_out: Annotated[
-        int, typer.Option("--held-out", parser=whole_number, help="Held-out samples that judge every fit.")
+        int,
+        typer.Option(
+            "--held-out", parser=whole_number, help="Number of held-out samples that every fit is evaluated on."
+        ),
     ] = 100_000,
     weights: Annotated[
-        str, typer.Option("--weights", help='"lambda1,lambda2", and lambda3 and lambda4 if wanted.')
+        str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3 and lambda4.')
     ] = WEIGHTS_TEXT,
     jobs: Annotated[
-        int | None, typer.Option("--jobs", parser=whole_number, help="Processes, one thread each; default all cores.")
+        int | None,
+        typer.Option("--jobs", parser=whole_number, help="Number of processes, one thread each; default: all cores."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder for tables, pictures and charts.")] = Path("comparison"),
     json: AsJson = False,
@@ -89,7 +96,7 @@ def compare(
         print_json(found.as_dict())
     else:
         print_table(found.rows())
-        typer.echo(f"\ntables, pictures and charts are in {out}")
+        typer.echo(f"\nTables, pictures and charts are in {out}.")
     failed = sum(result.failed for result in found.results)
     if failed:
         note(f"{failed} of {len(found.results)} fits failed, see comparison.csv")

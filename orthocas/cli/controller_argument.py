@@ -1,4 +1,4 @@
-"""Building a controller from command-line words, and refusing words that another controller takes."""
+"""Builds a controller from command-line options, and rejects options that belong to another controller."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -16,29 +16,36 @@ _OF_THE_PLANT = ("mass_factor", "friction")  # options for laws that command tor
 _CHOICES = ("coupling", "damping")  # options that are words
 
 Stiffness = Annotated[
-    str | None, typer.Option("--stiffness", help='"100" or one for each; default 2 Hz with the median inertia.')
+    str | None,
+    typer.Option(
+        "--stiffness", help='"100", or "100,50,..." per quantity; default: 2 Hz springs at the median inertia.'
+    ),
 ]
-DampingRatio = Annotated[str | None, typer.Option("--damping-ratio", help="One number, or one for each; default 0.7.")]
+DampingRatio = Annotated[
+    str | None, typer.Option("--damping-ratio", help='"0.7", or "0.7,1,..." per quantity; default: 0.7.')
+]
 CouplingName = Annotated[
-    str | None, typer.Option("--coupling", help="coupled or decoupled, default coupled; impedance and pd_plus.")
+    str | None, typer.Option("--coupling", help="coupled (default) or decoupled; for impedance and pd_plus.")
 ]
 DampingName = Annotated[
-    str | None, typer.Option("--damping", help="square_root (default) or double_diagonal; impedance and pd_plus.")
+    str | None, typer.Option("--damping", help="square_root (default) or double_diagonal; for impedance and pd_plus.")
 ]
 PostureStiffness = Annotated[
-    str | None, typer.Option("--posture-stiffness", help="Of the joint springs of projector; default 2 Hz.")
+    str | None,
+    typer.Option("--posture-stiffness", help="Stiffness of the joint springs; for projector. Default: 2 Hz springs."),
 ]
 Feedback = Annotated[
-    str | None, typer.Option("--feedback", help="[1/s], of kinematic and kinematic_projector; default 0.")
+    str | None,
+    typer.Option("--feedback", help="Feedback gain [1/s]; for kinematic and kinematic_projector. Default: 0."),
 ]
 Limit = Annotated[
-    str | None, typer.Option("--limit", help="Largest torque or speed of all joints, or of each; default none.")
+    str | None, typer.Option("--limit", help='Largest torque or speed, "50" or "50,40,..." per joint; default: none.')
 ]
 
 
 @dataclass(frozen=True)
 class ControllerOptions:
-    """The words of a command line that only some controllers take."""
+    """The command-line options that only some controllers take."""
 
     stiffness: str | None = None
     damping_ratio: str | None = None
@@ -51,23 +58,22 @@ class ControllerOptions:
 
 
 def require_options(name: str, options: ControllerOptions) -> None:
-    """Check the name of a controller, and that it takes all options that were given.
+    """Check that a controller exists and takes every option that was given.
 
     Raises:
         UnknownNameError: if there is no such controller.
-        InvalidValueError: for an option that it would ignore.
+        InvalidValueError: for an option that the controller would ignore.
     """
     taken = _taken(law_of(name))
     for field, value in vars(options).items():
         if value is not None and field not in taken:
             takers = ", ".join(other for other in CONTROLLERS if field in _taken(law_of(other)))
-            raise InvalidValueError(
-                f"--{field.replace('_', '-')}", value, f"no such option with {name}: it belongs to {takers}"
-            )
+            option = f"--{field.replace('_', '-')}"
+            raise InvalidValueError(option, value, f"no {option} with {name}, because it belongs to {takers}")
 
 
 def build_controller(name: str, chart: Chart, options: ControllerOptions, limit: str | None) -> Controller:
-    """The controller that a command line describes, see `require_options`.
+    """Build the controller that a command line describes; `require_options` has checked the options.
 
     Raises:
         OrthocasError: if anything does not fit together.
@@ -82,7 +88,7 @@ def build_controller(name: str, chart: Chart, options: ControllerOptions, limit:
 
 
 def _taken(law: type[Law]) -> tuple[str, ...]:
-    """Options that a law takes."""
+    """Names of the options that a law takes."""
     return (*law.options, *(_OF_THE_PLANT if law.command == "torque" else ()))
 
 

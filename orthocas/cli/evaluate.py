@@ -16,11 +16,11 @@ def evaluate(
         int, typer.Option("--samples", parser=whole_number, help="Number of held-out samples.")
     ] = 100_000,
     seed: Annotated[
-        int, typer.Option("--seed", parser=whole_number, help="Seed of the samples; take another than the fit's.")
+        int, typer.Option("--seed", parser=whole_number, help="Seed of the samples; use another one than for the fit.")
     ] = 1,
     json: AsJson = False,
 ) -> None:
-    """Judge a chart on held-out samples of its domain."""
+    """Measure the quality of a chart on held-out samples of its domain."""
     report = quality.evaluate(Chart.load(chart), samples, seed)
     if json:
         print_json(report.as_dict())

@@ -42,35 +42,47 @@ def fit(
     task: TaskName = None,
     metric: MetricName = None,
     param: Annotated[
-        str, typer.Option("--param", help="polynomial:4, fourier:2, mlp:64x64, linear or sew.")
+        str, typer.Option("--param", help="Parametrisation: polynomial:4, fourier:2, mlp:64x64, linear or sew.")
     ] = "polynomial:4",
     solver: Annotated[
         str | None,
-        typer.Option("--solver", help="gauss_newton, lbfgs, ipopt, adam or gradient_flow; default what suits."),
+        typer.Option(
+            "--solver",
+            help="gauss_newton, lbfgs, ipopt, adam or gradient_flow; default: one that suits the parametrisation.",
+        ),
     ] = None,
     centre: CentreText = None,
     home: HomeName = None,
     half_width: HalfWidth = None,
     samples: Annotated[
-        int | None, typer.Option("--samples", parser=whole_number, help="Training samples; default by size.")
+        int | None,
+        typer.Option(
+            "--samples", parser=whole_number, help="Number of training samples; default: from the problem size."
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", parser=whole_number, help="Seed of samples and random starts.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", parser=whole_number, help="Seed of the samples and of random starts.")
+    ] = 0,
     weights: Annotated[
-        str, typer.Option("--weights", help='"lambda1,lambda2", and lambda3 and lambda4 if wanted.')
+        str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3 and lambda4.')
     ] = WEIGHTS_TEXT,
     max_mutual_deg: Annotated[
         float | None,
         typer.Option(
             "--max-mutual-deg",
             parser=number,
-            help="Bound on the mutual angles' deviation from 90 deg (rms): the smallest task angle under it, by Ipopt.",
+            help="Bound on the rms deviation of the mutual angles from 90 deg; Ipopt minimises the task angle.",
         ),
     ] = None,
     checkpoint: Annotated[
         Path | None,
-        typer.Option("--checkpoint", help="File that keeps the state of a long fit; one that exists is gone on with."),
+        typer.Option(
+            "--checkpoint", help="File for the state of a long fit. If the file exists, the fit resumes from it."
+        ),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Chart file; default PROBLEM.orthocas here.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Chart file; default: PROBLEM.orthocas in the current folder.")
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
@@ -117,7 +129,7 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     rows = report_rows(report)
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
     if result.idle_joints:
-        rows["exact"] = f"joints the task does not feel: {', '.join(result.idle_joints)}"
+        rows["exact"] = f"joints that do not move the task: {', '.join(result.idle_joints)}"
     if result.problem_check.singular_samples:
         check = result.problem_check
         at = ", ".join(f"{value:.2f}" for value in check.most_singular_point)

@@ -48,7 +48,7 @@ def info(
 
 
 def _chart_path(target: str) -> Path:
-    """A path, or an error that lists the named problems if nothing is there and it looks like a name."""
+    """The path of a chart; a target that is no file but looks like a name raises an error with the known names."""
     path = Path(target)
     if not path.exists() and not path.suffix:
         build_problem(target, ProblemOptions())

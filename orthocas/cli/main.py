@@ -1,4 +1,4 @@
-"""Entry point: collects the commands and turns errors into one line and exit code 2."""
+"""Entry point: collects the commands, and turns errors into one line and exit code 2."""
 
 import sys
 
@@ -14,7 +14,7 @@ from orthocas.cli.reproduce import reproduce
 from orthocas.cli.simulate import simulate
 from orthocas.errors import OrthocasError
 
-INTERRUPTED = 130  #: exit code after Ctrl-C, as shells have it
+INTERRUPTED = 130  #: exit code after Ctrl-C, by the convention of shells
 
 app = typer.Typer(
     name="orthocas",
@@ -34,19 +34,19 @@ app.command()(codegen)
 
 
 def _complain(text: str) -> None:
-    """One line of bounded length on standard error."""
+    """Print an error as one line of bounded length on standard error."""
     line = " ".join(text.split())
     typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
 
 
 def main() -> None:
-    """Run the command line; bad input gives one line on standard error and exit code 2."""
+    """Run the command line. Bad input gives one line on standard error and exit code 2."""
     try:
         code = app(standalone_mode=False)
     except (OrthocasError, typer.TyperException) as error:
         _complain(error.format_message() if isinstance(error, typer.TyperException) else str(error))
         code = 2
-    except (OSError, MemoryError, np.linalg.LinAlgError) as error:  # from below: still one line, not a traceback
+    except (OSError, MemoryError, np.linalg.LinAlgError) as error:  # from libraries: also one line, no traceback
         _complain(f"{type(error).__name__}: {error}")
         code = 2
     except KeyboardInterrupt:

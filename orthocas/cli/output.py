@@ -1,4 +1,4 @@
-"""What commands print: aligned text for people, or one JSON object."""
+"""Output of the commands: aligned text for people, or one JSON object."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
@@ -10,22 +10,22 @@ from orthocas.quality import Report
 
 
 def whole_number(text: str) -> int:
-    """Read a whole number option."""
+    """Parse the value of an option that takes a whole number."""
     try:
         return int(text)
     except ValueError:
-        raise typer.BadParameter(f"{text!r} came, expected a whole number") from None
+        raise typer.BadParameter(f"received {text!r}, expected a whole number") from None
 
 
 def number(text: str) -> float:
-    """Read a number option."""
+    """Parse the value of an option that takes a number."""
     try:
         return float(text)
     except ValueError:
-        raise typer.BadParameter(f"{text!r} came, expected a number") from None
+        raise typer.BadParameter(f"received {text!r}, expected a number") from None
 
 
-_UNEVEN = 30.0  # gains in a coordinate mean something else where its gradient is that much longer
+_UNEVEN = 30.0  # ratio of gradient lengths above which the same gain means too different things across the domain
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
@@ -52,13 +52,13 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
 
 
 def note(text: str) -> None:
-    """A remark on standard error."""
+    """Print a remark on standard error."""
     typer.echo(f"note: {text}", err=True)
 
 
 def report_rows(report: Report) -> dict[str, str]:
-    """A quality report as rows, with advice for the command line."""
+    """The rows of a quality report, with advice on command-line options."""
     rows = report.facts()
     if report.length_ratio > _UNEVEN:
-        rows["lengths"] += "; for controllers fit with --weights 1000,30,150,1"
+        rows["lengths"] += "; for use in controllers, fit with --weights 1000,30,150,1"
     return rows

@@ -1,4 +1,4 @@
-"""Building a problem from command-line words: a named problem or a robot file, with overrides."""
+"""Builds a problem from command-line options: a named problem or a robot file, with overrides."""
 
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -16,25 +16,27 @@ from orthocas.problem import Problem
 from orthocas.robots import Robot
 from orthocas.tasks import Task
 
-ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem, or a URDF file.")]
-TipName = Annotated[str | None, typer.Option("--tip", help="Tip frame of a robot file; default the end of its chain.")]
+ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem or a URDF file.")]
+TipName = Annotated[str | None, typer.Option("--tip", help="Tip frame of a robot file; default: the end of its chain.")]
 Locks = Annotated[
     list[str] | None,
-    typer.Option("--lock", metavar="JOINT=VALUE", help="Fix a joint of a robot file [rad or m]; repeat for more."),
+    typer.Option(
+        "--lock", metavar="JOINT=VALUE", help="Lock a joint of a robot file at a value [rad or m]; repeat for more."
+    ),
 ]
 ToolText = Annotated[
     str | None,
-    typer.Option("--tool", help='Tool on the tip of a robot file, "x,y,z" or "x,y,z,roll,pitch,yaw" [m, rad].'),
+    typer.Option("--tool", help='Pose of a tool on the tip, "x,y,z" or "x,y,z,roll,pitch,yaw" [m, rad].'),
 ]
 TaskName = Annotated[
     str | None,
-    typer.Option("--task", help="position, position:xy, polar, orientation, pose, axis:z or position+axis:z."),
+    typer.Option("--task", help="Task: position, position:xy, polar, orientation, pose, axis:z or position+axis:z."),
 ]
-MetricName = Annotated[str | None, typer.Option("--metric", help="euclidean or inertia.")]
+MetricName = Annotated[str | None, typer.Option("--metric", help="Metric: euclidean or inertia.")]
 CentreText = Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')]
 HomeName = Annotated[
     str | None,
-    typer.Option("--home", help="Centre of the domain by its name in the SRDF file beside a URDF, or in an MJCF file."),
+    typer.Option("--home", help="Named posture as centre of the domain, from an MJCF file or the SRDF beside a URDF."),
 ]
 HalfWidth = Annotated[
     str | None, typer.Option("--half-width", help='Half-width of the domain, "0.4" or one per joint [rad or m].')
@@ -43,7 +45,7 @@ HalfWidth = Annotated[
 
 @dataclass(frozen=True)
 class ProblemOptions:
-    """The words of a command line that describe a problem."""
+    """The command-line options that describe a problem."""
 
     tip: str | None = None
     lock: tuple[str, ...] = ()
@@ -55,14 +57,14 @@ class ProblemOptions:
     half_width: str | None = None
 
     def given(self) -> bool:
-        """Whether any was given."""
+        """Whether any option was given."""
         return any(value not in (None, ()) for value in astuple(self))
 
     def require_no_robot(self, owner: str) -> None:
-        """Raise InvalidValueError if a word describes a robot, which `owner` has already."""
+        """Raise InvalidValueError if an option describes a robot, because `owner` has its own."""
         for option, value in (("tip", self.tip), ("lock", ", ".join(self.lock) or None), ("tool", self.tool)):
             if value is not None:
-                raise InvalidValueError(f"--{option}", value, f"no {option} for {owner}, it has its own robot")
+                raise InvalidValueError(f"--{option}", value, f"no {option} for {owner}, which has its own robot")
 
 
 def is_robot_file(name: str) -> bool:
@@ -71,7 +73,7 @@ def is_robot_file(name: str) -> bool:
 
 
 def build_robot(path: str, options: ProblemOptions) -> Robot:
-    """Build the chain that a command line describes; joints of the file that do not move the tip are locked.
+    """Build the chain that a command line describes. Joints that do not move the tip are locked.
 
     Raises:
         OrthocasError: if anything does not fit together.
@@ -84,7 +86,7 @@ def build_problem(name: str, options: ProblemOptions) -> Problem:
     """Build the problem that a command line describes.
 
     Raises:
-        UnknownNameError: if it is neither a named problem nor a robot file.
+        UnknownNameError: if `name` is neither a named problem nor a robot file.
         OrthocasError: if anything does not fit together.
     """
     if is_robot_file(name):
@@ -104,7 +106,7 @@ def build_problem(name: str, options: ProblemOptions) -> Problem:
 
 
 def parse_numbers(option: str, text: str) -> Array:
-    """Read "0,0.5,..."."""
+    """Parse "0,0.5,..."."""
     words = [part.strip() for part in text.split(",")]
     try:
         return np.array([float(word) for word in words])
@@ -122,7 +124,7 @@ def _from_file(name: str, options: ProblemOptions) -> Problem:
 
 
 def _centre(robot: Robot, options: ProblemOptions) -> Array | None:
-    """The centre that --centre or --home gives."""
+    """The centre that --centre or --home gives; None without either."""
     if options.home is None:
         return None if options.centre is None else parse_numbers("--centre", options.centre)
     if options.centre is not None:
@@ -139,7 +141,7 @@ def _half_width(options: ProblemOptions) -> Array | None:
 
 
 def _locked(words: tuple[str, ...]) -> dict[str, float]:
-    """Read "joint=value" words."""
+    """Parse "joint=value" words."""
     locked = {}
     for word in words:
         joint, equals, value = word.rpartition("=")

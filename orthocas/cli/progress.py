@@ -12,7 +12,7 @@ from orthocas.minimising.watch import Monitor, Progress, silent
 
 @contextmanager
 def terminal_monitor() -> Iterator[Monitor]:
-    """A monitor that draws one bar per stage; silent when standard error is not a terminal."""
+    """A monitor that draws one bar per stage. It is silent when standard error is not a terminal."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield silent

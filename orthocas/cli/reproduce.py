@@ -1,4 +1,4 @@
-"""`orthocas reproduce`: figures of the paper, drawn again."""
+"""`orthocas reproduce`: redraws figures of the paper."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,10 +15,10 @@ from orthocas.reproduce.registry import reproduce as reproduce_figures
 def reproduce(
     figure: Annotated[str, typer.Argument(metavar="figNN|all", help=f"One of {', '.join(FIGURES)}, or all.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for pictures, numbers and meshes.")],
-    quick: Annotated[bool, typer.Option("--quick", help="Coarser and faster.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Use coarser settings that run faster.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Draw figures of the paper again; print the numbers they show."""
+    """Redraw figures of the paper and print the numbers they show."""
     chosen(figure)
     folder = made_folder("--out", out)
     with terminal_monitor() as monitor:

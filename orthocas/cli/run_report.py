@@ -1,4 +1,4 @@
-"""What `orthocas simulate` says about a run: plain data for JSON, and rows for people."""
+"""The report of `orthocas simulate` about a run: plain data for JSON, and rows for people."""
 
 from math import isfinite
 from typing import Any
@@ -17,7 +17,7 @@ from orthocas.simulation.steps_file import Plan
 _REASONS = {
     ControlStatus.OUTSIDE_DOMAIN: "the arm left the domain",
     ControlStatus.SINGULAR: "the coordinates became singular",
-    ControlStatus.NOT_FINITE: "a number that the controller got was not finite",
+    ControlStatus.NOT_FINITE: "the controller received an input that was not finite",
 }
 
 
@@ -25,11 +25,11 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
     """Numbers of a run, SI units, ready for JSON.
 
     Args:
-        controller: what ran.
-        chart: the coordinates that judge it.
-        plan: what it followed.
+        controller: the controller that ran.
+        chart: the chart whose coordinates the run is measured in.
+        plan: the motion that it was to follow.
         seen: the run in the chart's coordinates.
-        seconds: computing time.
+        seconds: computing time [s].
     """
     bad = np.flatnonzero(seen.status != ControlStatus.OK)
     first = int(bad[0]) if bad.size else None
@@ -59,7 +59,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
 
 
 def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
-    """The report as rows."""
+    """The report as rows of text."""
     units = units_of(problem)
     errors = [
         f"{label} {_text(value)} {units.get(label, '')}".strip() for label, value in report["tracking_error"].items()
@@ -85,19 +85,19 @@ def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
 
 
 def fallback_text(report: dict[str, Any]) -> str | None:
-    """Since when and why the controller gave its fallback; None if it never did."""
+    """A sentence that says when and why the controller used its fallback; None if it never did."""
     fallback = report["fallback"]
     if fallback["since"] is None:
         return None
-    what = "the torque of gravity" if report["command"] == "torque" else "no velocity"
+    what = "the gravity torque" if report["command"] == "torque" else "zero velocity"
     return (
-        f"at t = {fallback['since']:.4g} s {fallback['reason']}: the controller gave {what} only, "
+        f"at t = {fallback['since']:.4g} s {fallback['reason']}: the controller commanded only {what} "
         f"for {fallback['share']:.1%} of the run"
     )
 
 
 def _coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str, dict[str, float]]:
-    """Commanded -> disturbed -> index, for what was commanded alone."""
+    """Commanded -> disturbed -> index, for quantities that were commanded alone."""
     found = coupling_index(chart, reference, seen)
     return {
         commanded: {
@@ -111,7 +111,7 @@ def _coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str,
 
 
 def _worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, ...]) -> str:
-    """The worst index of the task by an extra coordinate, and the other way round."""
+    """The worst disturbance of the task by an extra coordinate, and the reverse."""
     pairs = [(value, to, by) for by, column in index.items() for to, value in column.items()]
     texts = []
     for name, of_task in (("task <- extra", True), ("extra <- task", False)):
@@ -123,7 +123,7 @@ def _worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, ...]) 
 
 
 def _energy(seen: Trajectory) -> dict[str, float]:
-    """Storage and what the controller's damping took, [J]."""
+    """Storage, and the energy dissipated by the controller's damping, [J]."""
     taken = seen.energy_balance[-1] - seen.storage[-1] + seen.storage[0]
     return {
         "storage_start": seen.storage[0],

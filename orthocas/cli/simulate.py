@@ -38,14 +38,16 @@ from orthocas.simulation.figure import trajectory_figure, units_of
 from orthocas.simulation.run import simulate as run_closed_loop
 from orthocas.simulation.steps_file import Plan, read_steps
 
-_DIVERGED = 1  # exit code of a run whose integrator gave up: good input, a run that failed
+_DIVERGED = 1  # exit code when the integrator gave up: the input was valid but the run failed
 
 
 def simulate(
     chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
-    controller: Annotated[str, typer.Option("--controller", help=f"{', '.join(CONTROLLERS)}.")],
-    steps: Annotated[Path, typer.Option("--steps", help="What the robot is to do: a JSON file, see docs/simulate.md.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder for the run, its pictures and its report.")],
+    controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)}.")],
+    steps: Annotated[
+        Path, typer.Option("--steps", help="JSON file with the motion of the robot, see docs/simulate.md.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the run, its pictures and the report.")],
     stiffness: Stiffness = None,
     damping_ratio: DampingRatio = None,
     coupling: CouplingName = None,
@@ -54,22 +56,27 @@ def simulate(
     feedback: Feedback = None,
     limit: Limit = None,
     rate: Annotated[
-        float | None, typer.Option("--rate", parser=number, help="Control rate [Hz]; default continuous control.")
+        float | None, typer.Option("--rate", parser=number, help="Control rate [Hz]; default: continuous control.")
     ] = None,
     mass_factor: Annotated[
         float | None,
-        typer.Option("--mass-factor", parser=number, help="Masses of the robot over those the controller knows."),
+        typer.Option("--mass-factor", parser=number, help="True masses divided by those of the controller's model."),
     ] = None,
     friction: Annotated[
-        str | None, typer.Option("--friction", help='"viscous,coulomb" in every joint [N m s/rad], [N m].')
+        str | None, typer.Option("--friction", help='Joint friction, "viscous,coulomb" [N m s/rad], [N m].')
     ] = None,
     noise: Annotated[
-        str | None, typer.Option("--noise", help='"position,velocity" deviations [rad], [rad/s]; needs --rate.')
+        str | None,
+        typer.Option(
+            "--noise", help='Standard deviation of the sensors, "position,velocity" [rad], [rad/s]; needs --rate.'
+        ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", parser=whole_number, help="Seed of the noise; default 0.")
+        int | None, typer.Option("--seed", parser=whole_number, help="Seed of the noise; default: 0.")
     ] = None,
-    animation: Annotated[str, typer.Option("--animation", help="gif, mp4 (needs ffmpeg) or none.")] = "gif",
+    animation: Annotated[
+        str, typer.Option("--animation", help="Format of the animation: gif, mp4 (needs ffmpeg) or none.")
+    ] = "gif",
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
@@ -82,7 +89,7 @@ def simulate(
     _require_folder(out)
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         loaded = Chart.load(chart)
-        loaded.function("xi")  # refuses grown charts
+        loaded.function("xi")  # raises for grown charts
         plan = read_steps(steps, loaded)
         law = build_controller(controller, loaded, options, limit)
     conditions = {
@@ -100,7 +107,7 @@ def simulate(
             seen, report = finish()
             if animation != "none" and not interrupted:
                 save_animation(out / f"animation.{animation}", seen, loaded.problem, monitor)
-        except KeyboardInterrupt:  # the run is whole, and kept
+        except KeyboardInterrupt:  # the run is complete: keep it
             seen, report = finish()
             interrupted = True
     if json:
@@ -115,14 +122,14 @@ def simulate(
 
 
 def _require_folder(out: Path) -> None:
-    """Check, before anything is written, that there is a folder for files, or can be one."""
+    """Check, before anything is written, that the output folder exists or can be made."""
     if out.exists() and not out.is_dir():
         raise InvalidValueError("--out", str(out), "a folder")
     require_writable(out / "report.json" if out.is_dir() else out, ArchiveError)
 
 
 def _pair(option: str, text: str) -> tuple[float, float]:
-    """Read "0.1,0.2"."""
+    """Parse "0.1,0.2"."""
     values = parse_numbers(option, text).tolist()
     if len(values) != 2:
         raise InvalidValueError(option, repr(text), "two numbers")
@@ -130,21 +137,21 @@ def _pair(option: str, text: str) -> tuple[float, float]:
 
 
 def _noise(law: Controller, text: str | None, seed: int | None, rate: float | None) -> Noise | None:
-    """Noise of the sensors, and nothing that would be ignored."""
+    """The noise of the sensors; raises InvalidValueError for an option that would be ignored."""
     if text is None:
         if seed is not None:
-            raise InvalidValueError("--seed", seed, "none without --noise: nothing else is random")
+            raise InvalidValueError("--seed", seed, "no seed without --noise, because nothing else is random")
         return None
     if rate is None:
-        raise InvalidValueError("--noise", text, "none without --rate: white noise needs ticks")
+        raise InvalidValueError("--noise", text, "no noise without --rate, because white noise needs control ticks")
     position, velocity = _pair("--noise", text)
     if law.command == "velocity" and velocity != 0:
-        raise InvalidValueError("--noise", text, f"a velocity deviation of 0: {law.name} measures no velocity")
+        raise InvalidValueError("--noise", text, f"a velocity deviation of 0, because {law.name} measures no velocity")
     return Noise(position, velocity, 0 if seed is None else seed)
 
 
 def _run(law: Controller, chart: Chart, plan: Plan, conditions: dict[str, Any], monitor: Monitor) -> Trajectory:
-    """The closed loop; projectors get the joint positions that belong to the reference."""
+    """Run the closed loop. Projectors follow the joint positions that correspond to the reference."""
     reference = plan.reference
     if law.labels != chart.labels:
         reference = posture_reference(chart, reference, plan.q_start)
@@ -152,7 +159,7 @@ def _run(law: Controller, chart: Chart, plan: Plan, conditions: dict[str, Any], 
 
 
 def _in_chart(chart: Chart, reference: Reference, run: Trajectory) -> Trajectory:
-    """The run with the chart's coordinates as its quantities, also if the controller does not know them."""
+    """The run with the chart's coordinates as its quantities, even if the controller does not use them."""
     value, velocity, acceleration = reference.sample(run.times.clip(0, reference.duration))
     return replace(
         run,
@@ -167,7 +174,7 @@ def _in_chart(chart: Chart, reference: Reference, run: Trajectory) -> Trajectory
 def _finish(
     law: Controller, chart: Chart, plan: Plan, run: Trajectory, seconds: float, out: Path
 ) -> tuple[Trajectory, dict[str, Any]]:
-    """Judge the run and write it with picture and report; the animation of an earlier run goes away.
+    """Write the run, its picture and its report, and remove the animation of an earlier run.
 
     Returns:
         The run in the chart's coordinates, and the report.
@@ -185,13 +192,13 @@ def _finish(
 
 
 def _notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
-    """What to know about the run, on standard error."""
+    """Print remarks about the run on standard error."""
     for remark in law.remarks():
         note(remark)
     fallback = fallback_text(report)
     if fallback is not None:
         note(fallback)
     if report["outcome"] == Outcome.DIVERGED.value:
-        note(f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, what came before is written")
+        note(f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, the run so far is saved")
     if interrupted:
-        note("interrupted: what was simulated is written, without an animation")
+        note("interrupted: the run so far is saved, without an animation")

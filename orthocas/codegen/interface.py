@@ -1,4 +1,4 @@
-"""What stands in the generated files: names, sizes, tables and comments."""
+"""The contents of the generated files: names, sizes, tables and comments."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -15,21 +15,21 @@ from orthocas.control import Controller
 from orthocas.domains import borders, reach
 from orthocas.version import VERSION
 
-_MAX_EVALUATIONS = 100  # of the chart in one call of the inverse map
+_MAX_EVALUATIONS = 100  # largest number of chart evaluations in one call of the inverse map
 _IN_DOMAIN = "OUTSIDE_DOMAIN: q lies outside the domain of the chart."
-_EVERYWHERE = "This law needs no chart: it is never OUTSIDE_DOMAIN."
+_EVERYWHERE = "This law uses no chart, so the status is never OUTSIDE_DOMAIN."
 
 
 def template_values(
     chart: Chart, controller: Controller | None, name: str, kernels: Kernels, stack_bytes: int
 ) -> dict[str, str]:
-    """Every word that the templates ask for."""
+    """The values of all placeholders in the templates."""
     problem, n = chart.problem, chart.n
     domain = problem.domain
     lower, upper = borders(domain)
     somewhere = np.round(domain.centre + 0.5 * domain.half_width, 3)
     joints, labels = _words(problem.robot.joint_names), _words(chart.labels)
-    slides = [" (slides)" if sliding else "" for sliding in problem.robot.tree.prismatic]
+    slides = [" (prismatic)" if sliding else "" for sliding in problem.robot.tree.prismatic]
     values = {
         "name": name,
         "NAME": name.upper(),
@@ -66,7 +66,7 @@ def template_values(
 
 
 def _words(names: Iterable[str]) -> list[str]:
-    """Words from files of others, harmless in comments of C and in what CMake fills in."""
+    """Names from user files, made safe for C comments and for CMake substitution."""
     return [re.sub(r"[\x00-\x1f\x7f@]+|/(?=\*)|\*(?=/)", " ", name) for name in names]
 
 
@@ -89,7 +89,7 @@ def _control_values(controller: Controller) -> dict[str, str]:
         "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
         "commands_torque": str(int(torque)),
         "law": controller.formula,
-        "fallback": "the torque of gravity, or zero where that is not finite" if torque else "zero velocity",
+        "fallback": "the gravity torque, or zero where it is not finite" if torque else "zero velocity",
         "where": _EVERYWHERE if controller.chart is None else _IN_DOMAIN,
         "command": controller.command,
     }
@@ -108,11 +108,11 @@ def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
 
 
 def _numbers(values: Array) -> str:
-    """C literals that read back as the same numbers."""
+    """C literals that convert back to exactly the same numbers."""
     words = {np.inf: "INFINITY", -np.inf: "-INFINITY"}
     return ", ".join(words.get(float(value), repr(float(value))) for value in values)
 
 
 def filled(template: str, values: Mapping[str, str]) -> str:
-    """A template of `templates/` with its words put in."""
+    """A template of `templates/` with its placeholders filled in."""
     return Template((files("orthocas.codegen") / "templates" / f"{template}.in").read_text()).substitute(values)

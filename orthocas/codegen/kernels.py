@@ -1,4 +1,4 @@
-"""CasADi functions as C that a file of ours can include: static, free of warnings, without CasADi's own interface."""
+"""CasADi functions as C code to embed in our files: static, free of warnings, without CasADi's own interface."""
 
 import re
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ class Kernels:
     """C code of functions `static int PREFIX_NAME(const double** arg, double** res, int* iw, double* w, int mem)`."""
 
     code: str
-    work: dict[str, tuple[int, int, int, int]]  #: by name: entries of arg, res, iw and w that a call needs
+    work: dict[str, tuple[int, int, int, int]]  #: lengths of arg, res, iw and w that a call needs, by function name
 
     def array_bytes(self, name: str) -> int:
-        """Bytes of work arrays that a call of a function needs."""
+        """Size of the work arrays that a call of a function needs, in bytes."""
         arg, res, iw, w = self.work[name]
         return 8 * (arg + res + w) + 4 * iw
 
 
 def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
-    """Generate C99 for functions; what they share is written once, what none needs is left out.
+    """Generate C99 for functions. Shared code appears once, and unused code is left out.
 
     Args:
-        functions: with different names.
-        prefix: of every C name that is defined.
+        functions: functions with different names.
+        prefix: prefix of every C name that the code defines.
     """
     generator = ca.CodeGenerator("kernels.c", _OPTIONS)
     for function in functions:
@@ -51,14 +51,14 @@ _PRODUCT = re.compile(r"casadi_mtimes_dense\((\w+), (\d+), (\d+), (\w+), (\d+), 
 
 
 def _with_products_of_known_sizes(text: str) -> str:
-    """Dense products with their sizes as constants, which compilers vectorise; CasADi passes sizes as arguments."""
+    """Replace dense products by versions with constant sizes, which compilers vectorise; CasADi passes the sizes."""
     sizes = sorted({found.group(2, 3, 5) for found in _PRODUCT.finditer(text)})
     calls = _PRODUCT.sub(r"casadi_product_\2_\3_\5(\1, \4, \6)", text)
     return "\n\n".join([*(_product(*map(int, size)) for size in sizes), calls])
 
 
 def _product(rows: int, columns: int, count: int) -> str:
-    """C code of z += x y, x (rows, columns), y (columns, count); four columns at a time, to touch z less often."""
+    """C code for z += x y, with x (rows, columns) and y (columns, count). Four columns at a time save accesses to z."""
     fours = columns - columns % 4
     lines = [
         f"void casadi_product_{rows}_{columns}_{count}(const double* restrict x, const double* restrict y,"
@@ -79,7 +79,7 @@ def _product(rows: int, columns: int, count: int) -> str:
 
 
 def _definitions(text: str) -> dict[str, str]:
-    """Functions and constants by name, in order; preprocessor lines and comments between them are dropped."""
+    """Functions and constants by name, in order, without the preprocessor lines and comments between them."""
     found: dict[str, str] = {}
     lines = iter(text.splitlines())
     for line in lines:
@@ -88,14 +88,16 @@ def _definitions(text: str) -> dict[str, str]:
         if name is None:
             continue
         block = [line]
-        while not (block[-1].endswith(";") if data else block[-1] == "}" or line.endswith("}")):  # or in one line
+        while not (
+            block[-1].endswith(";") if data else block[-1] == "}" or line.endswith("}")
+        ):  # or the definition is a single line
             block.append(next(lines))
         found[name.group(1)] = "\n".join(block)
     return found
 
 
 def _needed(items: dict[str, str], roots: list[str]) -> list[str]:
-    """Names of what the roots use, directly or not, in the order of definition."""
+    """Names of everything that the roots use, directly or indirectly, in order of definition."""
     needed, waiting = set(), list(roots)
     while waiting:
         name = waiting.pop()
@@ -106,7 +108,7 @@ def _needed(items: dict[str, str], roots: list[str]) -> list[str]:
 
 
 def _without_warnings(block: str) -> str:
-    """Make a function static, and say which parameters it does not use."""
+    """Make a function static, and silence warnings about its unused parameters."""
     match = _FUNCTION.match(block)
     if match is None:
         return block

@@ -1,4 +1,4 @@
-"""Generated C, compiled and called from Python: for tests and proofs."""
+"""Compiles generated C and calls it from Python, for tests and proofs."""
 
 import ctypes
 import shutil
@@ -18,10 +18,10 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 
 
 def compilers() -> tuple[str, ...]:
-    """Gcc and clang, those that are on the path; if there is neither, cc.
+    """Those of gcc and clang that are on the PATH, or cc if neither is.
 
     Raises:
-        CompileError: if there is none.
+        CompileError: if there is no compiler.
     """
     found = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
     found = found or [path for path in (shutil.which("cc"),) if path is not None]
@@ -33,10 +33,10 @@ def compilers() -> tuple[str, ...]:
 def compile_shared(
     generated: GeneratedC, folder: Path, flags: tuple[str, ...] = ("-O2",), compiler: str | None = None
 ) -> Path:
-    """Compile to a shared library in a folder, warnings as errors; default the first of `compilers`.
+    """Compile a shared library in a folder, with warnings as errors; default compiler: the first of `compilers`.
 
     Raises:
-        CompileError: with the first lines of what the compiler says.
+        CompileError: if compilation fails; the message starts with the compiler's first lines.
     """
     library = folder / f"lib{generated.name}.so"
     source = generated.folder / f"{generated.name}.c"
@@ -50,19 +50,19 @@ def compile_shared(
 
 @dataclass(frozen=True, eq=False)
 class CompiledLibrary:
-    """The functions of a compiled library; arrays are NumPy, matrices (n, n)."""
+    """The functions of a compiled library, with NumPy arrays and matrices (n, n)."""
 
     path: Path
     name: str
     n: int
 
     def chart(self, q: Array) -> tuple[Array, Array, int]:
-        """Phi (n,), J (n, n), status."""
+        """phi (n,), J (n, n), status."""
         phi, J = np.empty(self.n), np.empty((self.n, self.n))
         return phi, J, self._call("chart", [q], [phi, J])
 
     def inverse(self, phi: Array, q_start: Array) -> tuple[Array, int]:
-        """Q (n,), status."""
+        """q (n,), status."""
         q = np.empty(self.n)
         return q, self._call("inverse", [phi, q_start], [q])
 
@@ -72,18 +72,18 @@ class CompiledLibrary:
         return M, bias, gravity, self._call("dynamics", [q, dq], [M, bias, gravity])
 
     def control(self, q: Array, dq: Array, reference: Array, gains: Array) -> tuple[Array, int]:
-        """Command (n,), status; reference (3 k,) and gains are the numbers of the C structs in a row."""
+        """Command (n,), status. Reference (3 k,) and gains hold the numbers of the C structs in order."""
         command = np.empty(self.n)
         return command, self._call("control", [q, dq, reference, gains], [command])
 
     @property
     def domain(self) -> tuple[Array, Array]:
-        """Lower and upper borders, (n,) each."""
+        """Lower and upper bounds, (n,) each."""
         lower, upper = (self._table(f"domain_{side}", self.n) for side in ("lower", "upper"))
         return lower, upper
 
     def default_gains(self, count: int) -> Array:
-        """The gains it was generated with, (count,)."""
+        """The gains that the library was generated with, (count,)."""
         return self._table("default_gains", count)
 
     def _table(self, name: str, count: int) -> Array:
@@ -96,11 +96,11 @@ class CompiledLibrary:
     def _call(self, function: str, inputs: list[Array], outputs: list[Array]) -> int:
         run = getattr(self._c, f"{self.name}_{function}")
         arrays = [np.ascontiguousarray(array, dtype=float) for array in inputs] + outputs
-        for array in arrays[:2]:  # q and dq, or q and an output: what C would read beyond
+        for array in arrays[:2]:  # q and dq, or q and an output; C would read beyond the end of a short array
             require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
         return int(run(*(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
 
 
 def gain_numbers(controller: Controller) -> Array:
-    """The gains of a controller as the C struct has them."""
+    """The gains of a controller in the order of the C struct."""
     return np.concatenate(list(controller.gains.values()))

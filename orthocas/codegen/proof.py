@@ -1,4 +1,4 @@
-"""`--check`: compiled C against the Python it came from."""
+"""`--check`: compares compiled C with the Python that it was generated from."""
 
 import tempfile
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ from orthocas.control.status import LARGEST
 from orthocas.domains import borders, contains
 from orthocas.errors import ProofError
 
-TOLERANCE = 1e-10  #: largest difference, relative to the largest entry of the result
-_REACH = 1.2  # random states lie in the domain and this much around it
-_ROUNDING = 1e-12  # where Python changes by more than this if q moves by one rounding, C may differ in proportion
+TOLERANCE = 1e-10  #: largest accepted difference, relative to the largest entry of the result
+_REACH = 1.2  # random states lie in the domain enlarged by this factor
+_ROUNDING = 1e-12  # where one rounding of q changes the Python result by more than this, C may differ in proportion
 _BAD = (np.nan, np.inf, -np.inf, 1e200)
 
 
 @dataclass(frozen=True)
 class Proof:
-    """Largest relative differences over all states and compilers, by function; statuses were equal everywhere."""
+    """Largest relative differences over all states and compilers, by function; all statuses were equal."""
 
     states: int
     compilers: tuple[str, ...]
@@ -35,15 +35,17 @@ class Proof:
 def check_c(
     generated: GeneratedC, chart: Chart, controller: Controller | None = None, states: int = 1000, seed: int = 0
 ) -> Proof:
-    """Compile (C99, warnings are errors) with gcc and clang, those that are there, and compare with Python.
+    """Compile with gcc and clang (C99, warnings as errors), if installed, and compare with Python.
 
-    Numbers and statuses, of random states inside and around the domain, some of them with NaN, infinities and huge
-    numbers; and at rest, of the centre of the domain, its lowest and highest corner, and the centres of its faces.
+    Compares numbers and statuses at random states inside and around the domain, some with NaN, infinite or huge
+    numbers. It also compares them at rest, at the centre of the domain, its lowest and highest corners, and the centres
+    of its faces.
 
     Raises:
-        CompileError: if there is no compiler, or one complains.
+        CompileError: if there is no compiler, or compilation fails.
         ProofError: if a result differs by more than 1e-10 of its largest entry, or a status differs. Near
-            singularities, where commands change by more than 1e-12 if q moves by one rounding, a hundred times that.
+            singularities, where one rounding of q changes commands by more than 1e-12, the accepted difference is a
+            hundred times that change.
     """
     require_kind("chart", chart, Chart)
     n, domain, places = chart.n, chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, chart.n))
@@ -69,7 +71,7 @@ def _compared(
     """Largest relative differences by function; the last positions are corner cases, taken at rest."""
     rng = np.random.default_rng(seed)
     if not np.array_equal(library.domain, borders(chart.problem.domain)):
-        raise ProofError("the domain in C is not that of the chart")
+        raise ProofError("the domain in C differs from the domain of the chart")
     dq = rng.normal(size=q.shape)
     dq[len(q) - len(_corner_cases(chart.n)) :] = 0
     differences = _chart_and_dynamics(library, chart, *_spoiled(rng, q, dq))
@@ -80,12 +82,12 @@ def _compared(
 
 
 def _corner_cases(n: int) -> Array:
-    """Of the box from -1 to 1: centre, two corners, centres of the faces, (3 + 2 n, n)."""
+    """Centre, two corners and centres of the faces of the box from -1 to 1, (3 + 2 n, n)."""
     return np.vstack([np.zeros(n), np.full(n, -1), np.full(n, 1), -np.eye(n), np.eye(n)])
 
 
 def _spoiled(rng: np.random.Generator, *arrays: Array) -> list[Array]:
-    """Copies in which every twentieth row has a number that is none, in one of the arrays; not in corner cases."""
+    """Copies with a NaN, infinite or huge number in every twentieth row of one array; corner cases stay as they are."""
     copies = [array.copy() for array in arrays]
     for row in range(0, len(arrays[0]) - len(_corner_cases(arrays[0].shape[1])), 20):
         array = copies[rng.integers(len(copies))]
@@ -121,7 +123,7 @@ def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Ar
 
 
 def _inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
-    """Largest remaining error in phi, of the solutions that are found; most must be, from nearby, if not from afar."""
+    """Largest remaining error in phi of the solutions. Most targets must be solved from nearby, but not from afar."""
     inner = q[: len(q) // 10]
     regular = [_is_regular(*pair) for pair in zip(chart.phi(inner), chart.jacobian(inner), strict=True)]
     inner = inner[np.array(regular, dtype=bool)]
@@ -130,12 +132,12 @@ def _inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
     far = [_inverse_error(library, chart, *pair) for pair in zip(targets + 1e3, inner, strict=True)]
     solved = np.isfinite(near).sum()
     if solved < 0.9 * len(inner):
-        raise ProofError(f"the inverse map found {solved} of {len(inner)} positions 0.01 away, expected most")
+        raise ProofError(f"the inverse map solved {solved} of {len(inner)} targets from 0.01 away, expected most")
     nothing = np.full(chart.n, np.nan)
     for given in ((nothing, q[0]), (q[0], nothing)):
         solution, status = library.inverse(*given)
         if status != ControlStatus.NOT_FINITE or solution.any():
-            raise ProofError(f"inverse of NaN gives {solution.tolist()} with status {status}, expected zeros and 3")
+            raise ProofError(f"inverse returns {solution.tolist()} and status {status} for NaN, expected zeros and 3")
     return max((error for error in (*near, *far) if np.isfinite(error)), default=0.0)
 
 
@@ -144,14 +146,14 @@ def _is_regular(phi: Array, J: Array) -> bool:
 
 
 def _inverse_error(library: CompiledLibrary, chart: Chart, target: Array, start: Array) -> float:
-    """Largest remaining error in phi; infinite if no solution is found, and then said and done as documented."""
+    """Largest remaining error in phi. Infinite without a solution; status and output must then be as documented."""
     solution, status = library.inverse(target, start)
     if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
         if (status == ControlStatus.OK) != contains(chart.problem.domain, solution):
             raise ProofError(f"the status of inverse is {status} at q = {solution.tolist()}")
         return float(np.abs(chart.phi(solution) - target).max())
     if status != ControlStatus.SINGULAR or not np.array_equal(solution, start):
-        raise ProofError(f"inverse gives {solution.tolist()} with status {status}, expected its start")
+        raise ProofError(f"inverse returns {solution.tolist()} and status {status}, expected its start")
     return np.inf
 
 
@@ -165,10 +167,10 @@ def _control(library: CompiledLibrary, controller: Controller, q: Array, dq: Arr
     command, status = law(q, dq, *parts, *gains)
     moved, status_there = law(np.nextafter(q, np.inf), dq, *parts, *gains)
     if not (status == ControlStatus.OK).any():
-        raise ProofError(f"{controller.name} is well defined at none of {len(q)} states, expected some to compare")
+        raise ProofError(f"{controller.name} is well defined at none of {len(q)} states, expected at least one")
     numbers = gain_numbers(controller)
     if not np.array_equal(library.default_gains(len(numbers)), numbers):
-        raise ProofError("the default gains in C are not those of the controller")
+        raise ProofError("the default gains in C differ from the gains of the controller")
     references, all_gains = np.hstack(parts), np.hstack(gains)
     found = [library.control(*row) for row in zip(q, dq, references, all_gains, strict=True)]
     _require_status("control", [row[1] for row in found], status[:, 0], q)
@@ -178,7 +180,7 @@ def _control(library: CompiledLibrary, controller: Controller, q: Array, dq: Arr
 
 
 def _random_gains(controller: Controller, rows: int, rng: np.random.Generator) -> list[Array]:
-    """Gains around those of the controller, (rows, length) each; limits are finite, and now and then no limits."""
+    """Random gains around those of the controller, (rows, length) each; limits are finite or, at times, infinite."""
     gains = []
     for name, gain in controller.gains.items():
         values = np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
@@ -189,13 +191,13 @@ def _random_gains(controller: Controller, rows: int, rng: np.random.Generator) -
 
 
 def _are_numbers(*arrays: Array) -> NDArray[np.bool_]:
-    """Rows without NaN, infinities and numbers that C refuses."""
+    """Rows without NaN, infinities and numbers that the C code rejects."""
     known: NDArray[np.bool_] = np.all([(np.abs(array) <= LARGEST).all(axis=1) for array in arrays], axis=0)
     return known
 
 
 def _zero_unless(good: NDArray[np.bool_], values: Array) -> Array:
-    """Values of the states that are good, zeros for the others."""
+    """Values at good states, zeros at the others."""
     return np.where(good.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0)
 
 
@@ -214,7 +216,7 @@ def _difference(found: Array, wanted: Array) -> float:
 
 
 def _differences(found: Array, wanted: Array) -> Array:
-    """Difference at each state relative to its largest entry, (N,); infinite where anything is not finite."""
+    """Difference at each state relative to the largest entry, (N,); infinite where an entry is not finite."""
     flat = (len(found), -1)
     scale = np.abs(wanted.reshape(flat)).max(axis=1).clip(1e-300)
     difference = np.abs(found - wanted).reshape(flat).max(axis=1) / scale

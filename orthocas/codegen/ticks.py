@@ -23,16 +23,16 @@ _MICROSECONDS = 3e5  # to spend on one measurement
 
 @dataclass(frozen=True)
 class Ticks:
-    """Times of calls of one controller [us]."""
+    """Computing times of one controller [us]."""
 
     median: float
     p99: float
-    worst: float  #: interrupts and whatever else the machine does included
-    slowest_state: float  #: of 64 states, at its best: without what the machine does
+    worst: float  #: includes interrupts and other activity of the machine
+    slowest_state: float  #: best time of the slowest of 64 states, which excludes other activity of the machine
 
 
 def control_tick(chart: Chart) -> float:
-    """Time of one call of decoupled PD+ on a chart, as generated C [us]: the slowest of 64 states, at its best.
+    """Time of one call of decoupled PD+ on a chart in generated C [us]: the best time of the slowest of 64 states.
 
     Raises:
         CompileError: if there is no C compiler.
@@ -48,10 +48,10 @@ def control_tick(chart: Chart) -> float:
 
 
 def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int = 100_000) -> list[Ticks]:
-    """Times of compiled controllers of one robot, with their own gains, on 64 states inside the domain.
+    """Measure compiled controllers of one robot, with their own gains, on 64 states inside the domain.
 
     Raises:
-        CompileError: if there is no C compiler, or the program that calls them cannot be built or run.
+        CompileError: if there is no C compiler, or the timing program cannot be built or run.
     """
     with TemporaryDirectory() as folder:
         data, program = Path(folder) / "states", Path(folder) / "ticks"
@@ -70,7 +70,7 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
 def _run(command: list[str]) -> str:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise CompileError(f"{command[0]} gave exit code {done.returncode}: {done.stderr[:500]}")
+        raise CompileError(f"{command[0]} failed with exit code {done.returncode}: {done.stderr[:500]}")
     return done.stdout
 
 

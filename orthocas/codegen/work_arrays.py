@@ -1,7 +1,7 @@
-"""Work arrays of generated functions, without the room that CasADi keeps in them for constants.
+"""Work arrays of generated functions, without the space that CasADi reserves in them for constants.
 
-CasADi's C refers to constants where they stand, but its work array keeps a place for every one: for a network of a
-thousand neurons that is megabytes of stack that nothing reads or writes.
+CasADi's C refers to constants directly, but reserves a slot for each of them in its work array. For a network of a
+thousand neurons, that is megabytes of stack that nothing reads or writes.
 """
 
 import re
@@ -17,14 +17,14 @@ _CALL = re.compile(r"\bcasadi_f\d+(?=\(arg1, res1, iw, w, 0\))")
 
 
 def compacted(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dict[str, str], dict[str, int]]:
-    """C code with smaller work arrays, and how many doubles each of the functions needs.
+    """C code with smaller work arrays, and the number of doubles that each function needs.
 
     Args:
-        blocks: C code by name; what functions call is casadi_f0, casadi_f1, ... in the order in which CasADi meets it.
-        functions: those the code was generated from, in the same order.
+        blocks: C code by name; called functions are casadi_f0, casadi_f1, ... in the order in which CasADi meets them.
+        functions: the functions that the code was generated from, in the same order.
 
     Raises:
-        CompileError: if the code is not laid out as expected, because CasADi changed.
+        CompileError: if a new version of CasADi lays the code out in another way.
     """
     names = {hash(f): f"casadi_f{number}" for number, f in enumerate(_in_order_of_generation(functions))}
     changed = dict(blocks)
@@ -44,7 +44,7 @@ def compacted(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dic
 
 
 def _in_order_of_generation(functions: list[ca.Function]) -> list[ca.Function]:
-    """The functions and all they call, callers before callees."""
+    """The functions and all that they call, callers before callees."""
     found: dict[int, ca.Function] = {}
 
     def visit(function: ca.Function) -> None:
@@ -66,15 +66,15 @@ def _callees(function: ca.Function) -> list[ca.Function]:
 
 
 def _moved(block: str, function: ca.Function, below: int) -> tuple[str, int]:
-    """Code whose places in the work array begin at `below`, and where they end."""
+    """Code whose slots in the work array begin at `below`, and the end of these slots."""
     body = _PLACE.sub("", block.split("{", 1)[1])
     if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
-        return block, function.sz_w()  # an operation uses the array in its own way
+        return block, function.sz_w()  # an operation uses the array in a way of its own
     sizes = _place_sizes(function)
     places = sorted((int(offset), sizes[int(place)]) for place, offset in _PLACE.findall(block))
     for (offset, size), (following, _) in pairwise(places):
         if offset + size > following:
-            raise CompileError(f"places at {offset} and {following} of {function.name()} overlap, {_VERSION}")
+            raise CompileError(f"work slots at {offset} and {following} of {function.name()} overlap, {_VERSION}")
     if not places:
         return block, below
     shift = below - places[0][0]
@@ -82,7 +82,7 @@ def _moved(block: str, function: ca.Function, below: int) -> tuple[str, int]:
 
 
 def _place_sizes(function: ca.Function) -> dict[int, int]:
-    """Numbers that every place of the work array holds."""
+    """Size of every slot of the work array, in numbers."""
     found: dict[int, int] = {}
     for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
         node = function.instruction_MX(k)

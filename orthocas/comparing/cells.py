@@ -1,4 +1,4 @@
-"""Fits side by side: a grid of parametrisations, solvers and seeds, judged on the same held-out samples."""
+"""The fits of a grid of parametrisations, solvers and seeds, evaluated on the same held-out samples."""
 
 import math
 import os
@@ -23,14 +23,14 @@ from orthocas.parametrisations import Parametrisation
 from orthocas.problem import Problem
 from orthocas.quality import Report, evaluate
 
-HELD_OUT_SEED = 2**31  #: seed of the held-out samples: no fit of a grid has it
+HELD_OUT_SEED = 2**31  #: seed of the held-out samples; no fit of a grid uses it
 _DIED = "its process died: out of memory, or a script that calls compare outside `if __name__ == '__main__'`"
-_stops: list[Event] = []  # in processes of ours: set when the parent does not want results any more
+_stops: list[Event] = []  # in worker processes: set when the parent no longer needs results
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One fit of a grid: plain settings that can be sent to another process."""
+    """One fit of a grid: settings that can be sent to another process."""
 
     problem: Problem
     parametrisation: Parametrisation
@@ -39,17 +39,17 @@ class Cell:
     weights: Weights
     samples: int | None
     held_out: int
-    chart_file: Path | None  #: where to save the chart
+    chart_file: Path | None  #: file to save the chart in
 
     @property
     def solver_name(self) -> str:
-        """Name of the solver; coordinates in closed form need none."""
+        """Name of the solver. Coordinates in closed form need none."""
         return self.solver.name if self.parametrisation.closed_form is None else "closed form"
 
 
 @dataclass(frozen=True)
 class CellResult:
-    """What one fit gave, or the error that stopped it; numbers of a failed one are NaN."""
+    """The result of one fit, or its error. The numbers of a failed fit are NaN."""
 
     problem: str
     parametrisation: str
@@ -57,7 +57,7 @@ class CellResult:
     seed: int
     status: str
     error: str = ""
-    seconds: float = float("nan")  #: of the fit
+    seconds: float = float("nan")  #: duration of the fit
     parameters: int = 0
     samples: int = 0
     iterations: int = 0
@@ -68,8 +68,8 @@ class CellResult:
     conditioning_p01: float = float("nan")
     conditioning_mean: float = float("nan")
     folded_samples: int = 0
-    control_tick_us: float = float("nan")  #: of decoupled PD+ on the chart, as generated C, if it was measured
-    history: tuple[tuple[float, float], ...] = ()  #: seconds and training loss as the fit went on
+    control_tick_us: float = float("nan")  #: a tick of decoupled PD+ as generated C; NaN if not measured
+    history: tuple[tuple[float, float], ...] = ()  #: seconds and training loss during the fit
 
     @property
     def failed(self) -> bool:
@@ -78,7 +78,7 @@ class CellResult:
 
 
 def run_cell(cell: Cell) -> CellResult:
-    """Fit and judge; an error becomes part of the result."""
+    """Fit and evaluate. An error becomes part of the result."""
     history: list[tuple[float, float]] = []
     start = time.perf_counter()
 
@@ -109,7 +109,7 @@ def run_cell(cell: Cell) -> CellResult:
 
 
 def _result(cell: Cell, found: Fit, report: Report, history: list[tuple[float, float]]) -> CellResult:
-    """The numbers of a fit."""
+    """The result of a successful fit."""
     results = [stage.result for stage in found.stages]
     return CellResult(
         problem=cell.problem.name,
@@ -133,7 +133,7 @@ def _result(cell: Cell, found: Fit, report: Report, history: list[tuple[float, f
 
 
 def failure(cell: Cell, error: str) -> CellResult:
-    """The result of a fit that did not come to its end."""
+    """The result of a fit that failed."""
     text = " ".join(error.split())
     return CellResult(
         cell.problem.name, cell.parametrisation.label, cell.solver_name, cell.seed, Status.FAILED.value, text
@@ -143,13 +143,13 @@ def failure(cell: Cell, error: str) -> CellResult:
 def run_cells(
     cells: Sequence[Cell], executor: Executor | None = None, jobs: int | None = None, monitor: Monitor = silent
 ) -> Iterator[CellResult]:
-    """Results of cells as they come in; a failing cell, or one that kills its process, fails alone.
+    """Run cells, and yield results as they arrive. A cell that fails or kills its process does not affect the others.
 
     Args:
-        cells: what to run.
-        executor: where to run them; default processes of this machine with one thread each.
-        jobs: number of such processes, default one for each core this process may use.
-        monitor: called with the share of cells that are done.
+        cells: the cells to run.
+        executor: runs the cells. Default: processes on this machine with one thread each.
+        jobs: number of these processes. Default: one for each core that this process may use.
+        monitor: called with the share of finished cells.
     """
     results = _own_processes(cells, jobs) if executor is None else _submitted(cells, executor)
     for done, result in enumerate(results, start=1):
@@ -159,7 +159,7 @@ def run_cells(
 
 
 def _submitted(cells: Sequence[Cell], executor: Executor) -> Iterator[CellResult]:
-    """All cells on a given executor."""
+    """Run all cells on a given executor."""
     futures = {executor.submit(run_cell, cell): cell for cell in cells}
     try:
         for future in as_completed(futures):
@@ -178,9 +178,9 @@ def _outcome(future: Future[CellResult], cell: Cell) -> CellResult:
 
 
 def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResult]:
-    """All cells in processes of our own. If one dies, all that were left are run again, each in a pool of its own.
+    """Run all cells in new processes. If a process dies, each remaining cell runs again in a pool of its own.
 
-    Cells go through files: a pool whose process dies while a large argument is on its way hangs in Python 3.11.2.
+    Cells are passed in files: a pool whose process dies while it receives a large argument hangs in Python 3.11.2.
     """
     with TemporaryDirectory(prefix="orthocas-") as folder:
         files = {}
@@ -196,9 +196,9 @@ def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResu
 
 
 def _in_pools(files: Mapping[Cell, Path], jobs: int | None) -> Iterator[CellResult]:
-    """Cells that lie in files, in a pool, and one by one what a dying process left."""
+    """Run cells stored in files: in one pool, then one by one the cells that a dying process left."""
     left: list[Cell] = []
-    context = get_context("spawn")  # new interpreters: forked ones would inherit threads that no longer run
+    context = get_context("spawn")  # new interpreters: forked ones inherit the locks of threads that no longer run
     stop = context.Event()
 
     def pool_of(size: int) -> ProcessPoolExecutor:
@@ -213,7 +213,7 @@ def _in_pools(files: Mapping[Cell, Path], jobs: int | None) -> Iterator[CellResu
                         left.append(futures[future])
                     else:
                         yield _outcome(future, futures[future])
-            except BaseException:  # Ctrl-C, or nobody wants the rest: fits that are running end at their next step
+            except BaseException:  # Ctrl-C, or the caller stops: running fits end at their next step
                 stop.set()
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
@@ -223,13 +223,13 @@ def _in_pools(files: Mapping[Cell, Path], jobs: int | None) -> Iterator[CellResu
 
 
 def _run_stored(file: Path) -> CellResult:
-    """Run a cell that this program has written to a file."""
+    """Run a cell from a file that this program wrote."""
     cell: Cell = pickle.loads(file.read_bytes())
     return run_cell(cell)
 
 
 def _begin(stop: Event) -> None:
-    """In a new process: leave Ctrl-C to the parent, who says when to stop."""
+    """Initialise a worker process: it ignores Ctrl-C, and the parent tells it when to stop."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _stops.append(stop)
 
@@ -240,7 +240,7 @@ def _cancelled() -> bool:
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """Processes started meanwhile use one thread each, so that they do not fight for cores and seconds compare."""
+    """Processes started in this block use one thread each. They do not compete for cores, and times are comparable."""
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"
     try:

@@ -1,4 +1,4 @@
-"""`compare`: a grid of parametrisations, solvers and seeds, fitted and judged side by side."""
+"""`compare`: fit and evaluate a grid of parametrisations, solvers and seeds."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -36,32 +36,47 @@ def compare(
     control_ticks: bool = False,
     monitor: Monitor = silent,
 ) -> Comparison:
-    """Fit every parametrisation with every solver and seed, and judge all on the same held-out samples.
+    """Fit every parametrisation with every solver and seed, and evaluate all on the same held-out samples.
 
-    A fit that fails is reported as such; the others go on. Ctrl-C returns the fits that are done. Coordinates in closed
-    form need no solver and no seed, and come once.
+    If a fit fails, the result says so and the others continue. After Ctrl-C the finished fits are returned. Coordinates
+    in closed form need no solver and no seed, so they are evaluated once.
+
+    In scripts, call it under `if __name__ == "__main__"`: it starts processes.
 
     Args:
         problem: robot, task, metric and domain.
-        parametrisations: what to fit.
-        solvers: default for each parametrisation what `fit` takes.
+        parametrisations: the parametrisations to fit.
+        solvers: the solvers to use. Default: for each parametrisation the default of `fit`.
         seeds: number of seeds 0, 1, ... of samples and random starts.
-        weights: of the loss; see `fit`.
-        samples: number of training samples; default grows with the number of parameters.
+        weights: weights of the loss; see `fit`.
+        samples: number of training samples. Default: grows with the number of parameters.
         held_out: number of held-out samples.
-        executor: any `concurrent.futures.Executor` (of processes or threads, Dask, MPI, ...); default processes of this
-            machine. Those use one thread each, so seconds are those of one core.
-        jobs: number of such processes, default one for each core.
+        executor: any `concurrent.futures.Executor` (processes, threads, Dask, MPI, ...). Default: processes on this
+            machine with one thread each, so that seconds are those of one core.
+        jobs: number of these processes. Default: one for each core.
         charts: folder to save charts in.
-        control_ticks: measure, after all fits, how long a control tick takes with each parametrisation: decoupled PD+
-            as generated C, on a chart of the folder. NaN where there is no C compiler.
+        control_ticks: measure after all fits how long a control tick takes with each parametrisation. The tick is
+            decoupled PD+ as generated C, on a saved chart. NaN if there is no C compiler.
         monitor: called with progress.
-
-    Call it under `if __name__ == "__main__"` in scripts, as all that starts processes.
 
     Raises:
         InvalidValueError: if the grid is empty, or two of its parametrisations or solvers have the same name.
         ChartFileError: if the folder for charts cannot be written.
+
+    Example:
+        >>> from concurrent.futures import ThreadPoolExecutor
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> with ThreadPoolExecutor(1) as executor:
+        ...     comparison = oc.compare(
+        ...         problems.get("planar_3r_xy"),
+        ...         [oc.Linear(), oc.Polynomial(degree=2)],
+        ...         samples=200,
+        ...         held_out=1000,
+        ...         executor=executor,
+        ...     )
+        >>> [result.parametrisation for result in comparison.results]
+        ['linear', 'polynomial:2']
     """
     require_kind("problem", problem, Problem)
     count, loss = require_count("seeds", seeds), Weights.of(weights)
@@ -100,7 +115,7 @@ def _fits(
 def _run_grid(
     cells: Sequence[Cell], executor: Executor | None, jobs: int | None, control_ticks: bool, monitor: Monitor
 ) -> Comparison:
-    """All fits, in the order of the grid; after Ctrl-C those that are done."""
+    """All fits in the order of the grid. After Ctrl-C, the finished ones."""
     order = {(cell.parametrisation.label, cell.solver_name, cell.seed): k for k, cell in enumerate(cells)}
     results: list[CellResult] = []
     interrupted = False
@@ -115,13 +130,13 @@ def _run_grid(
 
 
 def _require_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence[Solver] | None) -> None:
-    """Refuse grids that are empty, hold something else, or whose results could not be told apart."""
+    """Refuse grids that are empty, contain other objects, or have two entries of the same name."""
     for name, members, kinds, example in (
         ("parametrisations", parametrisations, Parametrisation, "Polynomial(degree=4)"),
         ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
     ):
         if not members:
-            raise InvalidValueError(name, "empty", f"at least one, as [{example}]")
+            raise InvalidValueError(name, "empty", f"at least one, such as [{example}]")
         for member in members:
             if not isinstance(member, kinds):
                 raise InvalidValueError(name, repr(member), f"objects such as {example}")
@@ -129,5 +144,5 @@ def _require_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence
         twice = [label for label in labels if labels.count(label) > 1]
         if twice:
             raise InvalidValueError(
-                name, f"holding two called '{twice[0]}'", "different ones; compare those in two grids"
+                name, f"a list with two called '{twice[0]}'", "different names; compare these in two grids"
             )

@@ -1,4 +1,4 @@
-"""Pictures of a comparison: the front of qualities, and the training loss over time."""
+"""Figures of a comparison: the front of task and mutual angles, and the training loss over time."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,11 +20,11 @@ _STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)))
 
 
 def front_figure(comparison: Comparison) -> Figure:
-    """Task angle against mutual angle of all fits: down and left is better.
+    """Task angle against mutual angle of all fits. Fits further down and left are better.
 
-    Colour tells the parametrisation, marker the solver, size the number of parameters; labels beside the picture name
-    both with the seconds, lines lead to the medians over seeds. With one extra coordinate there is no mutual angle, and
-    the 1 % quantile of the conditioning takes its place.
+    The colour shows the parametrisation, the marker the solver, and the size the number of parameters. Labels beside
+    the plot give both names and the seconds; lines connect them to the medians over seeds. With one extra coordinate
+    there is no mutual angle, so the axis shows the 1 % quantile of the conditioning.
     """
     summaries = [summary for summary in comparison.summaries() if summary.failed < summary.seeds]
     figure = Figure(figsize=(9.6, max(4.6, 1.2 + 0.21 * len(summaries))), layout="constrained")
@@ -55,7 +55,7 @@ def front_figure(comparison: Comparison) -> Figure:
 
 
 def convergence_figure(comparison: Comparison) -> Figure:
-    """Training loss over time, one line a fit; jumps are new stages with other samples and more parameters."""
+    """Training loss over time, one line per fit. Jumps are new stages with other samples and more parameters."""
     figure = Figure(figsize=(8.6, 4.6), layout="constrained")
     axes = figure.add_subplot()
     drawn = [result for result in comparison.results if result.history]
@@ -84,7 +84,7 @@ def _names(results: Sequence[CellResult], attribute: str) -> list[str]:
 
 
 def _colours(results: Sequence[CellResult]) -> dict[str, Colour]:
-    """One hue for every kind of parametrisation, darker for those later in the alphabet."""
+    """One hue for each kind of parametrisation, darker for labels later in the alphabet."""
     kinds: dict[str, list[str]] = {}
     for name in sorted(_names(results, "parametrisation")):
         kinds.setdefault(name.partition(":")[0], []).append(name)
@@ -100,7 +100,7 @@ def _size(parameters: int) -> float:
 
 
 def _label(axes: Axes, summaries: Sequence[Summary], single: bool, colours: Mapping[str, Colour]) -> None:
-    """Names and seconds in a column beside the axes, from top to bottom as the points lie, with lines to them."""
+    """Write names and seconds in a column beside the axes, in the order of the points, with lines to them."""
     places = {(s.parametrisation, s.solver): s.conditioning_p01 if single else s.mutual_std_deg for s in summaries}
     ordered = sorted(summaries, key=lambda s: (-places[s.parametrisation, s.solver], s.task_std_deg))
     for k, summary in enumerate(ordered):
@@ -124,7 +124,7 @@ def _label(axes: Axes, summaries: Sequence[Summary], single: bool, colours: Mapp
 
 
 def _scale(axes: Axes, *values: Sequence[float]) -> None:
-    """Logarithmic axes where values, none of them zero, spread over more than a factor of four."""
+    """Use a logarithmic axis if the values are positive and spread over more than a factor of four."""
     for name, numbers in zip(("x", "y"), values, strict=True):
         if numbers and max(numbers) > 4 * min(numbers) > 1e-3 * max(numbers):
             getattr(axes, f"set_{name}scale")("log")
@@ -135,7 +135,7 @@ def _scale(axes: Axes, *values: Sequence[float]) -> None:
 
 
 def _legends(axes: Axes, colours: Mapping[str, Colour], styles: Mapping[str, Any]) -> None:
-    """One legend for parametrisations and solvers, beside the picture."""
+    """One legend for parametrisations and solvers, beside the plot."""
     handles = [Line2D([], [], color=colour, linewidth=3, label=name) for name, colour in colours.items()]
     handles += [Line2D([], [], linestyle=style, color="0.3", label=name) for name, style in styles.items()]
     axes.legend(handles=handles, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)

@@ -1,4 +1,4 @@
-"""What a comparison leaves behind: a table, a CSV, a JSON."""
+"""The result of a comparison, as a table, CSV and JSON."""
 
 import csv
 import io
@@ -17,20 +17,20 @@ from orthocas.showing import Shown
 
 @dataclass(frozen=True)
 class Summary:
-    """One parametrisation and solver over all seeds: medians, and the spread of both angles over their medians."""
+    """One parametrisation and solver over all seeds: medians, and the relative spread of both angles."""
 
     parametrisation: str
     solver: str
     seeds: int
     failed: int
-    error: str  #: of the first failed seed
+    error: str  #: error of the first failed seed
     parameters: int
     seconds: float
     task_std_deg: float
     mutual_std_deg: float
     conditioning_p01: float
     folded_samples: int
-    control_tick_us: float  #: of decoupled PD+ as generated C
+    control_tick_us: float  #: duration of a decoupled PD+ tick as generated C
     task_spread: float  #: (largest - smallest) / median
     mutual_spread: float
 
@@ -40,10 +40,10 @@ class Comparison(Shown):
     """All fits of a grid."""
 
     results: tuple[CellResult, ...]
-    interrupted: bool = False  #: whether Ctrl-C stopped it before all were done
+    interrupted: bool = False  #: whether Ctrl-C stopped it before all fits were done
 
     def summaries(self) -> list[Summary]:
-        """One for every parametrisation and solver, best task angle first, failed ones last."""
+        """One summary per parametrisation and solver, best task angle first, failed ones last."""
         groups: dict[tuple[str, str], list[CellResult]] = {}
         for result in self.results:
             groups.setdefault((result.parametrisation, result.solver), []).append(result)
@@ -51,7 +51,7 @@ class Comparison(Shown):
         return sorted(summaries, key=lambda s: (math.isnan(s.task_std_deg), s.task_std_deg))
 
     def write(self, folder: Path) -> None:
-        """Write comparison.csv (one line a fit) and comparison.json (with histories)."""
+        """Write comparison.csv (one line per fit) and comparison.json (with histories)."""
         names = [field.name for field in fields(CellResult) if field.name != "history"]
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, names)
@@ -63,7 +63,7 @@ class Comparison(Shown):
             (drafts / "comparison.json").write_text(to_json(self.as_dict(), indent=1))
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON; NaN becomes None."""
+        """Plain data for JSON. NaN becomes None."""
         return {
             "summaries": [plain(asdict(summary)) for summary in self.summaries()],
             "fits": [plain(asdict(result)) for result in self.results],
@@ -79,7 +79,7 @@ class Comparison(Shown):
         }
 
     def rows(self) -> list[list[str]]:
-        """A table for people, its head first."""
+        """The rows of a readable table, with the header first."""
         head = ["parametrisation", "solver", "parameters", "task std", "mutual std", "cond 1 %", "folded"]
         head += ["seconds", "control tick"]
         return [head, *(_row(summary) for summary in self.summaries())]

@@ -1,4 +1,4 @@
-"""The column "control tick" of a comparison: measured once for a parametrisation, since parameters do not change it."""
+"""The column "control tick" of a comparison. It is measured once per parametrisation: parameters do not change it."""
 
 import math
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ from orthocas.minimising.watch import Monitor, Progress
 
 
 def with_control_ticks(results: Sequence[CellResult], cells: Sequence[Cell], monitor: Monitor) -> list[CellResult]:
-    """The results with `control_tick_us`, one after the other so that they do not disturb each other.
+    """Add `control_tick_us` to the results. Ticks are measured one at a time, so that they do not disturb each other.
 
-    NaN where there is no chart file, no C compiler, or no such controller.
+    It is NaN if there is no chart file, no C compiler, or the controller does not support the chart.
     """
     files = {
         cell.parametrisation.label: cell.chart_file for cell in cells if cell.chart_file and cell.chart_file.exists()
@@ -33,5 +33,5 @@ def with_control_ticks(results: Sequence[CellResult], cells: Sequence[Cell], mon
 def _control_tick(file: Path) -> float:
     try:
         return control_tick(Chart.load(file))
-    except (OrthocasError, OSError, RuntimeError, MemoryError):  # the fits are worth more than their ticks
+    except (OrthocasError, OSError, RuntimeError, MemoryError):  # never lose the fits because of a failed measurement
         return math.nan

@@ -1,4 +1,4 @@
-"""Controllers as CasADi functions of state, reference and gains, and the references they follow."""
+"""Controllers as CasADi functions of state, reference and gains, with the references they follow."""
 
 from orthocas.control.controller import Controller, Law
 from orthocas.control.kinematic import Kinematic

@@ -1,4 +1,4 @@
-"""What every controller offers: one CasADi function of state, reference and gains, with the gains it was made with."""
+"""The interface of every controller: one CasADi function of state, reference and gains, and the default gains."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
@@ -35,17 +35,17 @@ class Controller(Protocol):
 
     @property
     def chart(self) -> "Chart | None":
-        """The chart whose coordinates it uses, and whose domain it keeps to; None for laws without one."""
+        """The chart whose coordinates the law uses and whose domain it respects; None for laws without a chart."""
         ...
 
     @property
     def problem(self) -> Problem:
-        """Robot (the model the law uses), task, metric and domain."""
+        """Robot (the model that the law uses), task, metric and domain."""
         ...
 
     @property
     def command(self) -> Command:
-        """What comes out: joint torques [N m] or velocities [rad/s]."""
+        """Kind of the command: joint torques [N m] or joint velocities [rad/s]."""
         ...
 
     @property
@@ -55,45 +55,45 @@ class Controller(Protocol):
 
     @property
     def gains(self) -> dict[str, Array]:
-        """Values of the gains, by the names of their inputs."""
+        """Values of the gains by input name."""
         ...
 
     @property
     def gain_units(self) -> Mapping[str, str]:
-        """Units of the gains and what they allow, in words, by name."""
+        """Units and admissible values of the gains, in words, by name."""
         ...
 
     @property
     def settings(self) -> Mapping[str, str]:
-        """Choices that are no numbers, for example the coupling."""
+        """Choices that are not numbers, for example the coupling."""
         ...
 
     def remarks(self) -> list[str]:
-        """What to know before it is switched on, in sentences; empty if there is nothing."""
+        """Warnings to read before the controller is switched on, as sentences; empty if there are none."""
         ...
 
     @property
     def function(self) -> ca.Function:
-        """Inputs q, dq (n, 1), reference and two derivatives (k, 1), gains -> command (n, 1), status (1, 1)."""
+        """q, dq (n, 1), reference and two derivatives (k, 1), gains -> command (n, 1), status (1, 1)."""
         ...
 
     @property
     def graph(self) -> ca.Function:
-        """The same function as a graph of shared parts, which C is generated from."""
+        """The same function as a graph with shared subexpressions; C is generated from it."""
         ...
 
     @property
     def energy(self) -> ca.Function | None:
-        """Same inputs -> storage V [J] and power dissipated by damping [W]; None for velocity controllers."""
+        """The same inputs -> storage V [J] and power dissipated by damping [W]; None for velocity controllers."""
         ...
 
     @property
     def measured(self) -> ca.Function:
-        """The controlled quantities, q (n, 1) -> (k, 1)."""
+        """q (n, 1) -> the controlled quantities (k, 1)."""
         ...
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
-        """Raise UnreachableReferenceError, with time and place, if the reference leaves what the law can follow."""
+        """Raise UnreachableReferenceError, with time and place, if the law cannot follow the reference."""
         ...
 
 
@@ -106,18 +106,18 @@ class Law(Controller, Protocol):
 
     @classmethod
     def on_chart(cls, chart: "Chart", limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """The law on a chart, or on its problem.
+        """Build the law on a chart, or on the problem of the chart.
 
         Args:
             chart: the chart.
             limit: largest command of each joint.
-            settings: gains and choices by the names in `options`; those left out have defaults.
+            settings: gains and choices by the names in `options`; those left out take their defaults.
         """
         ...
 
 
 def law_facts(controller: Controller) -> dict[str, str]:
-    """What a controller shows: quantities, gains, other settings and problem."""
+    """The facts that every controller displays: quantities, gains, other settings and problem."""
     return {
         "law": f"{controller.name}, commands {controller.command} of {controller.problem.n} joints",
         "quantities": listed(controller.labels),
@@ -128,13 +128,13 @@ def law_facts(controller: Controller) -> dict[str, str]:
 
 
 def require_controller(controller: Controller) -> None:
-    """Raise InvalidValueError for what has not the attributes of a controller; none of its functions is built."""
+    """Raise InvalidValueError for an object without the attributes of a controller. Builds none of its functions."""
     if not all(hasattr(controller, name) for name in ("name", "problem", "command", "labels", "gains")):
         raise InvalidValueError("controller", f"a {type(controller).__name__}", "a controller, such as PDPlus")
 
 
 def named_inputs(n: int, gains: dict[str, Array], k: int) -> dict[str, ca.MX]:
-    """Symbols of the inputs of a controller, in order."""
+    """Symbols for the inputs of a controller, in order."""
     sizes = {"q": n, "dq": n, "reference": k, "reference_velocity": k, "reference_acceleration": k}
     sizes |= {name: len(value) for name, value in gains.items()}
     return {name: ca.MX.sym(name, size) for name, size in sizes.items()}
@@ -148,7 +148,7 @@ def guarded_graph(
     volume: ca.MX,
     domain: Domain | None,
 ) -> ca.Function:
-    """The graph of a controller: its law behind the guard of `orthocas.control.status`."""
+    """The graph of a controller: its law, protected by the guard of `orthocas.control.status`."""
     numbers = ca.vertcat(*(value for key, value in inputs.items() if key != "limit"))
     check = guard(domain, command.shape[0], numbers.shape[0])
     safe, status = check(command, fallback, inputs["limit"], inputs["q"], numbers, volume)

@@ -1,4 +1,4 @@
-"""Damping matrices for a stiffness and an inertia that changes with the posture."""
+"""Damping matrices for a given stiffness and a posture-dependent inertia."""
 
 from typing import Literal
 
@@ -14,7 +14,7 @@ DAMPING_DESIGNS: tuple[DampingDesign, ...] = ("square_root", "double_diagonal")
 def damping_matrix(
     design: DampingDesign, inertia: Expression, stiffness: Expression, damping_ratio: Expression
 ) -> Expression:
-    """D(q), (k, k), for an inertia (k, k), and diagonals of K and Z, (k, 1).
+    """Damping matrix D(q), (k, k), for an inertia (k, k) and the diagonals of K and Z, (k, 1).
 
     - square_root: D = M^1/2 Z K^1/2 + K^1/2 Z M^1/2. Symmetric, but not always positive semi-definite.
     - double_diagonal: D = 2 K^1/2 S^1/4 Z S^1/4 K^1/2 with S = K^-1/2 M K^-1/2, always positive semi-definite. With one
@@ -35,5 +35,5 @@ def damping_matrix(
 
 
 def _row(diagonal: Expression) -> Expression:
-    """Numbers (k, 1) in every row of (k, k): what columns are multiplied with, entry by entry."""
+    """The vector (k, 1) repeated in every row of (k, k); an entrywise product with it scales columns."""
     return ca.repmat(diagonal.T, diagonal.shape[0], 1)

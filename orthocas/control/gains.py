@@ -1,4 +1,4 @@
-"""Checks of gains: numbers a control law multiplies with, given as one for all or one for each."""
+"""Checks of gains, which are given as one number for all quantities or one number per quantity."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,9 +8,9 @@ from orthocas.errors import InvalidValueError
 
 STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
     "J per squared unit of the quantity, > 0",
-    "1 is critical damping, >= 0",
+    ">= 0, 1 is critical damping",
     "1/s, >= 0",
-    "largest command, by joints, > 0; INFINITY for none",
+    "largest command per joint, > 0; INFINITY for no limit",
 )
 
 
@@ -29,7 +29,7 @@ def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
 
 
 def command_limit(name: str, value: ArrayLike | None, length: int) -> Array:
-    """Numbers > 0, (length,), infinite where nothing was given."""
+    """Numbers > 0, (length,); infinite if `value` is None."""
     value = np.inf if value is None else value
     limit = np.array(np.broadcast_to(_one_or(name, value, length), (length,)))
     _require(name, limit, limit > 0, "positive numbers")

@@ -1,4 +1,4 @@
-"""Inertia in task and extra coordinates, in blocks, and how close its gradients are to being dependent."""
+"""Inertia in task and extra coordinates, in blocks, and a measure of how close the gradients are to dependent."""
 
 import casadi as ca
 import numpy as np
@@ -13,10 +13,11 @@ _SAMPLES, _SEED = 256, 0
 
 
 def block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
-    """A function J (k, n), A (n, n) -> B = A^-1 J^T (n, k), Lambda (k, k), volume (1, 1).
+    """J (k, n), A (n, n) -> B = A^-1 J^T (n, k), Lambda (k, k), volume (1, 1).
 
-    With the rows of J in blocks, k = sum(blocks): Lambda is block diagonal with (J_b A^-1 J_b^T)^-1, [AS2023] eqs.
-    (30), (31); one block gives the full M_phi. The volume is the product of det(J_b A^-1 J_b^T): 0 in singularities.
+    The rows of J are divided into blocks, k = sum(blocks). Lambda is block diagonal with (J_b A^-1 J_b^T)^-1, [AS2023]
+    eqs. (30), (31); one block gives the full M_phi. The volume is the product of det(J_b A^-1 J_b^T), which is 0 in
+    singularities.
     """
     k = sum(blocks)
     J, A = ca.SX.sym("J", k, n), ca.SX.sym("A", n, n)
@@ -32,7 +33,7 @@ def block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
 
 
 def median_volume(problem: Problem, jacobian: ca.Function, metric: str | Metric, blocks: tuple[int, ...]) -> float:
-    """Median of the volume of `block_inertia` over the domain: the scale for "near singular"."""
+    """Median of the volume of `block_inertia` over the domain. It sets the scale for "near singular"."""
     metric = Metric.from_spec(problem.robot, metric) if isinstance(metric, str) else metric
     q = ca.MX.sym("q", problem.n)
     volume = block_inertia(problem.n, blocks)(jacobian(q), metric.function(q))[2]

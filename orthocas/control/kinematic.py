@@ -26,10 +26,10 @@ class Kinematic(Shown):
     Args:
         chart: a chart with a closed expression (not a grown one).
         feedback: diagonal of Lambda, >= 0, (n,) or one number [1/s]; the paper uses 0.
-        limit: largest speed of each joint, (n,) or one number [rad/s] or [m/s]; default none.
+        limit: largest speed of each joint, (n,) or one number [rad/s] or [m/s]; default no limit.
 
     Raises:
-        ShapeError, InvalidValueError: for settings that do not fit.
+        ShapeError, InvalidValueError: for settings of the wrong shape or value.
         NoExpressionError: if the chart is grown.
 
     Source:
@@ -41,7 +41,7 @@ class Kinematic(Shown):
     limit: Array
 
     name: ClassVar[str] = "kinematic"
-    formula: ClassVar[str] = "Velocity control dq = J^-1 (d phi_d + Lambda (phi_d - phi)); the input dq is not used."
+    formula: ClassVar[str] = "Velocity control dq = J^-1 (d phi_d + Lambda (phi_d - phi)); does not use the input dq."
     command: ClassVar[Command] = "velocity"
     energy: ClassVar[None] = None
     gain_units: ClassVar[Mapping[str, str]] = {"feedback": FEEDBACK, "limit": LIMIT}
@@ -50,18 +50,18 @@ class Kinematic(Shown):
 
     def __init__(self, chart: Chart, feedback: ArrayLike = 0.0, limit: ArrayLike | None = None) -> None:
         require_kind("chart", chart, Chart)
-        chart.function("xi")  # refuses grown charts
+        chart.function("xi")  # raises for grown charts
         object.__setattr__(self, "chart", chart)
         object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))
         object.__setattr__(self, "limit", command_limit("limit", limit, chart.n))
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """The law on a chart; `feedback` is 0 unless given."""
+        """Build the law on a chart; `feedback` defaults to 0."""
         return cls(chart, limit=limit, **settings)
 
     def remarks(self) -> list[str]:
-        """Nothing."""
+        """No warnings."""
         return []
 
     @property
@@ -90,12 +90,12 @@ class Kinematic(Shown):
 
     @cached_property
     def function(self) -> ca.Function:
-        """Inputs q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
+        """q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
         return self.chart.runnable(self.graph)
 
     @cached_property
     def graph(self) -> ca.Function:
-        """The same function as a graph of shared parts, which C is generated from."""
+        """The same function as a graph with shared subexpressions; C is generated from it."""
         n, problem = self.chart.n, self.problem
         inputs = named_inputs(n, self.gains, n)
         q = inputs["q"]
@@ -106,5 +106,5 @@ class Kinematic(Shown):
         return guarded_graph(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
-        """Raise UnreachableReferenceError if the reference leaves the chart's domain, seen from q_start."""
+        """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""
         joint_path(self.chart, reference, q_start)

@@ -1,6 +1,6 @@
 """Inverse and square root of small symmetric positive definite matrices, as smooth CasADi expressions without branches.
 
-They end up in generated C, so there are no eigenvectors (which jump) and no loops that stop when they like.
+Generated C contains them, so they use no eigenvectors (which jump) and no loops with a data-dependent length.
 """
 
 from functools import cache
@@ -9,7 +9,7 @@ import casadi as ca
 
 from orthocas.parametrisations.family import Expression
 
-_ROUNDS = 8  # rounding accuracy up to a condition number of 1e6 (tests/test_control_algebra.py)
+_ROUNDS = 8  # accurate to rounding up to a condition number of 1e6 (tests/test_control_algebra.py)
 
 
 def spd_inverse(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -29,8 +29,9 @@ def spd_inverse(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
 def square_root(matrix: Expression) -> Expression:
     """The symmetric positive definite S with S S = A, (k, k).
 
-    Newton's iteration in the product form of Denman and Beavers, scaled by determinants, with a fixed number of rounds:
-    a rational function of the entries with square roots of determinants. Graphs (MX) call one function for all rounds.
+    Newton's iteration in the product form of Denman and Beavers, scaled by determinants, with a fixed number of rounds.
+    The result is a rational function of the entries and of roots of determinants. In graphs (MX), all rounds call one
+    function.
 
     Source:
         [H2008] Sec. 6.3, product form of the Denman-Beavers iteration with determinantal scaling.
@@ -46,7 +47,7 @@ def square_root(matrix: Expression) -> Expression:
 
 @cache
 def _newton_round(k: int) -> ca.Function:
-    """One round: S and the product X, both (k, k), all of them rational functions of A and so symmetric."""
+    """One round on S and the product X, both (k, k); all are rational functions of A and therefore symmetric."""
     root, product, identity = ca.SX.sym("S", k, k), ca.SX.sym("X", k, k), ca.SX.eye(k)
     inverse, determinant = spd_inverse(product)
     mu_squared = determinant ** (-1 / k)
@@ -56,5 +57,5 @@ def _newton_round(k: int) -> ca.Function:
 
 
 def _symmetric(matrix: ca.SX) -> ca.SX:
-    """A matrix that is symmetric but for rounding from its lower triangle: half of the operations."""
+    """Mirror the lower triangle of a matrix that is symmetric up to rounding, which halves the operations."""
     return ca.SX(ca.tril2symm(ca.tril(matrix)))

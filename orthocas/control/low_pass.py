@@ -1,4 +1,4 @@
-"""The second-order low pass that turns steps into references with two derivatives, in closed form."""
+"""The second-order low-pass filter, in closed form. It turns steps into references with two derivatives."""
 
 import casadi as ca
 import numpy as np
@@ -7,10 +7,10 @@ from orthocas.casadi_tools.batch import dense_function
 
 
 def low_pass_response(k: int, natural_frequency: float, damping_ratio: float) -> ca.Function:
-    """Response of k equal low passes to a constant target, from any start.
+    """Response of k equal low-pass filters to a constant target, from any start.
 
-    With e = value - target: dd_e + 2 zeta omega0 d_e + omega0^2 e = 0, solved in closed form for under-damped,
-    critical and over-damped filters.
+    The error e = value - target obeys dd_e + 2 zeta omega0 d_e + omega0^2 e = 0, solved in closed form for
+    underdamped, critically damped and overdamped filters.
 
     Args:
         k: number of quantities.
@@ -28,7 +28,7 @@ def low_pass_response(k: int, natural_frequency: float, damping_ratio: float) ->
         cosine, sine = ca.exp(-decay * t), t * ca.exp(-decay * t)
     elif damping_ratio < 1:
         cosine, sine = ca.exp(-decay * t) * ca.cos(beat * t), ca.exp(-decay * t) * ca.sin(beat * t) / beat
-    else:  # hyperbolic, written so that nothing overflows
+    else:  # hyperbolic functions, written so that they do not overflow
         slow, fast = ca.exp((beat - decay) * t), ca.exp(-(beat + decay) * t)
         cosine, sine = (slow + fast) / 2, (slow - fast) / (2 * beat)
     e0 = value0 - target

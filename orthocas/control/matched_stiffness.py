@@ -1,4 +1,4 @@
-"""Stiffness by frequency: scales and inertias of coordinates differ by orders of magnitude, so one number suits few."""
+"""Stiffness from a frequency, because the scales and inertias of coordinates differ by orders of magnitude."""
 
 import casadi as ca
 import numpy as np
@@ -11,14 +11,14 @@ from orthocas.control.inertia import block_inertia
 from orthocas.domains import sample_uniform
 from orthocas.problem import Problem
 
-SPRING_FREQUENCY = 4 * np.pi  #: [rad/s], 2 Hz: twice that of the paper's low pass
+SPRING_FREQUENCY = 4 * np.pi  #: [rad/s], 2 Hz: twice the frequency of the paper's low-pass filter
 _SAMPLES, _SEED = 256, 0
 
 
 def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY) -> Array:
-    """K_i = omega^2 times the inertia of each of [x; xi], its median over the domain, (n,).
+    """Stiffness K_i = omega^2 m_i, with the median m_i over the domain of the inertia of each entry of [x; xi], (n,).
 
-    The inertias are the diagonals of M_x and M_xi.
+    The inertias are the diagonal entries of M_x and M_xi.
 
     Args:
         chart: a chart with a closed expression.
@@ -35,7 +35,7 @@ def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY) -> Arra
 
 
 def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUENCY) -> Array:
-    """The same for the springs in the joints, with the diagonal of M, (n,)."""
+    """Stiffness of springs in the joints, from the diagonal of M in the same way, (n,)."""
     require_kind("problem", problem, Problem)
     q = ca.MX.sym("q", problem.n)
     return _springs(problem, q, ca.diag(problem.robot.mass_matrix(q)), frequency)

@@ -39,27 +39,27 @@ class DampingCheck:
     """Whether the damping matrix D is positive semi-definite over a domain."""
 
     samples: int
-    smallest_eigenvalue: float  #: of D, divided by its largest eigenvalue at the same point
+    smallest_eigenvalue: float  #: of D, divided by the largest eigenvalue at the same point
     indefinite_share: float  #: share of samples with a negative eigenvalue
     worst_point: tuple[float, ...]  #: [rad] or [m]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class _OperationalSpace(Shown):
-    """What impedance and PD+ share: settings, inertia and damping in the coordinates of a chart.
+    """The common part of impedance control and PD+: settings, inertia and damping in the coordinates of a chart.
 
     Args:
         chart: a chart with a closed expression (not a grown one).
         stiffness: diagonal of K, > 0, (n,) or one number for all; [N/m] for positions, [J] for coordinates.
         damping_ratio: diagonal of Z, >= 0, (n,) or one number.
-        coupling: `coupled` takes the full M_phi = (J M^-1 J^T)^-1; `decoupled` sums one controller for the task and one
+        coupling: `coupled` uses the full M_phi = (J M^-1 J^T)^-1; `decoupled` adds one controller for the task and one
             for the extra coordinates, each with its own inertia, and relies on condition (5).
         damping: `square_root` is the paper's design (29); `double_diagonal` is always positive semi-definite.
-        limit: largest torque of each joint, (n,) or one number [N m] or [N]; default none.
+        limit: largest torque of each joint, (n,) or one number [N m] or [N]; default no limit.
 
     Raises:
-        ShapeError, InvalidValueError, UnknownNameError: for settings that do not fit.
-        NoExpressionError: if the chart is grown; `orthocas.distil` makes one that fits.
+        ShapeError, InvalidValueError, UnknownNameError: for settings of the wrong shape, value or name.
+        NoExpressionError: if the chart is grown; `orthocas.distil` turns it into a chart with a closed expression.
     """
 
     chart: Chart
@@ -88,7 +88,7 @@ class _OperationalSpace(Shown):
         require_known("coupling", coupling, COUPLINGS)
         require_known("damping", damping, DAMPING_DESIGNS)
         require_kind("chart", chart, Chart)
-        chart.function("xi")  # refuses grown charts
+        chart.function("xi")  # raises for grown charts
         n = chart.n
         for name, value in {
             "chart": chart,
@@ -102,7 +102,7 @@ class _OperationalSpace(Shown):
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """The law on a chart; `stiffness` is that of springs of 2 Hz with the median inertia unless given."""
+        """Build the law on a chart; `stiffness` defaults to springs of 2 Hz at the median inertia."""
         stiffness = settings.pop("stiffness", None)
         return cls(chart, matched_stiffness(chart) if stiffness is None else stiffness, limit=limit, **settings)
 
@@ -112,17 +112,17 @@ class _OperationalSpace(Shown):
         return {"coupling": self.coupling, "damping": self.damping}
 
     def remarks(self) -> list[str]:
-        """Whether the metric decouples task and extra coordinates, and whether D is positive semi-definite."""
+        """Warnings if the metric does not decouple task and extra coordinates, or D is not positive semi-definite."""
         found, metric = [], self.problem.metric.name
         if metric != "inertia":
             found.append(
-                f"the metric of this chart is {metric}: task and extra coordinates are decoupled only with A = M "
+                f"the metric of this chart is {metric}, but task and extra coordinates are decoupled only for A = M "
                 "(inertia)"
             )
         if share := self.check_damping().indefinite_share:
             found.append(
-                f"the damping matrix (29) is not positive at {share:.1%} of the domain with these gains: "
-                "the damping design double_diagonal always is"
+                f"the damping matrix (29) is indefinite in {share:.1%} of the domain with these gains; "
+                "the damping design double_diagonal never is"
             )
         return found
 
@@ -152,12 +152,12 @@ class _OperationalSpace(Shown):
 
     @cached_property
     def function(self) -> ca.Function:
-        """Inputs q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
+        """q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
         return self.chart.runnable(self.graph)
 
     @cached_property
     def graph(self) -> ca.Function:
-        """The same function as a graph of shared parts, which C is generated from."""
+        """The same function as a graph with shared subexpressions; C is generated from it."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         q = inputs["q"]
         J, gravity = self.chart.function("jacobian")(q), self.problem.robot.gravity(q)
@@ -169,8 +169,8 @@ class _OperationalSpace(Shown):
     def energy(self) -> ca.Function:
         """V = 1/2 de^T M_phi de + 1/2 e^T K e [J] and P = de^T D de [W], e = phi - phi_d.
 
-        Impedance control takes the velocity J dq in place of de, so that V is kinetic energy and springs. M_phi is the
-        full inertia, also for decoupled controllers: the robot's energy has no blocks.
+        Impedance control uses the velocity J dq instead of de, so V is the kinetic energy plus that of the springs.
+        M_phi is the full inertia even for decoupled controllers, because the robot's energy is not block diagonal.
         """
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         q, K = inputs["q"], ca.diag(inputs["stiffness"])
@@ -186,7 +186,7 @@ class _OperationalSpace(Shown):
 
     @cached_property
     def damping_matrix(self) -> ca.Function:
-        """Q, stiffness, damping_ratio -> D(q), (n, n)."""
+        """q, stiffness, damping_ratio -> D(q), (n, n)."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         chosen = {name: inputs[name] for name in ("q", "stiffness", "damping_ratio")}
         q = chosen["q"]
@@ -194,7 +194,7 @@ class _OperationalSpace(Shown):
         return self.chart.runnable(named_function("damping_matrix", chosen, {"D": D}))
 
     def check_damping(self, samples: int = 1000, seed: int = 0) -> DampingCheck:
-        """Smallest eigenvalue of D over uniform samples of the domain: (29) can make it negative."""
+        """Find the smallest eigenvalue of D over uniform samples of the domain; (29) can make it negative."""
         points = sample_uniform(self.problem.domain, samples, seed)
         rows = [np.tile(gain, (samples, 1)) for gain in (self.stiffness, self.damping_ratio)]
         D = Batched(self.damping_matrix)(points, *rows)[0].reshape(samples, self.chart.n, self.chart.n)
@@ -204,7 +204,7 @@ class _OperationalSpace(Shown):
         return DampingCheck(samples, float(ratio[worst]), float((ratio < -1e-12).mean()), tuple(points[worst].tolist()))
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
-        """Raise UnreachableReferenceError if the reference leaves the chart's domain, seen from q_start."""
+        """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""
         joint_path(self.chart, reference, q_start)
 
     @property
@@ -229,7 +229,7 @@ class _OperationalSpace(Shown):
         e, de = self._errors(inputs, J)
         force = -inputs["stiffness"] * e - D @ de
         if self.feed_forward:
-            w = B @ (Lambda @ inputs["reference_velocity"])  # J^-1 d_phi_d; under (5) also when decoupled, by (8)
+            w = B @ (Lambda @ inputs["reference_velocity"])  # J^-1 d_phi_d; if (5) holds, by (8) also when decoupled
             curvature = self.chart.function("second_derivative")(q, dq, w)
             acceleration = inputs["reference_acceleration"] + B.T @ robot.coriolis_product(q, dq, w) - curvature
             force += Lambda @ acceleration
@@ -259,6 +259,14 @@ class PDPlus(_OperationalSpace):
 
     Source:
         [AS2023] eq. (35).
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> controller = oc.control.PDPlus(chart, stiffness=50.0, coupling="decoupled")
+        >>> controller.labels, controller.command
+        (('x', 'y', 'xi1'), 'torque')
     """
 
     feed_forward = True

@@ -1,4 +1,4 @@
-"""References of projector controllers that mean the same motion as a reference in a chart's coordinates."""
+"""References for projector controllers that describe the same motion as a reference in a chart's coordinates."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,12 +10,12 @@ from orthocas.control.reference import Reference
 
 
 def posture_reference(chart: Chart, reference: Reference, q_start: ArrayLike) -> Reference:
-    """[x_d; q_d] with phi(q_d) = phi_d at every instant: what to give a `Projector` to compare it with.
+    """The reference [x_d; q_d] with phi(q_d) = phi_d at every instant, for a fair comparison with a `Projector`.
 
     Args:
-        chart: the coordinates of the reference.
-        reference: in phi = [x; xi].
-        q_start: where the motion starts, (n,).
+        chart: the chart whose coordinates the reference is given in.
+        reference: the motion of phi = [x; xi].
+        q_start: joint position at the start, (n,).
 
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.

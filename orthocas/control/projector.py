@@ -1,4 +1,4 @@
-"""The state of the art to compare with: null-space projectors on torque and on velocity level."""
+"""The state of the art for comparison: null-space projectors at torque level and at velocity level."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,18 +33,18 @@ from orthocas.showing import Shown
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Projector(Shown):
-    """Impedance control of the task, and a joint spring to a posture q_d behind the projector of the task.
+    """Impedance control of the task, with joint springs to a posture q_d in the null space of the task.
 
-    tau = J_x^T (-K_x (x - x_d) - D_x J_x dq) + P^T (-K_q (q - q_d) - D_q dq) + g, P = I - J_x^#A J_x, with A the metric
-    of the problem: A = M is the dynamically consistent projector. The reference is [x_d; q_d]. Damping by (29), with
-    the inertia M_x in the task and M in the joints. There is no domain.
+    tau = J_x^T (-K_x (x - x_d) - D_x J_x dq) + P^T (-K_q (q - q_d) - D_q dq) + g, P = I - J_x^#A J_x, where A is the
+    metric of the problem; A = M gives the dynamically consistent projector. The reference is [x_d; q_d]. Eq. (29) gives
+    the damping, with the inertia M_x in the task and M in the joints. The law has no domain.
 
     Args:
         problem: robot, task and metric.
         stiffness: diagonal of K_x, > 0, (m,) or one number.
         posture_stiffness: diagonal of K_q, > 0, (n,) or one number [N m/rad].
-        damping_ratio: for all springs, >= 0, (m + n,) or one number.
-        limit: largest torque of each joint, (n,) or one number; default none.
+        damping_ratio: of all springs, >= 0, (m + n,) or one number.
+        limit: largest torque of each joint, (n,) or one number; default no limit.
 
     Source:
         [AS2023] eqs. (2), (3).
@@ -56,7 +56,7 @@ class Projector(Shown):
     limit: Array
 
     name: ClassVar[str] = "projector"
-    formula: ClassVar[str] = "Task impedance and a posture spring behind the projector of the task, plus g(q)."
+    formula: ClassVar[str] = "Task impedance plus posture springs in the null space of the task, plus g(q)."
     command: ClassVar[Command] = "torque"
     chart: ClassVar[None] = None
     gain_units: ClassVar[Mapping[str, str]] = {"stiffness": STIFFNESS, "damping_ratio": DAMPING_RATIO, "limit": LIMIT}
@@ -82,7 +82,7 @@ class Projector(Shown):
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """The law on the problem of a chart; springs of 2 Hz with the median inertia unless given."""
+        """Build the law on the problem of a chart; by default with springs of 2 Hz at the median inertia."""
         stiffness, posture = settings.pop("stiffness", None), settings.pop("posture_stiffness", None)
         return cls(
             chart.problem,
@@ -93,7 +93,7 @@ class Projector(Shown):
         )
 
     def remarks(self) -> list[str]:
-        """Nothing."""
+        """No warnings."""
         return []
 
     def facts(self) -> dict[str, str]:
@@ -117,12 +117,12 @@ class Projector(Shown):
 
     @cached_property
     def function(self) -> ca.Function:
-        """Inputs q, dq (n, 1), reference and its derivatives (m + n, 1), gains -> command (n, 1), status (1, 1)."""
+        """q, dq (n, 1), reference and its derivatives (m + n, 1), gains -> command (n, 1), status (1, 1)."""
         return scalar_code(self.graph)
 
     @cached_property
     def graph(self) -> ca.Function:
-        """The same function as a graph of shared parts, which C is generated from."""
+        """The same function as a graph with shared subexpressions; C is generated from it."""
         problem, m = self.problem, self.problem.m
         inputs = self._inputs()
         q, K = inputs["q"], inputs["stiffness"]
@@ -137,7 +137,7 @@ class Projector(Shown):
 
     @cached_property
     def energy(self) -> ca.Function:
-        """V = kinetic energy and all springs, also what the projector hides [J]; and what both dampers take [W]."""
+        """V, the kinetic energy plus all springs, also their projected-out part [J], and power of both dampers [W]."""
         problem, m = self.problem, self.problem.m
         inputs = self._inputs()
         q, dq = inputs["q"], inputs["dq"]
@@ -157,7 +157,7 @@ class Projector(Shown):
         return named_inputs(self.problem.n, self.gains, len(self.labels))
 
     def _errors_and_damping(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
-        """E = [x - x_d; q - q_d], D_x with the inertia M_x, and D_q with M."""
+        """e = [x - x_d; q - q_d], D_x with the inertia M_x, and D_q with M."""
         problem, m = self.problem, self.problem.m
         q, K, Z = inputs["q"], inputs["stiffness"], inputs["damping_ratio"]
         M = problem.robot.mass_matrix(q)
@@ -170,13 +170,13 @@ class Projector(Shown):
 class KinematicProjector(Shown):
     """Joint velocity dq = J_x^#A (d_x_d + Lambda_x (x_d - x)) + P (d_q_d + Lambda_q (q_d - q)).
 
-    With both feedbacks 0 and a constant posture this is pseudo-inverse control. The reference is [x_d; q_d].
+    With zero feedback and a constant posture, this is pseudo-inverse control. The reference is [x_d; q_d].
 
     Args:
         problem: robot, task and metric A.
         feedback: diagonal of Lambda_x, >= 0, (m,) or one number [1/s].
         posture_feedback: diagonal of Lambda_q, >= 0, (n,) or one number [1/s].
-        limit: largest speed of each joint, (n,) or one number; default none.
+        limit: largest speed of each joint, (n,) or one number; default no limit.
 
     Source:
         [AS2023] eq. (1).
@@ -187,7 +187,7 @@ class KinematicProjector(Shown):
     limit: Array
 
     name: ClassVar[str] = "kinematic_projector"
-    formula: ClassVar[str] = "Velocity control by pseudo-inverse and projector; the input dq is not used."
+    formula: ClassVar[str] = "Velocity control by pseudo-inverse and projector; does not use the input dq."
     command: ClassVar[Command] = "velocity"
     chart: ClassVar[None] = None
     energy: ClassVar[None] = None
@@ -211,13 +211,13 @@ class KinematicProjector(Shown):
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """The law on the problem of a chart; `feedback`, one number or (m + n,), is 0 unless given."""
+        """Build the law on the problem of a chart; `feedback`, one number or (m + n,), defaults to 0."""
         m, n = chart.m, chart.n
         feedback = non_negative_gains("feedback (task, then joints)", settings.pop("feedback", 0.0), m + n)
         return cls(chart.problem, feedback[:m], feedback[m:], limit, **settings)
 
     def remarks(self) -> list[str]:
-        """Nothing."""
+        """No warnings."""
         return []
 
     def facts(self) -> dict[str, str]:
@@ -241,12 +241,12 @@ class KinematicProjector(Shown):
 
     @cached_property
     def function(self) -> ca.Function:
-        """Inputs q, dq (n, 1), reference and its derivatives (m + n, 1), gains -> command (n, 1), status (1, 1)."""
+        """q, dq (n, 1), reference and its derivatives (m + n, 1), gains -> command (n, 1), status (1, 1)."""
         return scalar_code(self.graph)
 
     @cached_property
     def graph(self) -> ca.Function:
-        """The same function as a graph of shared parts, which C is generated from."""
+        """The same function as a graph with shared subexpressions; C is generated from it."""
         problem, m = self.problem, self.problem.m
         inputs = named_inputs(problem.n, self.gains, len(self.labels))
         q = inputs["q"]
@@ -283,6 +283,6 @@ def _require_posture_within_limits(problem: Problem, reference: Reference) -> No
     if outside.size:
         k, i = outside[0]
         raise UnreachableReferenceError(
-            f"the reference wants joint '{problem.robot.joint_names[i]}' at {postures[k, i]:.4g} "
+            f"the reference puts joint '{problem.robot.joint_names[i]}' at {postures[k, i]:.4g} "
             f"at t = {times[k]:.3g} s, expected within [{problem.robot.lower[i]:.4g}, {problem.robot.upper[i]:.4g}]"
         )

@@ -1,4 +1,4 @@
-"""Whether a reference can be followed inside the domain of a chart, found before anything moves."""
+"""Check, before anything moves, that a reference can be followed inside the domain of a chart."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,10 +11,10 @@ from orthocas.errors import InvalidValueError, InverseError, UnreachableReferenc
 
 
 def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
-    """Joint positions that have the reference's values, followed from q_start, (N, n) on `reference.grid()`.
+    """Joint positions with phi(q) equal to the reference, followed from q_start, (N, n) on `reference.grid()`.
 
     Raises:
-        UnreachableReferenceError: with the first time at which there is no such q near the one before, or it lies
+        UnreachableReferenceError: names the first time at which no such q exists near the previous one, or q lies
             outside the domain.
     """
     require_kind("chart", chart, Chart)

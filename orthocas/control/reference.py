@@ -1,4 +1,4 @@
-"""References: smooth motions phi_d(t) of named quantities, steps through a low pass or splines through points."""
+"""References: smooth motions phi_d(t) of named quantities, as low-pass filtered steps or splines through points."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,22 +20,22 @@ from orthocas.showing import Shown, listed, number_list
 NATURAL_FREQUENCY = 2 * np.pi  #: omega0 [rad/s] of [AS2023] Sec. 8
 DAMPING_RATIO = 0.7  #: zeta of [AS2023] Sec. 8
 _GRID = 0.05  # [s]
-_SWING = 0.3  # [rad] of the low pass's swing between two times of the grid: 0.048 s for the paper's
+_SWING = 0.3  # [rad] phase of the low-pass oscillation between two grid times; 0.048 s for the paper's filter
 _DEGREE = 5  # of splines through points
 Change = tuple[float, Mapping[str, float]]  #: a time [s] and the new targets by label
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Reference(Shown):
-    """Phi_d(t) and two derivatives, smooth on each of S segments. Use `steps` or `through` to build one."""
+    """phi_d(t) and two derivatives, smooth on each of S segments. Use `steps` or `through` to build one."""
 
     labels: tuple[str, ...]  #: names of the k quantities
-    times: Array  #: (S + 1,) starts of the segments, and the end [s]
-    targets: Array  #: (S, k) what each segment heads for
+    times: Array  #: (S + 1,) starts of the segments, then the end [s]
+    targets: Array  #: (S, k) targets of the segments
     start: Array  #: (k,) value at the start
     parameters: Array  #: (S, p) inputs of the profile
     profile: ca.Function  #: time since the start of the segment, parameters -> value, velocity, acceleration (k, 1)
-    spacing: float = _GRID  #: [s] that shows every swing
+    spacing: float = _GRID  #: [s], fine enough to resolve every oscillation
 
     @classmethod
     def steps(
@@ -47,21 +47,28 @@ class Reference(Shown):
         natural_frequency: float = NATURAL_FREQUENCY,
         damping_ratio: float = DAMPING_RATIO,
     ) -> Self:
-        """Steps of the target, through the low pass dd_phi_d = omega0^2 (target - phi_d) - 2 zeta omega0 d_phi_d.
+        """Steps of the target, filtered by dd_phi_d = omega0^2 (target - phi_d) - 2 zeta omega0 d_phi_d.
 
         Args:
-            labels: names of the quantities, as the controller has them.
-            start: value at t = 0, where the reference rests, (k,).
-            changes: (time, {label: new target}), in the order of time, 0 <= time < duration.
+            labels: names of the quantities, as in the controller.
+            start: value at t = 0, where the reference is at rest, (k,).
+            changes: pairs (time, {label: new target}) in order of time, 0 <= time < duration.
             duration: [s].
             natural_frequency: omega0 > 0 [rad/s].
             damping_ratio: zeta >= 0.
 
         Raises:
-            InvalidValueError, UnknownNameError, ShapeError: for what does not fit.
+            InvalidValueError, UnknownNameError, ShapeError: for arguments of the wrong value, label or shape.
 
         Source:
             [AS2023] Sec. 8.
+
+        Example:
+            >>> import orthocas as oc
+            >>> reference = oc.control.Reference.steps(["x", "xi1"], [1.0, 0.0], [(0.5, {"x": 1.2})], duration=4.0)
+            >>> value, velocity, acceleration = reference.sample([0.0, 4.0])
+            >>> value.round(2).tolist()
+            [[1.0, 0.0], [1.2, 0.0]]
         """
         names, value = tuple(labels), frozen_array("start", start, (len(labels),))
         _require_number("natural_frequency", natural_frequency, above=0.0)
@@ -86,7 +93,7 @@ class Reference(Shown):
             points: (N, k).
 
         Raises:
-            InvalidValueError, ShapeError: for what does not fit.
+            InvalidValueError, ShapeError: for arguments of the wrong value or shape.
         """
         names = tuple(labels)
         t = frozen_array("times", times, (None,))
@@ -116,7 +123,7 @@ class Reference(Shown):
         return float(self.times[-1])
 
     def segment(self, times: Array) -> Array:
-        """Index of the segment that holds each time; a border belongs to the later one."""
+        """Index of the segment that contains each time; a time on a border belongs to the later segment."""
         return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.parameters) - 1)
 
     def sample(self, times: ArrayLike) -> tuple[Array, Array, Array]:
@@ -162,7 +169,7 @@ def _stairs(labels: tuple[str, ...], start: Array, changes: Sequence[Change], du
 
 
 def _polynomial(k: int) -> ca.Function:
-    """Time, coefficients of k polynomials with the highest power first -> value and two derivatives."""
+    """Time and coefficients of k polynomials, highest power first -> value and two derivatives."""
     t, coefficients = ca.SX.sym("t"), ca.SX.sym("coefficients", k * (_DEGREE + 1))
     table = ca.reshape(coefficients, _DEGREE + 1, k).T
     value = ca.SX(table @ ca.vertcat(*(t ** (_DEGREE - i) for i in range(_DEGREE + 1))))

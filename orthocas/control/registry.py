@@ -11,26 +11,26 @@ _LAWS: dict[str, type[Law]] = {}
 
 
 def register(law: type[Law]) -> None:
-    """Make a law known by its name: `orthocas simulate` and `orthocas codegen` can then build it on a chart.
+    """Register a law under its name, so that `orthocas simulate` and `orthocas codegen` can build it on a chart.
 
     Raises:
-        InvalidValueError: if the name belongs to another law.
+        InvalidValueError: if another law has that name.
     """
     if _LAWS.get(law.name, law) is not law:
-        raise InvalidValueError("name", repr(law.name), f"a name that is not taken by {_LAWS[law.name].__name__}")
+        raise InvalidValueError("name", repr(law.name), f"a free name, because {_LAWS[law.name].__name__} has this one")
     _LAWS[law.name] = law
 
 
 def law_names() -> tuple[str, ...]:
-    """Names of all laws."""
+    """Names of all registered laws."""
     return tuple(_LAWS)
 
 
 def law_of(name: str) -> type[Law]:
-    """The law of that name.
+    """The law with a name.
 
     Raises:
-        UnknownNameError: if there is none.
+        UnknownNameError: if no law has that name.
     """
     require_known("controller", name, _LAWS)
     return _LAWS[name]

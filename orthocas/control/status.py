@@ -1,4 +1,4 @@
-"""What a controller says about its own output, and the guard that keeps that output finite and bounded."""
+"""The status of a controller's output, and the guard that keeps the output finite and bounded."""
 
 from enum import IntEnum
 
@@ -6,12 +6,12 @@ import casadi as ca
 
 from orthocas.domains import Domain, Torus, reach
 
-LARGEST = 1e100  #: numbers beyond are treated as not finite: their squares may overflow
+LARGEST = 1e100  #: larger numbers count as not finite, because their squares may overflow
 _SMALLEST_VOLUME = 1e-3  # of the parallelepiped of the gradients, relative to its median over the domain
 
 
 class ControlStatus(IntEnum):
-    """Whether a command comes from the control law, or is the fallback, and why.
+    """Tells whether a command comes from the control law, or why it is the fallback.
 
     The fallback is the gravity torque for torque controllers and zero for velocity controllers, within the limit.
     """
@@ -23,17 +23,18 @@ class ControlStatus(IntEnum):
 
 
 def guard(domain: Domain | None, n: int, numbers: int) -> ca.Function:
-    """The command if all is well, otherwise the fallback, both cut to +- limit; and the status.
+    """Choose the command if all is well and the fallback otherwise, clip it to +- limit, and report the status.
 
     Args:
-        domain: where the law is good; None for everywhere.
+        domain: where the law is valid; None for everywhere.
         n: number of joints.
-        numbers: how many numbers the law got as input.
+        numbers: count of input numbers of the law.
 
     Returns:
-        A function of the command of the law (n, 1), which may be NaN; the fallback (n, 1), whose entries become zero
-        where they are not finite; the limit (n, 1) of each entry, which may be infinite; q (n, 1); all numbers the law
-        got; and det(J A^-1 J^T) relative to its median over the domain. It gives command (n, 1) and status (1, 1).
+        A function with the outputs command (n, 1) and status (1, 1). Its inputs are: the command of the law (n, 1),
+        which may be NaN; the fallback (n, 1), whose entries become zero where they are not finite; the limit (n, 1) of
+        each entry, which may be infinite; q (n, 1); all input numbers of the law; and det(J A^-1 J^T) relative to its
+        median over the domain.
     """
     command, fallback, limit, q = (ca.SX.sym(name, n) for name in ("command", "fallback", "limit", "q"))
     inputs, volume = ca.SX.sym("inputs", numbers), ca.SX.sym("volume")
@@ -46,20 +47,20 @@ def guard(domain: Domain | None, n: int, numbers: int) -> ca.Function:
     for i in range(n):
         safe = ca.if_else(_is_finite(fallback[i]), fallback[i], 0)
         chosen = ca.if_else(status == float(ControlStatus.OK), command[i], safe)
-        bound = ca.if_else(limit[i] > 0, limit[i], 0)  # also where it is NaN
+        bound = ca.if_else(limit[i] > 0, limit[i], 0)  # 0 also where the limit is NaN
         rows.append(ca.fmin(ca.fmax(chosen, -bound), bound))
     return ca.Function("guard", [command, fallback, limit, q, inputs, volume], [ca.vertcat(*rows), status])
 
 
 def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
-    """Whether q (n, 1) lies in the domain; angles of a torus always do."""
+    """Whether q (n, 1) lies in the domain; always true for the angles of a torus."""
     if domain is None or isinstance(domain, Torus):
         return ca.SX(1)
     return ca.logic_all(ca.fabs(q - ca.DM(domain.centre)) <= ca.DM(reach(domain)))
 
 
 def _is_finite(value: ca.SX) -> ca.SX:
-    """False for NaN too, since comparisons with NaN are."""
+    """Whether a number is finite; false also for NaN, since comparisons with NaN are false."""
     return ca.fabs(value) <= LARGEST
 
 

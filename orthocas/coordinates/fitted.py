@@ -1,4 +1,4 @@
-"""The coordinates xi(q) of a chart: a fitted family on the active joints, and the idle joints as they are."""
+"""Fitted coordinates xi(q): a family on the active joints, and the idle joints themselves."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,20 +15,20 @@ from orthocas.coordinates.point_functions import point_functions
 from orthocas.parametrisations import Family, JointSpace, Parametrisation
 from orthocas.parametrisations.family import Expression
 
-_COLUMNS = 256  # samples side by side in matrix-shaped graphs
+_COLUMNS = 256  # samples side by side in graphs of matrices
 
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
     """xi(q) = [scale (family(q_active) - offset); q_idle - centre_idle], (r, 1).
 
-    Offset and scale make xi(centre) = 0 and the mean gradient length of each coordinate 1 over the domain; they
-    do not change the loss.
+    Offset and scale are chosen so that xi(centre) = 0, and the mean gradient length of each coordinate over the domain
+    is 1. They do not change any angles.
     """
 
     parametrisation: Parametrisation
     space: JointSpace = field(repr=False)  #: all joints of the robot
-    idle: tuple[int, ...]  #: joints that are coordinates themselves, listed last
+    idle: tuple[int, ...]  #: joints that are coordinates themselves; they come last
     theta: Array = field(repr=False)  #: parameters of the family, (size,)
     offset: Array = field(repr=False)  #: (r - idle,)
     scale: Array = field(repr=False)  #: (r - idle,)
@@ -57,12 +57,12 @@ class Coordinates:
 
     @property
     def active(self) -> list[int]:
-        """Joints the fitted family depends on."""
+        """Joints that the fitted family depends on."""
         return [i for i in range(self.space.n) if i not in self.idle]
 
     @property
     def as_matrices(self) -> bool:
-        """Whether graphs of them are made of dense products, as networks are."""
+        """Whether the graphs consist of dense matrix products, as for networks."""
         return bool(len(self.offset)) and self.family.as_matrices
 
     @cached_property
@@ -83,13 +83,13 @@ class Coordinates:
         return ca.vertcat(*rows)
 
     def xi(self, points: Array) -> Array:
-        """Coordinates at points (N, n), (N, r)."""
+        """Coordinates (N, r) at points (N, n)."""
         if self.as_matrices:
             return evaluate_columns(self._column_graphs["xi"].function, _COLUMNS, points)[0]
         return self._batched["xi"](points)[0]
 
     def jacobian(self, points: Array) -> Array:
-        """J_xi at points (N, n), (N, r, n)."""
+        """J_xi (N, r, n) at points (N, n)."""
         if self.as_matrices:
             flat = evaluate_columns(self._column_graphs["jacobian"].function, _COLUMNS, points)[0]
             return flat.reshape(len(points), self.r, self.space.n)
@@ -124,7 +124,7 @@ class Coordinates:
 
     @cached_property
     def _column_graphs(self) -> dict[str, NumpyGraph]:
-        """Functions xi and vec(J_xi^T) of many joint positions side by side: what dense products are fast at."""
+        """Functions xi and vec(J_xi^T) of many joint positions side by side, where dense products are fast."""
         q = ca.MX.sym("q", self.space.n, _COLUMNS)
         J_xi = ca.vertcat(*self._gradients(q))
         return {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}

@@ -1,4 +1,4 @@
-"""What coordinates xi(q) of a chart offer, however they were found."""
+"""The interface of coordinates xi(q), fitted or grown."""
 
 from typing import Protocol, runtime_checkable
 
@@ -17,40 +17,40 @@ class CoordinateMap(Protocol):
 
     @property
     def label(self) -> str:
-        """Short name of how they are described, for example 'polynomial:4'."""
+        """Short name of the representation, for example 'polynomial:4'."""
         ...
 
     @property
     def size(self) -> int:
-        """Number of numbers that describe them."""
+        """Number of parameters."""
         ...
 
     @property
     def functions(self) -> dict[str, ca.Function]:
         """CasADi functions of one joint position (n, 1), as graphs of shared parts.
 
-        Coordinates xi (r, 1), their jacobian (r, n), and second_derivative of q, v, w (r, 1): (d/ds) J_xi(q + s v) w.
+        They are xi (r, 1), jacobian (r, n), and second_derivative (r, 1) of q, v, w: (d/ds) J_xi(q + s v) w.
         """
         ...
 
     def xi(self, points: Array) -> Array:
-        """Coordinates at points (N, n), (N, r)."""
+        """Coordinates (N, r) at points (N, n)."""
         ...
 
     def jacobian(self, points: Array) -> Array:
-        """J_xi at points (N, n), (N, r, n)."""
+        """J_xi (N, r, n) at points (N, n)."""
         ...
 
 
 @runtime_checkable
 class InvertibleMap(Protocol):
-    """Coordinates that know their way back."""
+    """Coordinates with their own inverse map."""
 
     @property
     def turn(self) -> float:
-        """What may be added to a coordinate without changing the point: 2 pi on a circle, otherwise 0."""
+        """Period of the coordinates: 2 pi on a circle, 0 if they are not periodic."""
         ...
 
     def inverse(self, phi: Array, q_start: Array) -> Array:
-        """Joint positions with given task values and coordinates (N, n), (N, n); NaN where there are none."""
+        """Joint positions (N, n) with the given task values and coordinates phi (N, n); NaN where there are none."""
         ...

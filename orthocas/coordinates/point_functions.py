@@ -1,4 +1,4 @@
-"""Families as CasADi functions of one joint position, in the form that makes small and fast C."""
+"""Families as CasADi functions of one joint position, in a form that gives small and fast C."""
 
 from typing import Any
 
@@ -11,10 +11,10 @@ from orthocas.parametrisations.family import Family, LinearFamily, SelfDerivativ
 
 
 def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Function]:
-    """Xi (r, 1) and its jacobian (r, n), functions of q (n, 1); second_derivative (r, 1), a function of q, v, w.
+    """xi (r, 1) and jacobian (r, n) as functions of q (n, 1); second_derivative (r, 1) as a function of q, v, w.
 
-    The last is d^2 xi(q)[v, w]. Bases are evaluated once, and their coefficients are a table that a loop multiplies
-    with: written out, a polynomial of degree 4 on seven joints is ten thousand operations.
+    second_derivative is d^2 xi(q)[v, w]. A basis is evaluated once, and a loop multiplies it with a table of
+    coefficients: written out, a polynomial of degree 4 on seven joints takes ten thousand operations.
     """
     if isinstance(family, SelfDerivativeFamily):
         return _from_tables(family, theta, n)
@@ -22,19 +22,19 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
         return _from_basis(family, theta, n)
     kind: Any = ca.MX if family.as_matrices else ca.SX
     q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
-    parameters: Any = ca.DM(theta)  # numbers, so that slices and transposes of weights are not done at every call
+    parameters: Any = ca.DM(theta)  # constants, so that weights are not sliced and transposed at every call
     xi = family.expression(q, parameters)
     jacobian = ca.horzcat(*family.jacobian(q, parameters)).T
     return _functions(xi, jacobian, second_derivative(xi, q, v, w), q, v, w)
 
 
 def second_derivative(values: Any, q: Any, v: Any, w: Any) -> Any:
-    """(d/ds) J(q + s v) w of an expression, SX or MX."""
+    """(d/ds) J(q + s v) w of an SX or MX expression."""
     return ca.jtimes(ca.jtimes(values, q, w), q, v)
 
 
 def _from_basis(family: LinearFamily, theta: Array, n: int) -> dict[str, ca.Function]:
-    """With C the coefficients and psi the basis: xi = C psi, J = C dpsi/dq, and C d^2 psi[v, w]."""
+    """xi = C psi, J = C dpsi/dq and C d^2 psi[v, w], with the coefficients C and the basis psi."""
     x, a, b = (ca.SX.sym(name, n) for name in ("q", "v", "w"))
     psi = family.basis(x)
     basis = ca.Function("basis", [x], [psi])
@@ -46,9 +46,9 @@ def _from_basis(family: LinearFamily, theta: Array, n: int) -> dict[str, ca.Func
 
 
 def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str, ca.Function]:
-    """Derivatives of basis functions are sums of basis functions: d xi / d q_i = C_i psi' with few of them, psi'.
+    """Functions of a family whose basis is closed under differentiation: d xi / d q_i = C_i psi', psi' part of psi.
 
-    For a polynomial of degree d, psi' are those of degree d - 1, and J is one table times psi'.
+    For a polynomial of degree d, psi' holds the terms up to degree d - 1, and J is one table times psi'.
     """
     r = family.outputs
     tables = family.derivative_tables(theta)

@@ -1,4 +1,4 @@
-"""Self-contained files: one zip with a JSON header and `.npy` arrays. Loading never runs code; writing is atomic."""
+"""Self-contained files: a zip of a JSON header and `.npy` arrays. Loading never runs code, and writing is atomic."""
 
 import hashlib
 import io
@@ -20,12 +20,12 @@ Stored = NDArray[Any]  #: an array in a file, of floats or integers
 
 _HEADER, _DIGEST = "header.json", "digest.txt"
 _PACKED = zipfile.ZIP_DEFLATED
-_LARGEST_FILE = 2**32  # bytes a file may unpack to
+_LARGEST_FILE = 2**32  # bytes that a file may unpack to
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What a file holds, and the error that names it."""
+    """A kind of file, and the error that its readers and writers raise."""
 
     name: str  #: 'chart' or 'checkpoint'
     version: int  #: newest format version
@@ -41,10 +41,10 @@ def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], array
     """Write header and arrays to a file that appears whole or not at all.
 
     Raises:
-        ArchiveError: the kind's own, if the folder is missing or cannot be written.
+        ArchiveError: if the folder is missing or not writable. The error is `kind.error`.
     """
     require_writable(Path(path), kind.error)
-    target = Path(path).resolve()  # a link stays a link
+    target = Path(path).resolve()  # write through a symbolic link, and keep the link
     entries = {f"{name}.npy": _npy_bytes(array) for name, array in arrays.items()}
     full = {
         "format": kind.format,
@@ -69,14 +69,15 @@ def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str
     """Read header and arrays back.
 
     Raises:
-        ArchiveError: the kind's own, if the file is missing, truncated, foreign, edited, or from a newer version.
+        ArchiveError: if the file is missing, truncated, edited, of another format, or from a newer version. The error
+            is `kind.error`.
     """
     source = Path(path)
     try:
         with zipfile.ZipFile(source) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _LARGEST_FILE:
                 raise kind.error(
-                    f"{source} unpacks to more than {_LARGEST_FILE / 2**30:.0f} GiB, not a {kind.name} file"
+                    f"{source} unpacks to more than {_LARGEST_FILE / 2**30:.0f} GiB, expected a {kind.name} file"
                 )
             entries = {name: archive.read(name) for name in archive.namelist()}
     except FileNotFoundError:
@@ -95,12 +96,12 @@ def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str
             for name in header["sha256"]
         }
     except (ValueError, EOFError, TokenError):
-        raise kind.error(f"{source} holds an array that cannot be read") from None
+        raise kind.error(f"{source} contains an array that cannot be read") from None
     return header, arrays
 
 
 def _read_header(source: Path, kind: Kind, entries: Mapping[str, bytes]) -> dict[str, Any]:
-    """Check format, version and checksum before anything else is believed."""
+    """Check format, version and checksum before the rest of the header is used."""
     try:
         header = json.loads(entries[_HEADER])
         name, version, sums = header["format"], int(header["version"]), dict(header["sha256"])

@@ -11,9 +11,10 @@ from orthocas.errors import ArchiveError, InvalidValueError
 
 @contextmanager
 def published(folder: Path) -> Iterator[Path]:
-    """A draft folder; its files move to `folder` when the block ends, and vanish if it raises.
+    """A draft folder. Its files move to `folder` when the block ends, and are deleted if the block raises.
 
-    Each file appears whole or not at all, on disk before its name is. Files of the same names are replaced.
+    Each file appears whole or not at all: its content is on disk before its name is. Files of the same name are
+    replaced.
     """
     with tempfile.TemporaryDirectory(dir=folder, prefix=".orthocas-") as name:
         drafts = Path(name)
@@ -27,10 +28,10 @@ def published(folder: Path) -> Iterator[Path]:
 
 
 def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) -> None:
-    """Check early, before long work, that a file can be written.
+    """Check that a file can be written, before a long computation starts.
 
     Raises:
-        ArchiveError: if its folder is missing or read-only, or something other than a writable file is there.
+        ArchiveError: if the folder is missing or read-only, or the path exists and is not a writable file.
     """
     try:
         if not path.parent.is_dir():
@@ -46,10 +47,10 @@ def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) 
 
 
 def made_folder(name: str, out: str | Path) -> Path:
-    """The output folder, made if it does not exist, after a check that files can be written there.
+    """Create the output folder if needed, and check that files can be written there.
 
     Raises:
-        InvalidValueError: if they cannot; `name` says which argument it was.
+        InvalidValueError: if they cannot. The message names the argument `name`.
     """
     folder = Path(out)
     try:

@@ -1,4 +1,4 @@
-"""What a chart file holds: robot numbers, task, metric, domain, and the fitted or grown coordinates."""
+"""The content of a chart file: robot model, task, metric, domain, and the fitted or grown coordinates."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -24,11 +24,11 @@ from orthocas.tasks import Task
 
 CHART = Kind("chart", 1, ChartFileError)
 Notes = Mapping[str, str | float]
-_LEAF = "leaf_"  # of the names of arrays that belong to a base leaf
+_LEAF = "leaf_"  # prefix of the names of arrays that belong to a base leaf
 
 
 def write_chart(path: str | Path, problem: Problem, coordinates: CoordinateMap, notes: Notes) -> None:
-    """Write a chart; see `orthocas.files.archive` for the container.
+    """Write a chart. `orthocas.files.archive` describes the container.
 
     Raises:
         ChartFileError: if the file cannot be written.
@@ -57,7 +57,7 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:
     """Read a chart back.
 
     Raises:
-        ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
+        ChartFileError: if the file is missing, truncated, edited, not a chart file, or from a newer version.
     """
     header, arrays = read_archive(path, CHART)
     try:
@@ -100,15 +100,15 @@ def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str,
 
 
 def _with_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:
-    """A task or metric as plain data; a custom one with its expression."""
+    """A task or metric as plain data. A custom one includes its expression."""
     return {**recipe, "tape": to_tape(function)} if recipe["kind"] == "custom" else dict(recipe)
 
 
 def _idle(joints: list[int], n: int) -> tuple[int, ...]:
-    """Idle joints, checked."""
+    """The idle joints, checked against the number of joints."""
     idle = tuple(require_count("idle joint", k, least=0) for k in joints)
     if len(set(idle)) != len(idle) or any(k >= n for k in idle):
-        raise ChartFileError(f"idle joints {list(idle)} do not fit {n} joints")
+        raise ChartFileError(f"idle joints are {list(idle)}, expected different indices below {n}")
     return idle
 
 
@@ -116,7 +116,7 @@ def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTre
     numbers: dict[str, Any] = {
         name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
     }
-    for name in ("effort_limits", "velocity_limits"):  # unknown to older files
+    for name in ("effort_limits", "velocity_limits"):  # missing in older files
         numbers.setdefault(name, np.full(len(data["joint_names"]), np.inf))
     texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
     return KinematicTree(**texts, **numbers)

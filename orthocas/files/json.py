@@ -9,7 +9,7 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """The value with arrays and tuples as lists, and numbers that are not finite as None, all the way down."""
+    """Convert arrays and tuples to lists, and numbers that are not finite to None, at all levels."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -22,5 +22,5 @@ def plain(value: Any) -> Any:
 
 
 def to_json(data: Mapping[str, Any], indent: int | None = None) -> str:
-    """One JSON object; see `plain`."""
+    """Write one JSON object. Values are converted by `plain`."""
     return json.dumps(plain(data), allow_nan=False, indent=indent)

@@ -1,4 +1,4 @@
-"""Gradients of basis functions at samples: of any linear family, without the zeros."""
+"""Gradients of the basis functions of any linear family at samples, stored without the zeros."""
 
 import casadi as ca
 import numpy as np
@@ -13,11 +13,11 @@ from orthocas.parametrisations import LinearFamily
 class BasisGradients:
     """d psi / dq of a linear family.
 
-    Most entries are zero: of all polynomials of total degree d in n joints, a share of d / (n + d) depends on a joint.
-    Which entries are not is read off CasADi's sparsity pattern of the Jacobian.
+    Most entries are zero: of all polynomials of total degree d in n joints, a share of d / (n + d) depends on a given
+    joint. CasADi's sparsity pattern of the Jacobian tells which entries are not zero.
 
     Args:
-        family: the basis, n joints and K functions.
+        family: the basis, with K functions of n joints.
         n: number of joints.
     """
 
@@ -26,7 +26,7 @@ class BasisGradients:
 
     @cached_property
     def terms_of_joints(self) -> NDArray[np.int_]:
-        """For every joint the places of the functions that depend on it, (n, W); a shorter row ends with -1."""
+        """Indices of the functions that depend on each joint, (n, W). Shorter rows are padded with -1."""
         functions, joints = self._jacobian.sparsity().get_triplet()
         rows: list[list[int]] = [[] for _ in range(self._n)]
         for k, i in zip(functions, joints, strict=True):
@@ -35,19 +35,20 @@ class BasisGradients:
         return np.array([sorted(row) + [-1] * (width - len(row)) for row in rows])
 
     def at(self, points: Array) -> Array:
-        """The gradients d psi_k / dq_i that are not zero, at points (N, n), in blocks of c samples, (B, n, W, c).
+        """The nonzero gradients d psi_k / dq_i at points (N, n), in blocks of c samples, (B, n, W, c).
 
-        Entry w of joint i belongs to function `terms_of_joints[i, w]`; blocks as in `orthocas.casadi_tools.columns`.
+        Entry w of joint i belongs to function `terms_of_joints[i, w]`. `orthocas.casadi_tools.columns` describes the
+        blocks.
         """
         gradients = self._columns(blocked(points))[0]
         return gradients.reshape(len(gradients), self._n, -1, gradients.shape[2])
 
     def dense(self, gradients: Array, samples: int, every: int = 1) -> Array:
-        """All gradients sample by sample, zeros included, (N, n, K), from those of `at`.
+        """Expand the result of `at` to all gradients sample by sample, including zeros, (N, n, K).
 
         Args:
-            gradients: (B, n, W, c).
-            samples: number of samples, without the copies that fill the last block.
+            gradients: result of `at`, (B, n, W, c).
+            samples: number of samples, without the padding of the last block.
             every: take only every second, third, ... sample.
         """
         stack = gradients.transpose(0, 3, 1, 2).reshape(-1, *gradients.shape[1:3])[:samples:every]

@@ -1,4 +1,4 @@
-"""The loss of families linear in theta: basis gradients are sampled once, then all is dense products (ours)."""
+"""The loss of families linear in theta: basis gradients are sampled once, the rest is dense products (ours)."""
 
 from collections.abc import Iterator
 from copy import copy
@@ -15,26 +15,26 @@ from orthocas.fitting.loss.residuals import curvature_columns, loss_columns, res
 from orthocas.parametrisations import LinearFamily
 from orthocas.samples import Draw, Samples, even_parts
 
-_CHUNK = 512  # samples per block of the Gauss-Newton matrix: the rows stay in the cache
-_STRIDE = 2  # the Gauss-Newton matrix is a mean too, and half of the samples tell it well enough
+_CHUNK = 512  # samples per block of the Gauss-Newton matrix, so that the rows stay in the cache
+_STRIDE = 2  # every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
 
 
 class BasisObjective:
     """Mean loss (25) of xi = C psi(q) on fixed samples, with gradient, Gauss-Newton matrix and Hessian.
 
     With the basis gradients G = d psi / dq sampled once, the coordinate gradients are J_xi = C G^T. The loss of one
-    sample and its derivatives with respect to J_xi come from CasADi. The residual of task i and coordinate j depends on
-    row j of C only, so the Gauss-Newton matrix is built block by block from few rows per sample.
+    sample and its derivatives with respect to J_xi come from CasADi. The residual of task i and coordinate j depends
+    only on row j of C, so the Gauss-Newton matrix is built block by block from few rows per sample.
 
-    Samples lie in blocks as `orthocas.casadi_tools.columns` has them, and of G only the entries of the terms that
-    depend on a joint are stored: G is (B, n, W, c), J_xi is (B, n, r, c).
+    Samples are stored in the blocks of `orthocas.casadi_tools.columns`. Of G only the entries of terms that depend on a
+    joint are stored. So G is (B, n, W, c) and J_xi is (B, n, r, c).
 
     Args:
         family: the coordinates.
         samples: fixed samples of the family's joints.
-        weights: of the loss.
+        weights: weights of the loss.
         start: parameters, (size,), whose orientation the regularity term keeps.
-        draw: where fresh samples come from.
+        draw: draws fresh samples.
     """
 
     def __init__(self, family: LinearFamily, samples: Samples, weights: Weights, start: Array, draw: Draw) -> None:
@@ -82,14 +82,14 @@ class BasisObjective:
         """L(theta) and dL/dtheta."""
         C, value, gradient = self._by_joint(theta), 0.0, np.zeros((self.n, self.r, self.G.shape[2]))
         on_block = loss_columns(self._loss).on_one_block()
-        for G, share, *data in zip(self.G, self._share, *self._data, strict=True):  # G leaves memory only once
+        for G, share, *data in zip(self.G, self._share, *self._data, strict=True):  # reads G from memory once
             losses, slopes = on_block((C @ G).reshape(self.n * self.r, -1), *data)
             value += float(losses[0] @ share)
             gradient += (slopes * share).reshape(self.n, self.r, -1) @ G.transpose(0, 2, 1)
         return value, self._collected(gradient)
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
-        """L(theta), its gradient, and the Gauss-Newton matrix, whose products are taken in single precision."""
+        """L(theta), its gradient, and the Gauss-Newton matrix, computed with products in single precision."""
         value, gradient = self.value_and_gradient(theta)
         derivatives = residual_columns(self._loss)(self._jacobian_entries(theta), *self._data)
         H = self._gauss_newton_matrix(derivatives[: self.r])
@@ -112,7 +112,7 @@ class BasisObjective:
         return H.reshape(r * K, r * K)
 
     def reweighted(self, weights: Weights) -> Self:
-        """The same loss on the same samples with other weights; terms that need other data cannot be added later."""
+        """The same loss on the same samples with other weights. It cannot add terms that need other sample data."""
         other = copy(self)
         other.weights, other._loss = weights, Loss.of(self._loss.sizes, weights.by_name)
         assert set(other._loss.data) <= set(self._described)
@@ -145,7 +145,7 @@ class BasisObjective:
         return np.ascontiguousarray(C.transpose(1, 0, 2))
 
     def _collected(self, gradient: Array) -> Array:
-        """Slopes with respect to theta, (size,), from those of `_by_joint`."""
+        """Gradient with respect to theta, (size,), from the gradient with respect to `_by_joint`."""
         total = np.zeros((self.r, self.K))
         for places, slopes in zip(self._gradients.terms_of_joints, gradient, strict=True):
             known = places >= 0
@@ -158,7 +158,7 @@ class BasisObjective:
         return J.reshape(len(J), self.n * self.r, -1)
 
     def _gauss_newton_matrix(self, derivatives: list[Array]) -> Array:
-        """Part of the smooth residuals, block by block for pairs of coordinates, from every second sample."""
+        """Gauss-Newton matrix of the smooth residuals, by blocks of coordinate pairs, from every second sample."""
         r, K = self.r, self.K
         blocks = np.zeros((r, r, K, K))
         rows = self._loss.smooth_rows
@@ -182,7 +182,7 @@ class BasisObjective:
         return by_sample(blocks, self.N, _STRIDE).astype(np.float32)
 
     def _hinge_matrix(self, residual: Array, derivative: Array) -> Array:
-        """Part of a hinge residual, which couples all coordinates but acts at few samples."""
+        """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
         block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
         D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
         chosen: Array = self.G[block, :, :, column]  # (active, n, W)

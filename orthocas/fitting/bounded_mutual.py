@@ -1,4 +1,4 @@
-"""The constrained form: the smallest task term at a bounded mutual term, a point of the front (ours)."""
+"""The constrained form: minimise the task term at a bounded mutual term, a point on the Pareto front (ours)."""
 
 import numpy as np
 
@@ -13,22 +13,22 @@ class BoundedMutual:
     min  E[sum of task cosines^2] lambda1 / (2 m r)  (plus the regularity term, if there is one)
     s.t. E[mean of mutual cosines^2] <= bound^2  and  E|grad xi_j|^2 = 1 for every coordinate j.
 
-    The scales of the coordinates change neither term; the gauge condition fixes them, so that the solution is an
-    isolated point. sqrt(E cos^2) is, up to its third power, the root mean square deviation of mutual angles from a
-    right angle [rad].
+    The scales of the coordinates change neither term. The gauge condition fixes them, so that the solution is an
+    isolated point. Up to terms of third order, sqrt(E cos^2) is the root mean square deviation of mutual angles from
+    a right angle [rad].
 
     Args:
-        objective: the weighted loss on its samples; its lambda2 is not used.
-        bound: of the root mean square mutual cosine, > 0.
+        objective: the weighted loss on its samples. Its lambda2 is not used.
+        bound: upper bound on the root mean square mutual cosine, > 0.
 
     Source:
         ours, docs/derivations.md#constrained-form.
     """
 
     def __init__(self, objective: BasisObjective, bound: float) -> None:
-        weights, self._gram = objective.weights, objective.gram  # sampled once, shared by what follows
+        weights, self._gram = objective.weights, objective.gram  # sampled once, and shared by the objectives below
         self._task = objective.reweighted(Weights(weights.task, mutual=0.0, regularity=weights.regularity))
-        only_mutual = Weights(task=0.0, mutual=2.0, regularity=0.0)  # twice a half: the mean of squares itself
+        only_mutual = Weights(task=0.0, mutual=2.0, regularity=0.0)  # 2 cancels the factor 1/2 of the loss
         self._mutual = objective.reweighted(only_mutual)
         self._r, self._K, self._bound = objective.r, objective.K, bound
 
@@ -47,7 +47,7 @@ class BoundedMutual:
         return np.concatenate([[-np.inf], ones]), np.concatenate([[1.0], ones])
 
     def constraints(self, theta: Array) -> tuple[Array, Array]:
-        """Mutual term over its bound, then the gauge of every coordinate, (1 + r,), and the Jacobian."""
+        """Mutual term over its bound, then the gauge of every coordinate, (1 + r,), and their Jacobian."""
         value, gradient = self._mutual.value_and_gradient(theta)
         C = theta.reshape(self._r, self._K)
         raised = C @ self._gram

@@ -1,4 +1,4 @@
-"""Checkpoints of long fits: a killed run goes on where its file says, and loses nothing else."""
+"""Checkpoints of long fits: a killed run resumes from the last state in its file."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -13,7 +13,7 @@ from orthocas.minimising.solver import SolveResult, Status
 from orthocas.minimising.watch import State
 
 CHECKPOINT = Kind("checkpoint", 1, CheckpointError)
-_SECONDS = 30.0  # between two writes of a running stage
+_SECONDS = 30.0  # least time between two writes of a running stage
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,19 +26,20 @@ class Stage:
     result: SolveResult
 
     def interrupted(self) -> "Stage":
-        """The same, marked as the last because of Ctrl-C."""
+        """The same stage, marked as interrupted by Ctrl-C."""
         return replace(self, result=replace(self.result, status=Status.INTERRUPTED))
 
 
 class Checkpoint:
-    """The finished stages of one fit and the state of the running one, in a file or, without a path, nowhere.
+    """The finished stages of a fit and the state of the running one, kept in a file. Without a path nothing is kept.
 
     Args:
-        path: the file; it is read if it exists.
-        fit: settings that tell this fit from others; a file of another fit is refused.
+        path: the file. If it exists, it is read.
+        fit: settings that identify this fit. A file of another fit is rejected.
 
     Raises:
-        CheckpointError: if the file cannot be written, is damaged, or belongs to another fit (the setting is named).
+        CheckpointError: if the file cannot be written, is damaged, or belongs to another fit. The message names the
+            setting that differs.
     """
 
     def __init__(self, path: Path | None, fit: Mapping[str, str]) -> None:
@@ -52,11 +53,11 @@ class Checkpoint:
             self._read(path)
 
     def finished(self, label: str) -> Stage | None:
-        """The stage of that label if an earlier run finished it."""
+        """The stage with this label, if an earlier run finished it."""
         return next((stage for stage in self._stages if stage.label == label), None)
 
     def add(self, stage: Stage) -> None:
-        """Write a finished stage; one that was interrupted is not finished."""
+        """Write a finished stage. Interrupted stages are not finished."""
         if stage.result.status is Status.INTERRUPTED:
             return
         self._stages.append(stage)
@@ -64,7 +65,7 @@ class Checkpoint:
         self._write()
 
     def keeper(self, label: str) -> "StageKeeper":
-        """Where the solver of a stage keeps its state."""
+        """The keeper in which the solver of a stage keeps its state."""
         state = self._running[1] if self._running and self._running[0] == label else None
         return StageKeeper(state, lambda new: self._keep(label, new))
 
@@ -88,8 +89,8 @@ class Checkpoint:
             for name, wanted in self._fit.items():
                 if other.get(name) != wanted:
                     raise CheckpointError(
-                        f"{path} is of another fit: its {name} is {other.get(name)}, expected {wanted}; "
-                        "remove the file to start anew"
+                        f"{path} belongs to another fit: its {name} is {other.get(name)}, expected {wanted}; "
+                        "remove the file to start again"
                     )
             self._stages = [_stage(data, arrays[f"stage_{k}"]) for k, data in enumerate(header["stages"])]
             state = {name.removeprefix("state_"): a for name, a in arrays.items() if name.startswith("state_")}
@@ -101,7 +102,7 @@ class Checkpoint:
 
 
 class StageKeeper:
-    """Keeper of one stage: writes at most once in a while."""
+    """Keeper of one stage. It limits how often the file is written."""
 
     def __init__(self, state: State | None, write: Callable[[State], None]) -> None:
         self._state, self._write = state, write
@@ -109,17 +110,17 @@ class StageKeeper:
         self._last = time.monotonic()
 
     def restored(self) -> State | None:
-        """The state of an earlier run."""
+        """The state that an earlier run kept, or None."""
         return self._state
 
     def keep(self, state: Callable[[], State]) -> None:
-        """Write the state if the last write is long enough ago."""
+        """Write the state, unless the last write was too recent."""
         self._newest = state()
         if time.monotonic() - self._last >= _SECONDS:
             self.flush()
 
     def flush(self) -> None:
-        """Write the newest state now."""
+        """Write the latest state now."""
         if self._newest is not None:
             self._write(self._newest)
             self._newest, self._last = None, time.monotonic()

@@ -1,4 +1,4 @@
-"""Fitting coordinates to a problem: idle joints split off, spectral start, degree continuation, a minimiser."""
+"""Fit coordinates to a problem: split off idle joints, start spectrally, raise the degree, minimise."""
 
 import time
 from collections.abc import Sequence
@@ -22,22 +22,30 @@ from orthocas.problem import Problem, ProblemCheck, check
 from orthocas.samples import Samples, sample_problem
 from orthocas.showing import Shown, listed
 
-_FIRST_SAMPLES = 1000  # tag of the samples that scale coordinates, apart from those of the stages
+_FIRST_SAMPLES = 1000  # seed tag of the samples that scale coordinates; stages use other tags
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Shown):
-    """A fitted chart and how it came about."""
+    """A fitted chart, and how it was found.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> fit = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300)
+        >>> [stage.label for stage in fit.stages], fit.idle_joints
+        (['polynomial:2'], ())
+    """
 
     chart: Chart
     stages: tuple[Stage, ...]
     problem_check: ProblemCheck
-    idle_joints: tuple[str, ...]  #: joints that are exact coordinates themselves
-    seconds: float  #: of this run; those of stages count what ran before a checkpoint too
+    idle_joints: tuple[str, ...]  #: names of joints that are exact coordinates themselves
+    seconds: float  #: of this run; the seconds of stages include earlier runs of a checkpoint
 
     @property
     def status(self) -> Status:
-        """How the last stage ended; CONVERGED if there was nothing to minimise."""
+        """How the last stage ended, or CONVERGED if there was nothing to minimise."""
         return self.stages[-1].result.status if self.stages else Status.CONVERGED
 
     def facts(self) -> dict[str, str]:
@@ -68,33 +76,43 @@ def fit(
 ) -> Fit:
     """Find coordinates xi(q) that are as orthogonal as possible to the task.
 
-    Minimises the mean of [AS2023] eq. (24) over uniform samples of the domain. Joints that the task does not feel
-    become coordinates themselves; families linear in their parameters start from a spectral solution of low degree
-    and climb degree by degree. Ctrl-C returns the best coordinates so far, with status INTERRUPTED.
+    The fit minimises the mean of [AS2023] eq. (24) over uniform samples of the domain. Joints that do not affect the
+    task become coordinates themselves. Families linear in their parameters start from a spectral solution of low
+    degree, and the degree rises step by step. After Ctrl-C the fit returns the best coordinates so far, with status
+    INTERRUPTED.
 
     Args:
         problem: robot, task, metric and domain.
-        parametrisation: default Polynomial(degree=4).
-        solver: default GaussNewton for families linear in their parameters, LBFGS otherwise.
-        weights: of the terms of the loss, see `Weights`; two to four numbers (lambda1, lambda2, ...) do as well.
-        samples: number of samples; default grows with the number of parameters.
-        seed: seed of samples and of random starts.
+        parametrisation: the family of coordinates. Default: Polynomial(degree=4).
+        solver: the minimiser. Default: GaussNewton for families linear in their parameters, LBFGS otherwise.
+        weights: weights of the loss, as `Weights` or as two to four numbers (lambda1, lambda2, ...).
+        samples: number of samples. Default: grows with the number of parameters.
+        seed: seed of the samples and of random starts.
         monitor: called with progress.
-        max_mutual_deg: the constrained form: the smallest task term while mutual angles deviate from 90 degrees by at
-            most this much (root mean square over the samples) [deg], found by Ipopt; lambda2 is not used then.
+        max_mutual_deg: bound on the root mean square deviation of mutual angles from 90 degrees over the samples [deg].
+            With a bound, Ipopt minimises the task term, and lambda2 is not used.
         checkpoint: a file that keeps the state of a long fit. If it exists, the fit resumes from it.
-        align_to: a chart of the same robot whose coordinates tell order and signs, for a refit. By default coordinates
-            that move the first joints come first, and move the joint they move most in its positive direction.
+        align_to: a chart of the same robot that defines order and signs of the coordinates, for a refit. By default,
+            coordinates that move the first joints come first, and each moves its main joint in the positive direction.
 
     Returns:
-        The chart, how each stage went, and seconds.
+        The chart, the result of each stage, and the seconds.
 
     Raises:
         SingularTaskError, MetricError: if the problem does not pass its own check.
         MemoryNeedError: if the degree is too large for this machine.
-        InvalidValueError, SolveError: if settings do not fit together, or the loss is not finite.
+        InvalidValueError, SolveError: if settings are invalid or contradict each other, or the loss is not finite.
         InfeasibleError: if max_mutual_deg cannot be met.
         CheckpointError: if the checkpoint is damaged, or belongs to another fit.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> fit = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300)
+        >>> fit.status.value
+        'converged'
+        >>> fit.chart.xi([0.6, 0.8, 0.8]).shape
+        (1,)
     """
     start = time.perf_counter()
     wanted = Polynomial(degree=4) if parametrisation is None else parametrisation
@@ -130,7 +148,7 @@ def _minimised(
     checkpoint: Checkpoint,
     samples: Samples,
 ) -> tuple[tuple[Stage, ...], Coordinates]:
-    """Stages of the fit, and the coordinates found."""
+    """Run the stages of the fit. Returns them and the coordinates."""
     space, r = JointSpace.of(problem), problem.r - len(idle)
     if r == 0:
         return (), Coordinates(settings.parametrisation, space, idle, np.zeros(0), np.zeros(0), np.zeros(0))
@@ -141,7 +159,7 @@ def _minimised(
 
 
 def _notes(stages: Sequence[Stage], settings: FitSettings) -> dict[str, str | float]:
-    """How a chart was made."""
+    """Notes of the chart: how it was made."""
     weights = settings.weights
     extra = {f"weight of {name}": weight for name, weight in weights.extra.items()}
     return {

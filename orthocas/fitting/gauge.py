@@ -1,4 +1,4 @@
-"""What the loss leaves free: offset, scale, order and sign of coordinates, chosen the same way every time (ours)."""
+"""The gauge: fix what the loss leaves free, that is offset, scale, order and sign of the coordinates (ours)."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from orthocas.samples import Samples
 
 
 def in_closed_form(problem: Problem, parametrisation: Parametrisation, samples: Samples) -> Coordinates:
-    """Coordinates that need no fit; see `orthocas.parametrisations.ClosedForm`."""
+    """Coordinates in closed form, which need no fit; see `orthocas.parametrisations.ClosedForm`."""
     assert parametrisation.closed_form is not None
     found = parametrisation.closed_form(problem)
     r = problem.r
@@ -28,24 +28,24 @@ def in_closed_form(problem: Problem, parametrisation: Parametrisation, samples: 
 
 
 def normalised(raw: Coordinates, origin: Array, samples: Samples) -> Coordinates:
-    """Shift and scale fitted coordinates so that they vanish at the origin and their mean gradient length is 1.
+    """Shift and scale fitted coordinates so that they vanish at the origin, and their mean gradient length is 1.
 
     Raises:
-        OrthocasError: if a coordinate has no gradient on the domain.
+        OrthocasError: if the gradient of a coordinate vanishes on the domain.
     """
     r = len(raw.offset)
     lengths = np.linalg.norm(raw.jacobian(samples.points)[:, :r], axis=2).mean(axis=0)
     if not lengths.min() > 0:
-        raise OrthocasError(f"coordinate {int(np.argmin(lengths))} has no gradient on the domain")
+        raise OrthocasError(f"coordinate {int(np.argmin(lengths))} has a vanishing gradient on the domain")
     return replace(raw, offset=raw.xi(origin[None, :])[0, :r], scale=1 / lengths)
 
 
 def in_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
-    """The same coordinates in an order and with signs that do not depend on how a fit found them.
+    """Reorder coordinates and choose their signs, independently of how a fit found them.
 
-    At the centre of the domain, coordinates that move the first joints come first: they are ordered by
-    sum_k k g_k^2 / |g|^2 with g the gradient, the joint that moves on average. The joint with the largest |g_k| moves
-    in the positive direction. Idle joints stay last.
+    Coordinates that move the first joints come first. They are sorted by the mean index of the joints that move,
+    sum_k k g_k^2 / |g|^2, with the gradient g at the centre of the domain. The joint with the largest |g_k| moves in
+    the positive direction. Idle joints stay last.
     """
     g = coordinates.jacobian(centre[None, :])[0, : len(coordinates.offset)]
     moved = (g**2 @ np.arange(g.shape[1])) / (g**2).sum(axis=1)
@@ -54,9 +54,9 @@ def in_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
 
 
 def aligned(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordinates:
-    """The same coordinates in the order and with the signs that bring them closest to those of a chart.
+    """Reorder coordinates and choose their signs so that they are closest to those of a chart.
 
-    Each goes with the coordinate of the chart that its gradient is most parallel to, on average over samples.
+    Each is matched with the coordinate of the chart whose gradient is most parallel, on average over samples.
 
     Raises:
         InvalidValueError: if the chart has other joints, another number of coordinates, or other idle joints.
@@ -81,12 +81,12 @@ def aligned(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordin
 
 
 def _rearranged(coordinates: Coordinates, order: NDArray[np.int_], signs: Array) -> Coordinates:
-    """Coordinates in another order, each times a sign; families that cannot change places keep theirs.
+    """Coordinates in another order, each times a sign. Families that cannot be reordered keep their order.
 
     Args:
-        coordinates: as they are.
-        order: for every new place, the old one.
-        signs: of the coordinates in their old places.
+        coordinates: the coordinates.
+        order: the old place of each new place.
+        signs: signs of the coordinates in their old places.
     """
     family = coordinates.family
     if not isinstance(family, ReorderableFamily):

@@ -1,4 +1,4 @@
-"""The loss of a family made of dense products as one CasADi graph, with its gradient by symbolic differentiation."""
+"""The loss of a family of dense products as one CasADi graph, with its gradient by symbolic differentiation."""
 
 from collections.abc import Iterator
 from copy import copy
@@ -17,19 +17,19 @@ from orthocas.fitting.loss.residuals import loss_columns
 from orthocas.parametrisations import Family
 from orthocas.samples import Draw, Samples, even_parts
 
-_ORIENTING = 200  # samples that tell the orientation of the start
-_CHUNK_ENTRIES = 2**20  # of the largest matrix in a graph: more leave the cache
+_ORIENTING = 200  # samples that determine the orientation of the start
+_CHUNK_ENTRIES = 2**20  # entries of the largest matrix in a graph; larger ones leave the cache
 
 
 class GraphObjective:
-    """Mean loss (25) of any family on fixed samples, samples side by side as columns.
+    """Mean loss (25) of any family on fixed samples, with samples side by side as columns.
 
     Args:
         family: the coordinates.
         samples: fixed samples of the family's joints.
-        weights: of the loss.
+        weights: weights of the loss.
         start: parameters, (size,), whose orientation the regularity term keeps.
-        draw: where fresh samples come from.
+        draw: draws fresh samples.
     """
 
     def __init__(self, family: Family, samples: Samples, weights: Weights, start: Array, draw: Draw) -> None:
@@ -49,14 +49,14 @@ class GraphObjective:
         return sum(value for value, _ in parts), np.sum([gradient for _, gradient in parts], axis=0)
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
-        """The same loss on `count` fresh sample sets of `size` each; graphs are shared."""
+        """The same loss on `count` fresh sample sets of `size` each. They share their graphs."""
         for part in even_parts(self._draw(size * count, seed), count):
             other = copy(self)
             other._put(part, size)
             yield other
 
     def _put(self, samples: Samples, room: int) -> None:
-        """Take samples; graphs are made for `room` of them, so that smaller sets share them."""
+        """Use these samples. Graphs are built for `room` samples, so that smaller sets share them."""
         entries = _entries(samples.described(self._graphs.loss.data, self._orientation), len(samples))
         graph = self._graphs.of_size(room)
         self._blocks = [
@@ -67,14 +67,14 @@ class GraphObjective:
 
 @dataclass(frozen=True, eq=False)
 class _Graphs:
-    """Graphs of one loss, one for every number of columns."""
+    """The graphs of one loss, one for each number of columns."""
 
     family: Family
     loss: Loss
     known: dict[int, "_LossGraph"] = field(default_factory=dict)
 
     def of_size(self, samples: int) -> "_LossGraph":
-        """The graph for a set of samples: all at once, or as many as stay in the cache."""
+        """The graph for a set of samples: for all at once, or for as many as stay in the cache."""
         most = max(1, _CHUNK_ENTRIES // (self.family.outputs * self.family.width))
         columns = ceil(samples / ceil(samples / most))
         if columns not in self.known:
@@ -96,7 +96,7 @@ class _LossGraph:
         r = loss.sizes.r
         values, *slopes = replay(loss_columns(loss).tape, [*entries, *(ca.horzsplit(data) if loss.data else [])])
         weighted = [ca.horzcat(*(share * slope for slope in slopes[j::r])) for j in range(r)]
-        # the chain rule, cut at J_xi: slopes of the loss come from one sample's graph, replayed on columns
+        # chain rule, split at J_xi: the derivatives of the loss are one sample's graph, replayed on columns
         by_theta = ca.jtimes(ca.horzcat(*gradients), theta, ca.horzcat(*(part.T for part in weighted)), True)
         value, inputs = ca.dot(share, values), [theta, q, data, share]
         self.value = NumpyGraph("loss", inputs, [value])
@@ -105,7 +105,7 @@ class _LossGraph:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Samples in the columns of a graph; columns left over count nothing."""
+    """Samples in the columns of a graph. Unused columns have weight 0."""
 
     graph: _LossGraph
     points: Array  #: (c, n)
@@ -114,20 +114,20 @@ class _Block:
 
     @classmethod
     def filled(cls, graph: _LossGraph, points: Array, data: Array, total: int) -> "_Block":
-        """Samples with weight 1 / total each, repeated with weight 0 where columns are left over."""
+        """Samples with weight 1 / total each. Unused columns repeat samples with weight 0."""
         kept = np.arange(graph.columns) % len(points)
         share = np.where(np.arange(graph.columns) < len(points), 1 / total, 0.0)
         return cls(graph, np.ascontiguousarray(points[kept]), np.ascontiguousarray(data[kept].T), share)
 
     def run(self, theta: Array, gradient: bool) -> tuple[float, Array]:
-        """This block's share of the loss and of its gradient (empty if not wanted)."""
+        """This block's share of the loss and of its gradient, which is empty unless requested."""
         graph = self.graph.both if gradient else self.graph.value
         value, *slopes = graph(np.ascontiguousarray(theta), self.points, self.data, self.share)
         return float(value[0, 0]), slopes[0][0] if gradient else np.empty(0)
 
 
 def _entries(data: list[Array], samples: int) -> Array:
-    """Data of samples in rows, matrices column by column, (N, entries)."""
+    """Data of the samples as rows (N, entries), with matrices column by column."""
     flat = [(part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(samples, -1) for part in data]
     return np.concatenate([np.empty((samples, 0)), *flat], axis=1)
 

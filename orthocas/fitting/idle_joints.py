@@ -1,19 +1,19 @@
-"""Idle joints: joints that the task does not feel give exact coordinates xi = q_k (ours)."""
+"""Idle joints: joints on which the task does not depend are exact coordinates xi = q_k (ours)."""
 
 import numpy as np
 
 from orthocas.problem import Problem
 from orthocas.samples import Samples
 
-_NEGLIGIBLE = 1e-10  # angles with ten decimals in robot files
+_NEGLIGIBLE = 1e-10  # robot files give angles with ten decimals
 
 
 def idle_joints(problem: Problem, samples: Samples) -> list[int]:
-    """Joints k that the task does not feel and the metric keeps apart.
+    """Joints k on which the task does not depend, and which the metric does not couple to the others.
 
-    The column of J_x vanishes and the row of A^-1 is zero off the diagonal at every sample, and A does not depend on
-    q_k. Then J_x A^-1 e_k = 0, so xi = q_k is exact, orthogonal to every coordinate of the other joints, and the rest
-    of the problem does not know of joint k.
+    At every sample column k of J_x vanishes, row k of A^-1 is zero off the diagonal, and A does not depend on q_k. Then
+    J_x A^-1 e_k = 0, so xi = q_k is exact and orthogonal to every coordinate of the other joints. The rest of the
+    problem does not depend on joint k.
     """
     J = samples.task_jacobian
     size = np.abs(J).max(axis=(0, 1))

@@ -1,4 +1,4 @@
-"""What is fitted, and how: the settings of one fit, checked once."""
+"""The settings of one fit, checked once."""
 
 import hashlib
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from orthocas.problem import Problem
 from orthocas.samples import sample_problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt
 
-_TELLTALE = (20, (0, 1000))  # samples that tell one problem from another: number and seed
+_TELLTALE = (20, (0, 1000))  # number and seed of the samples that identify a problem
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Everything that decides what a fit of a problem finds."""
+    """All settings that determine the result of a fit."""
 
     parametrisation: Parametrisation
     solver: Solver
@@ -39,10 +39,10 @@ class FitSettings:
         seed: int,
         max_mutual_deg: float | None,
     ) -> "FitSettings":
-        """Settings that fit together, with the default solver where there is none.
+        """Check the settings, and fill in the default solver.
 
         Raises:
-            InvalidValueError, ShapeError: for settings that do not.
+            InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
         require_parametrisation(parametrisation)
         bound = parametrisation.for_problem(problem)
@@ -52,7 +52,7 @@ class FitSettings:
             solver = default_solver(bound) if max_mutual_deg is None else Ipopt()
         require_solver(solver)
         if max_mutual_deg is not None and not isinstance(solver, Ipopt):
-            raise InvalidValueError("solver", solver.name, "ipopt, which alone can keep max_mutual_deg")
+            raise InvalidValueError("solver", solver.name, "ipopt, the only solver that supports max_mutual_deg")
         count = None if samples is None else require_count("samples", samples, least=2)
         return cls(bound, solver, Weights.of(weights), count, require_count("seed", seed, least=0), max_mutual_deg)
 
@@ -62,7 +62,7 @@ class FitSettings:
         return None if self.max_mutual_deg is None else float(np.radians(self.max_mutual_deg))
 
     def identity(self, problem: Problem) -> dict[str, str]:
-        """What tells this fit from others, for its checkpoint."""
+        """Settings that identify this fit, for its checkpoint."""
         return {
             "problem": _digest(problem),
             "parametrisation": self.parametrisation.label,
@@ -99,7 +99,7 @@ def _require_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> N
 
 
 def _digest(problem: Problem) -> str:
-    """A fingerprint of a problem: task, metric and domain as they act on some samples."""
+    """A fingerprint of a problem: its domain, and its task and metric at some samples."""
     samples = sample_problem(problem, *_TELLTALE)
     parts = [samples.points, samples.task_jacobian]
     parts += [] if samples.metric_inverse is None else [samples.metric_inverse]

@@ -1,4 +1,4 @@
-"""Spectral start: the best coordinates of a linear family in a quadratic sense, without an initial guess (ours)."""
+"""Spectral start: the best coordinates of a linear family for a quadratic loss, without an initial guess (ours)."""
 
 import numpy as np
 
@@ -9,15 +9,15 @@ from orthocas.samples import Samples
 
 _MUTUAL_WEIGHT = 1.0
 _MIXING_ANGLE = np.radians(10)
-_RIDGE = 1e-10  # relative; keeps the pencil definite where basis functions coincide on the samples
+_RIDGE = 1e-10  # relative; keeps the pencil definite if basis functions coincide on the samples
 
 
 def spectral_start(family: LinearFamily, samples: Samples) -> Array:
-    """Coefficients, (r K,), of coordinates found one after the other from generalised eigenproblems.
+    """Coefficients (r K,) of coordinates, found one after the other from generalised eigenproblems.
 
-    Each minimises E |Pi_x grad xi|^2 subject to E |grad xi|^2 = 1, with Pi_x the A-orthogonal projector on the task
-    gradients; plus E (grad xi_j . grad xi)^2 / |grad xi_j|^2 for those already found, because a function of a found
-    coordinate would be a minimiser too. All products in the metric A^-1.
+    Each coordinate minimises E |Pi_x grad xi|^2 subject to E |grad xi|^2 = 1, with the A-orthogonal projector Pi_x on
+    the task gradients. A function of a coordinate xi_j that is already found would be a minimiser too, so each xi_j
+    adds the term E (grad xi_j . grad xi)^2 / |grad xi_j|^2. All products are taken in the metric A^-1.
 
     Source:
         ours, docs/derivations.md#spectral-start.
@@ -43,7 +43,7 @@ def spectral_start(family: LinearFamily, samples: Samples) -> Array:
 
 
 def _mixed(C: Array, G: Array) -> Array:
-    """Scale coordinates to a mean gradient length of 1 and mix neighbours a little.
+    """Scale coordinates to a mean gradient length of 1, and mix neighbours slightly.
 
     The spectral solution inherits the symmetries of the problem, and a symmetric point is often a saddle of the loss.
     """

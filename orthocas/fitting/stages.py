@@ -1,4 +1,4 @@
-"""The minimisations a fit is made of: samples, a start, an objective, a solver."""
+"""The stages of a fit. Each is a minimisation: samples, a start, an objective, a solver."""
 
 from dataclasses import dataclass, replace
 from math import ceil
@@ -25,26 +25,26 @@ from orthocas.samples import Samples, sample_problem, samples_at
 from orthocas.solvers import GaussNewton
 
 MLP_SAMPLES = 2000  #: default sample count of families that are not linear in theta
-_START_SEED = 0  # of the samples that spectral starts are found on, the same for all fits
-_FRESH = 2000  # tag of samples drawn while a solver runs, apart from those of the stages
+_START_SEED = 0  # seed of the samples of spectral starts, the same for all fits
+_FRESH = 2000  # seed tag of samples drawn while a solver runs; stages use other tags
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Minimisations that are done, and the parametrisation they reached."""
+    """Finished minimisations, and the parametrisation that they reached."""
 
     stages: tuple[Stage, ...]
     parametrisation: Parametrisation
 
     @property
     def theta(self) -> Array:
-        """Parameters that the last minimisation found."""
+        """Parameters found by the last minimisation."""
         return self.stages[-1].result.theta
 
 
 @dataclass(frozen=True, eq=False)
 class StageRunner:
-    """What the stages of one fit share."""
+    """Runs the stages of one fit, and holds what they share."""
 
     problem: Problem
     settings: FitSettings
@@ -58,7 +58,7 @@ class StageRunner:
         return JointSpace.of(self.problem).restricted_to(self.active)
 
     def run(self, r: int) -> Solved:
-        """All minimisations for r coordinates of the active joints."""
+        """Run all minimisations for r coordinates of the active joints."""
         parametrisation, solver = self.settings.parametrisation, self.settings.solver
         if isinstance(parametrisation, GradedParametrisation):
             return self.graded(parametrisation, r, solver)
@@ -66,7 +66,7 @@ class StageRunner:
         return Solved((stage,), parametrisation)
 
     def graded(self, target: GradedParametrisation, r: int, solver: Solver) -> Solved:
-        """Degree continuation: solve a low degree from a spectral start, embed, solve the next, ..."""
+        """Degree continuation: solve a low degree from a spectral start, embed the result, solve the next degree."""
         self._require_memory(target, r)
         stages: list[Stage] = []
         lower = None
@@ -78,7 +78,7 @@ class StageRunner:
             try:
                 minimiser = solver if final else solver.coarser()
                 stages.append(self.stage(current, family, start, minimiser, degree, final))
-            except KeyboardInterrupt:  # between minimisations: the last degree is the best so far
+            except KeyboardInterrupt:  # between minimisations: the last degree is the best result so far
                 if not stages:
                     raise
                 return Solved((*stages[:-1], stages[-1].interrupted()), target.of_degree(degree - 1))
@@ -96,10 +96,10 @@ class StageRunner:
         degree: int = 0,
         final: bool = True,
     ) -> Stage:
-        """Draw samples, find a start if there is none, and minimise; or take the stage from the checkpoint.
+        """Draw samples, find a start if none is given, and minimise. A finished stage comes from the checkpoint.
 
         Raises:
-            SolveError: if there is no usable point. A bound on mutual angles has to be kept by the final stage only.
+            SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
         """
         label = parametrisation.label
         done = self.checkpoint.finished(label)
@@ -127,11 +127,13 @@ class StageRunner:
         return stage
 
     def _objective(self, label: str, family: Family, samples: Samples, theta: Array | None) -> tuple[Objective, Array]:
-        """The loss of a family on samples, and where to start."""
+        """The loss of a family on samples, and the start."""
         if not isinstance(family, LinearFamily):
             if self.settings.max_mutual is not None:
                 raise InvalidValueError(
-                    "max_mutual_deg", f"given with {label}", "a parametrisation linear in its parameters, as polynomial"
+                    "max_mutual_deg",
+                    f"given with {label}",
+                    "a parametrisation linear in its parameters, such as polynomial",
                 )
             self._require_graph_memory(label, family, len(samples))
             theta = family.initial(self.settings.seed) if theta is None else theta
@@ -144,15 +146,15 @@ class StageRunner:
         fitted, all_pairs = len(pairs(family.outputs)), len(pairs(self.problem.r))
         if not fitted:
             raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
-        # pairs with an idle joint are exactly orthogonal, so the others may use their share
+        # pairs with an idle joint are exactly orthogonal, so the other pairs may use their share
         bounded = BoundedMutual(objective, self.settings.max_mutual * (all_pairs / fitted) ** 0.5)
-        if fresh:  # the weighted problem first: minima far from its own are worse
+        if fresh:  # solve the weighted problem first: minima far from its own are worse
             weighted = replace(self.settings.weights, mutual=DEFAULT_WEIGHTS.mutual)
             theta = GaussNewton().minimise(objective.reweighted(weighted), theta).theta
         return bounded, bounded.in_gauge(theta)
 
     def _spectral_start(self, family: LinearFamily, count: int) -> Array:
-        """A start that does not depend on the seed: eigenvalues lie close, and other samples would mix coordinates."""
+        """A start that does not depend on the seed: eigenvalues are close, so other samples would mix coordinates."""
         points = sample_evenly(self.problem.domain, count, _START_SEED)
         return spectral_start(family, samples_at(self.problem, points).restricted_to(self.active))
 
@@ -165,15 +167,15 @@ class StageRunner:
         return self.settings.samples or MLP_SAMPLES
 
     def _linear_sample_count(self, terms: int, r: int) -> int:
-        """Samples for a linear family: enough that every coefficient sees about 140 residuals."""
+        """Number of samples for a linear family, so that there are about 140 residuals per coefficient."""
         return self.settings.samples or 1000 + ceil(140 * terms / (self.problem.m + r - 1))
 
     def _require_graph_memory(self, label: str, family: Family, count: int) -> None:
-        """Refuse a network whose parameters and minimiser memory do not fit."""
+        """Refuse a network whose parameters and solver state exceed the memory."""
         require_memory(f"{label} with {family.size} parameters", 8.0 * (60 * family.size + 100 * count * self.space.n))
 
     def _require_memory(self, target: GradedParametrisation, r: int) -> None:
-        """Refuse a degree that does not fit, before building anything."""
+        """Refuse a degree that exceeds the memory, before building anything."""
         K = target.term_count(self.space.n)
         N = self._linear_sample_count(K, r)
         curvature = (self.space.n * r) ** 2 if self.settings.max_mutual is not None else 0
@@ -182,13 +184,13 @@ class StageRunner:
 
 
 def missed_bound(label: str, bound: float, objective: BoundedMutual, result: SolveResult) -> SolveError:
-    """The error that says how far a bound on mutual angles [rad] was missed, and why."""
+    """The error of a missed bound on mutual angles [rad]: by how much it was missed, and why."""
     wanted = np.degrees(bound)
     reached = wanted * objective.constraints(result.theta)[0][0] ** 0.5
     found = f"{label} coordinates with mutual angles within {wanted:.4g} deg"
     if result.status is Status.INFEASIBLE:
         return InfeasibleError(
-            f"there are no {found} near, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
+            f"there are no {found} nearby, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
         )
     return SolveError(
         f"no {found} found in {result.iterations} iterations, the closest have {reached:.4g} deg: "

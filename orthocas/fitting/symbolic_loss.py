@@ -1,4 +1,4 @@
-"""The loss of a fit as one CasADi expression of its parameters, with all derivatives by CasADi."""
+"""The loss of a fit as one CasADi expression of the parameters, which CasADi can differentiate."""
 
 from typing import Any
 
@@ -28,22 +28,22 @@ def loss(
 ) -> ca.Function:
     """L(theta), the mean loss (25) of [AS2023] on given samples, for `ca.nlpsol`, `ca.gradient` and `ca.hessian`.
 
-    A graph of plain operations, without callbacks: it can be differentiated as often as wanted, at the price of speed;
+    The function is a graph of plain operations without callbacks, so it can be differentiated any number of times.
     `fit` evaluates the same numbers faster. All r coordinates depend on all joints: idle joints are not split off.
 
     Args:
         problem: robot, task, metric and domain.
-        parametrisation: theta (size, 1) are the parameters of its family, for bases the coefficients row by row.
-        weights: of the terms; see `Weights`.
-        samples: how many to draw, or joint positions (N, n) [rad] or [m].
-        seed: of drawn samples, and of the start of a network.
+        parametrisation: the family with parameters theta (size, 1). For bases they are the coefficients row by row.
+        weights: weights of the terms; see `Weights`.
+        samples: number of samples to draw, or joint positions (N, n) [rad] or [m].
+        seed: seed of drawn samples, and of the start of a network.
         start: parameters (size,) whose orientation the regularity term keeps. Default: where `fit` starts.
 
     Returns:
         A function `loss` with input `theta` (size, 1) and output `loss` (1, 1).
 
     Raises:
-        InvalidValueError, ShapeError: for settings that do not fit.
+        InvalidValueError, ShapeError: if an argument is invalid.
 
     Example:
         >>> import casadi as ca

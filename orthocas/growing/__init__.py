@@ -1,4 +1,4 @@
-"""Growing exact coordinates: flows along the task gradients, charts of the base leaf, and both together."""
+"""Growing of exact coordinates: flows along the task gradients, charts of the base leaf, and their combination."""
 
 from orthocas.growing.flow import Arrival, Moved, TaskFlow
 from orthocas.growing.grown import GrownCoordinates

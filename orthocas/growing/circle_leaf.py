@@ -15,26 +15,26 @@ from orthocas.errors import GrowError, InvalidValueError
 from orthocas.growing.leaf import LeafValues, require_on_leaf, turning_joints, without_turns
 from orthocas.problem import Problem, task_jacobians
 
-SAMPLES = 2000  #: of the curve; the spline through them is good to about 1e-12
-_ON_CURVE = 1e-5  # distance [rad] beyond which a point belongs to another piece of the leaf
-_PIECE, _STEPS = 1.0, 100  # arc length and outputs of one call of the integrator
-_LONGEST = 200.0  # [rad]
+SAMPLES = 2000  #: points on the curve; the spline through them is accurate to about 1e-12
+_ON_CURVE = 1e-5  # distance [rad] beyond which a point belongs to another component of the leaf
+_PIECE, _STEPS = 1.0, 100  # arc length and number of outputs per call of the integrator
+_LONGEST = 200.0  # longest curve [rad]
 _SINGULAR = 0.01  # smallest singular value of J_x on the curve, relative to the largest
-_FEWEST = 20  # samples of a curve
-_CLOSINGS = 3  # corrections of the length
+_FEWEST = 20  # smallest number of samples of a curve
+_CLOSINGS = 3  # number of corrections of the length
 _PROJECTIONS = 4  # Gauss-Newton steps from the nearest sample to the nearest point of the curve
 
 
 @dataclass(frozen=True, eq=False)
 class CircleLeaf:
-    """xi0 = 2 pi l / L on a closed curve of length L, l its arc length from the first sample, xi0 in (-pi, pi].
+    """xi0 = 2 pi l / L in (-pi, pi] on a closed curve of length L, where l is the arc length from the first sample.
 
-    The point opposite to the first sample is the cut: a circle has no single smooth coordinate.
+    The cut is the point opposite the first sample, because a circle has no coordinate that is smooth everywhere.
     """
 
     problem: Problem = field(repr=False)
     level: Array  #: x0, (m,)
-    curve: Array = field(repr=False)  #: samples at equal arc lengths, (K + 1, n); the last is the first, up to turns
+    curve: Array = field(repr=False)  #: samples at equal arc lengths, (K + 1, n); the last equals the first up to turns
     length: Array  #: L, (1,)
     kind = "circle"
     turn = 2 * np.pi
@@ -70,7 +70,7 @@ class CircleLeaf:
         return LeafValues(xi[:, None], gradients[:, None, :], inside)
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
-        """Points of the leaf with coordinates xi (N, 1) in [-pi, pi], both ends at the cut; NaN for others."""
+        """Points of the leaf with coordinates xi (N, 1) in [-pi, pi]; both ends are at the cut. NaN for other xi."""
         along = xi[:, 0] * self.length[0] / (2 * np.pi)
         return np.where(np.abs(xi) <= np.pi + 1e-9, self._at(along), np.nan)
 
@@ -85,7 +85,7 @@ class CircleLeaf:
 
     @cached_property
     def _spline(self) -> CubicSpline:
-        """The curve without its drift, periodic in the arc length."""
+        """A spline of the curve without its drift, periodic in the arc length."""
         share = np.linspace(0.0, 1.0, len(self.curve))[:, None]
         periodic = self.curve - share * self._drift
         periodic[-1] = periodic[0]
@@ -99,20 +99,20 @@ class CircleLeaf:
         return cKDTree(self._embedded(self.curve[:-1]))
 
     def _embedded(self, points: Array) -> Array:
-        """Angles as points of circles, so that whole turns do not matter."""
+        """Angles as points on circles, so that whole turns do not matter."""
         turning = turning_joints(self.problem)
         angles = points[:, turning]
         return np.concatenate([np.cos(angles), np.sin(angles), points[:, ~turning]], axis=1)
 
 
 def circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAMPLES) -> CircleLeaf:
-    """Trace the leaf from a point on it until it closes.
+    """Trace the leaf from one of its points until it closes.
 
     Args:
-        problem: with r = 1.
+        problem: a problem with r = 1.
         level: x0, (m,).
         start: a point of the leaf, where xi0 = 0, (n,).
-        samples: number of samples kept.
+        samples: number of samples to keep.
 
     Raises:
         GrowError: if the leaf does not close within 200 rad, or runs into a singularity.
@@ -132,7 +132,7 @@ def circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAM
 
 
 def _closed(problem: Problem, level: Array, start: Array, length: float, samples: int) -> CircleLeaf:
-    """Trace the leaf once around, with its length corrected."""
+    """Trace the leaf once around, with corrections of its length."""
     trace = _tracer(problem, level, samples)
     for _ in range(_CLOSINGS):
         curve = trace(start, length)
@@ -150,9 +150,9 @@ def _singular(level: Array) -> GrowError:
 
 
 def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, float], Array]:
-    """A map (point, length) -> points at equal arc lengths (steps + 1, n) along the leaf, by SUNDIALS.
+    """A map (point, length) -> points at equal arc lengths (steps + 1, n) along the leaf, integrated by SUNDIALS.
 
-    The curve follows the unit vector orthogonal to all task gradients; -J_x^# (h - x0) pulls it back to the leaf.
+    The curve follows the unit vector orthogonal to all task gradients; the term -J_x^# (h - x0) keeps it on the leaf.
     """
     q, length = ca.SX.sym("q", problem.n), ca.SX.sym("length")
     J = problem.task.jacobian_function(q)

@@ -1,4 +1,4 @@
-"""A base leaf with the topology of a disk, three joints and one task, charted by a harmonic map ([AS2023] Sec. 5.2)."""
+"""A base leaf with disk topology, for n = 3 and m = 1, charted by a harmonic map ([AS2023] Sec. 5.2)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,19 +15,19 @@ from orthocas.growing.level_surface import TriangleMesh, level_surface
 from orthocas.growing.triangle_locator import TriangleLocator
 from orthocas.problem import Problem
 
-CELLS = 60  #: marching cubes cells along the longest edge of the region
+CELLS = 60  #: default number of marching cubes cells along the longest edge of the region
 _ROUNDS = 30  # Newton steps from a triangle to the leaf above it
-_ON_LEAF = 1e-12  # distance [rad] or [m]
-_FEWEST_ACROSS = 5  # cells along the shortest edge of a region
-_SCALE_SAMPLES = 1000  # that tell the size of the gradient
+_ON_LEAF = 1e-12  # accepted distance from the leaf [rad] or [m]
+_FEWEST_ACROSS = 5  # smallest number of cells along the shortest edge of a region
+_SCALE_SAMPLES = 1000  # samples to measure the size of the gradient
 
 
 @dataclass(frozen=True, eq=False)
 class DiskLeaf:
-    """xi0(q): the harmonic map of a triangulated leaf onto the unit disk, linear on every triangle.
+    """xi0(q), the harmonic map of a triangulated leaf onto the unit disk, linear on every triangle.
 
-    A point of the leaf gets the coordinates of the nearest point of the mesh. From one triangle to the next, the jump
-    of the gradient is of the order of the cell size, and that of the value of its third power.
+    A point of the leaf gets the coordinates of the nearest point of the mesh. Between neighbouring triangles, the jump
+    of the gradient is of the order of the cell size, and the jump of the value is of the order of its third power.
     """
 
     problem: Problem = field(repr=False)
@@ -61,7 +61,7 @@ class DiskLeaf:
 
     @property
     def region(self) -> Box:
-        """The box whose part of the leaf is charted."""
+        """The box that bounds the charted part of the leaf."""
         return Box(self.region_centre, self.region_half_width)
 
     @cached_property
@@ -78,9 +78,9 @@ class DiskLeaf:
         return LeafValues(xi, self._gradients[found.face], covers(self.region, points))
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
-        """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for others.
+        """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for other xi.
 
-        The point of the triangle is moved along the triangle's normal onto the leaf, so that `values` returns xi.
+        Each point moves from its triangle along the triangle's normal onto the leaf, so that `values` returns xi.
         """
         inside = np.hypot(xi[:, 0], xi[:, 1]) <= 1
         found = self._in_disk.locate(np.where(inside[:, None], xi, 0.0))
@@ -126,7 +126,7 @@ class DiskLeaf:
 
     @cached_property
     def _gradients(self) -> Array:
-        """Gradients of the two coordinates on every triangle, (F, 2, 3): E G^T = edges in the disk, n G^T = 0."""
+        """Gradients G of the two coordinates on every triangle, (F, 2, 3): E G^T = edges in the disk, n G^T = 0."""
         in_space, in_disk = self._edges
         return np.asarray((np.linalg.pinv(in_space) @ in_disk).transpose(0, 2, 1))
 
@@ -135,29 +135,31 @@ def disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -
     """Triangulate the part of a leaf inside a region, and map it onto the unit disk.
 
     Args:
-        problem: with n = 3 and m = 1.
+        problem: a problem with n = 3 and m = 1.
         level: x0, (1,).
-        region: box whose part of the leaf is charted.
-        cells: number of cells along its longest edge.
+        region: box that bounds the charted part of the leaf.
+        cells: number of cells along the longest edge of the region.
 
     Raises:
-        GrowError: if n or m differ.
+        GrowError: if n is not 3, m is not 1, or the shortest edge of the region has fewer than 5 cells.
         NotADiskError: if that part of the leaf is not a disk; the message says what it is.
     """
     if (problem.n, problem.m) != (3, 1):
-        raise GrowError(f"a disk chart is for n = 3 joints and m = 1 task, got n = {problem.n} and m = {problem.m}")
+        raise GrowError(
+            f"the problem has n = {problem.n} and m = {problem.m}, expected n = 3 and m = 1 for a disk leaf"
+        )
     low, high = region.centre - region.half_width, region.centre + region.half_width
     shortest = cells * float(region.half_width.min() / region.half_width.max())
     if shortest < _FEWEST_ACROSS:
         widths = (2 * region.half_width).round(4).tolist()
         raise GrowError(
-            f"the leaf's region has edges {widths}: {cells} cells along the longest leave {shortest:.1f} for "
+            f"the region has edges {widths}, so {cells} cells along the longest give {shortest:.1f} along "
             f"the shortest, expected at least {_FEWEST_ACROSS}"
         )
     require_memory(f"a mesh with {cells} cells", 40.0 * cells**3)
     task = problem.task
     points = sample_uniform(region, _SCALE_SAMPLES, 0)
-    scale = float(np.sqrt((task.batched_jacobian(points)[0] ** 2).sum(axis=(1, 2)).mean()))  # units do not matter
+    scale = float(np.sqrt((task.batched_jacobian(points)[0] ** 2).sum(axis=(1, 2)).mean()))  # makes units irrelevant
     mesh = level_surface(
         lambda q: task.batched(q)[0][:, 0] / scale,
         lambda q: task.batched_jacobian(q)[0].reshape(-1, 3) / scale,

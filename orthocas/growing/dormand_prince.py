@@ -1,7 +1,7 @@
-"""Many independent initial value problems at once, each with its own step size.
+"""Integrates many independent initial value problems at once, each with its own step size.
 
-Mapped SUNDIALS solvers are several times slower on systems of a few states (benchmarks/growing_queries.py): here one
-step of all trajectories is an operation on columns of samples, which leaves little but arithmetic.
+For systems with a few states, mapped SUNDIALS solvers are several times slower (benchmarks/growing_queries.py). Here,
+one step of all trajectories is an operation on columns of samples, with little overhead beyond arithmetic.
 """
 
 from dataclasses import dataclass
@@ -18,36 +18,36 @@ from orthocas.casadi_tools.columns import ColumnFunction, blocked, by_sample
 from orthocas.checks import Array
 
 _STAGES = 12
-_FEW = 64  # trajectories, or fewer, for which a block of columns does not pay
+_FEW = 64  # up to this many trajectories, a block of columns does not pay off
 _FIRST = 0.25  # first step
-_SMALLEST = 1e-9  # step at which a trajectory is given up: its field is singular there
+_SMALLEST = 1e-9  # smaller steps mean that the field is singular, so the trajectory stops
 _SHRINK, _GROW, _SAFETY = 0.2, 10.0, 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class BatchedFlow:
-    """Integrates dy/ds = f(y, p) from s = 0 to 1 for many y and p, by the 8th order method of Dormand and Prince.
+    """Integrates dy/ds = f(y, p) from s = 0 to 1 for many y and p, by the 8th-order method of Dormand and Prince.
 
     Coefficients and error estimate are those of `scipy.integrate.DOP853` ([HNW1993] Sec. II.10); the batching is ours.
 
     Args:
         field: f, (k, 1) x (l, 1) -> (k, 1).
-        scale: factor of the tolerance of each state, (k,).
+        scale: factor on the tolerance of each state, (k,).
     """
 
     field: ca.Function
     scale: Array
 
     def end_points(self, starts: Array, parameters: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
-        """States at s = 1, (N, k), and which trajectories got there, (N,).
+        """States at s = 1, (N, k), and which trajectories reached s = 1, (N,).
 
-        The others stopped where their step size fell below 1e-9 or the field was not finite; their last state is
-        returned.
+        The other trajectories stopped where the step size fell below 1e-9 or the field was not finite. Their rows hold
+        the last state.
 
         Args:
             starts: (N, k).
             parameters: (N, l).
-            tolerance: of the local error of a step.
+            tolerance: tolerance of the local error of a step.
         """
         y, s, step = starts.copy(), np.zeros(len(starts)), np.full(len(starts), _FIRST)
         running = np.arange(len(starts))
@@ -63,7 +63,7 @@ class BatchedFlow:
         return y, s >= 1
 
     def _moved(self, *arguments: Array) -> list[Array]:
-        """A step of some trajectories: y (N, k), step sizes (N, 1), p (N, l) -> y (N, k), errors (N, 1)."""
+        """One step of some trajectories: y (N, k), step sizes (N, 1), p (N, l) -> y (N, k), errors (N, 1)."""
         N = len(arguments[0])
         if N <= _FEW:
             return self._few(*arguments)
@@ -80,7 +80,7 @@ class BatchedFlow:
 
     @cached_property
     def _step(self) -> ca.Function:
-        """One step: y, step size, p -> new y and the estimate of its error in units of the tolerance."""
+        """One step: y, step size, p -> new y and its estimated error in units of the tolerance."""
         k = self.field.size1_in(0)
         y, step, p = ca.SX.sym("y", k), ca.SX.sym("step"), ca.SX.sym("p", self.field.size1_in(1))
         slopes: list[Any] = []

@@ -1,4 +1,4 @@
-"""Motion along the task gradients: the flows that carry coordinates from leaf to leaf ([AS2023] Sec. 5)."""
+"""Flows along the task gradients, which carry coordinates from leaf to leaf ([AS2023] Sec. 5)."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -15,38 +15,38 @@ from orthocas.metrics import metric_matrices
 from orthocas.problem import Problem, task_jacobians
 from orthocas.samples import Samples
 
-TOLERANCE = 1e-10  #: default local error of a step [rad] or [m]; end points are then good to about 1e-8
-_LOOSER = 100.0  # tolerance of tangent vectors, which need fewer digits than points
+TOLERANCE = 1e-10  #: default local error of a step [rad] or [m]; end points are then accurate to about 1e-8
+_LOOSER = 100.0  # factor on the tolerance of tangent vectors, which need fewer digits than points
 
 
 class Arrival(IntEnum):
     """How a trajectory ended."""
 
-    REACHED = 0  #: at the wanted task value
+    REACHED = 0  #: reached the desired task value
     SINGULAR = 1  #: stopped on the way, where the task gradients vanish or become dependent
-    OUTSIDE = 2  #: at the wanted task value, but where the base leaf has no chart
+    OUTSIDE = 2  #: reached the desired task value, but outside the chart of the base leaf
 
 
 @dataclass(frozen=True, eq=False)
 class Moved:
     """End points of trajectories."""
 
-    points: Array  #: (N, n); where SINGULAR, the last point before
-    status: NDArray[np.int_]  #: `Arrival` of each, (N,), int
+    points: Array  #: (N, n); for SINGULAR, the last point before the singularity
+    status: NDArray[np.int_]  #: `Arrival` of each trajectory, (N,), int
 
     @property
     def reached(self) -> NDArray[np.bool_]:
-        """Which trajectories arrived, (N,)."""
+        """Which trajectories reached the desired task value, (N,)."""
         return np.asarray(self.status == Arrival.REACHED)
 
 
 @dataclass(frozen=True, eq=False)
 class TaskFlow:
-    """The flow dq/ds = J_x^#A dx, s in [0, 1]: task values change by exactly dx, A-orthogonally to the leaves.
+    """The flow dq/ds = J_x^#A dx, s in [0, 1], which changes task values by exactly dx, A-orthogonally to the leaves.
 
     For m = 1 it is dq/ds = dx grad_A h / (dh(grad_A h)), the curve of [AS2023] eq. (23) with the task value as its
-    parameter: it ends on the wanted leaf without a stopping rule (ours, docs/derivations.md#growing). For m >= 2 it
-    follows the straight line in task coordinates; other lines end elsewhere unless the distribution is involutive.
+    parameter. It ends on the desired leaf without a stopping rule (ours, docs/derivations.md#growing). For m >= 2 it
+    follows the straight line in task coordinates; other paths end elsewhere unless the distribution is involutive.
     """
 
     problem: Problem
@@ -56,23 +56,24 @@ class TaskFlow:
 
         Args:
             points: joint positions.
-            dx: wanted changes.
+            dx: desired changes of the task values.
             tolerance: local error of a step [rad] or [m].
         """
         ends, arrived = self._positions.end_points(points, dx, tolerance)
         return Moved(ends, np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
 
     def pull(self, points: Array, level: Array, tolerance: float = TOLERANCE) -> Moved:
-        """Bring points (N, n) to the leaf h(q) = level (m,)."""
+        """Pull points (N, n) to the leaf h(q) = level (m,)."""
         return self.move(points, level - self.problem.task.batched(points)[0], tolerance)
 
     def pull_with_derivative(self, points: Array, level: Array, tolerance: float = TOLERANCE) -> tuple[Moved, Array]:
-        """As `pull`, with d q_hat / dq, (N, n, n), by forward sensitivities.
+        """Do the same as `pull`, and return d q_hat / dq, (N, n, n), by forward sensitivities.
 
-        The flow carries leaves to leaves, so r vectors v that start tangent to the leaf of q stay tangent to leaves;
-        dv/ds = (df/dq) v. They are kept as direction and logarithm of length: where flow lines converge, lengths fall
-        by many orders of magnitude and directions would drown in rounding. Along the flow q_hat does not change, so
-        with an A-orthonormal basis Z of ker J_x(q) the derivative is [v_1 ... v_r] Z^T A.
+        The flow maps leaves to leaves, so r vectors v that start tangent to the leaf of q stay tangent to leaves, with
+        dv/ds = (df/dq) v. The code stores each v as a direction and the logarithm of its length. Where flow lines
+        converge, lengths fall by many orders of magnitude, and rounding would destroy the directions of v itself. Since
+        q_hat is constant along the flow, the derivative is [v_1 ... v_r] Z^T A, where Z is an A-orthonormal basis of
+        ker J_x(q).
         """
         n, r = self.problem.n, self.problem.r
         A = metric_matrices(self.problem.metric, points)
@@ -90,7 +91,7 @@ class TaskFlow:
 
     @cached_property
     def field(self) -> ca.Function:
-        """Q (n, 1), dx (m, 1) -> J_x^#A dx (n, 1)."""
+        """q (n, 1), dx (m, 1) -> J_x^#A dx (n, 1)."""
         q, dx = ca.SX.sym("q", self.problem.n), ca.SX.sym("dx", self.problem.m)
         gradients = self.gradients(q)
         J = self.problem.task.jacobian_function(q)
@@ -107,7 +108,7 @@ class TaskFlow:
 
     @cached_property
     def _with_tangents(self) -> BatchedFlow:
-        """The flow with r tangent vectors: directions u with |u| = 1 and logarithms of lengths."""
+        """The flow with r tangent vectors, stored as directions u with |u| = 1 and logarithms of lengths."""
         n, m, r = self.problem.n, self.problem.m, self.problem.r
         y, dx = ca.SX.sym("y", n + r * (n + 1)), ca.SX.sym("dx", m)
         q, directions = y[:n], ca.reshape(y[n : n + r * n], n, r)
@@ -120,5 +121,5 @@ class TaskFlow:
 
 
 def _spd_solve(A: ca.SX, B: ca.SX) -> ca.SX:
-    """A^-1 B for symmetric positive definite A, in half the operations of `ca.solve`."""
+    """A^-1 B for symmetric positive definite A, with half the operations of `ca.solve`."""
     return ca.ldl_solve(B, *ca.ldl(A))

@@ -1,4 +1,4 @@
-"""Coordinates grown from a base leaf: exact ones, evaluated by following a flow ([AS2023] Sec. 5)."""
+"""Exact coordinates grown from a base leaf, evaluated by following a flow ([AS2023] Sec. 5)."""
 
 from dataclasses import dataclass, field
 
@@ -13,16 +13,16 @@ from orthocas.growing.flow import TOLERANCE, Arrival, Moved, TaskFlow
 from orthocas.growing.leaf import LeafChart, LeafValues, without_turns
 from orthocas.problem import Problem
 
-_INVERSE_TOLERANCE = 1e-12  # the inverse follows the flow back
+_INVERSE_TOLERANCE = 1e-12  # tolerance of the flow back from the leaf
 
 
 @dataclass(frozen=True, eq=False)
 class GrownCoordinates:
-    """xi(q) = xi0(q_hat): q_hat is where the flow along the task gradients meets the base leaf, xi0 the leaf's chart.
+    """xi(q) = xi0(q_hat), where the flow along the task gradients meets the base leaf in q_hat and xi0 charts the leaf.
 
-    J_xi = Dxi0(q_hat) dq_hat/dq, with the derivative of the flow from forward sensitivities: [AS2023] Sec. 6 names the
-    missing Jacobian as a drawback of growing. Values are NaN where the flow runs into a singularity or ends outside the
-    chart of the leaf; `pull` tells which.
+    J_xi = Dxi0(q_hat) dq_hat/dq, with the derivative of the flow from forward sensitivities. ([AS2023] Sec. 6 names the
+    missing Jacobian as a drawback of growing.) Values are NaN where the flow runs into a singularity or ends outside
+    the chart of the leaf; `pull` tells which.
     """
 
     problem: Problem = field(repr=False)
@@ -40,7 +40,7 @@ class GrownCoordinates:
 
     @property
     def size(self) -> int:
-        """How many numbers describe the chart of the leaf."""
+        """Count of the numbers that describe the chart of the leaf."""
         return sum(array.size for array in self.leaf.to_arrays().values())
 
     @property
@@ -49,7 +49,7 @@ class GrownCoordinates:
         return self.leaf.turn
 
     def pull(self, points: ArrayLike, tolerance: float = TOLERANCE) -> Moved:
-        """Where points meet the base leaf, with the status of each.
+        """Pull points to the base leaf; the result holds the end points and the status of each.
 
         Args:
             points: joint positions, (N, n) or (n,) for N = 1.
@@ -60,22 +60,22 @@ class GrownCoordinates:
         return Moved(moved.points, self._status(moved, self._on_leaf(moved)))
 
     def xi(self, points: Array) -> Array:
-        """Coordinates at points (N, n), (N, r)."""
+        """Coordinates (N, r) at points (N, n)."""
         moved = self.flow.pull(points, self.leaf.level)
         values = self._on_leaf(moved)
         return self._where_known(moved, values, values.xi)
 
     def jacobian(self, points: Array) -> Array:
-        """J_xi at points (N, n), (N, r, n)."""
+        """J_xi (N, r, n) at points (N, n)."""
         moved, derivative = self.flow.pull_with_derivative(points, self.leaf.level)
         values = self._on_leaf(moved)
         return self._where_known(moved, values, values.gradients @ derivative)
 
     def inverse(self, phi: Array, q_start: Array) -> Array:
-        """Joint positions with given task values and coordinates, (N, n): from the leaf back along the flow.
+        """Joint positions with given task values and coordinates, (N, n), by the flow back from the leaf.
 
-        The start (N, n) selects the whole turns and, where a linear leaf has several sheets, the sheet. NaN where there
-        is no solution.
+        The start (N, n) selects the whole turns and, if a linear leaf has several sheets, the sheet. Rows without a
+        solution are NaN.
         """
         m, n = self.problem.m, self.problem.n
         start = self.flow.pull(q_start, self.leaf.level)
@@ -89,20 +89,20 @@ class GrownCoordinates:
     def _onto_task(self, points: Array, x: Array) -> Array:
         """Points (N, n) after a Newton step along the task gradients to the task values x (N, m).
 
-        It removes the error of the integration, which matters if task values are large numbers.
+        The step removes the integration error, which matters if task values are large numbers.
         """
         dx = x - self.problem.task.batched(points)[0]
         return self.flow.move(points, dx, _INVERSE_TOLERANCE).points
 
     @property
     def functions(self) -> dict[str, ca.Function]:
-        """None: they are not expressions.
+        """Not available, because grown coordinates have no CasADi expression.
 
         Raises:
             NoExpressionError: always.
         """
         raise NoExpressionError(
-            "grown coordinates are found by integration and have no CasADi expression: "
+            "grown coordinates are computed by integration and have no CasADi expression: "
             "evaluate them with chart.xi and chart.jacobian, or fit an expression to them with orthocas.distil"
         )
 
@@ -112,7 +112,7 @@ class GrownCoordinates:
         return TaskFlow(self.problem)
 
     def _on_leaf(self, moved: Moved) -> LeafValues:
-        """The leaf's chart at end points; an arbitrary point replaces those that did not arrive."""
+        """The leaf's chart at end points; an arbitrary point replaces those of trajectories that did not arrive."""
         return self.leaf.values(np.where(moved.reached[:, None], moved.points, self.problem.domain.centre))
 
     @staticmethod

@@ -12,20 +12,20 @@ from orthocas.growing.mesh_improvement import cotangents
 def harmonic_disk(mesh: TriangleMesh) -> Array:
     """One-to-one harmonic map of a mesh onto the unit disk.
 
-    Boundary vertices are placed on the unit circle by arc length; the one with the lowest index gets angle 0. Every
+    Boundary vertices lie on the unit circle, spaced by arc length; the one with the lowest index has angle 0. Every
     inner vertex is the mean of its neighbours, weighted by cot(alpha) + cot(beta) with the angles opposite the edge. If
-    no weight is negative (a Delaunay mesh), the map is one-to-one. Every map is checked for folds.
+    no weight is negative (a Delaunay mesh), the map is one-to-one. The result is always checked for folds.
 
     Args:
         mesh: a topological disk.
 
     Returns:
-        (V, 2); all triangles are counterclockwise.
+        Images of the vertices, (V, 2); all triangles are counterclockwise.
 
     Raises:
         NotADiskError: if the mesh is not a disk.
         InvalidValueError: if a triangle has no area.
-        FoldedMapError: if the map turns triangles over.
+        FoldedMapError: if the map inverts triangles.
 
     Source:
         [AS2023] eqs. (40)-(43), by libigl. The check is ours: docs/derivations.md#disk-chart.
@@ -46,14 +46,14 @@ def solve_dirichlet(mesh: TriangleMesh, fixed: Indices, values: Array) -> Array:
 
     Args:
         mesh: triangles with areas > 0.
-        fixed: vertices (B,), at least one in each part of the mesh.
-        values: (B, k).
+        fixed: indices of vertices (B,), at least one in each component of the mesh.
+        values: values at these vertices, (B, k).
 
     Returns:
-        (V, k).
+        Values at all vertices, (V, k).
 
     Raises:
-        ShapeError: if the values do not belong to the fixed vertices.
+        ShapeError: if the values do not match the fixed vertices.
         InvalidValueError: if a triangle has no area, or the equations are singular.
 
     Source:
@@ -64,13 +64,13 @@ def solve_dirichlet(mesh: TriangleMesh, fixed: Indices, values: Array) -> Array:
     try:
         result: Array = igl.harmonic(mesh.vertices, mesh.faces, fixed, values, 1)
     except RuntimeError:
-        wanted = "at least one in each part of a mesh without nearly flat triangles"
+        wanted = "at least one in each component of a mesh without nearly flat triangles"
         raise InvalidValueError("fixed", f"{len(fixed)} vertices", wanted) from None
     return result
 
 
 def signed_areas(points: Array, faces: Indices) -> Array:
-    """Areas of triangles in the plane, (F,), > 0 where counterclockwise."""
+    """Signed areas of triangles in the plane, (F,), positive if counterclockwise."""
     a, b = points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
     areas: Array = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
     return areas

@@ -1,4 +1,4 @@
-"""What a chart of the base leaf S0 = {h(q) = x0} offers; implementations lie beside this module."""
+"""The interface of a chart of the base leaf S0 = {h(q) = x0}; neighbouring modules implement it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -48,15 +48,15 @@ class LeafChart(Protocol):
 
     @property
     def periodic(self) -> bool:
-        """Whether whole turns of the joints lead to the same coordinates."""
+        """Whether the coordinates stay the same under whole turns of the joints."""
         ...
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
-        """Points of the leaf with coordinates xi (N, r), (N, n); NaN where there is none.
+        """Points of the leaf (N, n) with coordinates xi (N, r); NaN where no such point exists.
 
         Args:
             xi: coordinates.
-            near: points of the leaf, (N, n), NaN if unknown. If several solutions exist, one near these is returned.
+            near: points of the leaf, (N, n), NaN if unknown; they select one of several solutions.
         """
         ...
 

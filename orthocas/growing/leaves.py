@@ -18,11 +18,11 @@ LEAVES: dict[str, type[LinearLeaf] | type[CircleLeaf] | type[DiskLeaf]] = {
 
 
 def leaf_from_arrays(problem: Problem, kind: str, arrays: Mapping[str, NDArray[Any]]) -> LeafChart:
-    """Build a leaf's chart from its arrays.
+    """Build the chart of a leaf from its arrays.
 
     Raises:
-        UnknownNameError: if there is no such kind.
-        ShapeError: if an array has another shape.
+        UnknownNameError: if no kind has that name.
+        ShapeError: if an array has the wrong shape.
     """
     require_known("leaf", kind, LEAVES)
     return LEAVES[kind](problem, **arrays)

@@ -1,4 +1,4 @@
-"""The surface where a function of three joints has a given value, as a triangle mesh."""
+"""Level surfaces of a function of three joints, as triangle meshes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ Mask = NDArray[np.bool_]
 Function = Callable[[Array], Array]  # (N, 3) -> (N,), or (N, 3) for a gradient
 
 _ON_LEVEL = 2e-13  # |h - level| of a vertex, relative to the larger of 1 and the largest |h|
-_ROUNDS = 4  # of flips and smoothing
+_ROUNDS = 4  # rounds of flips and smoothing
 _NEWTON_STEPS = 20
 _BISECTIONS = 60
-_CLEARANCE = 0.1  # of a cell's edge, between marching cubes' vertices and grid points
+_CLEARANCE = 0.1  # smallest distance of marching cubes vertices from grid points, as a share of a cell's edge
 _TINY = 1e-300
-_CHUNK = 500_000  # grid points handed to h at once
+_CHUNK = 500_000  # grid points per call of h
 
 
 def level_surface(
@@ -31,23 +31,23 @@ def level_surface(
 ) -> TriangleMesh:
     """The surface {q : low <= q <= high, h(q) = level}.
 
-    Marching cubes finds its topology, Newton steps along the gradient bring every vertex onto it, and flips of edges
-    and tangential smoothing make its triangles round and Delaunay. Vertices on faces of the box stay on them.
+    Marching cubes finds the topology, Newton steps along the gradient move every vertex onto the surface, and edge
+    flips with tangential smoothing make the triangles round and Delaunay. Vertices on faces of the box stay there.
 
     Args:
         h: function (N, 3) -> (N,).
         gradient: dh/dq, (N, 3) -> (N, 3).
-        level: the value.
+        level: the value of h on the surface.
         low: (3,) lower corner of the box [rad] or [m].
         high: (3,) upper corner of the box, > low.
         cells: number of grid cells along the longest edge of the box, >= 2.
 
     Returns:
-        A mesh with |h - level| <= 1e-12 (relative to the largest |h| if that is above 1) at its vertices and normals
-        along the gradient. Parts smaller than a cell may be missed.
+        A mesh with normals along the gradient and |h - level| <= 1e-12 at its vertices, relative to the largest |h| if
+        that exceeds 1. Components smaller than a cell may be missed.
 
     Raises:
-        ShapeError: if low, high, or a value of h or its gradient has another shape.
+        ShapeError: if low, high, or a value of h or its gradient has the wrong shape.
         InvalidValueError: if h does not take the value in the box, is not finite, or jumps across the value.
 
     Source:
@@ -71,25 +71,25 @@ def level_surface(
 
 @dataclass(frozen=True)
 class _Sheet:
-    """The surface and the box, on which the vertices of the mesh move."""
+    """The surface and the box; vertices of the mesh move on both."""
 
     h: Function
     gradient: Function
     level: float
     corners: Array  # (2, 3)
-    free: Mask  # (V, 3): whether a vertex may move along an axis; not across a face of the box it lies on
+    free: Mask  # (V, 3): whether a vertex may move along an axis; false across the faces of the box that it lies on
     tolerance: float  # of h
     cell: float  # edge length of a grid cell
 
     def start(self, points: Array, ends: Array) -> Array:
-        """Move vertices of marching cubes onto the surface; where Newton fails, by bisection between ends (2, V, 3)."""
+        """Move marching cubes vertices onto the surface, by bisection between ends (2, V, 3) where Newton fails."""
         moved, failed = self._newton(points)
         if failed.any():
             moved[failed] = self._bisect(ends[:, failed])
         return moved
 
     def slide(self, points: Array, steps: Array) -> Array:
-        """Move vertices by the part of their steps along the surface and the box; they stay where Newton fails."""
+        """Move vertices by the part of their steps along surface and box; a vertex stays in place if Newton fails."""
         normal = _values(self.gradient, points, "gradient", (3,)) * self.free
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), _TINY)
         along = steps * self.free
@@ -98,7 +98,7 @@ class _Sheet:
         return moved
 
     def _newton(self, start: Array) -> tuple[Array, Mask]:
-        """Newton steps along the free part of the gradient, and which vertices fail or move farther than a cell."""
+        """Take Newton steps along the free part of the gradient; tell which vertices fail or move more than a cell."""
         points, moving = start.copy(), np.arange(len(start))
         for _ in range(_NEWTON_STEPS):
             gap = self._gap(points[moving])
@@ -130,7 +130,7 @@ class _Sheet:
         return points
 
     def _gap(self, points: Array) -> Array:
-        """Values of h - level, checked."""
+        """Checked values of h - level."""
         return _values(self.h, points, "h", ()) - self.level
 
 
@@ -142,7 +142,7 @@ def _grid_axes(corners: Array, cells: int) -> list[Array]:
 
 
 def _sampled_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[np.float32], float]:
-    """The sign-preserving single-precision h - level on the grid, and the largest |h|."""
+    """h - level on the grid in single precision with the signs preserved, and the largest |h|."""
     shape = tuple(len(axis) for axis in axes)
     gap = np.empty(shape, dtype=np.float32)
     slab = max(1, _CHUNK // (shape[1] * shape[2]))
@@ -168,9 +168,9 @@ def _march(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, Indices,
 
 
 def _push_from_zero(gap: NDArray[np.float32]) -> None:
-    """Keep the surface off the grid points, where triangles of marching cubes shrink to nothing.
+    """Keep the surface away from grid points, where marching cubes triangles shrink to zero size.
 
-    |h - level| becomes at least _CLEARANCE of the largest change to a neighbour, in place; a zero becomes positive.
+    In place, |h - level| becomes at least _CLEARANCE times the largest change to a neighbour. Zeros become positive.
     """
     change = np.zeros_like(gap)
     for axis in range(3):

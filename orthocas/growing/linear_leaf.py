@@ -1,4 +1,4 @@
-"""Linear coordinates on the base leaf: the chart that exists for any number of joints."""
+"""Linear coordinates on the base leaf, available for any number of joints."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,8 +13,8 @@ from orthocas.metrics import metric_matrices
 from orthocas.problem import Problem, task_jacobians
 from orthocas.samples import samples_at
 
-_STAGES = 8  # on the way to the wanted coordinates
-_ITERATIONS = 10  # Newton steps at each
+_STAGES = 8  # intermediate points on the way to the desired coordinates
+_ITERATIONS = 10  # Newton steps at each point
 _SOLVED = 1e-12
 
 
@@ -22,8 +22,8 @@ _SOLVED = 1e-12
 class LinearLeaf:
     """xi0(q) = N^T (q - q0) for q on the leaf of q0, as in [AS2023] eq. (21).
 
-    A chart where the leaf is a graph over its tangent space at q0. Its values are defined everywhere on the leaf; where
-    the leaf folds over, the Jacobian of the grown chart loses rank, and `evaluate` shows it.
+    It is a chart where the leaf is a graph over its tangent space at q0. Its values are defined everywhere on the leaf.
+    Where the leaf folds over, the Jacobian of the grown chart loses rank, which `evaluate` shows.
     """
 
     problem: Problem = field(repr=False)
@@ -48,9 +48,10 @@ class LinearLeaf:
         return LeafValues((points - self.centre) @ self.normals, gradients, np.ones(len(points), dtype=bool))
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
-        """Points of the leaf with coordinates xi (N, r), NaN where there is none.
+        """Points of the leaf (N, n) with coordinates xi (N, r); NaN where no such point exists.
 
-        Newton's method along the straight line from the coordinates of `near`, or of q0, to xi: it stays on one sheet.
+        Newton's method follows the straight line from the coordinates of `near`, or of q0, to xi, and so stays on one
+        sheet.
         """
         q = np.broadcast_to(self.centre, (len(xi), len(self.centre)))
         q = q if near is None else np.where(np.isfinite(near), near, q)
@@ -76,7 +77,7 @@ class LinearLeaf:
 
     @cached_property
     def _scale(self) -> float:
-        """Size of J_x at q0, so that units of the task do not matter."""
+        """Size of J_x at q0, which makes the units of the task irrelevant."""
         return float(np.linalg.norm(task_jacobians(self.problem, self.centre[None])))
 
 

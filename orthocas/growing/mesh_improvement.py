@@ -1,6 +1,6 @@
-"""Rounder triangles for a mesh on a surface: flips of edges towards Delaunay, and tangential smoothing.
+"""Rounder triangles for a mesh on a surface, by edge flips towards Delaunay and tangential smoothing.
 
-The flips are ours: libigl flips intrinsically only, so that its new edges need not be straight lines in space, and
+The flips are ours, because libigl has only intrinsic flips, whose new edges need not be straight lines in space, and
 trimesh has no flips.
 """
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from orthocas.checks import Array, Indices
 from orthocas.growing.triangle_mesh import edge_keys, half_edges
 
-_MOST_ROUNDS = 200  # of flips; a few dozen are enough, but on a curved surface nothing proves that they end
-_FLAT = -1e-9  # cot + cot of the angles opposite an edge below this asks for a flip
+_MOST_ROUNDS = 200  # rounds of flips; a few dozen suffice, but there is no proof that they end on a curved surface
+_FLAT = -1e-9  # an edge is flipped if the sum of the cotangents of its opposite angles is below this
 
 
 def cotangents(vertices: Array, faces: Indices) -> Array:
-    """Cotangents of the corner angles, (F, 3); not finite where a triangle has no area."""
+    """Cotangents of the corner angles, (F, 3); not finite for triangles without area."""
     cot: Array = 2 * igl.cotmatrix_entries(vertices, faces)
     return cot
 
@@ -24,15 +24,15 @@ def cotangents(vertices: Array, faces: Indices) -> Array:
 def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
     """Flip edges until the angles opposite every inner edge add up to at most half a turn.
 
-    Then all weights cot(alpha) + cot(beta) are >= 0. An edge is not flipped if the new edge exists already, or if a new
+    All weights cot(alpha) + cot(beta) are then >= 0. An edge is not flipped if the new edge already exists, or if a new
     triangle would face away from the old ones.
 
     Args:
         vertices: (V, 3).
-        faces: (F, 3) of an oriented mesh with at most two triangles at each edge.
+        faces: (F, 3), triangles of an oriented mesh with at most two triangles at each edge.
 
     Returns:
-        New faces (F, 3): same vertices, boundary and topology.
+        New faces (F, 3) with the same vertices, boundary and topology.
 
     Source:
         Ours, after [BS2007]: docs/derivations.md#disk-chart.
@@ -50,7 +50,7 @@ def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
 
 
 def steps_to_neighbours(points: Array, faces: Indices) -> Array:
-    """Smoothing steps (V, 3) from each vertex to the mean of its neighbours; every vertex belongs to a triangle."""
+    """Smoothing steps (V, 3) from each vertex to the mean of its neighbours; every vertex must be in a triangle."""
     neighbours = igl.adjacency_matrix(faces)
     mean = (neighbours @ points) / np.diff(neighbours.indptr)[:, None]
     steps: Array = mean - points
@@ -58,7 +58,7 @@ def steps_to_neighbours(points: Array, faces: Indices) -> Array:
 
 
 def _inner_edges(faces: Indices, count: int) -> tuple[Indices, Indices, Indices]:
-    """Sorted keys of all edges, and the two half-edges of each inner edge; four times as fast as `igl.edge_flaps`."""
+    """Sorted keys of all edges, and the two half-edges of each inner edge. Four times as fast as `igl.edge_flaps`."""
     keys = edge_keys(*half_edges(faces), count)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
@@ -67,7 +67,7 @@ def _inner_edges(faces: Indices, count: int) -> tuple[Indices, Indices, Indices]
 
 
 def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second: Indices) -> bool:
-    """Flip edges that do not share a triangle, in place; returns whether any was flipped."""
+    """Flip edges that do not share a triangle, in place, and return whether any was flipped."""
     quads = _quads(faces, first, second)
     allowed = _allowed(vertices, quads, keys)
     quads, face, other = quads[allowed], first[allowed] % len(faces), second[allowed] % len(faces)
@@ -79,7 +79,7 @@ def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second
 
 
 def _quads(faces: Indices, first: Indices, second: Indices) -> Indices:
-    """Edge i -> j, the corner k opposite in its first triangle and the corner n opposite in its second, (N, 4)."""
+    """Edges i -> j, with the opposite corners k in the first triangle and n in the second, as rows (N, 4)."""
     face, corner = first % len(faces), first // len(faces)
     i, j, k = (faces[face, (corner + shift) % 3] for shift in (1, 2, 0))
     return np.stack([i, j, k, faces[second % len(faces), second // len(faces)]], axis=1)
@@ -98,7 +98,7 @@ def _allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bool_
 
 
 def _independent(quads: Indices, face: Indices, other: Indices, count: int) -> NDArray[np.bool_]:
-    """Which flips, given best first, come first at both of their triangles and at their new edge."""
+    """Which flips, given best first, are the first at both of their triangles and at their new edge."""
     number = np.arange(len(face))
     _, at_face = np.unique(np.stack([face, other], axis=1), return_index=True)
     wins = np.bincount(at_face // 2, minlength=len(face)) == 2

@@ -1,6 +1,6 @@
-"""The flows of growing by SUNDIALS CVODES: the paper's equation (23) with its stopping rule, and a second opinion.
+"""The flows of growing, integrated by SUNDIALS CVODES: eq. (23) of [AS2023] with its stopping rule, and a cross-check.
 
-`orthocas.growing.flow` is several times faster (docs/performance.md#growing) and is what charts use.
+Charts use `orthocas.growing.flow`, which is several times faster (docs/performance.md#growing).
 """
 
 from dataclasses import dataclass
@@ -17,17 +17,19 @@ from orthocas.growing.flow import Arrival, Moved, TaskFlow
 from orthocas.problem import Problem
 
 CHANGE = 1e-6  #: the paper's stopping rule: change of q between two steps [rad] or [m]
-_STEPS = 2000  # most steps of the gradient flow
-_ON_LEAF = 1e-4  # |h - x0| of a trajectory that stopped on the leaf, not in a singularity; relative to the start
+_STEPS = 2000  # largest number of steps of the gradient flow
+_ON_LEAF = (
+    1e-4  # largest |h - x0|, relative to the start, of a trajectory that stopped on the leaf and not in a singularity
+)
 _NEARLY_SINGULAR = 1e-6  # J A^-1 J^T, relative to its mean over the batch, below which the flow is slowed down
 
 
 @dataclass(frozen=True, eq=False)
 class SundialsFlow:
-    """Flows of a problem with m = 1 to a leaf h(q) = x0, by CVODES (Adams, functional iteration), batched.
+    """Batched flows of a problem with m = 1 to a leaf h(q) = x0, by CVODES (Adams, functional iteration).
 
     Args:
-        problem: with m = 1.
+        problem: a problem with m = 1.
         tolerance: relative and absolute tolerance of CVODES.
 
     Raises:
@@ -39,13 +41,13 @@ class SundialsFlow:
 
     def __post_init__(self) -> None:
         if self.problem.m != 1:
-            raise GrowError(f"this flow is for m = 1 tasks, got m = {self.problem.m}")
+            raise GrowError(f"the task has m = {self.problem.m} components, expected m = 1 for this flow")
 
     def gradient_flow(self, points: Array, level: float, change: float = CHANGE) -> Moved:
         """Follow dq/dt = (x0 - h(q)) grad_A h(q), [AS2023] eq. (23), until q changes by less than `change` in a step.
 
-        A step lasts 1 / (mean J A^-1 J^T), about the time in which the distance to the leaf falls by e. A trajectory
-        that comes to rest away from the leaf has run into a singularity.
+        A step lasts 1 / (mean J A^-1 J^T), about the time in which the distance to the leaf falls by a factor of e. A
+        trajectory that comes to rest away from the leaf has run into a singularity.
 
         Args:
             points: (N, n).
@@ -71,8 +73,8 @@ class SundialsFlow:
     def pull(self, points: Array, level: float) -> Moved:
         """Follow dq/ds = (x0 - h(q_1)) grad_A h / (dh(grad_A h)), s in [0, 1].
 
-        Near singularities the denominator is kept from vanishing, so that CVODES continues. Such a trajectory ends
-        beside the leaf, with status SINGULAR.
+        Near singularities a lower bound keeps the denominator from vanishing, so that CVODES continues. Such a
+        trajectory ends off the leaf, with status SINGULAR.
 
         Args:
             points: (N, n).
@@ -106,7 +108,7 @@ class SundialsFlow:
         return self._integrator(q, p, p[0] * gradient / ca.fmax(strength, p[1]))
 
     def _integrator(self, q: ca.SX, p: ca.SX, rate: ca.SX) -> Batched:
-        """Start, p -> end after a unit of time."""
+        """start, p -> end after a unit of time."""
         options: dict[str, Any] = {
             "linear_multistep_method": "adams",
             "nonlinear_solver_iteration": "functional",

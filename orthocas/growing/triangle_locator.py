@@ -1,4 +1,4 @@
-"""The closest point on a triangle mesh to each of many points."""
+"""Closest points on a triangle mesh, for many points at once."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from orthocas.checks import Array, Indices, frozen_array, frozen_indices, require_finite, require_shape
 from orthocas.errors import InvalidValueError
 
-_CHUNK = 10_000  # points of one call of libigl, which Ctrl-C cannot interrupt; 0.1 s on 200,000 triangles
+_CHUNK = 10_000  # points per call of libigl, which Ctrl-C cannot interrupt; 0.1 s on 200,000 triangles
 
 
 class Located(NamedTuple):
@@ -31,8 +31,9 @@ class TriangleLocator:
         faces: (F, 3) indices of vertices, triangles with areas > 0.
 
     Raises:
-        ShapeError: if an array has another shape.
-        InvalidValueError: if there is no triangle, a triangle has no area, or a vertex is not finite or does not exist.
+        ShapeError: if an array has the wrong shape.
+        InvalidValueError: if there is no triangle, a triangle has no area, a vertex is not finite, or a face refers to
+            a vertex that does not exist.
 
     Source:
         The nearest face by a tree: [AS2023] Sec. 5.2.
@@ -53,14 +54,14 @@ class TriangleLocator:
         self._tree.init(self._points, self._faces)
 
     def __reduce__(self) -> tuple[type["TriangleLocator"], tuple[Array, Indices]]:
-        """Pickle and copy the mesh: the tree is built again."""
+        """Pickle and copy only the mesh; the tree is rebuilt."""
         return TriangleLocator, (self._vertices, self._faces)
 
     def locate(self, points: Array) -> Located:
         """Closest points on the mesh to points (N, d).
 
         Raises:
-            ShapeError: if the points have another dimension than the mesh.
+            ShapeError: if the dimension of the points differs from that of the mesh.
             InvalidValueError: if a point, or its squared distance, is not finite.
         """
         require_finite("points", points)
@@ -71,29 +72,31 @@ class TriangleLocator:
 
     def _locate(self, points: Array) -> Located:
         squares, face, closest = self._tree.squared_distance(self._points, self._faces, points)
-        require_finite("squared distance", squares)  # otherwise libigl has found no face
+        require_finite("squared distance", squares)  # if not finite, libigl has found no face
         return Located(face, _barycentric(closest, self._points[self._faces[face]]), np.sqrt(squares))
 
 
 def _in_space(points: Array) -> Array:
-    """Points (N, 2) in the plane z = 0; the tree of libigl reads beyond the end of arrays with two columns."""
+    """Points (N, 2) in the plane z = 0, because libigl's tree reads beyond the end of arrays with two columns."""
     return np.ascontiguousarray(np.pad(points, ((0, 0), (0, 3 - points.shape[1]))))
 
 
 def _barycentric(points: Array, triangles: Array) -> Array:
-    """Barycentric coordinates (N, 3) of points (N, 3) of triangles (N, 3, 3).
+    """Barycentric coordinates (N, 3) of points (N, 3) on triangles (N, 3, 3).
 
-    Ours because libigl's lose digits in flat triangles: with height 1e-4 and length 1 they lead back to the point up to
-    1e-8, these up to 1e-13.
+    Ours, because those of libigl lose digits in flat triangles. For height 1e-4 and length 1, they reproduce the point
+    to 1e-8, and ours to 1e-13.
     """
     normals = _normals(triangles)
     to_corners = triangles - points[:, None]
-    parts = np.cross(np.roll(to_corners, -1, axis=1), np.roll(to_corners, -2, axis=1))  # opposite corner 0, 1, 2
+    parts = np.cross(
+        np.roll(to_corners, -1, axis=1), np.roll(to_corners, -2, axis=1)
+    )  # of the triangles opposite corners 0, 1, 2
     weights = np.maximum(np.einsum("ncd,nd->nc", parts, normals), 0.0)
     result: Array = weights / weights.sum(axis=1, keepdims=True)
     return result
 
 
 def _normals(triangles: Array) -> Array:
-    """Vectors across triangles (N, 3, 3), twice as long as the areas, (N, 3)."""
+    """Normal vectors of triangles (N, 3, 3), with twice the area as length, (N, 3)."""
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

@@ -19,8 +19,8 @@ class TriangleMesh:
         faces: (F, 3) indices of vertices, counterclockwise seen from the side the normal points to.
 
     Raises:
-        ShapeError: if an array has another shape.
-        InvalidValueError: if a vertex is not finite, or a face names a vertex that does not exist.
+        ShapeError: if an array has the wrong shape.
+        InvalidValueError: if a vertex is not finite, or a face refers to a vertex that does not exist.
     """
 
     vertices: Array
@@ -34,14 +34,14 @@ class TriangleMesh:
     @cached_property
     def edges(self) -> Indices:
         """Every edge once, (E, 2), the smaller index first."""
-        if not len(self.faces):  # libigl runs out of memory
+        if not len(self.faces):  # libigl would run out of memory
             return np.empty((0, 2), dtype=np.int64)
         edges: Indices = igl.edges(self.faces)
         return edges
 
     @cached_property
     def boundary_edges(self) -> Indices:
-        """Edges of a single triangle, in the direction in which that triangle passes them, (B, 2)."""
+        """Edges with a single triangle, directed as in that triangle, (B, 2)."""
         edges: Indices = igl.boundary_facets(self.faces)[0]
         return edges
 
@@ -49,7 +49,7 @@ class TriangleMesh:
     def clashing_edges(self) -> int:
         """Number of edges with three or more triangles, or with two triangles of opposite orientation.
 
-        Ours because `igl.is_edge_manifold` misses the latter.
+        Ours, because `igl.is_edge_manifold` misses the second case.
         """
         start, end = half_edges(self.faces)
         keys, count = np.unique(start * len(self.vertices) + end, return_counts=True)
@@ -58,7 +58,7 @@ class TriangleMesh:
 
     @cached_property
     def components(self) -> int:
-        """Number of connected parts; triangles are connected by edges, not by vertices."""
+        """Number of connected components; triangles are connected through edges, not through vertices."""
         return int(igl.facet_components(self.faces)[0])
 
     @cached_property
@@ -76,13 +76,13 @@ class TriangleMesh:
 
 
 def require_disk(mesh: TriangleMesh) -> Indices:
-    """The boundary of a mesh that is a topological disk.
+    """Check that a mesh is a topological disk, and return its boundary.
 
     A surface with at most two triangles at each edge is a disk if it has one component, one boundary loop and
     V - E + F = 1. Two corners that touch in a vertex lower V - E + F.
 
     Returns:
-        The boundary loop (B,), counterclockwise seen from the side of the normals, starting at its lowest index.
+        The boundary loop (B,), counterclockwise seen from the side of the normals, starting at the lowest index.
 
     Raises:
         NotADiskError: if the mesh is not a disk; the message says what it is.
@@ -98,7 +98,7 @@ def require_disk(mesh: TriangleMesh) -> Indices:
 
 
 def half_edges(faces: Indices) -> tuple[Indices, Indices]:
-    """Start and end of the edges of all faces, (3 F,) each: first those opposite corner 0, then 1, then 2."""
+    """Start and end of the edges of all faces, (3 F,) each; edges opposite corner 0 first, then 1, then 2."""
     return faces[:, [1, 2, 0]].T.ravel(), faces[:, [2, 0, 1]].T.ravel()
 
 

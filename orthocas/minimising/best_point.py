@@ -1,4 +1,4 @@
-"""The best point of one minimisation, kept through interrupts and restarts: what all solvers share."""
+"""The best point of a minimisation, kept through interrupts and restarts. All solvers use it."""
 
 import time
 from collections.abc import Callable
@@ -15,9 +15,9 @@ class BestPoint:
     """Counts evaluations of an objective and remembers the best point, its value and the time spent.
 
     Args:
-        objective: what is minimised.
-        theta0: where a new run starts.
-        watch: its keeper may hold the state of an earlier run, which is then taken over.
+        objective: the function to minimise.
+        theta0: start of a new run.
+        watch: monitor and keeper. If the keeper holds the state of an earlier run, the run resumes from it.
     """
 
     def __init__(self, objective: Objective, theta0: Array, watch: Watch) -> None:
@@ -32,7 +32,7 @@ class BestPoint:
 
     @property
     def seconds(self) -> float:
-        """Time spent, that of earlier runs included."""
+        """Time spent, including earlier runs."""
         return time.perf_counter() - self._start
 
     @property
@@ -41,31 +41,31 @@ class BestPoint:
         return bool(np.isfinite(self.value))
 
     def offer(self, theta: Array, value: float) -> bool:
-        """Take a point if it is better; whether it was."""
+        """Take a point if it is better, and tell whether it was."""
         better = value < self.value
         if better:
             self.theta, self.value = np.array(theta), float(value)
         return better
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
-        """Evaluate the objective and take the point if it is better."""
+        """Evaluate the objective, and take the point if it is better."""
         value, gradient = self.objective.value_and_gradient(theta)
         self.evaluations += 1
         self.offer(theta, value)
         return value, gradient
 
     def next_iteration(self, limit: int, **state: Array | float) -> None:
-        """Count an iteration, tell the monitor, and offer the state to the keeper."""
+        """Count an iteration, report it to the monitor, and offer the state to the keeper."""
         self.iterations += 1
         self.keep(**state)
         self.watch.report(self.iterations / limit, self.value)
 
     def keep(self, **state: Array | float) -> None:
-        """Offer the state to the keeper: the best point, the counts, and what the solver adds."""
+        """Offer the state to the keeper: the best point, the counts, and the solver's own state."""
         self.watch.keeper.keep(lambda: self._state(**state))
 
     def run(self, iterate: Callable[[], Status]) -> SolveResult:
-        """Iterate to the end, or to Ctrl-C: then the best point is the result, if there is one already."""
+        """Iterate to the end. After Ctrl-C the result is the best point so far, if there is one."""
         try:
             status = iterate()
         except KeyboardInterrupt:
@@ -75,7 +75,7 @@ class BestPoint:
         return self.result(status)
 
     def result(self, status: Status) -> SolveResult:
-        """What was found; FAILED if there is no finite value (of a point that keeps the constraints)."""
+        """The result. Its status is FAILED if no point (that satisfies the constraints) has a finite value."""
         if not self.found and status is not Status.INFEASIBLE:
             status = Status.FAILED
         return SolveResult(self.theta, self.value, status, self.iterations, self.evaluations, self.seconds)

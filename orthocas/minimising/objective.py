@@ -1,4 +1,4 @@
-"""What minimisers see: an objective, and what more some objectives can tell."""
+"""The objectives that minimisers see, and the further data that some of them offer."""
 
 from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
@@ -38,10 +38,10 @@ class SmoothObjective(Objective, Protocol):
 
 @runtime_checkable
 class SampledObjective(Objective, Protocol):
-    """A mean over samples, of which fresh ones can be drawn."""
+    """A mean over samples that can draw fresh ones."""
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Objective]:
-        """The same mean over `count` fresh sample sets, of `size` each or a little less."""
+        """The same mean over `count` fresh sample sets, of at most `size` samples each."""
         ...
 
 
@@ -51,7 +51,7 @@ class ConstrainedObjective(Objective, Protocol):
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper, (constraints,) each."""
+        """Lower and upper bounds, (constraints,) each."""
         ...
 
     def constraints(self, theta: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""What a minimiser is, and what it returns. Solvers live in `orthocas.solvers` and import this, never the reverse."""
+"""The interface of a minimiser, and its result. `orthocas.solvers` imports this module, never the reverse."""
 
 from dataclasses import dataclass, field
 from enum import Enum
@@ -23,7 +23,7 @@ class Status(Enum):
 
 @dataclass(frozen=True, eq=False)
 class SolveResult:
-    """Outcome of a minimisation; theta is the best point seen, whatever the status."""
+    """Result of a minimisation. Whatever the status, theta is the best point found."""
 
     theta: Array = field(repr=False)
     value: float
@@ -33,7 +33,7 @@ class SolveResult:
     seconds: float
 
     def raise_if_failed(self) -> "SolveResult":
-        """Raise SolveError if no usable point was found; running out of iterations is usable."""
+        """Raise SolveError if no usable point was found. A point found when iterations ran out is usable."""
         if self.status in (Status.FAILED, Status.INFEASIBLE):
             raise SolveError(
                 f"the minimiser ended after {self.iterations} iterations at loss {self.value:.6g}: {self.status.value}"
@@ -47,16 +47,16 @@ class Solver(Protocol):
 
     @property
     def name(self) -> str:
-        """Short name, as on the command line."""
+        """Short name, as used on the command line."""
         ...
 
     def coarser(self) -> "Solver":
-        """The same with looser settings, for the stages of a continuation before the last."""
+        """The same solver with looser settings, for all stages of a continuation but the last."""
         ...
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
-        """Minimise from theta0, or go on from the state that the watch's keeper restores.
+        """Minimise from theta0, or resume from the state that the watch's keeper restores.
 
-        Ctrl-C returns the best point so far with status INTERRUPTED.
+        After Ctrl-C it returns the best point so far, with status INTERRUPTED.
         """
         ...

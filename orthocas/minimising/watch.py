@@ -1,4 +1,4 @@
-"""Observing long work: progress for displays, and a keeper of state for checkpoints."""
+"""Observe long computations: progress for displays, and a keeper of the state for checkpoints."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -9,36 +9,36 @@ from orthocas.checks import Array
 
 @dataclass(frozen=True)
 class Progress:
-    """One step of long work, for progress displays."""
+    """One progress report of a long computation."""
 
     stage: str
-    fraction: float  #: of the stage, 0 to 1
+    fraction: float  #: completed fraction of the stage, 0 to 1
     detail: str
-    value: float = float("nan")  #: loss, if there is one already
+    value: float = float("nan")  #: current loss; NaN before there is one
 
 
 Monitor = Callable[[Progress], None]
-State = Mapping[str, Array]  #: all that a minimiser needs to go on where it was
+State = Mapping[str, Array]  #: all that a minimiser needs to resume
 
 
 def silent(progress: Progress) -> None:
-    """The default monitor: shows nothing."""
+    """The default monitor. It shows nothing."""
 
 
 class Keeper(Protocol):
-    """Keeps the state of a minimisation, so that a killed run can go on."""
+    """Keeps the state of a minimisation, so that a killed run can resume."""
 
     def restored(self) -> State | None:
-        """The state that an earlier run kept; None for a new run."""
+        """The state that an earlier run kept, or None for a new run."""
         ...
 
     def keep(self, state: Callable[[], State]) -> None:
-        """Offer the current state; the keeper decides whether it is time to write it."""
+        """Offer the current state. The keeper decides whether to write it."""
         ...
 
 
 class Forgetful:
-    """The default keeper: keeps nothing."""
+    """The default keeper. It keeps nothing."""
 
     def restored(self) -> State | None:
         """Nothing."""
@@ -53,14 +53,14 @@ FORGETFUL = Forgetful()
 
 @dataclass(frozen=True)
 class Watch:
-    """Who looks on while a minimiser works."""
+    """Observes a running minimiser: a monitor and a keeper."""
 
     monitor: Monitor = silent
-    stage: str = ""  #: name of the work for the monitor
+    stage: str = ""  #: name of the stage, for the monitor
     keeper: Keeper = FORGETFUL
 
     def report(self, fraction: float, value: float) -> None:
-        """Tell the monitor."""
+        """Report progress to the monitor."""
         self.monitor(Progress(self.stage, fraction, f"loss {value:.5g}", value))
 
 

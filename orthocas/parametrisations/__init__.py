@@ -1,4 +1,4 @@
-"""Parametrisations xi_theta(q): linear, polynomial, Fourier, MLP, given in closed form, and your own."""
+"""Parametrisations xi_theta(q): linear, polynomial, Fourier, MLP, closed forms, and your own."""
 
 from orthocas.parametrisations.basis import BasisFamily
 from orthocas.parametrisations.family import (

@@ -1,4 +1,4 @@
-"""Families xi = C psi(q) of any basis psi: what a basis of your own needs to be fitted by Gauss-Newton."""
+"""Families xi = C psi(q) of any basis psi. Gauss-Newton can fit a basis of your own with it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,13 +14,12 @@ from orthocas.parametrisations.family import Expression, JointSpace, component_g
 
 @dataclass(frozen=True, eq=False)
 class BasisFamily:
-    """xi_theta(q) = C psi(q), with theta the rows of C (r, K) one after the other.
+    """xi_theta(q) = C psi(q), where theta holds the rows of C (r, K) one after the other.
 
     Args:
         space: the joints.
         outputs: number r of components.
-        functions: psi, a map of SX or MX columns q (n, N) to (K, N), each column from its own column of q. No function
-            may be constant.
+        functions: psi, a map of SX or MX columns q (n, N) to (K, N), column by column. No function may be constant.
     """
 
     space: JointSpace

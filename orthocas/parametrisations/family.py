@@ -1,4 +1,4 @@
-"""What a parametrisation is: a choice of family, and the family itself once the joints are known."""
+"""The interface of parametrisations: the choice of a family, and the family for given joints."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ Expression = TypeVar("Expression", ca.SX, ca.MX)
 
 @dataclass(frozen=True, eq=False)
 class JointSpace:
-    """The joints a family is a function of: the box it is scaled to, and which joints slide."""
+    """The joints that a family depends on: the box for scaling, and which joints are prismatic."""
 
     centre: Array  #: (n,)
     half_width: Array  #: (n,), > 0
@@ -35,7 +35,7 @@ class JointSpace:
         return len(self.centre)
 
     def restricted_to(self, joints: list[int]) -> "JointSpace":
-        """The same space with only some of the joints."""
+        """The space of some of the joints."""
         return JointSpace(
             self.centre[joints],
             self.half_width[joints],
@@ -59,12 +59,12 @@ class Family(Protocol):
 
     @property
     def as_matrices(self) -> bool:
-        """Whether the family is made of dense products: MX graphs with samples as columns suit it, SX does not."""
+        """Whether the family consists of dense products. Then it needs MX graphs with samples as columns, not SX."""
         ...
 
     @property
     def width(self) -> int:
-        """Largest number of intermediate values of one sample: how many samples fit side by side into the cache."""
+        """Largest number of intermediate values per sample. It limits how many samples fit into the cache."""
         ...
 
     def expression(self, q: Expression, theta: Expression) -> Expression:
@@ -72,7 +72,7 @@ class Family(Protocol):
         ...
 
     def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
-        """Gradients of the components, r matrices (n, N): column s of the j-th is dxi_j/dq at joint position s."""
+        """Gradients of the components, r matrices (n, N). Column s of matrix j is dxi_j/dq at joint position s."""
         ...
 
     def initial(self, seed: int) -> Array:
@@ -82,18 +82,18 @@ class Family(Protocol):
 
 @runtime_checkable
 class ReorderableFamily(Family, Protocol):
-    """A family whose components can change places."""
+    """A family whose components can be reordered."""
 
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
-        """Parameters of the same components in another order, (size,)."""
+        """Parameters of the components in another order, (size,)."""
         ...
 
 
 @runtime_checkable
 class LinearFamily(Family, Protocol):
-    """A family linear in its parameters: xi_theta(q) = C psi(q), with theta the rows of C (r, K) one after the other.
+    """A family linear in its parameters: xi_theta(q) = C psi(q), where theta holds the rows of C (r, K) in a row.
 
-    No basis function is constant: a constant does not change J_xi. `BasisFamily` makes one of any basis.
+    No basis function is constant: a constant does not change J_xi. `BasisFamily` builds such a family for any basis.
     """
 
     def basis(self, q: Expression) -> Expression:
@@ -106,13 +106,13 @@ class GradedFamily(LinearFamily, Protocol):
     """A linear family whose basis contains the bases of lower degrees."""
 
     def embed(self, theta: Array, coarser: Self) -> Array:
-        """Parameters of a family of lower degree, written in this one, (size,)."""
+        """Convert parameters of a family of lower degree to this family, (size,)."""
         ...
 
 
 @runtime_checkable
 class SelfDerivativeFamily(LinearFamily, Protocol):
-    """A linear family whose derivatives are sums of its own functions: controllers and C then need no other basis."""
+    """A linear family whose derivatives are sums of its own functions. Controllers and C need no other basis."""
 
     def derivative_tables(self, theta: Array) -> Array:
         """C_i with d xi / d q_i = C_i (1, psi), (n, r, 1 + K)."""
@@ -121,44 +121,44 @@ class SelfDerivativeFamily(LinearFamily, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ClosedForm:
-    """Coordinates that follow from the problem without a fit."""
+    """Parameters of coordinates that need no fit."""
 
     theta: Array  #: parameters of the family, (size,)
-    origin: Array | None = None  #: joint position where xi = 0, (n,); default the centre of the domain
+    origin: Array | None = None  #: joint position where xi = 0, (n,). Default: the centre of the domain
     scaled: bool = True  #: whether coordinates are scaled to a mean gradient length of 1
 
 
 @runtime_checkable
 class Parametrisation(Protocol):
-    """A choice of family, before the joints are known; plain settings only."""
+    """The choice of a family, before the joints are known. It holds plain settings only."""
 
     @property
     def label(self) -> str:
-        """Short name that the command line understands, for example 'polynomial:4'."""
+        """Short name, as used on the command line, for example 'polynomial:4'."""
         ...
 
     @property
     def linear(self) -> bool:
-        """Whether its families are linear in their parameters: then Gauss-Newton is the default solver."""
+        """Whether its families are linear in their parameters. Then Gauss-Newton is the default solver."""
         ...
 
     @property
     def closed_form(self) -> "Callable[[Problem], ClosedForm] | None":
-        """What finds the parameters without a fit; None if they are fitted."""
+        """The function that gives the parameters without a fit, or None if they are fitted."""
         ...
 
     def for_problem(self, problem: "Problem") -> "Parametrisation":
-        """The same with everything it has to know of the problem; itself, if that is nothing."""
+        """The parametrisation for this problem. It is the object itself if it does not depend on the problem."""
         ...
 
     def family(self, space: JointSpace, outputs: int) -> Family:
-        """The family of functions of the given joints with `outputs` components."""
+        """The family on the given joints, with `outputs` components."""
         ...
 
 
 @runtime_checkable
 class GradedParametrisation(Parametrisation, Protocol):
-    """A parametrisation with a degree, whose families of lower degree lie inside those of higher degree."""
+    """A parametrisation with a degree. Families of higher degree contain those of lower degree."""
 
     @property
     def degree(self) -> int:
@@ -182,7 +182,7 @@ def component_gradients(xi: Expression, q: Expression) -> list[Expression]:
     """dxi_j/dq of every component j by reverse automatic differentiation, r matrices (n, N).
 
     Args:
-        xi: (r, N), whose column s depends on column s of q only.
+        xi: expression (r, N). Its column s depends only on column s of q.
         q: symbols (n, N).
     """
     gradients = []

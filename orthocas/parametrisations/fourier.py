@@ -18,10 +18,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Fourier:
-    """Products of sqrt(2) cos(k q_i) and sqrt(2) sin(k q_i), total degree <= degree; periodic in every joint.
+    """Products of sqrt(2) cos(k q_i) and sqrt(2) sin(k q_i) of total degree <= degree, periodic in every joint.
 
     Args:
         degree: total degree, >= 1.
+
+    Example:
+        >>> import orthocas as oc
+        >>> fourier = oc.Fourier(degree=2)
+        >>> fourier.label, fourier.term_count(3)
+        ('fourier:2', 24)
     """
 
     degree: int
@@ -37,11 +43,11 @@ class Fourier:
         return f"fourier:{self.degree}"
 
     def for_problem(self, problem: "Problem") -> "Fourier":
-        """Itself."""
+        """The object itself: it does not depend on the problem."""
         return self
 
     def of_degree(self, degree: int) -> "Fourier":
-        """The same with another degree."""
+        """The same parametrisation with another degree."""
         return Fourier(degree)
 
     def term_count(self, n: int) -> int:
@@ -52,12 +58,12 @@ class Fourier:
         """Fourier terms of the joint angles.
 
         Raises:
-            InvalidValueError: if a joint is prismatic (named).
+            InvalidValueError: if a joint is prismatic. The message names it.
         """
         if any(space.prismatic):
             name = space.joint_names[space.prismatic.index(True)]
             raise InvalidValueError(
-                f"joint '{name}' of a Fourier basis", "prismatic", "revolute joints; use polynomial"
+                f"joint '{name}' of a Fourier basis", "prismatic", "a revolute joint; use polynomial instead"
             )
 
         def waves(i: int, q: ca.SX) -> list[ca.SX]:

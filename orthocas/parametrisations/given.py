@@ -1,4 +1,4 @@
-"""Coordinates given in closed form: nothing to fit, but a chart to judge, save and use like any other."""
+"""Coordinates given in closed form. Their chart is evaluated, saved and used like any other, without a fit."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """Coordinates xi(q) of elementary operations, without parameters. Use `from_function`.
+    """Coordinates xi(q) as a CasADi expression without parameters. Use `from_function` to build one.
 
     Args:
         label: a name for reports.
@@ -35,10 +35,18 @@ class Given:
 
     @classmethod
     def from_function(cls, name: str, n: int, function: Callable[[ca.SX], ca.SX] | ca.Function) -> "Given":
-        """From a map of an SX column q (n, 1) to xi (r, 1).
+        """Build from a function of an SX column q (n, 1) that returns xi (r, 1).
 
         Raises:
             ShapeError: if xi is not a column.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> direction = oc.Given.from_function("hand direction", 3, lambda q: q[0] + q[1] + q[2])
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), direction).chart
+            >>> chart.labels
+            ('x', 'y', 'xi1')
         """
         q = ca.SX.sym("q", n)
         xi = expression_of(f"coordinates '{name}'", function, q)
@@ -46,18 +54,18 @@ class Given:
         return cls(name, n, to_tape(dense_function("xi", [q], [xi])))
 
     def for_problem(self, problem: "Problem") -> "Given":
-        """Itself."""
+        """The object itself: it does not depend on the problem."""
         return self
 
     def closed_form(self, problem: "Problem") -> ClosedForm:
-        """No parameters."""
+        """There are no parameters."""
         return ClosedForm(np.zeros(0))
 
     def family(self, space: JointSpace, outputs: int) -> "GivenFamily":
         """The coordinates as a family without parameters.
 
         Raises:
-            ShapeError: if there are not as many of them as the problem has redundant joints, or the joints differ.
+            ShapeError: if the number of coordinates is not `outputs`, or the number of joints differs.
         """
         require_shape(f"q of coordinates '{self.label}'", (self.n,), (space.n,))
         require_shape(f"coordinates '{self.label}'", (int(self.tape["rows"]), 1), (outputs, 1))
@@ -75,7 +83,7 @@ class GivenFamily:
 
     @cached_property
     def width(self) -> int:
-        """Number of steps."""
+        """Number of steps of the tape."""
         return len(self.given.tape["steps"])
 
     def expression(self, q: Expression, theta: Expression) -> Expression:
@@ -88,5 +96,5 @@ class GivenFamily:
         return component_gradients(self.expression(q, theta), q)
 
     def initial(self, seed: int) -> Array:
-        """No parameters, (0,)."""
+        """An empty array: there are no parameters."""
         return np.zeros(0)

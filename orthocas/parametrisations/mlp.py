@@ -18,10 +18,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MLP:
-    """xi = W_out tanh(W_2 tanh(W_1 [sin q; cos q] + b_1) + b_2) + b_out; a prismatic joint enters as q itself.
+    """xi = W_out tanh(W_2 tanh(W_1 [sin q; cos q] + b_1) + b_2) + b_out. Prismatic joints enter as q itself.
 
     Args:
         hidden: widths of the hidden layers, each >= 1.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems, solvers
+        >>> network = oc.MLP(hidden=(6, 6))
+        >>> solver = solvers.LBFGS(max_iterations=5)
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), network, solver, samples=100).chart
+        >>> chart.coordinates.label, chart.coordinates.size
+        ('mlp:6x6', 91)
     """
 
     hidden: tuple[int, ...] = (64, 64)
@@ -39,7 +48,7 @@ class MLP:
         return "mlp:" + "x".join(map(str, self.hidden))
 
     def for_problem(self, problem: "Problem") -> "MLP":
-        """Itself."""
+        """The object itself: it does not depend on the problem."""
         return self
 
     def family(self, space: JointSpace, outputs: int) -> "MLPFamily":
@@ -49,7 +58,7 @@ class MLP:
 
 @dataclass(frozen=True, eq=False)
 class MLPFamily:
-    """The network on given joints. theta holds W_1, b_1, W_2, b_2, ..., W_out, b_out, matrices column by column."""
+    """The network on given joints. theta holds W_1, b_1, ..., W_out, b_out, with matrices column by column."""
 
     space: JointSpace
     outputs: int
@@ -78,8 +87,8 @@ class MLPFamily:
     def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
         """Gradients of the components, r matrices (n, N), by the chain rule from the outputs to the inputs.
 
-        The gradients of all components go through the layers side by side, as one matrix (width, r N): large products
-        are what BLAS is fast at.
+        The gradients of all components pass through the layers side by side, as one matrix (width, r N), because BLAS
+        is fast at large products.
         """
         layers = self._layers(theta)
         slopes = self._forward(q, layers)[1]
@@ -88,7 +97,7 @@ class MLPFamily:
         gradients = ca.horzcat(*(ca.repmat(W_out[j, :].T, 1, N) for j in range(self.outputs)))
         for (W, _), slope in zip(layers[-2::-1], reversed(slopes), strict=True):
             gradients *= ca.repmat(slope, 1, self.outputs)
-            # of one sample as rows: generated C then needs no transposed copy of the weights
+            # one sample as rows: then generated C needs no transposed copy of the weights
             gradients = (gradients.T @ W).T if N == 1 else W.T @ gradients
         t = len(self._turning)
         by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[self._turning, :]), 1, self.outputs)
@@ -117,7 +126,7 @@ class MLPFamily:
     def _forward(
         self, q: Expression, layers: list[tuple[Expression, Expression]]
     ) -> tuple[Expression, list[Expression]]:
-        """Outputs (r, N), and the slopes 1 - tanh^2 of the hidden layers, (width, N) each."""
+        """Outputs (r, N), and the derivatives 1 - tanh^2 of the hidden layers, (width, N) each."""
         angles = q[self._turning, :]
         layer = ca.vertcat(ca.sin(angles), ca.cos(angles), q[self._sliding, :])
         slopes = []
@@ -138,7 +147,7 @@ class MLPFamily:
         return np.concatenate(parts)
 
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
-        """The outputs in another order, (size,)."""
+        """Parameters with the outputs in another order, (size,)."""
         last = self.outputs * (self.widths[-2] + 1)  # W_out column by column, then b_out
         columns = theta[-last:].reshape(-1, self.outputs)[:, list(order)]
         return np.concatenate([theta[:-last], columns.ravel()])

@@ -17,10 +17,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Polynomial:
-    """Tensor Legendre polynomials of total degree <= degree, orthonormal for the uniform density on the box.
+    """Products of Legendre polynomials of total degree <= degree, orthonormal for the uniform density on the box.
 
     Args:
         degree: total degree, >= 1.
+
+    Example:
+        >>> import orthocas as oc
+        >>> polynomial = oc.Polynomial(degree=4)
+        >>> polynomial.label, polynomial.term_count(7)
+        ('polynomial:4', 329)
     """
 
     degree: int
@@ -36,11 +42,11 @@ class Polynomial:
         return f"polynomial:{self.degree}"
 
     def for_problem(self, problem: "Problem") -> "Polynomial":
-        """Itself."""
+        """The object itself: it does not depend on the problem."""
         return self
 
     def of_degree(self, degree: int) -> "Polynomial":
-        """The same with another degree."""
+        """The same parametrisation with another degree."""
         return Polynomial(degree)
 
     def term_count(self, n: int) -> int:
@@ -58,7 +64,7 @@ class Polynomial:
             return [sqrt(2 * k + 1) * p for k, p in enumerate(P[: self.degree + 1])]
 
         def derivatives(i: int) -> Array:
-            """P_a' = sum of (2 b + 1) P_b over b = a - 1, a - 3, ..., here for normalised ones."""
+            """P_a' = sum of (2 b + 1) P_b over b = a - 1, a - 3, ..., here for normalised polynomials."""
             a, b = np.indices((self.degree + 1, self.degree + 1))
             values: Array = np.sqrt((2 * a + 1) * (2 * b + 1)) * ((a > b) & ((a - b) % 2 == 1)) / space.half_width[i]
             return values

@@ -11,15 +11,14 @@ from orthocas.checks import Array
 from orthocas.parametrisations.basis import BasisFamily
 from orthocas.parametrisations.family import JointSpace
 
-Term = tuple[int, ...]  #: for every joint, which one-joint function the term takes; 0 is the constant 1
+Term = tuple[int, ...]  #: index of the one-joint function of every joint; 0 is the constant 1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProductFamily(BasisFamily):
-    """psi_k(q) = prod_i f_i,k_i(q_i) over the joints; `product_family` makes one.
+    """psi_k(q) = prod_i f_i,k_i(q_i) over the joints. Use `product_family` to build one.
 
-    Derivatives of terms are sums of terms: with a term, the family has those that come from it when a factor is
-    differentiated.
+    Derivatives of terms are sums of terms. So with each term, the family contains the terms of its derivatives.
     """
 
     terms: tuple[Term, ...]
@@ -31,13 +30,13 @@ class ProductFamily(BasisFamily):
         return len(self.terms)
 
     def initial(self, seed: int) -> Array:
-        """Random coefficients that fall with the degree, (size,)."""
+        """Random coefficients that decrease with the degree, (size,)."""
         order = np.array([np.count_nonzero(term) for term in self.terms])
         C = np.random.default_rng(seed).normal(size=(self.outputs, len(self.terms))) * 0.3**order
         return C.ravel()
 
     def embed(self, theta: Array, coarser: "ProductFamily") -> Array:
-        """Coefficients of a basis that this one contains, written in this one, (size,)."""
+        """Convert coefficients of a smaller basis to this one, (size,)."""
         place = {term: k for k, term in enumerate(self.terms)}
         wide = np.zeros((self.outputs, self.width))
         wide[:, [place[term] for term in coarser.terms]] = theta.reshape(self.outputs, coarser.width)
@@ -68,7 +67,7 @@ def product_family(
     Args:
         space: the joints.
         outputs: number of components.
-        terms: none constant; with a term, those that come from it when a factor is differentiated.
+        terms: the terms. None is constant, and the terms of their derivatives are included.
         one_joint_functions: f_i,0 = 1, f_i,1, ... of joint i at its position.
         one_joint_derivatives: D of joint i, with f_i,a' = sum_b D_ab f_i,b.
     """
@@ -84,7 +83,7 @@ def product_family(
 
 
 def _product(term: Term, tables: list[list[Any]], products: dict[Term, Any]) -> Any:
-    """Value of a term: the term without its last factor, times that factor."""
+    """Value of a term: the product of all factors but the last, times the last."""
     if term not in products:
         last = int(np.flatnonzero(term)[-1])
         rest = (*term[:last], 0, *term[last + 1 :])
@@ -97,8 +96,8 @@ def terms_up_to(degrees: list[list[int]], total: int) -> Iterator[Term]:
     """All non-constant choices of one function per joint whose degrees add up to at most `total`.
 
     Args:
-        degrees: for every joint, the degrees of its functions; the first is 0.
-        total: the largest sum of degrees.
+        degrees: the degrees of the functions of every joint. The first is 0.
+        total: largest sum of degrees.
     """
 
     def extend(prefix: Term, left: int) -> Iterator[Term]:

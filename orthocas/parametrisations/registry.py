@@ -1,4 +1,4 @@
-"""Parametrisations by name: short labels for the command line, plain data for chart files, and how to add your own."""
+"""The registry of parametrisations: labels for the command line, plain data for chart files. Add your own here."""
 
 import json
 import warnings
@@ -19,48 +19,59 @@ from orthocas.parametrisations.sew import SEW
 
 @dataclass(frozen=True)
 class Registration:
-    """A parametrisation that files and the command line know."""
+    """A parametrisation that chart files and the command line support."""
 
     kind: type[Parametrisation]
-    parse: Callable[[str], Parametrisation] | None  #: from what follows 'name:' on the command line
+    parse: Callable[[str], Parametrisation] | None  #: parses the text after 'name:' on the command line
 
 
 _REGISTERED: dict[str, Registration] = {}
 
 
 def register(name: str, kind: type[Parametrisation], parse: Callable[[str], Parametrisation] | None = None) -> None:
-    """Make a parametrisation known by a name: charts of it can be saved and loaded, and the command line can read it.
+    """Register a parametrisation, so that its charts can be saved and loaded, and the command line accepts it.
 
-    Whoever opens such a chart file must have registered the same name first.
+    A program that loads such a chart file must register the same name first.
 
     Args:
-        name: unique; labels begin with it.
-        kind: a dataclass whose fields are plain data (numbers, texts, tuples of them), and which can be made of them.
-        parse: what follows the colon in 'name:text' -> parametrisation; without it the command line cannot name it.
+        name: unique name. Labels begin with it.
+        kind: a dataclass that is built from its fields. They are plain data: numbers, text, or tuples of them.
+        parse: converts the text after the colon in 'name:text' to a parametrisation. Without it, the command line does
+            not accept the name.
 
     Raises:
         InvalidValueError: if the name belongs to another class, or the class is not a dataclass.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> import orthocas as oc
+        >>> @dataclass(frozen=True)
+        ... class Cubic(oc.Polynomial):
+        ...     degree: int = 3
+        >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
+        >>> oc.parametrisations.parse_parametrisation("cubic")
+        Cubic(degree=3)
     """
     known = _REGISTERED.get(name)
     if known is not None and known.kind is not kind:
-        raise InvalidValueError("name", repr(name), f"a name that is not taken by {known.kind.__name__}")
+        raise InvalidValueError("name", repr(name), f"a name that {known.kind.__name__} does not use")
     if not is_dataclass(kind):
-        raise InvalidValueError("kind", repr(kind), "a dataclass: chart files hold its fields")
+        raise InvalidValueError("kind", repr(kind), "a dataclass: chart files store its fields")
     _REGISTERED[name] = Registration(kind, parse)
 
 
 def parametrisation_names() -> tuple[str, ...]:
-    """Names that the command line understands."""
+    """Names that the command line accepts."""
     return tuple(name for name, known in _REGISTERED.items() if known.parse is not None)
 
 
 def require_savable(parametrisation: Parametrisation) -> None:
-    """Raise InvalidValueError unless charts of this parametrisation can be saved, before anything is fitted."""
+    """Raise InvalidValueError, before a fit, unless charts of this parametrisation can be saved."""
     parametrisation_to_data(parametrisation)
 
 
 def warn_unless_savable(parametrisation: Parametrisation) -> None:
-    """Warn before a fit, with NotSavableWarning, if its chart could not be saved."""
+    """Issue a NotSavableWarning, before a fit, if its chart cannot be saved."""
     try:
         require_savable(parametrisation)
     except InvalidValueError as error:
@@ -68,7 +79,7 @@ def warn_unless_savable(parametrisation: Parametrisation) -> None:
 
 
 def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
-    """Kind and settings as plain data.
+    """Convert a parametrisation to plain data: kind and settings.
 
     Raises:
         InvalidValueError: if it is not registered, or its settings are not plain data.
@@ -78,21 +89,21 @@ def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
         raise InvalidValueError(
             "parametrisation",
             kind.__name__,
-            f"a registered one, for a chart file: orthocas.parametrisations.register('...', {kind.__name__})",
+            f"a registered one, so that it can be saved: orthocas.register_parametrisation('...', {kind.__name__})",
         )
     settings = asdict(parametrisation)
     try:
         json.dumps(settings)
     except (TypeError, ValueError) as error:
-        raise InvalidValueError(f"settings of {kind.__name__}", f"no plain data ({error})", "plain data") from None
+        raise InvalidValueError(f"settings of {kind.__name__}", f"not plain data ({error})", "plain data") from None
     return {"parametrisation": kind.__name__, "settings": settings}
 
 
 def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
-    """Read `parametrisation_to_data` back.
+    """Convert the result of `parametrisation_to_data` back.
 
     Raises:
-        UnknownNameError: if there is no such parametrisation here.
+        UnknownNameError: if no such parametrisation is registered.
     """
     kinds = {known.kind.__name__: known.kind for known in _REGISTERED.values()}
     require_known("parametrisation", data["parametrisation"], kinds)
@@ -100,11 +111,11 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
 
 
 def parse_parametrisation(label: str) -> Parametrisation:
-    """Read 'polynomial:4', 'fourier:2', 'mlp:64x64', 'linear', 'sew:stereographic', or the label of a registered one.
+    """Parse a label: 'polynomial:4', 'fourier:2', 'mlp:64x64', 'linear', 'sew:stereographic', or your own.
 
     Raises:
         UnknownNameError: if there is no such parametrisation.
-        InvalidValueError: if the part after the colon does not fit.
+        InvalidValueError: if the text after the colon is invalid.
     """
     name, _, text = label.partition(":")
     require_known("parametrisation", name, parametrisation_names())

@@ -1,4 +1,4 @@
-"""The shoulder-elbow-wrist angle as a coordinate: what 7-joint arms with a pose task use today."""
+"""The shoulder-elbow-wrist angle as a coordinate: the common choice for 7-joint arms with a pose task."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,9 +13,9 @@ from orthocas.problem import Problem
 
 @dataclass(frozen=True)
 class SEW:
-    """xi(q) = psi(q), the turn of the elbow about the line from shoulder to wrist [EW2024].
+    """xi(q) = psi(q), the rotation of the elbow about the line from shoulder to wrist [EW2024].
 
-    A baseline: it names the self-motion well, but nothing makes its gradient orthogonal to the task's.
+    It is a baseline: it describes the self-motion well, but its gradient is not orthogonal to that of the task.
 
     Args:
         kind: "conventional" or "stereographic"; see `orthocas.parametrisations.shoulder_elbow_wrist.sew_angle`.
@@ -36,21 +36,21 @@ class SEW:
         """The angle of the problem's arm.
 
         Raises:
-            InvalidValueError: if the problem does not leave exactly one degree of redundancy.
+            InvalidValueError: if the degree of redundancy is not 1.
             RobotError: if the arm has no shoulder, elbow and wrist.
         """
         if problem.r != 1:
-            raise InvalidValueError("r", problem.r, "1, one SEW angle: take the task pose of a 7-joint arm")
+            raise InvalidValueError("r", problem.r, "1 for one SEW angle: use a pose task and a 7-joint arm")
         return Given.from_function(self.label, problem.n, sew_angle(problem.robot, self.kind))
 
     def closed_form(self, problem: Problem) -> ClosedForm:
-        """No parameters."""
+        """There are no parameters."""
         return self.for_problem(problem).closed_form(problem)
 
     def family(self, space: JointSpace, outputs: int) -> GivenFamily:
-        """Not known yet.
+        """Not available: call `for_problem` first.
 
         Raises:
-            InvalidValueError: always: the angle depends on the robot, which `for_problem` looks at.
+            InvalidValueError: always, because the angle depends on the robot.
         """
         raise InvalidValueError("parametrisation", self.label, "the angle of a robot: for_problem(problem)")

@@ -1,4 +1,4 @@
-"""The shoulder-elbow-wrist (SEW) angle of a seven-joint arm: one number for where the elbow is."""
+"""The shoulder-elbow-wrist (SEW) angle of a seven-joint arm: one number for the position of the elbow."""
 
 import casadi as ca
 import numpy as np
@@ -11,35 +11,36 @@ from orthocas.robots.kinematics import Pose, body_poses
 
 SEW_KINDS = ("conventional", "stereographic")
 
-# (e_t, e_r) in the world. The singular half-line e_t points down into the base; e_r = -x puts psi = 0, not the jump
-# at +-pi, where the arm reaches along +x with its elbow up.
+# (e_t, e_r) in the world. The singular half-line e_t points down into the base. With e_r = -x, an arm that reaches
+# along +x with its elbow up has psi = 0, far from the jump at +-pi.
 _DIRECTIONS = {
     "conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)),
 }
-_MEETING = 1e-5  # axes this close meet [m]
-_PARALLEL = 1e-6  # axes at an angle this small are parallel [rad]
+_MEETING = 1e-5  # axes closer than this meet [m]
+_PARALLEL = 1e-6  # axes at a smaller angle are parallel [rad]
 
 
 def sew_angle(robot: Robot, kind: str) -> ca.Function:
-    """The SEW angle psi(q): how far the elbow is turned about the line from shoulder to wrist.
+    """The SEW angle psi(q): the rotation of the elbow about the line from shoulder to wrist.
 
     S is the point where axes 1, 2 and 3 meet, W the point where axes 5 and 6 meet, E the point of axis 4 nearest to
     axis 3. With p_SE = E - S, p_SW = W - S and e_SW = p_SW / |p_SW|,
 
-        k_r = (e_SW - e_t) x e_r,  k_x = k_r x p_SW,  psi = atan2(e_SW . (k_x x p_SE), k_x . p_SE):
+        k_r = (e_SW - e_t) x e_r,  k_x = k_r x p_SW,  psi = atan2(e_SW . (k_x x p_SE), k_x . p_SE).
 
-    the angle about e_SW, right-handed, from the half-plane of k_x to the half-plane of E. Where axis 7 meets W too, a
-    motion that keeps the tip's pose turns E about a fixed line, and psi by as much; elsewhere W moves with the elbow.
+    This is the right-handed angle about e_SW from the half-plane of k_x to the half-plane of E. If axis 7 also meets W,
+    a motion that keeps the tip's pose rotates E about a fixed line, and psi by the same angle. Otherwise W moves with
+    the elbow.
 
     - conventional: e_t = 0, e_r = z, so that k_x is e_r across e_SW: psi = 0 in the vertical plane of S and W with
       the elbow up. Singular where W is straight above or straight below S: a line, which upright arms reach.
-    - stereographic: e_t = -z, e_r = -x, so that k_x is e_r turned along with e_SW from +z by the shortest way.
-      Singular where W is straight below S only: a half-line, inside the base of an arm that stands upright.
+    - stereographic: e_t = -z, e_r = -x, so that k_x is e_r rotated with e_SW from +z by the shortest way.
+      Singular only where W is straight below S: a half-line, inside the base of an upright arm.
 
     Both are undefined where S, E and W lie on one line, as in a stretched arm. Near a singularity the gradient grows
-    like 1 / distance; at it psi is arbitrary and its gradient huge or NaN. psi jumps between -pi and pi, its gradient
-    does not.
+    like 1 / distance. At a singularity psi is arbitrary, and its gradient is huge or NaN. psi jumps between -pi and pi,
+    its gradient does not.
 
     Args:
         robot: a chain of seven revolute joints. Its z axis is the up direction above.
@@ -54,8 +55,8 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
             and W.
 
     Source:
-        Both angles and where they are singular: [EW2024]. E as the foot of the common normal of axes 3 and 4, e_r = -x
-        and writing the conventional angle as e_t = 0 are our choices.
+        Both angles and their singularities: [EW2024]. The choice of E (the foot of the common normal of axes 3 and 4)
+        and of e_r = -x is ours, and so is the conventional angle as the case e_t = 0.
     """
     require_known("SEW angle", kind, SEW_KINDS)
     _require_seven_revolute(robot.tree)
@@ -68,7 +69,7 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
 
 
 def _angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.SX:
-    """Psi of columns (3, 1); atan2 needs no unit k_x."""
+    """psi of columns (3, 1). atan2 needs no unit k_x."""
     e_SW = p_SW / ca.norm_2(p_SW)
     k_r = ca.cross(e_SW - e_t, e_r)
     k_x = ca.cross(k_r, p_SW)
@@ -84,8 +85,8 @@ def _on_axis(pose: Pose, height: float) -> ca.SX:
 def _heights(tree: KinematicTree) -> tuple[float, float, float]:
     """Heights [m] of S on axis 1, of E on axis 4 and of W on axis 5, above the origins of bodies 1, 4 and 5.
 
-    What neighbouring axes share does not depend on q, so that no posture is needed: S stays in the base and in bodies
-    1 to 3, E in bodies 3 and 4, W in bodies 4 to 6.
+    The heights do not depend on q, because neighbouring axes are fixed to each other: S is fixed in the base and in
+    bodies 1 to 3, E in bodies 3 and 4, and W in bodies 4 to 6.
     """
     names = tree.joint_names
     shoulder, on_2, gap_12 = _common_normal(tree, 0)
@@ -100,19 +101,21 @@ def _heights(tree: KinematicTree) -> tuple[float, float, float]:
             )
     if abs(on_2 - also_on_2) > _MEETING:
         raise RobotError(
-            f"the axes of joints '{names[0]}' and '{names[2]}' meet that of '{names[1]}' in points "
+            f"the axes of joints '{names[0]}' and '{names[2]}' meet that of '{names[1]}' at points "
             f"{abs(on_2 - also_on_2):.3g} m apart, expected one point within {_MEETING:g} m"
         )
     return shoulder, elbow, wrist
 
 
 def _common_normal(tree: KinematicTree, i: int) -> tuple[float, float, float]:
-    """Ends of the common normal of axes i and i + 1, as heights on each, and its length [m]."""
+    """Ends of the common normal of axes i and i + 1, as heights on the two axes, and its length [m]."""
     origin, axis = tree.translations[i + 1], tree.rotations[i + 1][:, 2]  # of joint i + 1 in body i, whose axis is z
     across = axis[:2]
     if np.linalg.norm(across) < _PARALLEL:
         names = tree.joint_names
-        raise RobotError(f"the axes of joints '{names[i]}' and '{names[i + 1]}' are parallel, expected an angle")
+        raise RobotError(
+            f"the axes of joints '{names[i]}' and '{names[i + 1]}' are parallel, expected axes at an angle"
+        )
     height = -float(origin[:2] @ across) / float(across @ across)
     end = origin + height * axis
     return float(end[2]), height, float(np.linalg.norm(end[:2]))

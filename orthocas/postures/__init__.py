@@ -1,3 +1,3 @@
-"""Postures that suit a task: where a domain lies when none is given."""
+"""Postures that suit a task. They are the centres of default domains."""
 
 __all__: list[str] = []

@@ -1,4 +1,4 @@
-"""A default domain for a task: the middle of the joint limits, or a bent posture if the task is singular there."""
+"""The default domain of a task: around the middle of the joint limits, or around a bent posture if it is singular."""
 
 from dataclasses import dataclass
 from itertools import combinations
@@ -11,29 +11,29 @@ from orthocas.domains import Box, default_box, default_half_width, sample_evenly
 from orthocas.robots import Robot
 from orthocas.tasks import Task
 
-_REGULAR = 0.04  # regularity from which the middle of the limits stays: 5 % of the box may have less
-_SAMPLES, _WORST = 24, 6  # samples that judge a candidate, by the mean of the worst of them
-_JUDGES = 256  # samples that judge the middle
-_FARTHEST = np.pi / 2  # [rad] from the middle
-_FIRST_BEND = 0.75  # of the way a joint may go
-_BENDS = np.linspace(-1, 1, 9)  # of that way, when one joint after the other finds its place
-_PENALTY = 0.015  # regularity that a bend by 1 rad must bring
+_REGULAR = 0.04  # regularity that keeps the middle of the limits; 5 % of the box may have less
+_SAMPLES, _WORST = 24, 6  # samples of a candidate; the mean of the worst 6 counts
+_JUDGES = 256  # samples of the middle
+_FARTHEST = np.pi / 2  # largest distance from the middle [rad]
+_FIRST_BEND = 0.75  # first bend, as a share of a joint's range
+_BENDS = np.linspace(-1, 1, 9)  # later bends, as shares of the range, one joint at a time
+_PENALTY = 0.015  # regularity that a bend of 1 rad must gain
 _ROUNDS = 10
 
 
 def regular_box(robot: Robot, task: Task) -> Box:
-    """The default box of a robot, moved to a bent posture if the task is singular in its middle or close by.
+    """The default box of a robot, moved to a bent posture if the task is singular in or near its middle.
 
-    A posture is as good as its box is regular, less 0.015 for every radian between it and the middle of the limits.
-    Candidates bend one or two joints; from the best one, joints move one at a time while that improves it. Sliding
-    joints stay in the middle. The choice is deterministic.
+    The score of a posture is the regularity of its box, less 0.015 for every radian from the middle of the limits.
+    Candidates bend one or two joints. From the best candidate, joints move one at a time while the score improves.
+    Prismatic joints stay in the middle. The choice is deterministic.
 
     Args:
         robot: the robot.
-        task: a task of that robot; a reference that it lacks is taken at the centre of each box.
+        task: a task of that robot. A missing reference is taken at the centre of each box.
 
     Source:
-        Ours.
+        ours.
     """
     box = default_box(robot)
     judge = _Judge.of(robot, task, box)
@@ -52,13 +52,13 @@ def regular_box(robot: Robot, task: Task) -> Box:
 
 @dataclass(frozen=True)
 class _Judge:
-    """How regular a task is on the default boxes about other postures."""
+    """Scores postures: how regular a task is on the default boxes around them."""
 
     robot: Robot
     m: int
     jacobian: Batched
     middle: Array
-    scale: Array  # of the rows of J_x, (m,)
+    scale: Array  # scale of the rows of J_x, (m,)
 
     @classmethod
     def of(cls, robot: Robot, task: Task, box: Box) -> "_Judge":
@@ -68,10 +68,10 @@ class _Judge:
         return cls(robot, task.m, jacobian, box.centre, _row_scale(J, task.units))
 
     def regularity(self, centres: Array, samples: int) -> Array:
-        """Smallest singular values of [J_x; N^T] on the boxes about centres (N, n), (N, samples + 1).
+        """Smallest singular values of [J_x; N^T] on the boxes around centres (N, n), (N, samples + 1).
 
-        Rows of J_x are of order one, N is an orthonormal basis of the self-motions at the centre. It vanishes where the
-        task is singular, and where coordinates that are straight along the self-motions of the centre fold over.
+        Rows of J_x are scaled to order one, and N is an orthonormal basis of the self-motions at the centre. The value
+        is zero where the task is singular, and where coordinates along the self-motions of the centre fold over.
         """
         n = self.robot.n
         unit = np.vstack([np.zeros(n), sample_evenly(Box(np.zeros(n), 1.0), samples, 0)])
@@ -84,7 +84,7 @@ class _Judge:
         return np.asarray(np.linalg.svd(stacked, compute_uv=False)[..., -1])
 
     def best(self, offsets: Array) -> tuple[Array, float]:
-        """The best of some offsets from the middle (N, n), and its value."""
+        """The best of the offsets (N, n) from the middle, and its score."""
         worst = np.sort(self.regularity(self.middle + offsets, _SAMPLES - 1), axis=1)[:, :_WORST].mean(axis=1)
         values = worst - _PENALTY * np.abs(offsets).sum(axis=1)
         k = int(np.argmax(values))
@@ -92,14 +92,14 @@ class _Judge:
 
 
 def _bent_postures(way: Array) -> Array:
-    """No bend, one joint bent, or two, either way."""
+    """Offsets with no joint, one joint or two joints bent, in both directions."""
     single = [sign * _FIRST_BEND * row for row in np.diag(way)[way > 0] for sign in (-1, 1)]
     double = [a + b for a, b in combinations(single, 2) if not (a * b).any()]
     return np.array([np.zeros(len(way)), *single, *double])
 
 
 def _one_joint_moved(posture: Array, way: Array) -> Array:
-    """The posture, and those where one joint is elsewhere on its way."""
+    """The posture, and those with one joint moved within its range."""
     moved = [posture]
     for i in np.flatnonzero(way):
         for bend in _BENDS:
@@ -109,7 +109,7 @@ def _one_joint_moved(posture: Array, way: Array) -> Array:
 
 
 def _row_scale(J: Array, units: tuple[str, ...]) -> Array:
-    """Root mean square length of the rows with the same unit, (m,), so that turned axes give the same; 1 for none."""
+    """Root mean square length of the rows of each unit, (m,). It does not depend on how axes are turned; 1 if zero."""
     squares = (J**2).sum(axis=2).mean(axis=0)
     groups = [unit or f"own {i}" for i, unit in enumerate(units)]
     means = [
@@ -119,5 +119,5 @@ def _row_scale(J: Array, units: tuple[str, ...]) -> Array:
 
 
 def _finite(J: Array) -> Array:
-    """Singular where it is not finite."""
+    """J with zeros, that is singular, where it is not finite."""
     return np.where(np.isfinite(J), J, 0.0)

@@ -1,4 +1,4 @@
-"""The figures of [AS2023], drawn again with numbers that are printed and tested."""
+"""Reproductions of the figures of [AS2023], with numbers that are printed and tested."""
 
 from orthocas.reproduce.drawing import Drawing, save
 from orthocas.reproduce.registry import FIGURES, Recipe, reproduce

@@ -1,4 +1,4 @@
-"""Meshes that show what lies on them: their own triangles, or isolines of several functions."""
+"""Meshes drawn with their own triangles, or with isolines of several functions."""
 
 from collections.abc import Sequence
 
@@ -9,18 +9,18 @@ from orthocas.checks import Array
 from orthocas.reproduce.painting import Isolines, Numbers, cut, paint
 from orthocas.reproduce.scene import Scene
 
-_SAME = 9  # decimals of corners that are one [rad]
+_SAME = 9  # corners that agree in this many decimals are one point [rad]
 
 
 def add_with_lines(scene: Scene, vertices: Array, faces: Numbers, colour: str, families: Sequence[Isolines]) -> None:
-    """Add a triangle mesh with several families of isolines; later families cross over earlier ones.
+    """Add a triangle mesh with several families of isolines. Later families are drawn over earlier ones.
 
     Args:
-        scene: where to add it.
+        scene: scene to add the mesh to.
         vertices: (V, 3).
         faces: (F, 3).
-        colour: of the mesh.
-        families: values at its vertices, levels and looks.
+        colour: colour of the mesh.
+        families: values at the vertices, levels and style of each family.
     """
     corners, colours = vertices[faces], np.tile((*to_rgb(colour), 1.0), (len(faces), 1))
     values = [lines.values[faces] for lines in families]
@@ -42,12 +42,12 @@ def part_below(
     Args:
         vertices: (V, 3).
         faces: (F, 3).
-        height: that function at the vertices, (V,).
-        level: where the mesh is cut.
-        values: more functions at the vertices, (V, k).
+        height: values of the function at the vertices, (V,).
+        level: value at which the mesh is cut.
+        values: other functions at the vertices, (V, k).
 
     Returns:
-        Vertices, faces and values of the part.
+        Vertices, faces and values of this part.
     """
     corners = np.concatenate([vertices, height[:, None], values], axis=1)[faces]
     pieces, _ = cut(corners, np.arange(len(faces)), np.full(len(faces), level))
@@ -56,15 +56,15 @@ def part_below(
 
 
 def add_with_edges(scene: Scene, vertices: Array, faces: Numbers, colours: Array, edge: Array, width: float) -> None:
-    """Add a triangle mesh with its edges drawn as borders within the triangles, which stay flat.
+    """Add a triangle mesh with its edges drawn as borders inside the triangles, which stay flat.
 
     Args:
-        scene: where to add it.
+        scene: scene to add the mesh to.
         vertices: (V, 3).
         faces: (F, 3).
-        colours: of the triangles, RGB (F, 3).
-        edge: colour of edges, RGB (3,).
-        width: of an edge, the borders of both its triangles together.
+        colours: colours of the triangles, RGB (F, 3).
+        edge: colour of the edges, RGB (3,).
+        width: width of an edge, which covers the borders of both its triangles.
     """
     corners = vertices[faces]
     opposite = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)  # (F, 3)
@@ -93,7 +93,7 @@ def _shares(corners: Array, points: Array) -> Array:
 
 
 def _welded(corners: Array) -> tuple[Array, Numbers]:
-    """Points (P, k) and faces (F, 3) of triangles (F, 3, k): equal corners become one point."""
+    """Points (P, k) and faces (F, 3) of triangles (F, 3, k), with equal corners merged into one point."""
     flat = corners.reshape(-1, corners.shape[2])
     _, first, number = np.unique(np.round(flat, _SAME), axis=0, return_index=True, return_inverse=True)
     return flat[first], number.reshape(-1, 3)

@@ -1,6 +1,6 @@
-"""Panels of closed loops: coordinates and joints over time, projections on coordinate planes.
+"""Panels of closed loops: coordinates and joints over time, and projections on coordinate planes.
 
-What was asked for is wide and pale, what came is thin and dark.
+The reference curve is wide and pale; the measured curve is thin and dark.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ _NAMES = {"x": "$x$", "y": "$y$", "xi1": r"$\xi_1$", "xi2": r"$\xi_2$"}
 
 
 def symbol(run: Run, label: str) -> str:
-    """A coordinate in mathematical text; a single extra coordinate has no number."""
+    """The symbol of a coordinate in mathematical text; a single extra coordinate has no number."""
     return r"$\xi$" if label == "xi1" and run.chart.r == 1 else _NAMES[label]
 
 
@@ -34,14 +34,14 @@ def _with_unit(run: Run, label: str) -> str:
 
 
 def moved(run: Run, label: str) -> tuple[Array, Array]:
-    """Actual and desired values of a coordinate, counted from the start, (N,) each."""
+    """Actual and desired values of a coordinate relative to the start, (N,) each."""
     k = run.chart.labels.index(label)
     start = run.reference.start[k]
     return run.trajectory.value[:, k] - start, run.trajectory.reference[:, k] - start
 
 
 def draw_coordinates(axes: Any, run: Run) -> None:
-    """All coordinates over time, counted from their values at the start."""
+    """Draw all coordinates over time, relative to their values at the start."""
     for label in run.chart.labels:
         actual, desired = moved(run, label)
         axes.plot(run.trajectory.times, desired, color=COLOURS[label], linewidth=_WIDE, alpha=_PALE)
@@ -50,7 +50,7 @@ def draw_coordinates(axes: Any, run: Run) -> None:
 
 
 def draw_joints(axes: Any, run: Run) -> None:
-    """Joint angles over time, counted from their values at the start."""
+    """Draw joint angles over time, relative to their values at the start."""
     for joint, colour in enumerate(JOINTS):
         angle = run.trajectory.q[:, joint] - run.trajectory.q[0, joint]
         axes.plot(run.trajectory.times, angle, color=colour, linewidth=_THIN + 0.3)
@@ -58,7 +58,7 @@ def draw_joints(axes: Any, run: Run) -> None:
 
 
 def finish(axes: Any, run: Run) -> None:
-    """Ticks, grid and limits of a panel over time; grey where the controller gave its fallback."""
+    """Set ticks, grid and limits of a panel over time; shade in grey where the controller used its fallback."""
     times = run.trajectory.times
     axes.fill_between(
         times, 0, 1, where=run.trajectory.status != ControlStatus.OK, transform=axes.get_xaxis_transform(), color="0.85"
@@ -69,7 +69,7 @@ def finish(axes: Any, run: Run) -> None:
 
 
 def draw_plane(axes: Any, run: Run, across: str, up: str) -> None:
-    """The trajectory projected on the plane of two coordinates."""
+    """Draw the trajectory projected on the plane of two coordinates."""
     (actual_across, desired_across), (actual_up, desired_up) = moved(run, across), moved(run, up)
     axes.plot(desired_across, desired_up, color="0.4", linewidth=_WIDE, alpha=_PALE)
     axes.plot(actual_across, actual_up, color=INK, linewidth=_THIN)
@@ -79,7 +79,7 @@ def draw_plane(axes: Any, run: Run, across: str, up: str) -> None:
 
 
 def draw_planes(figure: Figure, cell: Any, run: Run) -> list[Any]:
-    """Projections on all three planes of three coordinates, with common axes; the first of four places stays empty."""
+    """Draw projections on all three planes of three coordinates with shared axes; one of the four cells stays empty."""
     first, second, third = run.chart.labels
     grid = cell.subgridspec(2, 2, wspace=0.0, hspace=0.0)
     lower_left = figure.add_subplot(grid[1, 0])
@@ -98,12 +98,12 @@ def draw_planes(figure: Figure, cell: Any, run: Run) -> list[Any]:
 
 
 def name_panel(axes: Any, text: str) -> None:
-    """A title at the left end above a panel."""
+    """Put a title above a panel, on the left."""
     axes.set_title(text, fontsize=LABEL, loc="left", pad=4)
 
 
 def curve_legend(figure: Figure, run: Run, joints: bool = True, extra: Sequence[Line2D] = ()) -> None:
-    """One line below everything: colours of coordinates and joints, and what pale and dark mean."""
+    """Add one line at the bottom with the colours of coordinates and joints, and the meaning of pale and dark."""
     handles = [Line2D([], [], color=COLOURS[c], linewidth=2, label=symbol(run, c)) for c in run.chart.labels]
     if joints:
         handles += [Line2D([], [], color=c, linewidth=2, label=f"$q_{k}$") for k, c in enumerate(JOINTS, 1)]
@@ -129,7 +129,7 @@ def _style(axes: Any) -> None:
 
 
 def interleaved(chart: Chart, quick: bool) -> Drawing:
-    """The picture of Figs. 22 and 23 for a chart around the base."""
+    """Draw the picture of Figs. 22 and 23 for a chart around the base."""
     arm = Arm()
     run = follow(chart, arm.base(GENTLE), INTERLEAVED)
     return Drawing(

@@ -1,4 +1,4 @@
-"""What a recipe returns: pictures, numbers and meshes, and how they become files."""
+"""The result of a figure recipe (pictures, numbers and meshes), and its output files."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -15,26 +15,26 @@ from orthocas.reproduce.style import DPI
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A figure of the paper, drawn again."""
+    """A reproduced figure of the paper."""
 
     figures: Mapping[str, Figure]  #: suffix of the file name -> picture, {"": ...} or {"a": ..., "b": ...}
-    numbers: Mapping[str, float]  #: what is printed, saved and tested; finite
+    numbers: Mapping[str, float]  #: numbers that are printed, saved and tested; finite
     meshes: Mapping[str, trimesh.Trimesh] = field(default_factory=dict)  #: suffix -> printable solid [mm]
 
 
 def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
-    """Write `<name><suffix>.png`, `<name>_<suffix>.stl` and `<name>.json`; each appears whole or not at all.
+    """Write `<name><suffix>.png`, `<name>_<suffix>.stl` and `<name>.json`. Each file appears whole or not at all.
 
-    Figures without 3-D axes are written as `<name><suffix>.pdf` too, in vectors. In 3-D these would be large files with
-    hairlines between triangles.
+    Figures without 3-D axes are also written as vector graphics, `<name><suffix>.pdf`. In 3-D these files would be
+    large, with hairlines between triangles.
 
     Args:
-        drawing: what to write.
-        name: how file names begin, for example "fig07".
-        out: a folder that exists.
+        drawing: the drawing to write.
+        name: prefix of the file names, for example "fig07".
+        out: an existing folder.
 
     Returns:
-        The files, numbers last.
+        The files, with the numbers last.
 
     Raises:
         ValueError: if a number is not finite.
@@ -50,7 +50,7 @@ def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
     for suffix, mesh in drawing.meshes.items():
         writers[f"{name}_{suffix}.stl"] = mesh.export
     writers[f"{name}.json"] = lambda draft: draft.write_text(text)
-    with published(folder) as drafts:  # all at once, so that numbers belong to the picture beside them
+    with published(folder) as drafts:  # all at once, so that the numbers match the pictures
         for file, write in writers.items():
             write(drafts / file)
     return [folder / file for file in writers]

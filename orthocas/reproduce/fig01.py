@@ -1,8 +1,8 @@
 """[AS2023] Fig. 1: leaves of the task x of the planar arm with three joints, and orthogonal leaves.
 
-Coordinates (xi1, xi2) of the base leaf x = 0 are those of Fig. 15. All surfaces are grids in (x, xi1, xi2),
-carried along the task gradients from the base leaf: patches of two task leaves, and leaves of xi1 and xi2 through the
-middle of these.
+The coordinates (xi1, xi2) of the base leaf x = 0 are those of Fig. 15. All surfaces are grids in (x, xi1, xi2), carried
+along the task gradients from the base leaf. They are patches of two task leaves, and leaves of xi1 and xi2 through the
+middle of these patches.
 """
 
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.style import INK, LABEL, add_3d, joint_cube, line_legend, new_figure
 
 _MIDDLE, _REACH = np.array([-0.45, 0.3]), np.array([0.12, 0.22])  # of the patch in the disk of (xi1, xi2)
-_VALUES = (-0.5, 0.5)  # of x on the task leaves [m]
-_BEYOND = 1.5  # how much farther than the patch, and than the task leaves, the leaves of xi reach
-_AT = np.array([0.5, -0.1, 0.15])  # x [m] and xi, counted from the middle, where gradients are drawn
-_ARROW = 0.48  # their length in the picture [rad]
-_LIFT = 0.045  # of the arrows above the leaf [rad]
+_VALUES = (-0.5, 0.5)  # x on the task leaves [m]
+_BEYOND = 1.5  # size of the leaves of xi, relative to the patch and to the distance of the task leaves
+_AT = np.array([0.5, -0.1, 0.15])  # x [m] and xi, relative to the middle, where gradients are drawn
+_ARROW = 0.48  # length of the gradients in the picture [rad]
+_LIFT = 0.045  # height of the arrows above the leaf [rad]
 _SHEET = "#8ab6f2"
 _GRADIENTS = {r"$\nabla x$": INK, r"$\nabla\xi_1$": FIRST, r"$\nabla\xi_2$": "#a87e00"}
 _LOW, _HIGH = np.array([1, -5, 3]) * np.pi / 8, np.array([6, 2, 8]) * np.pi / 8
@@ -39,7 +39,7 @@ class Grid:
     """A surface as a square grid of points."""
 
     points: Array  #: (N, N, 3)
-    xi: Array  #: counted from the middle, (N, N, 2)
+    xi: Array  #: relative to the middle, (N, N, 2)
 
     @property
     def faces(self) -> Numbers:
@@ -58,9 +58,9 @@ class Grid:
 
 
 def draw(quick: bool) -> Drawing:
-    """Two task leaves, a leaf of xi1, one of xi2, and gradients; numbers tell the angles between them."""
+    """Draw two task leaves, a leaf of xi1, a leaf of xi2, and gradients; the numbers are the angles between them."""
     coordinates, _ = grown_disk(30 if quick else 100)
-    half = 8 if quick else 20  # times _BEYOND is a whole number, so that all surfaces share points where they meet
+    half = 8 if quick else 20  # half times _BEYOND is a whole number, so that all surfaces share points where they meet
     sheet, wide = (np.linspace(-b, b, 2 * int(b * half) + 1) for b in (1.0, _BEYOND))
     task_leaves = [grid(coordinates, np.array([x]), _REACH[0] * sheet, _REACH[1] * sheet) for x in _VALUES]
     heights, zero = wide * _VALUES[-1], np.zeros(1)
@@ -77,7 +77,7 @@ def draw(quick: bool) -> Drawing:
 
 
 def grid(coordinates: GrownCoordinates, x: Array, first: Array, second: Array) -> Grid:
-    """Points with all combinations of x, xi1 and xi2 (counted from the middle), one of which has a single value."""
+    """Points with all combinations of x, xi1 and xi2 (relative to the middle); one of the three has a single value."""
     x, first, second = np.meshgrid(x, first, second, indexing="ij")
     xi = np.stack([first.ravel(), second.ravel()], axis=1)
     on_leaf = coordinates.leaf.points(_MIDDLE + xi)
@@ -102,7 +102,7 @@ def _scene(task_leaves: list[Grid], walls: list[Grid]) -> Scene:
 
 
 def _add_gradients(axes: Any, scene: Scene, coordinates: GrownCoordinates) -> None:
-    """Arrows a little above a task leaf, with their names."""
+    """Draw arrows with their names a little above a task leaf."""
     on_leaf = grid(coordinates, _AT[:1], _AT[1:2], _AT[2:]).points[0]
     gradients = np.concatenate(_jacobians(coordinates, on_leaf), axis=1)[0]
     units = gradients / np.linalg.norm(gradients, axis=1, keepdims=True)

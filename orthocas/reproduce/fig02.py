@@ -1,8 +1,8 @@
 """[AS2023] Fig. 2: a spring along the self-motion manifold, and a projected spring that is stuck, with real numbers.
 
-The arm and both springs are those of `orthocas.reproduce.hidden_spring`. Each joint is drawn at the scale of the square
-root of its stiffness: then the energy of the posture spring goes with the square of its drawn length, its torque points
-along it, and a torque that the projector hides is drawn at right angles to the curve.
+The arm and both springs are those of `orthocas.reproduce.hidden_spring`. Each joint axis is scaled by the square root
+of the joint's stiffness. So the energy of the posture spring is proportional to the square of its drawn length, its
+torque points along the spring, and a torque that the projector hides is orthogonal to the curve.
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ from orthocas.reproduce.style import EXTRA, GREY, INK, LABEL, TASK, THIRD, TICK,
 
 _NEARER = 0.5  # distance of the tip from the base at which the spring comes free [m]
 _SCALE = np.sqrt(np.asarray(POSTURE_STIFFNESS) / max(POSTURE_STIFFNESS))
-_LOW, _HIGH = np.array([-3.8, 1.2, 1.2]), np.array([2.7, 2.85, 2.85])  # of the picture [rad]
+_LOW, _HIGH = np.array([-3.8, 1.2, 1.2]), np.array([2.7, 2.85, 2.85])  # corners of the picture [rad]
 _TICKS = ((-3.0, 0.0), (1.5, 2.0, 2.5), (1.5, 2.0, 2.5))  # [rad]
 _VIEW = (20, -20)
 _COIL, _DISK = 0.06, 0.2  # radii in the picture
@@ -26,9 +26,9 @@ _RINGS = 0.25  # step of xi between two marks
 
 
 def draw(quick: bool) -> Drawing:
-    """Both springs, and the energy in them along the curve; numbers tell what is hidden.
+    """Draw both springs and their energy along the curve; the numbers show what is hidden.
 
-    `quick` makes no difference: all of it takes a second.
+    `quick` has no effect, because the figure takes only a second.
     """
     spring = HiddenSpring()
     figure = new_figure(5.4, layout=None)
@@ -45,7 +45,7 @@ def draw(quick: bool) -> Drawing:
 
 
 def _scene(spring: HiddenSpring, geodetic: bool) -> Scene:
-    """The curve, the spring as a coil, and start and goal; on the left marks of xi, on the right the torque."""
+    """The curve, the spring as a coil, start and goal, with marks of xi on the left and the torque on the right."""
     scene = Scene()
     scene.add_cube(_LOW * _SCALE, _HIGH * _SCALE, 0.006)
     scene.add_tube(spring.curve * _SCALE, 0.016, TASK)
@@ -65,7 +65,7 @@ def _scene(spring: HiddenSpring, geodetic: bool) -> Scene:
 
 
 def _label(axes: Any, spring: HiddenSpring, geodetic: bool) -> None:
-    """Names of points and axes; ticks tell joint angles, whatever the scale."""
+    """Add names of points and axes; ticks show joint angles, whatever the scale."""
     for q, text in ((spring.stuck, "$q$"), (spring.goal, "$q_d$")):
         axes.text(*(q * _SCALE + np.array([0, 0, 0.12])), text, fontsize=LABEL, ha="center")
     if not geodetic:
@@ -83,7 +83,7 @@ def _label(axes: Any, spring: HiddenSpring, geodetic: bool) -> None:
 
 
 def _draw_energy(axes: Any, spring: HiddenSpring, geodetic: bool) -> None:
-    """Energy along the self-motion curve, over the first joint, which grows all the way."""
+    """Draw the energy along the self-motion curve against the first joint, which grows monotonically."""
     curve = _charted(spring)
     places = np.array([spring.stuck, spring.goal])
     if geodetic:
@@ -118,7 +118,7 @@ def _way(spring: HiddenSpring) -> Array:
 
 
 def _marks(spring: HiddenSpring, path: Array) -> Array:
-    """Points of a path at even steps of xi."""
+    """Points of a path at equal steps of xi."""
     xi = spring.chart.xi(path)[:, 0]
     steps = np.arange(np.ceil(xi.min() / _RINGS), np.floor(xi.max() / _RINGS) + 1) * _RINGS
     order = np.argsort(xi)
@@ -126,13 +126,13 @@ def _marks(spring: HiddenSpring, path: Array) -> Array:
 
 
 def _arrow(spring: HiddenSpring) -> Array:
-    """The torque of the posture spring at the stuck point as it is drawn, (3,)."""
+    """The torque of the posture spring at the stuck point, in drawing scale, (3,)."""
     torque = spring.posture_torque(spring.stuck) / _SCALE
     return np.asarray(0.4 * torque / np.linalg.norm(torque))
 
 
 def _disk(spring: HiddenSpring) -> tuple[Array, Array]:
-    """A disk at the stuck point, at right angles to the drawn curve: vertices and faces."""
+    """A disk at the stuck point, orthogonal to the drawn curve: vertices and faces."""
     near = np.argsort(np.abs(spring.curve[:, 0] - spring.stuck[0]))[:2]
     normal = (spring.curve[near[1]] - spring.curve[near[0]]) * _SCALE
     first = np.cross(normal, _arrow(spring))
@@ -145,7 +145,7 @@ def _disk(spring: HiddenSpring) -> tuple[Array, Array]:
 
 
 def _coil(path: Array, turns: int, lead: float) -> Array:
-    """A spring around a path (P, 3), straight in a first share of it."""
+    """A coil around a path (P, 3), straight in the first share `lead` of it."""
     share = np.linspace(0, 1, 32 * turns)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     middle = np.stack([np.interp(share * length[-1], length, axis) for axis in path.T], axis=1)
@@ -177,6 +177,6 @@ def _numbers(spring: HiddenSpring) -> dict[str, float]:
 
 
 def _minima(energy: Array) -> float:
-    """How often an energy stops falling before the last point; the first point counts if it is a minimum."""
+    """Number of times an energy stops falling before the last point; the first point counts if it is a minimum."""
     rising = np.diff(energy) > 0
     return float(rising[0]) + float(np.count_nonzero(~rising[:-1] & rising[1:]))

@@ -18,14 +18,14 @@ from orthocas.reproduce.style import EXTRA, INK, LABEL, TICK, TURN, add_3d, join
 from orthocas.tasks import Task
 
 LEVELS = np.linspace(-2, 2, 20)  #: task values [m]
-_LABELLED = (1, 3, 5, 7)  # numbers of the levels with a label, counted from either end
+_LABELLED = (1, 3, 5, 7)  # indices of the labelled levels, counted from either end
 _BIG, _SMALL = 2.0, 0.95  # radii of the torus in the picture
 _SHADES = mpl.colormaps["viridis"].resampled(256)
 _NORM = Normalize(-2.0, 2.0)
 
 
 def draw(quick: bool) -> Drawing:
-    """Both panels; numbers tell how many singular points there are and how exact lines and points are."""
+    """Draw both panels; the numbers are the count of singular points and the accuracy of lines and points."""
     task = problems.get("planar_2r").task
     singular, gradient, indices = singular_points(task)
     figure = new_figure(2.9, layout=None)
@@ -70,7 +70,7 @@ def singular_points(task: Task) -> tuple[Array, float, int]:
     found = points[(np.abs(evaluate(points)[0]).max(axis=1) < 1e-12) & (np.abs(points).max(axis=1) < np.pi + 1e-9)]
     found = found[np.unique(np.round(found, 6), axis=0, return_index=True)[1]]
     slope, curvature = evaluate(found)
-    once = np.all(found > -np.pi + 1e-6, axis=1)  # opposite edges are the same
+    once = np.all(found > -np.pi + 1e-6, axis=1)  # opposite edges are identical
     return found, float(np.abs(slope).max()), int(np.sign(np.linalg.det(curvature[once])).sum())
 
 
@@ -81,7 +81,7 @@ def embedded(q: Array) -> Array:
 
 
 def _draw_plane(axes: Any, task: Task, singular: Array, cells: int) -> tuple[Array, Array]:
-    """Level sets in the plane; returns the points of the lines (N, 2) and their levels (N,)."""
+    """Draw level sets in the plane; return the points of the lines (N, 2) and their levels (N,)."""
     q = np.linspace(-np.pi, np.pi, cells + 1)
     points = np.stack(np.meshgrid(q, q), axis=-1).reshape(-1, 2)
     h = task.batched(points)[0].reshape(cells + 1, cells + 1)
@@ -95,7 +95,7 @@ def _draw_plane(axes: Any, task: Task, singular: Array, cells: int) -> tuple[Arr
 
 
 def _label_places(task: Task) -> list[tuple[float, float]]:
-    """Where rays from the maximum and the minimum, near the long axes of the ovals, meet the labelled levels."""
+    """Places of the labels: rays from maximum and minimum, near the long axes of the ovals, cross the levels there."""
     along = np.linspace(0, 3, 300)[:, None] * [0.6, -1.0]
     places = []
     for start, sign in (((0.0, 0.0), 1), ((-np.pi, 0.0), -1)):
@@ -107,7 +107,7 @@ def _label_places(task: Task) -> list[tuple[float, float]]:
 
 
 def _draw_torus(axes: Any, task: Task, singular: Array, cells: int) -> None:
-    """The same lines on the torus, and the singular points as balls."""
+    """Draw the same lines on the torus, and the singular points as balls."""
     around, along = np.arange(cells) * TURN / cells, np.arange(cells // 2) * 2 * TURN / cells
     q = np.stack(np.meshgrid(around, along, indexing="ij"), axis=-1).reshape(-1, 2)
     lines = Isolines(task.batched(q)[0][:, 0], LEVELS, _SHADES(_NORM(LEVELS)), 0.045)
@@ -122,7 +122,7 @@ def _draw_torus(axes: Any, task: Task, singular: Array, cells: int) -> None:
     axes.text2D(
         0.5,
         -0.06,
-        "singular: two in sight, two behind",
+        "singular: two visible, two hidden",
         fontsize=TICK,
         color=EXTRA,
         ha="center",
@@ -131,7 +131,7 @@ def _draw_torus(axes: Any, task: Task, singular: Array, cells: int) -> None:
 
 
 def torus_faces(rows: int, columns: int) -> Array:
-    """Triangles of a grid whose opposite sides are glued, (2 rows columns, 3)."""
+    """Triangles of a grid with opposite sides identified, (2 rows columns, 3)."""
     number = np.arange(rows * columns).reshape(rows, columns)
     a, b = number, np.roll(number, -1, axis=0)
     c, d = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)

@@ -1,8 +1,8 @@
 """[AS2023] Fig. 7: leaves of the task x of the planar arm with three joints, in the cube 0 <= q_i <= 2 pi.
 
-With absolute angles a = q1, b = q1 + q2, c = q1 + q2 + q3 a leaf is cos a + cos b + cos c = x. Singular are x = +-1 and
-+-3 only. For |x| < 1 the leaf, closed up in the 3-torus, is one surface of genus 3 (Euler characteristic -4), sheared
-from the surface that approximates the Schwarz P surface; for 1 < |x| < 3 it is a sphere.
+With absolute angles a = q1, b = q1 + q2, c = q1 + q2 + q3, a leaf is cos a + cos b + cos c = x. The only singular
+values are x = +-1 and +-3. For |x| < 1, the leaf closes in the 3-torus to one surface of genus 3 (Euler characteristic
+-4), a sheared version of the approximate Schwarz P surface. For 1 < |x| < 3 it is a sphere.
 """
 
 from typing import Any
@@ -22,8 +22,8 @@ from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.style import LABEL, TICK, TURN, add_3d, joint_cube, new_figure
 from orthocas.tasks import Task
 
-_VALUES = (-2.5, -1.7, -0.6, 0.6, 1.7, 2.5)  # of x on the leaves of (b) [m]
-_HEIGHTS = np.linspace(-2.75, 2.75, 12)  # of y on the lines of (a) [m]
+_VALUES = (-2.5, -1.7, -0.6, 0.6, 1.7, 2.5)  # x on the leaves of (b) [m]
+_HEIGHTS = np.linspace(-2.75, 2.75, 12)  # y on the lines of (a) [m]
 _EDGE, _THICKNESS = 100.0, 3.0  # of the printable model [mm]
 _SHADES = mpl.colormaps["viridis"].resampled(256)
 _NORM = Normalize(-3.0, 3.0)
@@ -31,7 +31,7 @@ _VIEW = (24, -58)
 
 
 def draw(quick: bool) -> Drawing:
-    """One leaf with lines of constant y, several leaves, and a printable model; numbers tell what surfaces they are."""
+    """Draw a leaf with lines of constant y, several leaves and a printable model; the numbers identify the surfaces."""
     task = problems.get("planar_3r_x").task
     cells = 31 if quick else 73
     one, several = leaf(task, 0.0, cells), {value: leaf(task, value, cells) for value in _VALUES}

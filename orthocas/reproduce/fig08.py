@@ -1,9 +1,9 @@
 """[AS2023] Fig. 8: self-motion curves of the planar arm with three joints, task (x, y), in the cube of joint angles.
 
-What tells the two classes apart (ours): with links of 1 m, |tip|^2 = 3 + 2 cos q2 + 2 cos q3 + 2 cos(q2 + q3) does not
-depend on q1. It has its maximum at q2 = q3 = 0, saddles of height 1 m^2, and its zeros at q2 = q3 = +-2 pi/3. So a tip
-farther than 1 m has one curve, around the line q2 = q3 = 0, along which q1 swings back and forth. A nearer tip has
-two curves, one around either line of zeros, along which q1 makes a whole turn.
+The two classes differ as follows (ours). With links of 1 m, |tip|^2 = 3 + 2 cos q2 + 2 cos q3 + 2 cos(q2 + q3) does not
+depend on q1. It has its maximum at q2 = q3 = 0, saddles of height 1 m^2, and zeros at q2 = q3 = +-2 pi/3. A tip farther
+away than 1 m therefore has one curve, around the line q2 = q3 = 0, along which q1 swings back and forth. A nearer tip
+has two curves, one around each line of zeros, along which q1 makes a whole turn.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ _ANGLES = TURN * np.arange(3) / 3  # directions of the tip [rad]
 
 
 def draw(quick: bool) -> Drawing:
-    """Two views; numbers tell how exact the curves are and how they divide."""
+    """Draw two views; the numbers show the accuracy of the curves and their division into classes."""
     task = problems.get("planar_3r_xy").task
     starts = np.concatenate([postures(radius, angle) for radius in (*_NEAR, *_FAR) for angle in _ANGLES])
     curves = trace(task, starts, 0.12 if quick else 0.05)
@@ -40,9 +40,9 @@ def draw(quick: bool) -> Drawing:
 
 
 def postures(radius: float, angle: float) -> Array:
-    """One joint position on every self-motion curve of a tip at a radius in (0, 3) [m] and an angle [rad], (1 or 2, 3).
+    """One joint position on each self-motion curve of a tip at a radius in (0, 3) [m] and an angle [rad], (1 or 2, 3).
 
-    With q2 = q3 = s the tip is 1 + 2 cos s from the base, in direction q1 + s.
+    With q2 = q3 = s, the tip lies at distance 1 + 2 cos s from the base, in direction q1 + s.
     """
     s = np.arccos((radius - 1) / 2)
     both = np.array([[angle - s, s, s], [angle + s, -s, -s]])

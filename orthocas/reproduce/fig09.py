@@ -1,7 +1,7 @@
 """[AS2023] Fig. 9: orthogonal foliations of the plane of two joints for dynamic consistency, A = M.
 
-M^-1 J_x^T is tangent to the leaves of xi, to which J_xi is orthogonal; M^-1 J_xi^T is tangent to the leaves of the
-task, to which J_x is orthogonal. Arrows have one length, as if the rows had been scaled.
+M^-1 J_x^T is tangent to the leaves of xi, and J_xi is orthogonal to them. M^-1 J_xi^T is tangent to the leaves of the
+task, and J_x is orthogonal to them. All arrows have the same length, as if the rows were scaled.
 """
 
 from typing import Any
@@ -26,9 +26,9 @@ from orthocas.samples import samples_at
 
 _LOW, _HIGH = np.array([1, -1]) * np.pi / 12, np.array([6, 4]) * np.pi / 12  # corners of the patch [rad]
 _LEVELS = {-0.2: "-3", 0.2: "-2", 0.6: "-1", LEVEL: "0", 1.4: "1"}  # task value [m] -> name of the leaf
-_VALUES = np.linspace(-1.2, 1.2, 19)  # of xi on the leaves drawn [rad]
-_CROSSINGS = ((1.0, -0.5), (1.0, 0.0), (0.6, 0.4), (0.2, 0.1))  # (x, xi) where arrows stand
-_LENGTH = 0.16  # of arrows [rad]
+_VALUES = np.linspace(-1.2, 1.2, 19)  # xi on the leaves in the figure [rad]
+_CROSSINGS = ((1.0, -0.5), (1.0, 0.0), (0.6, 0.4), (0.2, 0.1))  # (x, xi) of the arrows
+_LENGTH = 0.16  # length of arrows [rad]
 _ARROWS = {  # text -> colour, as in the paper
     r"$J_x$": "#0b2f6b",
     r"$M^{-1}J_x^\mathsf{T}$": INK,
@@ -38,7 +38,7 @@ _ARROWS = {  # text -> colour, as in the paper
 
 
 def draw(quick: bool) -> Drawing:
-    """Leaves and arrows; numbers tell how exact the right angles are, and that the gradients are not parallel."""
+    """Draw leaves and arrows; the numbers show the accuracy of right angles, and that gradients are not parallel."""
     chart = grown_chart(planar_problem("inertia"))
     figure = new_figure(3.9, layout=None)
     axes = figure.add_axes((0.1, 0.12, 0.54, 0.86))
@@ -58,7 +58,7 @@ def draw(quick: bool) -> Drawing:
 
 
 def _draw_leaves(axes: Any, chart: Chart, steps: int) -> None:
-    """Leaves of the task with their names, and leaves of xi, which are flow lines through the base leaf."""
+    """Draw leaves of the task with their names, and leaves of xi, which are flow lines through the base leaf."""
     q = np.stack(np.meshgrid(*np.linspace(_LOW, _HIGH, 121).T), axis=-1)
     h = chart.task(q.reshape(-1, 2)).reshape(121, 121)
     widths = [2.4 if level == LEVEL else 1.4 for level in _LEVELS]
@@ -93,7 +93,7 @@ def _add_legend(figure: Any) -> None:
 
 
 def _numbers(chart: Chart, samples: int) -> dict[str, float]:
-    """Facts at random points of the patch."""
+    """Measurements at random points of the patch."""
     points = np.random.default_rng(0).uniform(_LOW, _HIGH, (samples, 2))
     vectors = _vectors(chart, points)
     J_x, _, J_xi, raised_xi = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in vectors)

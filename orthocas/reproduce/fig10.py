@@ -1,11 +1,11 @@
-"""[AS2023] Fig. 10: two ways in task space, lifted along the task gradients, end at different joint positions.
+"""[AS2023] Fig. 10: two paths in task space, lifted along the task gradients, end at different joint positions.
 
 Derivation (ours). The lift of the unit field of task coordinate i is X_i = J^#A e_i. Moving by eps along X_1, then X_2,
-ends at q0 + eps (X_1 + X_2) + eps^2 (X_1' X_1 / 2 + X_2' X_2 / 2 + X_2' X_1) + O(eps^3); in the other order the last
+ends at q0 + eps (X_1 + X_2) + eps^2 (X_1' X_1 / 2 + X_2' X_2 / 2 + X_2' X_1) + O(eps^3). In the other order, the last
 term is X_1' X_2. So q_a - q_b = eps^2 [X_1, X_2] + O(eps^3). Both fields project to fields of the task plane that
-commute, so the bracket lies in the kernel of J_x: q_a and q_b are on one self-motion curve. The bracket modulo the
-span is bilinear, so |[X_1, X_2]|_A = d / sqrt(det(J_x A^-1 J_x^T)) with the involutivity defect d: det is the squared
-area of the two gradients, and X_1, X_2 are dual to them.
+commute, so the bracket lies in the kernel of J_x, and q_a and q_b are on one self-motion curve. The bracket modulo the
+span is bilinear, so |[X_1, X_2]|_A = d / sqrt(det(J_x A^-1 J_x^T)) with the involutivity defect d, because det is the
+squared area of the two gradients and X_1, X_2 are dual to them.
 """
 
 import casadi as ca
@@ -28,18 +28,22 @@ from orthocas.tasks import Task
 RED, GREEN = "#c8102e", "#2a9d4a"  #: gradients of x and y
 _START = np.array([0.0, 1.6, 1.6])  # q0 [rad]
 _DRAWN = -0.6  # change of x and y in the picture [m]
-_STEPS = (0.04, 0.02, 0.01)  # of the numbers [m]
-_TIGHT = 1e-13  # tolerance of the flow for them
+_STEPS = (0.04, 0.02, 0.01)  # steps for the numbers [m]
+_TIGHT = 1e-13  # tolerance of the flow for the numbers
 _LOW, _HIGH = np.array([-2, 3, 2]) * np.pi / 8, np.array([3, 7, 6]) * np.pi / 8
 _DEGREE = 4
 _LEAF = "#b4b8be"
-_LABELS = {"$q_0$": (0.0, 0.1, 0.04), "$q_a$": (0.0, 0.0, -0.12), "$q_b$": (0.0, 0.1, -0.04)}  # their offsets [rad]
+_LABELS = {
+    "$q_0$": (0.0, 0.1, 0.04),
+    "$q_a$": (0.0, 0.0, -0.12),
+    "$q_b$": (0.0, 0.1, -0.04),
+}  # offsets of the labels [rad]
 _ARROW = 0.22  # length of unit gradients in the picture [rad]
 _VIEW = (20, 14)
 
 
 def draw(quick: bool) -> Drawing:
-    """Both ways, self-motion curves, gradients and a fitted leaf; numbers tell how far apart the ways end.
+    """Draw both paths, self-motion curves, gradients and a fitted leaf; the numbers tell how far apart the paths end.
 
     `quick` draws a coarser leaf.
     """
@@ -87,7 +91,7 @@ def _scene(problem: Problem, chart: Chart, ways: list[Array], cells: int) -> Sce
 
 
 def _numbers(problem: Problem, chart: Chart, ways: list[Array]) -> dict[str, float]:
-    """Gaps of smaller and smaller paths against the bracket, and for a pair of fields that commute."""
+    """Gaps of ever smaller paths compared with the bracket, and gaps for a pair of fields that commute."""
     gaps = np.array([_gap(problem, _START, eps) for eps in _STEPS])
     bracket, defect = _bracket(problem, _START)
     ends = np.array([path[-1] for path in ways])
@@ -115,7 +119,7 @@ def _distance(point: Array, curve: Array) -> float:
 
 
 def _gap(problem: Problem, start: Array, change: float) -> float:
-    """Distance of the ends of both ways [rad]."""
+    """Distance between the ends of both paths [rad]."""
     ends = []
     for order in ((0, 1), (1, 0)):
         q = start[None]
@@ -126,7 +130,7 @@ def _gap(problem: Problem, start: Array, change: float) -> float:
 
 
 def _bracket(problem: Problem, at: Array) -> tuple[float, float]:
-    """|[X_1, X_2]| of the lifts at a point, and d / sqrt(det(J J^T)), which it should be."""
+    """|[X_1, X_2]| of the lifts at a point, and its expected value d / sqrt(det(J J^T))."""
     q = ca.SX.sym("q", problem.n)
     lifts = [TaskFlow(problem).field(q, ca.DM.eye(2)[:, k]) for k in range(2)]
     J = problem.task.jacobian_function(q)
@@ -139,7 +143,7 @@ def _bracket(problem: Problem, at: Array) -> tuple[float, float]:
 
 
 def _elbow(problem: Problem) -> Problem:
-    """The same arm with the end of link 2 as its task: two joints move it, and gradients span their plane."""
+    """The same arm with the end of link 2 as its task. Two joints move it, and the gradients span their plane."""
 
     def end(q: ca.SX) -> ca.SX:
         return ca.vertcat(ca.cos(q[0]) + ca.cos(q[0] + q[1]), ca.sin(q[0]) + ca.sin(q[0] + q[1]))

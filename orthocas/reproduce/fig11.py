@@ -19,15 +19,15 @@ _STEP, _STEPS, _SHOWN = (
     24,
     36,
 )  # along the curve [rad]; steps from q2 = q3 to the point; steps shown to both sides
-_HALF = 5 * np.pi / 8  # of the box around the point [rad]
-_REACH = 1.65  # of the plane [rad]
+_HALF = 5 * np.pi / 8  # half-width of the box around the point [rad]
+_REACH = 1.65  # radius of the drawn plane [rad]
 _VIEW = (20, -102)
 
 
 def draw(quick: bool) -> Drawing:
-    """The four rows at a point of a self-motion curve; numbers tell how well the polar ones lie in the plane.
+    """Draw the four rows at a point of a self-motion curve; the numbers tell how well the polar rows lie in the plane.
 
-    `quick` changes nothing.
+    `quick` has no effect.
     """
     cartesian = problems.get("planar_3r_xy").task
     (closed,) = trace(cartesian, postures(_RADIUS, _ANGLE), _STEP)
@@ -62,7 +62,7 @@ def _scene(q: Array, rows: Array, curve: Array, centre: Array) -> Scene:
 
 
 def _plane(q: Array, rows: Array, cells: int = 24) -> tuple[Array, Array, Array]:
-    """A disc around q in the plane of two rows: vertices, faces, and its border."""
+    """A disc around q in the plane of two rows: vertices, faces and boundary."""
     basis = np.linalg.qr(rows.T)[0].T
     angle = np.linspace(0, 2 * np.pi, 4 * cells + 1)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ basis

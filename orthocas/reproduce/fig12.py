@@ -5,5 +5,5 @@ from orthocas.reproduce.flow_picture import draw_flow
 
 
 def draw(quick: bool) -> Drawing:
-    """Both panels; numbers tell where flow lines end and how exactly pulled points lie on the base leaf."""
+    """Draw both panels; the numbers tell where flow lines end and how exactly pulled points lie on the base leaf."""
     return draw_flow("euclidean", quick)

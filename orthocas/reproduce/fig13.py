@@ -1,9 +1,9 @@
 """[AS2023] Fig. 13: the grown coordinate xi(q) of the planar arm with two joints, for A = I and A = M.
 
-xi is an angle: with a cyclic colour map the cut of S0, where xi passes from pi to -pi, does not show and is drawn as a
-line. Edges of colour are true jumps: lines that flow from the minimum of h into a saddle, where points on their sides
-part. Lower row (ours): each point is shifted by whole turns to where its flow line meets S0 around the origin. The
-torus becomes one region, all jumps lie on its boundary, and the puzzle of the paper is solved.
+xi is an angle. With a cyclic colour map, the cut of S0, where xi passes from pi to -pi, does not show and is drawn as a
+line. Edges of colour are true jumps: lines that flow from the minimum of h into a saddle, where points on their two
+sides separate. In the lower row (ours), each point is shifted by whole turns to where its flow line meets S0 around the
+origin. The torus then becomes one region with all jumps on its boundary, which solves the puzzle of the paper.
 """
 
 import time
@@ -41,7 +41,7 @@ from orthocas.reproduce.self_motion import wrapped
 from orthocas.reproduce.style import INK, LABEL, TICK, TURN, joint_axis, joint_plane, new_figure, pi_text
 from orthocas.singularities import Jump, SingularPoint, jumps, singular_points
 
-_COLOURS = "twilight"  # light at +-pi
+_COLOURS = "twilight"  # this map is light at +-pi
 _HALO = [withStroke(linewidth=3.2, foreground="white")]
 _SHOWN: dict[str, Any] = {
     "origin": "lower",
@@ -61,13 +61,13 @@ class _Field:
 
     chart: Chart
     singular: tuple[SingularPoint, ...]
-    xi: Array  #: (cells, cells), q2 first
+    xi: Array  #: (cells, cells), first index along q2
     turns: Array  #: whole turns from S0 around the origin to where each flow line ends, (cells, cells, 2)
     seconds: float
 
 
 def draw(quick: bool) -> Drawing:
-    """Both metrics on the torus and put together; numbers tell speed, jumps, and how exact the coordinates are."""
+    """Draw both metrics on the torus and reassembled; the numbers are speed, jumps and accuracy of the coordinates."""
     cells = 60 if quick else 330
     fields = [_evaluated(metric, cells) for metric in NAMES]
     figure = new_figure(7.1, layout=None)
@@ -100,7 +100,7 @@ def _evaluated(metric: str, cells: int) -> _Field:
     points = cell_centres(cells)
     chart.xi(points[:1])  # builds functions
     start = time.perf_counter()
-    pulled = grown_coordinates(chart).pull(points)  # once, for both xi and turns
+    pulled = grown_coordinates(chart).pull(points)  # one pull serves both xi and turns
     xi = np.where(pulled.reached, base_leaf(chart).values(pulled.points).xi[:, 0], np.nan)
     seconds = time.perf_counter() - start
     turns = np.round(pulled.points / TURN)
@@ -120,7 +120,7 @@ def _draw_torus(axes: Any, field: _Field) -> None:
 
 
 def _put_together(field: _Field) -> Array:
-    """Cells shifted to where their flow lines end, on a grid of three by three copies of the torus, elsewhere NaN."""
+    """Cells shifted to where their flow lines end, on a grid of 3 x 3 copies of the torus; NaN elsewhere."""
     cells = len(field.xi)
     everywhere = np.full((3, cells, 3, cells), np.nan)
     rows, columns = np.mgrid[:cells, :cells]
@@ -144,7 +144,7 @@ def _draw_region(axes: Any, field: _Field) -> None:
     joint_axis(axes, "x", 1, -1.5 * np.pi, 1.5 * np.pi, parts=6)
     joint_axis(axes, "y", 2, -2.25 * np.pi, 2.25 * np.pi, parts=8, margin=np.pi / 4)
     axes.set_aspect("equal")
-    axes.set_title("put together", fontsize=LABEL)
+    axes.set_title("reassembled", fontsize=LABEL)
 
 
 def _entries() -> list[Line2D]:
@@ -152,13 +152,13 @@ def _entries() -> list[Line2D]:
 
 
 def _cut_line(chart: Chart) -> list[Array]:
-    """The flow line through the point of S0 where xi passes from pi to -pi, down and up."""
+    """The flow line, down and up, through the point of S0 where xi passes from pi to -pi."""
     goals = np.array([-EXTREME, EXTREME])
     return flow_lines(chart.problem, np.tile(base_leaf(chart).cut, (2, 1)), goals, 100)
 
 
 def _jump_lines(field: _Field) -> list[tuple[list[Array], Array]]:
-    """The two lines that flow into each saddle, from there, and turns (2, 2) to S0 from their two sides."""
+    """The two lines that flow into each saddle, starting there, and the turns (2, 2) to S0 from their two sides."""
     found = []
     for saddle in (s for s in field.singular if s.kind == "saddle"):
         falling, rising = 1e-3 * saddle.directions.T

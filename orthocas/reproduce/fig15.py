@@ -1,7 +1,7 @@
 """[AS2023] Fig. 15: coordinates grown from the leaf x = 0 of the planar arm with three joints, 0 <= q1 <= pi, A = I.
 
-The first joint is kept to half a turn as in the paper, so that the leaf is a disk. Panel (d) cuts the leaves in front
-away in steps along lines of constant xi2, for else they would hide the others.
+As in the paper, the first joint is limited to half a turn, so that the leaf is a disk. In panel (d), the front leaves
+are cut away in steps along lines of constant xi2, because they would hide the other leaves.
 """
 
 from collections.abc import Mapping
@@ -32,10 +32,10 @@ from orthocas.tasks import Task
 FIRST, SECOND = "#c8102e", "#f2b701"  #: lines and leaves of constant xi1, xi2
 _LOW, _HIGH = np.array([0.0, -np.pi, -np.pi]), np.full(3, np.pi)
 _COARSE = 15  # cells along an edge in (a) and (b)
-_STEP = 0.3  # of x between leaves [m]
-_LEVELS = np.linspace(-0.8, 0.8, 9)  # of xi1 and xi2
-_COLOURS = {0.0: "#3a64a8", _STEP: "#a9d1f2", -_STEP: "#c3c6cc"}  # of leaves
-_CUTS = {0.0: 0.3, _STEP: np.inf, -_STEP: -0.3}  # xi2 where leaves of (d) end
+_STEP = 0.3  # step of x between leaves [m]
+_LEVELS = np.linspace(-0.8, 0.8, 9)  # levels of xi1 and xi2
+_COLOURS = {0.0: "#3a64a8", _STEP: "#a9d1f2", -_STEP: "#c3c6cc"}  # colours of the leaves
+_CUTS = {0.0: 0.3, _STEP: np.inf, -_STEP: -0.3}  # xi2 at which the leaves of (d) end
 _NAMES = {f"$x = {x:g}$ m": colour for x, colour in _COLOURS.items()}
 _SAMPLES = 1000
 _COVER_CELLS = 40
@@ -48,7 +48,7 @@ def grown_disk(cells: int) -> tuple[GrownCoordinates, DiskLeaf]:
     """Coordinates of [AS2023] Sec. 5.2 (three joints, task x, A = I, 0 <= q1 <= pi), and their base leaf.
 
     Args:
-        cells: of marching cubes, along the longest edge of the box.
+        cells: number of marching cubes cells along the longest edge of the box.
     """
     robot = problems.get("planar_3r_x").robot
     domain = Box((_LOW + _HIGH) / 2, (_HIGH - _LOW) / 2)
@@ -59,7 +59,7 @@ def grown_disk(cells: int) -> tuple[GrownCoordinates, DiskLeaf]:
 
 
 def draw(quick: bool) -> Drawing:
-    """Triangles, their image, isolines on the base leaf and on others; numbers tell how exact the coordinates are."""
+    """Draw triangles, their image, and isolines on leaves; the numbers show the accuracy of the coordinates."""
     start = perf_counter()
     coordinates, fine = grown_disk(24 if quick else 70)
     seconds = perf_counter() - start
@@ -106,14 +106,14 @@ def _draw_disk(figure: Any, leaf: DiskLeaf) -> None:
 
 
 def _quadrants(leaf: DiskLeaf) -> Array:
-    """Colours of triangles by the quadrant of the disk their middles lie in, (F, 3)."""
+    """Colours of triangles by the quadrant of the disk that contains their centres, (F, 3)."""
     right, upper = (leaf.disk[leaf.faces].mean(axis=1) > 0).T
     tints: Array = _TINTS[2 * right + upper]
     return tints
 
 
 def _draw_leaves(axes: Any, leaf: DiskLeaf, cuts: Mapping[float, float]) -> None:
-    """Leaves with isolines; `cuts` tells for each x where it is drawn, xi2 < cut."""
+    """Draw leaves with isolines; `cuts` gives, for each x, the bound of the drawn part xi2 < cut."""
     scene = Scene()
     scene.add_cube(_LOW, _HIGH, 0.02)
     for x, cut in cuts.items():
@@ -139,7 +139,7 @@ def _mesh_numbers(fine: DiskLeaf, coarse: DiskLeaf) -> dict[str, float]:
 
 
 def _flow_numbers(coordinates: GrownCoordinates) -> dict[str, float]:
-    """How orthogonal, how constant along the flow, and how far the coordinates reach."""
+    """Orthogonality of the coordinates, their constancy along the flow, and their coverage."""
     problem = coordinates.problem
     points = sample_uniform(problem.domain, _SAMPLES, 3)
     pulled = coordinates.pull(points)
@@ -158,7 +158,7 @@ def _flow_numbers(coordinates: GrownCoordinates) -> dict[str, float]:
 
 
 def _covered(coordinates: GrownCoordinates, x: float) -> float:
-    """Share of the area of a leaf in the domain where coordinates have values."""
+    """Share of the area of a leaf in the domain where the coordinates have values."""
     task, low, high = coordinates.problem.task, _LOW, _HIGH
     mesh = level_surface(
         lambda q: task.batched(q)[0][:, 0], lambda q: task.batched_jacobian(q)[0][:, 0], x, low, high, _COVER_CELLS

@@ -1,8 +1,8 @@
 """[AS2023] Fig. 17: coordinates of the planar arm with two joints, fitted on the whole torus, for A = I and A = M.
 
-No smooth function parametrises closed leaves with one number, so there are regions of bad fit: along the lines that
-flow into singular points, and along folds, where xi has its extrema on the leaves. Equal parts of the torus lie between
-neighbouring isolines of xi, and as much of it where xi > 0 as where xi < 0.
+No smooth function parametrises closed leaves with one number, so there are regions of bad fit. They lie along the lines
+that flow into singular points, and along folds, where xi has its extrema on the leaves. Neighbouring isolines of xi
+enclose equal parts of the torus, and the parts with xi > 0 and xi < 0 are equal.
 """
 
 from typing import Any
@@ -31,15 +31,15 @@ from orthocas.reproduce.planar_flow import (
 from orthocas.reproduce.style import EXTRA, LABEL, TASK, TICK, joint_plane, new_figure
 from orthocas.singularities import singular_points
 
-_LEAVES = (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5)  # task values where values of xi are counted [m]
-_INSIDE = (0.3, 0.8)  # a point from where all leaves are reached [rad]
+_LEAVES = (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5)  # task values of the leaves on which values of xi are counted [m]
+_INSIDE = (0.3, 0.8)  # a point from which the flow reaches all leaves [rad]
 _SHADES = "Greys"
 _FITS = {"euclidean": fitted_from_grown, "inertia": freely_fitted}
 _GOOD = 10.0  # deviation [deg]
 
 
 def draw(quick: bool) -> Drawing:
-    """Isolines over the angle; numbers tell how large deviations are and how often a leaf has a value."""
+    """Draw isolines over the angle; the numbers tell the deviations and how often a value occurs on a leaf."""
     cells = 60 if quick else 240
     figure = new_figure(3.7, layout=None)
     numbers: dict[str, float] = {}
@@ -71,7 +71,7 @@ def _draw_plane(axes: Any, chart: Chart, angles: Array, cells: int) -> None:
     q, points = corners(cells)
     h, xi = (values.reshape(cells + 1, cells + 1) for values in chart.phi(points).T)
     axes.contour(q, q, h, levels=np.linspace(-1.75, 1.75, 8), colors=TASK, linewidths=0.8, linestyles="-")
-    xi = xi - np.median(xi)  # any constant may be added
+    xi = xi - np.median(xi)  # xi is defined up to a constant
     axes.contour(q, q, xi, levels=np.quantile(xi, np.linspace(0.025, 0.975, 20)), colors=EXTRA, linewidths=0.9)
     mark_singular(axes, singular_points(chart.problem))
     joint_plane(axes)
@@ -101,12 +101,12 @@ def _numbers(chart: Chart, points: Array, angles: Array) -> dict[str, float]:
 
 
 def _counts(chart: Chart) -> Array:
-    """How often leaves have values, for several leaves and values."""
+    """How often values occur on leaves, for several leaves and values."""
     return np.concatenate([_crossings(chart, level) for level in _LEAVES])
 
 
 def _crossings(chart: Chart, level: float, values: int = 21) -> Array:
-    """How often a closed leaf has each of some values between the extrema of xi on it."""
+    """How often each of some values between the extrema of xi occurs on a closed leaf."""
     flow, x0 = TaskFlow(chart.problem), np.array([level])
     start = flow.pull(np.array([_INSIDE]), x0, 1e-12).points[0]
     xi = chart.xi(circle_leaf(chart.problem, x0, start).curve)[:, 0]
@@ -116,7 +116,7 @@ def _crossings(chart: Chart, level: float, values: int = 21) -> Array:
 
 
 def _angles_to_grown(chart: Chart, points: Array, most: int = 5000) -> Array:
-    """Angle between the lines along the gradients of fitted and of grown coordinates [deg]."""
+    """Angles between the gradient lines of fitted and grown coordinates [deg]."""
     some = points[:: len(points) // most + 1]
     fitted, grown = (c.jacobian(some)[:, 1] for c in (chart, grown_chart(chart.problem)))
     sines = (fitted[:, 0] * grown[:, 1] - fitted[:, 1] * grown[:, 0]) / (

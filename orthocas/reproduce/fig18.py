@@ -15,7 +15,7 @@ from orthocas.reproduce.style import LABEL, TICK, add_3d, joint_axis, new_figure
 
 
 def draw(quick: bool) -> Drawing:
-    """Both surfaces; numbers tell their ranges, and that right angles hold almost everywhere."""
+    """Draw both surfaces; the numbers give their ranges and show right angles almost everywhere."""
     chart = fitted_from_grown(planar_problem("euclidean"), quick)
     cells = 40 if quick else 160
     q, points = corners(cells)
@@ -40,7 +40,7 @@ def draw(quick: bool) -> Drawing:
 
 
 def _draw_surface(axes: Any, q: Array, values: Array) -> None:
-    """A shaded surface with isolines under it."""
+    """Draw a shaded surface with isolines below it."""
     low, high = values.min(), values.max()
     shades = LightSource(315, 50).shade(values, mpl.colormaps["viridis"], blend_mode="soft", vert_exag=0.4)
     axes.plot_surface(

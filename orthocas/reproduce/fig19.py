@@ -1,7 +1,7 @@
 """[AS2023] Fig. 19: a section of joint space, task (x, y), and a fitted coordinate that is as orthogonal as possible.
 
-Our coordinate is a polynomial, the paper's a neural network. Rectangles are drawn where self-motion curves cross the
-isosurfaces, 0.03 rad above them on the side of the viewer, so that their tilt can be seen.
+Our coordinate is a polynomial, that of the paper a neural network. Rectangles mark where self-motion curves cross the
+isosurfaces. They lie 0.03 rad above the surfaces, on the side of the viewer, so that their tilt is visible.
 """
 
 import numpy as np
@@ -22,17 +22,17 @@ from orthocas.reproduce.style import TASK, add_3d, joint_cube, line_legend, new_
 
 _LOW, _HIGH = np.array([-2.0, 1, 1]) * np.pi / 8, np.array([2.0, 5, 5]) * np.pi / 8
 _DEGREE = 5
-_SHARES = (0.3, 0.7)  # of the samples below each isosurface
-_SPREAD = 0.45  # between self-motion curves, along the task gradients at the centre [rad]
+_SHARES = (0.3, 0.7)  # share of the samples below each isosurface
+_SPREAD = 0.45  # distance of self-motion curves along the task gradients at the centre [rad]
 _HALF, _ARROW = 0.13, 0.2  # half an edge of the rectangles, length of the gradients [rad]
-_LIFT = 0.03  # of rectangles above isosurfaces [rad]
+_LIFT = 0.03  # height of the rectangles above isosurfaces [rad]
 _SAMPLES = 2000
 _LEAF, _PLANE = "#c9cdd3", "#e4572e"
 _VIEW = (25, 244)
 
 
 def draw(quick: bool) -> Drawing:
-    """Curves, gradients, planes and isosurfaces; numbers tell how far planes and isosurfaces are from tangent.
+    """Draw curves, gradients, planes and isosurfaces; the numbers tell how far planes and isosurfaces are from tangent.
 
     `quick` draws coarser surfaces.
     """
@@ -64,7 +64,7 @@ def _starts(problem: Problem) -> Array:
 
 
 def _crossings(chart: Chart, curve: Array, levels: Array) -> Array:
-    """Where a curve passes the levels of the coordinate, (N, 3)."""
+    """Points where a curve crosses the levels of the coordinate, (N, 3)."""
     xi = chart.xi(curve)[:, 0]
     order = np.argsort(xi)
     inside = levels[(levels > xi.min()) & (levels < xi.max())]

@@ -1,8 +1,8 @@
 """[AS2023] Fig. 20: angles between dxi_j and grad_M h_i of fitted coordinates, with and without exact solutions.
 
-The planar arm with three joints and A = M: task x (exact coordinates exist) and task (x, y) (they do not). The paper
-does not say on what part of joint space it fits; here it is the box of `orthocas.problems.planar_3r_x` for both tasks,
-where neither is singular.
+The arm is the planar arm with three joints and A = M, with the task x (exact coordinates exist) and the task (x, y)
+(they do not). The paper does not state on what part of joint space it fits. Here both tasks use the box of
+`orthocas.problems.planar_3r_x`, in which neither is singular.
 """
 
 from typing import Any
@@ -20,11 +20,14 @@ _PANELS = {
     "involutive": ("planar_3r_x", "(a) involutive: task $x$", TASK),
     "non_involutive": ("planar_3r_xy", "(b) non-involutive: task $(x, y)$", EXTRA),
 }
-_GROUP, _FIRST_EDGE = 3, 0.15  # bins of 0.1 degree in one bar, so that a right angle is in the middle of its bar; [deg]
+_GROUP, _FIRST_EDGE = (
+    3,
+    0.15,
+)  # bins of 0.1 degree per bar, and the first edge [deg]; a right angle is at the centre of its bar
 
 
 def draw(quick: bool) -> Drawing:
-    """Both histograms on the same axes; numbers are their means and standard deviations."""
+    """Draw both histograms with the same axes; the numbers are their means and standard deviations."""
     figure = new_figure(2.9)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     numbers: dict[str, float] = {}

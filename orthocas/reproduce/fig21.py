@@ -1,7 +1,7 @@
-"""[AS2023] Fig. 21: the closed loop of the simulations as a block diagram, and what its low pass makes of a step.
+"""[AS2023] Fig. 21: the closed loop of the simulations as a block diagram, and its low-pass step response.
 
-The numbers hold the diagram against the code: the torque of `PDPlus` is J^T (f_FF + f_FB) + g with both forces taken
-from their formulas, and the low pass has the overshoot exp(-pi zeta / sqrt(1 - zeta^2)) of its differential equation.
+The numbers check the diagram against the code. The torque of `PDPlus` is J^T (f_FF + f_FB) + g with both forces from
+their formulas, and the low-pass filter has the overshoot exp(-pi zeta / sqrt(1 - zeta^2)) of its differential equation.
 """
 
 from collections.abc import Sequence
@@ -35,13 +35,13 @@ _BOXES = {  # text: middle, width, height [cm]
     "$g(q)$": (11.9, 3.85, 1.2, 0.7),
 }
 _SUMS = ((8.8, 2.2), (11.9, 2.2))
-_RADIUS = 0.2  # of a sum [cm]
+_RADIUS = 0.2  # of a summing point [cm]
 
 
 def draw(quick: bool) -> Drawing:
-    """The diagram, and below it a unit step through the low pass.
+    """Draw the diagram and, below it, a unit step through the low-pass filter.
 
-    `quick` makes no difference: all of it takes less than a second.
+    `quick` has no effect, because the figure takes less than a second.
     """
     figure = new_figure(4.0, layout=None)
     diagram = figure.add_axes((0.0, 0.44, 1.0, 0.56))
@@ -77,7 +77,7 @@ def _draw_diagram(axes: Any) -> None:
 
 
 def _draw_wires(axes: Any) -> None:
-    """Signals, with arrow heads where they enter; dots where they branch."""
+    """Draw signals, with arrow heads where they enter a block and dots where they branch."""
     wires: Sequence[Sequence[tuple[float, float]]] = (
         ((0.4, 2.2), (1.95, 2.2)),
         ((3.85, 2.2), (4.9, 2.2), (4.9, 3.3), (5.45, 3.3)),
@@ -99,7 +99,7 @@ def _draw_wires(axes: Any) -> None:
 
 
 def _draw_response(figure: Any, response: Reference) -> None:
-    """Value, velocity and acceleration of a unit step, side by side."""
+    """Draw value, velocity and acceleration of a unit step side by side."""
     times = np.linspace(0, _DURATION, 1501)
     panels = zip(
         response.sample(times),
@@ -134,7 +134,7 @@ def _low_pass_numbers(response: Reference) -> dict[str, float]:
 
 
 def _loop_numbers() -> dict[str, float]:
-    """The torque of the controller against the sum in the diagram, at random states and references."""
+    """The torque of the controller compared with the sum in the diagram, at random states and references."""
     chart = fit(problems.get("planar_3r_x"), Polynomial(4), samples=1500).chart
     controller = PDPlus(chart, _STIFFNESS)
     q = sample_uniform(chart.problem.domain, _STATES, 0)

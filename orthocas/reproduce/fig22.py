@@ -1,6 +1,7 @@
-"""[AS2023] Fig. 22: interleaved steps in x and xi1 with linear coordinates where leaves are little curved, PD+.
+"""[AS2023] Fig. 22: interleaved steps in x and xi1 with PD+ and linear coordinates, where leaves have low curvature.
 
-Arm, base, gains and steps stand in `orthocas.reproduce.planar_loop`; Fig. 23 takes the same with fitted coordinates.
+Arm, base, gains and steps are defined in `orthocas.reproduce.planar_loop`. Fig. 23 uses the same with fitted
+coordinates.
 """
 
 from orthocas.reproduce.closed_loop_picture import interleaved
@@ -9,5 +10,5 @@ from orthocas.reproduce.planar_loop import GENTLE, Arm
 
 
 def draw(quick: bool) -> Drawing:
-    """Coordinates over time, their plane, and joints; numbers tell the coupling."""
+    """Draw coordinates over time, their plane, and joints; the numbers are the coupling."""
     return interleaved(Arm().linear("x", GENTLE), quick)

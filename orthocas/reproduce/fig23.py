@@ -6,5 +6,5 @@ from orthocas.reproduce.planar_loop import GENTLE, Arm
 
 
 def draw(quick: bool) -> Drawing:
-    """As Fig. 22; numbers tell that nothing couples."""
+    """Draw the panels of Fig. 22; the numbers show that nothing couples."""
     return interleaved(Arm().fitted("x", GENTLE, quick), quick)

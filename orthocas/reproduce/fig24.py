@@ -1,8 +1,8 @@
-"""[AS2023] Fig. 24: steps in x, xi1 and xi2, PD+: linear coordinates at two bases, and fitted ones at the second.
+"""[AS2023] Fig. 24: steps in x, xi1 and xi2 with PD+; linear coordinates at two bases, and fitted ones at the second.
 
-Both bases have their tip at x = 0, as in the paper; at the second the leaves of x are ten times more curved, and there
-linear coordinates and the task ask for things that contradict each other: the line in joint space where xi1 and xi2
-have their targets does not come near the leaf where x has its own.
+Both bases have their tip at x = 0, as in the paper. At the second base, the leaves of x have ten times the curvature,
+and linear coordinates contradict the task: the line in joint space where xi1 and xi2 have their target values stays
+away from the leaf where x has its target value.
 """
 
 from typing import Any
@@ -36,8 +36,8 @@ from orthocas.reproduce.planar_loop import (
 )
 from orthocas.reproduce.style import LABEL, TICK, add_3d, new_figure
 
-_TARGETS = (0.0, 0.25)  # of x [m]
-_GRID = np.array([np.linspace(-0.04, 0.34, 13), np.linspace(-0.34, 0.04, 13)])  # of coordinate lines
+_TARGETS = (0.0, 0.25)  # targets of x [m]
+_GRID = np.array([np.linspace(-0.04, 0.34, 13), np.linspace(-0.34, 0.04, 13)])  # xi1 and xi2 of the coordinate lines
 _COLUMNS = {  # name: title, place, view of the camera
     "gentle_linear": ("linear, low curvature", GENTLE, (15, 60)),
     "strong_linear": ("linear, high curvature", STRONG, (20, 35)),
@@ -47,7 +47,7 @@ _LEFT, _RIGHT = 0.115, 0.985
 
 
 def draw(quick: bool) -> Drawing:
-    """Three columns of coordinates, planes, joints and curves in joint space; numbers of each."""
+    """Draw three columns of coordinates, planes, joints and curves in joint space; the numbers describe each column."""
     arm = Arm()
     charts = {
         "gentle_linear": arm.linear("x", GENTLE),
@@ -88,7 +88,7 @@ def largest_curvature(arm: Arm, place: Place) -> float:
 
 
 def _draw_column(figure: Figure, cells: list[Any], run: Run, column: int, title: str) -> None:
-    """Coordinates, planes and joints."""
+    """Draw coordinates, planes and joints."""
     above = figure.add_subplot(cells[0])
     draw_coordinates(above, run)
     planes = draw_planes(figure, cells[1], run)

@@ -1,6 +1,6 @@
-"""[AS2023] Fig. 25: the steps of Fig. 23 with feedback alone, and where unwanted task acceleration comes from.
+"""[AS2023] Fig. 25: the steps of Fig. 23 with feedback only, and the sources of unwanted task acceleration.
 
-Impedance control (33) regulates: it gets the desired position, but no desired velocity, and neither acceleration.
+Impedance control (33) regulates: it receives the desired position, but no desired velocity or acceleration.
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ from orthocas.reproduce.planar_loop import GENTLE, INTERLEAVED, Arm, Run, follow
 from orthocas.reproduce.style import LABEL, TICK, new_figure
 from orthocas.simulation import Breakdown, task_acceleration_breakdown
 
-_PARTS = {  #: of the unwanted task acceleration: field of the breakdown, name, colour
+_PARTS = {  #: terms of the unwanted task acceleration: field of the breakdown, name, colour
     "curvature": ("curvature", "#0b84a5"),
     "coriolis": ("Coriolis and centrifugal", "#d8a200"),
     "error": ("error (38)", "#c8102e"),
@@ -29,7 +29,7 @@ _PARTS = {  #: of the unwanted task acceleration: field of the breakdown, name, 
 
 
 def draw(quick: bool) -> Drawing:
-    """Coordinates, parts of the acceleration, plane, joints; numbers compare the parts, also of linear coordinates."""
+    """Draw coordinates, acceleration terms, plane and joints; numbers compare the terms, also for linear charts."""
     arm = Arm()
     chart = arm.fitted("x", GENTLE, quick)
     run = follow(chart, arm.base(GENTLE), INTERLEAVED, feed_forward=False)
@@ -40,7 +40,7 @@ def draw(quick: bool) -> Drawing:
 
 
 def parts(run: Run) -> dict[str, float]:
-    """Largest and root mean square value of each part [m/s^2]."""
+    """Largest and root mean square value of each term [m/s^2]."""
     found = _breakdown(run)
     largest = {f"largest_{name}": float(np.abs(getattr(found, name)).max()) for name in _PARTS}
     return largest | {f"rms_{name}": float(np.sqrt(np.mean(getattr(found, name) ** 2))) for name in _PARTS}
@@ -67,7 +67,7 @@ def _picture(run: Run) -> Figure:
     handles, names = accelerations.get_legend_handles_labels()
     corner = figure.add_subplot(grid[2, 1])
     corner.axis("off")
-    corner.legend(handles, names, loc="center left", fontsize=TICK, title="parts in (b)", title_fontsize=TICK)
+    corner.legend(handles, names, loc="center left", fontsize=TICK, title="terms in (b)", title_fontsize=TICK)
     curve_legend(figure, run)
     return figure
 

@@ -1,8 +1,8 @@
-"""[AS2023] Fig. 26: steps in x and xi for the task (x, y), linear and fitted coordinates, and feedback only.
+"""[AS2023] Fig. 26: steps in x and xi for the task (x, y), with linear and fitted coordinates, and with feedback only.
 
-Large steps are more than three times as large as small ones, so large that no posture has all targets of the linear
-coordinates. A decoupled PD+ knows the whole inertia of the task, so that x and y hardly couple with feed-forward;
-without it they couple more than xi does with either, as the paper says.
+Large steps are more than three times as large as small ones, so that no posture meets all targets of the linear
+coordinates. Decoupled PD+ knows the full inertia of the task, so x and y hardly couple with feed-forward. Without
+feed-forward they couple more with each other than with xi, as the paper says.
 """
 
 from typing import Any
@@ -29,7 +29,7 @@ _TITLES = {
 
 
 def draw(quick: bool) -> Drawing:
-    """Four columns of coordinates, plane and joints; numbers of each."""
+    """Draw four columns of coordinates, plane and joints; the numbers describe each column."""
     arm = Arm()
     start, box = arm.base(FOLDED), arm.box(FOLDED)
     linear, fitted = arm.linear("xy", FOLDED), arm.fitted("xy", FOLDED, quick)

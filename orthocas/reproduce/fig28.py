@@ -1,7 +1,7 @@
 """[AS2023] Fig. 28: a journey of the 7-DoF arm in task and extra coordinates, which ends where it began.
 
-Velocity control dq = J^-1 d_phi_d without feedback (Sec. 9), A = I, polynomials in place of the network. The paper
-shows measurements on a robot; here dq is integrated, and the steps are ours.
+The control law is velocity control dq = J^-1 d_phi_d without feedback (Sec. 9), with A = I and polynomials instead of
+the network. The paper shows measurements on a robot; here dq is integrated, and the steps are ours.
 """
 
 from itertools import cycle
@@ -19,19 +19,19 @@ from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.style import LABEL, TICK, new_figure
 from orthocas.simulation import Trajectory, coupling_index, simulate
 
-JOURNEY = (  # which coordinate steps, and where to: from its value at the start, [m] or [1]
+JOURNEY = (  # coordinate and target of each step, relative to the value at the start, [m] or [1]
     *(("xi1", -0.5), ("x", 0.12), ("xi3", -0.6), ("y", -0.3), ("xi4", 0.6), ("z", -0.15), ("xi2", 0.4)),
     *(("y", 0.25), ("xi1", 0.2), ("x", -0.2), ("xi3", 0.3), ("xi4", -0.45), ("z", 0.15), ("xi2", -0.25)),
     *(("y", -0.25), ("xi3", -0.5), ("x", 0.06), ("xi1", -0.45), ("z", -0.25), ("xi2", 0.6)),
     *(("y", 0.0), ("xi4", 0.0), ("xi3", 0.0), ("x", 0.0), ("xi1", 0.0), ("z", 0.0), ("xi2", 0.0)),
 )
-_FIRST, _PAUSE, _REST = 1.0, 2.0, 6.0  # time of the first step, between two steps, and after the last one [s]
-_TOLERANCE = 1e-10  # of CVODES: without feedback its errors stay in the joints
+_FIRST, _PAUSE, _REST = 1.0, 2.0, 6.0  # time of the first step, between steps, and after the last step [s]
+_TOLERANCE = 1e-10  # of CVODES; without feedback, its errors remain in the joints
 _COLOURS = ("#1f5fa8", "#d95f02", "#1b9e77", "#e7298a", "#7570b3", "#a6761d", "#222222")
 
 
 def draw(quick: bool) -> Drawing:
-    """Task, coordinates and joints over time; numbers tell how exactly the arm returns."""
+    """Draw task, coordinates and joints over time; the numbers tell how exactly the arm returns."""
     chart = fit(problems.get("iiwa"), Polynomial(4)).chart
     reference = journey(chart)
     run = simulate(Kinematic(chart), reference, chart.problem.domain.centre, tolerance=_TOLERANCE)
@@ -39,7 +39,7 @@ def draw(quick: bool) -> Drawing:
     panes = figure.subplots(3, 1, sharex=True)
     names = [rf"$\xi_{k + 1}$" for k in range(chart.r)]
     _draw_values(
-        panes[0], run, slice(chart.m), list(chart.problem.task.labels), "(a) task $x$ [m]; broad: wanted, thin: reached"
+        panes[0], run, slice(chart.m), list(chart.problem.task.labels), "(a) task $x$ [m]; wide: desired, thin: actual"
     )
     _draw_values(panes[1], run, slice(chart.m, None), names, r"(b) coordinates $\xi$ [1]")
     _draw_joints(panes[2], run)
@@ -62,7 +62,7 @@ def draw(quick: bool) -> Drawing:
 
 
 def journey(chart: Chart) -> Reference:
-    """The steps of `JOURNEY` from the centre of the domain, through the low pass."""
+    """The steps of `JOURNEY` from the centre of the domain, through the low-pass filter."""
     start = chart.phi(chart.problem.domain.centre)
     times = _FIRST + _PAUSE * np.arange(len(JOURNEY))
     home = dict(zip(chart.labels, start, strict=True))
@@ -71,7 +71,7 @@ def journey(chart: Chart) -> Reference:
 
 
 def _draw_values(axes: Any, run: Trajectory, which: slice, names: list[str], title: str) -> None:
-    """Wanted values broad and light, reached ones thin and dark on top."""
+    """Draw desired values wide and pale, and actual values thin and dark on top."""
     for wanted, reached, name, colour in zip(
         run.reference[:, which].T, run.value[:, which].T, names, cycle(_COLOURS), strict=False
     ):
@@ -81,11 +81,11 @@ def _draw_values(axes: Any, run: Trajectory, which: slice, names: list[str], tit
 
 
 def _draw_joints(axes: Any, run: Trajectory) -> None:
-    """Joint angles, with dotted lines where they started."""
+    """Draw joint angles, with dotted lines at their start values."""
     for k, (q, colour) in enumerate(zip(run.q.T, _COLOURS, strict=True), 1):
         axes.plot(run.times, q, color=colour, linewidth=0.9, label=f"$q_{k}$")
         axes.axhline(q[0], color=colour, linewidth=0.9, linestyle=":")
-    _finish(axes, "(c) joints $q$ [rad]; dotted: where they started")
+    _finish(axes, "(c) joints $q$ [rad]; dotted: start values")
 
 
 def _finish(axes: Any, title: str) -> None:

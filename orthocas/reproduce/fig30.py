@@ -17,7 +17,7 @@ _TITLES = {"feed_forward": "with feed-forward", "feedback": "feedback only"}
 
 
 def draw(quick: bool) -> Drawing:
-    """Two columns of coordinates, planes and joints; numbers of each."""
+    """Draw two columns of coordinates, planes and joints; the numbers describe each column."""
     arm = Arm()
     chart, start = arm.fitted("xy", FOLDED, quick), arm.base(FOLDED)
     runs = {name: follow(chart, start, ALL_OF_XY, name == "feed_forward") for name in _TITLES}

@@ -34,22 +34,22 @@ from orthocas.reproduce.self_motion import wrapped
 from orthocas.reproduce.style import EXTRA, GREY, INK, LABEL, TASK, TICK, TURN, add_3d, joint_plane, new_figure
 from orthocas.singularities import SingularPoint, singular_points
 
-_LEVELS = np.linspace(-1.8, 1.8, 10)  #: task values of the leaves drawn [m]
-_PULLED = np.array([[2.5, 0.6], [-1.2, -1.9], [-0.25, 0.45]])  #: examples of pulls [rad]
+_LEVELS = np.linspace(-1.8, 1.8, 10)  #: task values of the drawn leaves [m]
+_PULLED = np.array([[2.5, 0.6], [-1.2, -1.9], [-0.25, 0.45]])  #: start points of example pulls [rad]
 _PULL, _END = "#c8102e", "#7b2fbe"
 _BIG = 2.95  # reach of the torus of `embedded`
 
 
 def draw_flow(metric: str, quick: bool) -> Drawing:
-    """Plane and torus; numbers tell where the curves end and how exactly pulled points lie on S0.
+    """Draw plane and torus; the numbers tell where the curves end and how exactly pulled points lie on S0.
 
     Args:
         metric: "euclidean" or "inertia".
-        quick: fewer curves and points.
+        quick: draw fewer curves and points.
     """
     problem = planar_problem(metric)
     chart, singular = grown_chart(problem), singular_points(problem)
-    starts = cell_centres(6 if quick else 10)  # off the lines of symmetry
+    starts = cell_centres(6 if quick else 10)  # away from the lines of symmetry
     steps = 30 if quick else 120
     up, down = (flow_lines(problem, starts, np.full(len(starts), sign * EXTREME), steps) for sign in (1, -1))
     pulls = flow_lines(problem, _PULLED, np.full(len(_PULLED), LEVEL), steps)
@@ -103,14 +103,14 @@ def _draw_torus(
 
 
 def _above(q: Array, height: float) -> Array:
-    """Points over the embedded torus, (N, 3): tubes around them are not half sunk in it."""
+    """Points above the embedded torus, (N, 3), so that tubes around them do not sink into it."""
     outwards = np.stack([np.cos(q[:, 0]) * np.cos(q[:, 1]), np.sin(q[:, 0]) * np.cos(q[:, 1]), np.sin(q[:, 1])], axis=1)
     points: Array = embedded(q) + height * outwards
     return points
 
 
 def _thinned(curve: Array, step: float = 0.02) -> Array:
-    """A curve without points nearer than a step to the one before: tubes need directions."""
+    """A curve without points closer than a step to the previous one, because tubes need directions."""
     kept = [0]
     for k in range(1, len(curve)):
         if np.linalg.norm(curve[k] - curve[kept[-1]]) > step:
@@ -125,15 +125,15 @@ def _add_legend(figure: Any) -> None:
         symbol("+", GREY, "their start points"),
         Line2D([], [], color=INK, linewidth=2, label="base leaf $S_0$, $x = 1$ m"),
         Line2D([], [], color=_PULL, linewidth=2, label="pull onto $S_0$"),
-        symbol("x", INK, "where it starts"),
-        symbol("x", _END, "where it ends"),
+        symbol("x", INK, "start of pull"),
+        symbol("x", _END, "end of pull"),
         *singular_symbols(),
     ]
     figure.legend(handles=handles, loc="lower center", ncols=4, fontsize=TICK, frameon=False, columnspacing=1.4)
 
 
 def _curve_numbers(up: list[Array], down: list[Array], singular: tuple[SingularPoint, ...]) -> dict[str, float]:
-    """Where curves end; those that start on the line into a saddle end there."""
+    """End points of curves; curves that start on the line into a saddle end there."""
     ends = np.array([curve[-1] for curve in up + down])
     kinds = [singular[int(np.argmin([distance_to(end[None], (s,))[0] for s in singular]))].kind for end in ends]
     counts = Counter(kinds)
@@ -147,7 +147,7 @@ def _curve_numbers(up: list[Array], down: list[Array], singular: tuple[SingularP
 
 
 def _pull_numbers(chart: Chart, pulls: list[Array], samples: int) -> dict[str, float]:
-    """How exact pulls are, those drawn and those of random points of the torus."""
+    """Accuracy of the drawn pulls and of pulls from random points of the torus."""
     moved = grown_coordinates(chart).pull(sample_uniform(chart.problem.domain, samples, 0))
     drawn = np.array([pull[-1] for pull in pulls])
     return {

@@ -16,9 +16,9 @@ from orthocas.reproduce.style import INK, TICK, joint_cube
 
 SHEETS = ("#5b97da", "#a9b8cc")  #: colours of self-motion manifolds, in the order of the targets
 _MARGIN = 0.12  # of the box around the curve [rad]
-_SLIMMEST = 0.5  # edge of the box, compared with its longest edge
+_SLIMMEST = 0.5  # smallest edge of the box relative to its longest edge
 _ALPHA = 0.5
-_EVERY = 3  # points of the grid between two coordinate lines
+_EVERY = 3  # grid points from one coordinate line to the next
 
 
 def draw_path(
@@ -28,11 +28,11 @@ def draw_path(
 
     Args:
         axes: 3-D axes.
-        run: what is drawn.
-        targets: task values.
+        run: the run to draw.
+        targets: task values of the manifolds.
         view: elevation and azimuth of the camera [deg].
-        cells: of the manifolds, along the longest edge of the box.
-        grid: values of xi1 and of xi2 on coordinate lines, (2, N); none without.
+        cells: number of cells for the manifolds along the longest edge of the box.
+        grid: values of xi1 and xi2 on coordinate lines, (2, N); without it, no lines are drawn.
     """
     q, task = run.trajectory.q, run.chart.problem.task
     low, high = _box_around(q)
@@ -60,7 +60,7 @@ def draw_path(
 
 
 def coordinate_grid(chart: Chart, start: Array, target: float, grid: Array) -> Array:
-    """Joint positions with h(q) = target and all pairs of xi1 and xi2, found one beside the other, (N, N, 3)."""
+    """Joint positions with h(q) = target and all pairs of xi1 and xi2, each solved from its neighbour, (N, N, 3)."""
     nearest = [int(np.abs(values).argmin()) for values in grid]
     points = np.empty((len(grid[0]), len(grid[1]), 3))
     first, second = nearest
@@ -74,7 +74,7 @@ def coordinate_grid(chart: Chart, start: Array, target: float, grid: Array) -> A
 
 
 def add_coordinate_lines(scene: Scene, points: Array, radius: float) -> None:
-    """Lines of constant xi1 and of constant xi2 through a grid (N, N, 3)."""
+    """Add lines of constant xi1 and of constant xi2 through a grid (N, N, 3)."""
     for line in points[::_EVERY]:
         scene.add_tube(line, radius, COLOURS["xi1"])
     for line in points.transpose(1, 0, 2)[::_EVERY]:
@@ -82,7 +82,7 @@ def add_coordinate_lines(scene: Scene, points: Array, radius: float) -> None:
 
 
 def _box_around(curve: Array) -> tuple[Array, Array]:
-    """Lower and upper corner of the picture: with a margin, and not too slim."""
+    """Lower and upper corners of the picture, with a margin and without very short edges."""
     low, high = curve.min(axis=0), curve.max(axis=0)
     half = (high - low) / 2 + _MARGIN
     half = np.maximum(half, _SLIMMEST * half.max())
@@ -90,7 +90,7 @@ def _box_around(curve: Array) -> tuple[Array, Array]:
 
 
 def _thinned(curve: Array, step: float) -> Array:
-    """Points of a curve that lie at least a step apart: a tube has no direction where the motion rests."""
+    """Points of a curve at least a step apart, because a tube has no direction where the motion rests."""
     kept = [curve[0]]
     for point in curve[1:]:
         if np.linalg.norm(point - kept[-1]) > step:
@@ -99,13 +99,13 @@ def _thinned(curve: Array, step: float) -> Array:
 
 
 def _set_ticks(axis: Any, low: float, high: float) -> None:
-    """Two or three round numbers, away from the ends, where labels of other axes are."""
+    """Set two or three round ticks away from the ends, where the labels of other axes are."""
     ticks = np.asarray(MaxNLocator(3).tick_values(low, high))
     inside = ticks[np.abs(ticks - (low + high) / 2) < 0.42 * (high - low)]
     axis.set_ticks(inside, [f"{tick:g}" for tick in inside], fontsize=TICK)
 
 
 def _outwards(middle: int, count: int) -> list[tuple[int, int]]:
-    """Places from the middle to both ends, each with the one before it."""
+    """Indices from the middle to both ends, each with its predecessor."""
     up = [(k, k - 1) for k in range(middle + 1, count)]
     return up + [(k, k + 1) for k in range(middle - 1, -1, -1)]

@@ -1,4 +1,4 @@
-"""Leaves of a scalar task of three joints as triangle meshes, glued to the 3-torus or made into a printable wall."""
+"""Leaves of a scalar task of three joints as triangle meshes, glued to the 3-torus or turned into a printable wall."""
 
 import numpy as np
 import trimesh
@@ -9,7 +9,7 @@ from orthocas.checks import Array
 from orthocas.reproduce.style import TURN
 from orthocas.tasks import Task
 
-_SAME = 1e-6  # distance of vertices that are one [rad]
+_SAME = 1e-6  # vertices closer than this are one [rad]
 
 
 def leaf(task: Task, value: float, cells: int) -> trimesh.Trimesh:
@@ -18,9 +18,9 @@ def leaf(task: Task, value: float, cells: int) -> trimesh.Trimesh:
     Vertices on faces of the cube stay there, so that opposite faces fit together.
 
     Args:
-        task: m = 1 task of a robot with n = 3 revolute joints.
-        value: a task value that is not singular.
-        cells: number of cells along an edge of the cube. A prime number keeps vertices of the grid off the surface.
+        task: task with m = 1 of a robot with n = 3 revolute joints.
+        value: a nonsingular task value.
+        cells: number of cells along an edge of the cube. A prime number keeps grid vertices away from the surface.
     """
     grid = _grid_values(task, cells) - value
     q, faces, _, _ = marching_cubes(grid, 0.0, spacing=3 * (TURN / cells,))
@@ -34,8 +34,8 @@ def leaf(task: Task, value: float, cells: int) -> trimesh.Trimesh:
 
 
 def glued(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The same surface in the 3-torus: vertices on opposite faces of the cube become one, as far as topology goes."""
-    q = np.asarray(mesh.vertices) % TURN % TURN  # twice: tiny negative numbers round up to a whole turn
+    """The same surface in the 3-torus: vertices on opposite faces of the cube become topologically one."""
+    q = np.asarray(mesh.vertices) % TURN % TURN  # twice, because tiny negative numbers round up to a whole turn
     tree = cKDTree(q, boxsize=TURN)
     first = np.array([min(near) for near in tree.query_ball_point(q, _SAME)])
     names, merged = np.unique(first, return_inverse=True)
@@ -45,15 +45,15 @@ def glued(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def wall(task: Task, value: float, cells: int, edge: float, thickness: float) -> trimesh.Trimesh:
     """A printable wall around a leaf in the cube: the solid |h - value| / |grad h| <= thickness / 2, cut at the cube.
 
-    Marching cubes on the depth below its surface, the smaller one of those below the wall and below the cube, gives a
-    closed surface. The grid reaches half a cell beyond the cube, so that cut edges are smooth.
+    Marching cubes on the depth inside the solid (the smaller of the depths inside wall and cube) give a closed surface.
+    The grid extends half a cell beyond the cube, so that cut edges are smooth.
 
     Args:
-        task: m = 1 task of a robot with n = 3 revolute joints.
-        value: a task value that is not singular.
-        cells: number of cells along an edge of the cube, so small that a cell is not longer than the wall is thick.
-        edge: of the cube [mm].
-        thickness: of the wall [mm].
+        task: task with m = 1 of a robot with n = 3 revolute joints.
+        value: a nonsingular task value.
+        cells: number of cells along an edge of the cube, large enough that a cell is no longer than the wall is thick.
+        edge: edge length of the cube [mm].
+        thickness: thickness of the wall [mm].
     """
     line = (np.arange(cells + 2) - 0.5) * edge / cells  # [mm]
     points = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -69,7 +69,7 @@ def wall(task: Task, value: float, cells: int, edge: float, thickness: float) ->
 
 
 def _grid_values(task: Task, cells: int) -> Array:
-    """The task on a grid in the cube, (cells + 1)^3, exactly the same on opposite faces."""
+    """The task on a grid in the cube, (cells + 1)^3, with exactly equal values on opposite faces."""
     angle = np.arange(cells + 1) % cells * TURN / cells
     points = np.stack(np.meshgrid(angle, angle, angle, indexing="ij"), axis=-1).reshape(-1, 3)
     return task.batched(points)[0].reshape(3 * (cells + 1,))

@@ -1,4 +1,4 @@
-"""Lines of constant value painted on triangles, which are cut along both edges of every line."""
+"""Paints lines of constant value on triangles by cutting the triangles along both edges of every line."""
 
 from dataclasses import dataclass
 
@@ -7,30 +7,30 @@ from numpy.typing import NDArray
 
 from orthocas.checks import Array
 
-Numbers = NDArray[np.intp]  #: of vertices or triangles
+Numbers = NDArray[np.intp]  #: indices of vertices or triangles
 
 
 @dataclass(frozen=True, eq=False)
 class Isolines:
     """Lines of constant value on a surface."""
 
-    values: Array  #: at its vertices, (V,)
+    values: Array  #: values at the vertices, (V,)
     levels: Array  #: (L,)
     colours: Array  #: of the levels, RGBA, (L, 4)
     width: float  #: in units of the surface
 
 
 def paint(corners: Array, faces: Numbers, lines: Isolines, colours: Array) -> tuple[Array, Array, Numbers]:
-    """Cut triangles along lines and colour those within.
+    """Cut triangles along lines, and colour the parts inside the lines.
 
     Args:
         corners: vertices of triangles, (F, 3, 3).
-        faces: their numbers, (F, 3).
-        lines: what to paint.
+        faces: vertex indices of the triangles, (F, 3).
+        lines: the lines to paint.
         colours: RGBA of the triangles, (F, 4).
 
     Returns:
-        Corners (G, 3, 3), colours (G, 4), and the triangle each comes from (G,).
+        Corners (G, 3, 3), colours (G, 4), and the original triangle of each part (G,).
     """
     values = lines.values[faces]
     half = lines.width / 2 * np.maximum(_slopes(corners, values), 1e-3 * np.ptp(lines.values) / max(np.ptp(corners), 1))
@@ -47,15 +47,15 @@ def paint(corners: Array, faces: Numbers, lines: Isolines, colours: Array) -> tu
 
 
 def cut(pieces: Array, source: Numbers, levels: Array) -> tuple[Array, Numbers]:
-    """Cut triangles where their last column, linear on each, passes a level.
+    """Cut triangles where a function, linear on each triangle, crosses a level.
 
     Args:
-        pieces: corners with a value in the last column, (F, 3, 4).
-        source: any number that parts inherit, (F,).
-        levels: one per triangle, (F,).
+        pieces: corners with the value of the function in the last column, (F, 3, 4).
+        source: an index that the parts inherit, (F,).
+        levels: one level per triangle, (F,).
 
     Returns:
-        Pieces (G, 3, 4) and their numbers (G,).
+        Pieces (G, 3, 4) and their indices (G,).
     """
     above = pieces[..., 3] > levels[:, None]
     count = above.sum(axis=1)
@@ -69,7 +69,7 @@ def cut(pieces: Array, source: Numbers, levels: Array) -> tuple[Array, Numbers]:
 
 
 def _between(a: Array, b: Array, levels: Array) -> Array:
-    """The point of each edge where the last column has the level."""
+    """The point of each edge where the last column equals the level."""
     share = (levels - a[:, 3]) / (b[:, 3] - a[:, 3])
     point: Array = a + share[:, None] * (b - a)
     point[:, 3] = levels
@@ -77,7 +77,7 @@ def _between(a: Array, b: Array, levels: Array) -> Array:
 
 
 def _slopes(corners: Array, values: Array) -> Array:
-    """Length of the gradient of a linear function on each triangle, (F,); 0 where a triangle has no area."""
+    """Length of the gradient of a linear function on each triangle, (F,); 0 for triangles without area."""
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     rise = np.stack([values[:, 1] - values[:, 0], values[:, 2] - values[:, 0]], axis=1)
     edges = np.stack([first, second], axis=1)  # (F, 2, 3)

@@ -1,8 +1,9 @@
-"""Coordinates of the planar arm with two joints, fitted on the whole torus: what Figs. 17 and 18 of [AS2023] share.
+"""Coordinates of the planar arm with two joints, fitted on the whole torus, for Figs. 17 and 18 of [AS2023].
 
 The paper fits a network; here Fourier terms of degree 12 take some seconds. The loss has many minima on the torus. For
-A = M `oc.fit` finds one with every value twice on a leaf, as in the paper; for A = I it finds one whose values appear
-more often, and the paper's is reached from the cosine of the grown coordinate, which has every value twice itself.
+A = M, `oc.fit` finds one where every value occurs twice on a leaf, as in the paper. For A = I, it finds one whose
+values occur more often. The minimum of the paper is reached from the cosine of the grown coordinate, which itself has
+every value twice.
 """
 
 from functools import partial
@@ -24,16 +25,16 @@ from orthocas.reproduce.planar_flow import grown_chart
 from orthocas.samples import sample_problem, samples_at
 from orthocas.solvers import GaussNewton
 
-_WEIGHTS = Weights.of((1000.0, 0.0))  # one coordinate: no mutual angles
+_WEIGHTS = Weights.of((1000.0, 0.0))  # one coordinate has no mutual angles
 
 
 def freely_fitted(problem: Problem, quick: bool) -> Chart:
-    """What `oc.fit` finds without a start."""
+    """The chart that `oc.fit` finds without a given start."""
     return fit(problem, _series(quick), weights=(_WEIGHTS.task, 0.0), samples=_sample_count(quick)).chart
 
 
 def fitted_from_grown(problem: Problem, quick: bool) -> Chart:
-    """The minimum of the loss (25) that is reached from the cosine of the grown coordinate."""
+    """The chart at the minimum of the loss (25) that is reached from the cosine of the grown coordinate."""
     space, series = JointSpace.of(problem), _series(quick)
     family = series.family(space, 1)
     points = sample_evenly(problem.domain, _sample_count(quick), 0)

@@ -1,7 +1,7 @@
-"""Flow lines of the planar arm with two joints, and what the figures of this arm share.
+"""Flow lines of the planar arm with two joints, and the common parts of its figures.
 
-With links of 1 m the task x = cos q1 + cos(q1 + q2) has its maximum 2 m at (0, 0), its minimum -2 m at (pi, 0), and two
-saddles of height 0 at (0, pi) and (pi, pi).
+With links of 1 m, the task x = cos q1 + cos(q1 + q2) has its maximum 2 m at (0, 0), its minimum -2 m at (pi, 0), and
+two saddles of height 0 at (0, pi) and (pi, pi).
 """
 
 from typing import Any
@@ -25,8 +25,8 @@ from orthocas.singularities import SingularPoint
 
 NAMES = {"euclidean": "A = I", "inertia": "A = M"}
 LEVEL = 1.0  #: task value of the base leaf S0 [m]
-EXTREME = 2.0 - 1e-8  #: task value [m] where flow lines end: 1e-4 rad from the maximum or the minimum
-_ORIGIN = (np.pi / 3, 0.0)  # on S0, so that both metrics have the same chart of it
+EXTREME = 2.0 - 1e-8  #: task value at which flow lines end [m], 1e-4 rad from the maximum or the minimum
+_ORIGIN = (np.pi / 3, 0.0)  # on S0, so that both metrics give S0 the same chart
 MARKS = {"maximum": "^", "minimum": "v", "saddle": "X"}
 
 
@@ -42,7 +42,7 @@ def grown_chart(problem: Problem) -> Chart:
 
 
 def grown_coordinates(chart: Chart) -> GrownCoordinates:
-    """What `grown_chart` made."""
+    """The coordinates of a chart that `grown_chart` made."""
     assert isinstance(chart.coordinates, GrownCoordinates)
     return chart.coordinates
 
@@ -57,16 +57,16 @@ def base_leaf(chart: Chart) -> CircleLeaf:
 def flow_lines(problem: Problem, starts: Array, goals: Array, steps: int) -> list[Array]:
     """Curves of +-grad_A h from points to given task values.
 
-    Task values of their points are close together near 2, 0 and -2 m, where the curves are fast.
+    The task values of their points are dense near 2, 0 and -2 m, where the curves are fast.
 
     Args:
-        problem: made by `planar_problem`.
-        starts: (N, 2).
+        problem: a problem that `planar_problem` made.
+        starts: start points, (N, 2).
         goals: task values at the ends, (N,), within +-2 m.
-        steps: number of steps of each.
+        steps: number of steps per curve.
 
     Returns:
-        One curve per start, (steps + 1, 2) without wrapping, or shorter if it runs into a singular point.
+        One curve per start, (steps + 1, 2) without wrapping, or shorter if the curve runs into a singular point.
     """
     flow, first, last = TaskFlow(problem), _stage(problem.task.batched(starts)[0][:, 0]), _stage(goals)
     curves, running = [[q] for q in starts], np.arange(len(starts))
@@ -81,7 +81,7 @@ def flow_lines(problem: Problem, starts: Array, goals: Array, steps: int) -> lis
 
 
 def _stage(height: Array) -> Array:
-    """0 at -2 m, 1 at 0, 2 at 2 m, such that equal stages are short in height near these values."""
+    """A scale of height: 0 at -2 m, 1 at 0, 2 at 2 m. Equal stages are small changes of height near these values."""
     upper = (height > 0).astype(float)
     stage: Array = upper + np.arccos(np.clip(2 * upper - 1 - height, -1, 1)) / np.pi
     return stage
@@ -101,17 +101,17 @@ def corners(cells: int) -> tuple[Array, Array]:
 
 
 def cell_centres(cells: int) -> Array:
-    """Centres of the cells of a grid over the torus, row by row with q1 running first, (cells^2, 2)."""
+    """Centres of the cells of a grid over the torus, row by row with q1 running fastest, (cells^2, 2)."""
     q = (np.arange(cells) + 0.5) * TURN / cells - np.pi
     return np.stack(np.meshgrid(q, q), axis=-1).reshape(-1, 2)
 
 
 def deviations(problem: Problem, points: Array, J_xi: Array) -> Array:
-    """Angle between grad_A h and dxi ([AS2023] eq. (24)) as deviation from 90 degrees [deg], (N,).
+    """Deviation from 90 degrees of the angle between grad_A h and dxi ([AS2023] eq. (24)) [deg], (N,).
 
     Args:
-        problem: with n = 2 and m = 1.
-        points: (N, 2), none of them singular.
+        problem: a problem with n = 2 and m = 1.
+        points: nonsingular points, (N, 2).
         J_xi: gradients of xi, (N, 2).
     """
     gradients = samples_at(problem, points).unit_task_gradients[:, 0]
@@ -121,14 +121,15 @@ def deviations(problem: Problem, points: Array, J_xi: Array) -> Array:
 
 
 def cosines_by_differences(chart: Chart, points: Array, step: float = 1e-4) -> Array:
-    """Cosine between grad_A h and dxi with central differences of xi instead of J_xi, (N,); NaN where xi is.
+    """Cosine between grad_A h and dxi, by central differences of xi instead of J_xi, (N,); NaN where xi is NaN.
 
-    Independent of J_xi, which is orthogonal by construction: its tangent vectors start on the leaf of q.
+    This check does not use J_xi, which is orthogonal by construction because its tangent vectors start on the leaf of
+    q.
 
     Args:
-        chart: with n = 2, grown from a circle.
+        chart: a chart with n = 2, grown from a circle.
         points: (N, 2).
-        step: half the distance of the values [rad].
+        step: half the distance between the values [rad].
     """
     shifts = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     xi = chart.xi((points[:, None] + shifts).reshape(-1, 2)).reshape(-1, 2, 2)
@@ -152,18 +153,18 @@ def mark(axes: Any, kind: str, points: Array, size: float = 7.0) -> None:
 
 
 def symbol(marker: str, colour: str, text: str) -> Line2D:
-    """An entry of a legend for a mark."""
+    """A legend entry for a marker."""
     edge = INK if colour == "white" else colour
     return Line2D([], [], linestyle="", marker=marker, color=colour, markeredgecolor=edge, markersize=6, label=text)
 
 
 def singular_symbols() -> list[Line2D]:
-    """Entries of a legend for singular points."""
+    """Legend entries for singular points."""
     return [symbol(marker, "white", f"{kind} of $h$") for kind, marker in MARKS.items()]
 
 
 def mark_singular(axes: Any, singular: tuple[SingularPoint, ...], size: float = 7.0) -> None:
-    """Mark singular points in the square |q_i| <= pi, at its edges too."""
+    """Mark singular points in the square |q_i| <= pi, including its edges."""
     shifts = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]) * TURN
     for one in singular:
         copies = one.point + shifts
@@ -171,7 +172,7 @@ def mark_singular(axes: Any, singular: tuple[SingularPoint, ...], size: float = 
 
 
 def distance_to(points: Array, singular: tuple[SingularPoint, ...]) -> Array:
-    """Distance of points (N, 2) from the nearest singular point on the torus [rad], (N,)."""
+    """Distances of points (N, 2) from the nearest singular point on the torus [rad], (N,)."""
     apart = np.stack([np.linalg.norm(wrapped(points - s.point), axis=1) for s in singular])
     nearest: Array = apart.min(axis=0)
     return nearest

@@ -1,11 +1,12 @@
-"""Closed loops of the planar arm with three joints: what Figs. 22 to 26 and 30 of [AS2023] share (Sec. 8).
+"""Closed loops of the planar arm with three joints: the common part of Figs. 22 to 26 and 30 of [AS2023] (Sec. 8).
 
-From the paper: links of 3 kg, mass spread uniformly, gravity along -y, A = M, steps through the low pass with omega0 =
-2 pi rad/s and zeta = 0.7, the controllers (33) and (35). Ours, since the paper does not print them: everything that is
-written in capitals here, but for MASS.
+From the paper: uniform links of 3 kg, gravity along -y, A = M, steps through the low-pass filter with omega0 = 2 pi
+rad/s and zeta = 0.7, and the controllers (33) and (35). The constants in capitals, except MASS, are ours, because the
+paper does not state them.
 
-The controllers are decoupled: one for the task and one for the extra coordinates, each with its own inertia, as the
-paper sums them up. With the full inertia M_phi tracking is exact in any regular chart, which hides what is to be seen.
+The controllers are decoupled: the command is the sum of one controller for the task and one for the extra coordinates,
+each with its own inertia, as in the paper. With the full inertia M_phi, tracking would be exact in any regular chart,
+which would hide the effect that the figures show.
 """
 
 from dataclasses import dataclass, replace
@@ -31,16 +32,16 @@ from orthocas.simulation import Coupling, Trajectory, coupling_index, simulate
 from orthocas.tasks import Task
 
 Axes = Literal["x", "xy"]
-Moves = tuple[dict[str, float], ...]  #: one step after another: new targets, counted from the start [m] or [1]
+Moves = tuple[dict[str, float], ...]  #: steps in order, each with new targets relative to the start [m] or [1]
 
 
 @dataclass(frozen=True)
 class Place:
-    """A base with its tip straight above joint 1, and a box that holds the motions from there."""
+    """A base with its tip straight above joint 1, and a box around the motions from there."""
 
     q2: float  #: of the base [rad]
     q3: float
-    low: tuple[float, float, float]  #: corners of the box, counted from the base [rad]
+    low: tuple[float, float, float]  #: corners of the box relative to the base [rad]
     high: tuple[float, float, float]
 
 
@@ -48,10 +49,10 @@ LENGTHS = (1.0, 1.0, 1.0)  #: of the links [m]
 MASS = 3.0  #: of a link [kg], from the paper
 STIFFNESS = 100.0  #: K: [N/m] for x and y, [J] for xi
 DAMPING_RATIO = 0.7  #: Z
-PAUSE = 2.0  #: from one step to the next; the first comes at 1 s [s]
+PAUSE = 2.0  #: time between steps [s]; the first step is at 1 s
 
 GENTLE = Place(2.8, -1.9, (-0.35, -0.25, -0.8), (0.4, 0.3, 0.6))  #: leaves of x with low curvature
-STRONG = Place(2.07, 2.07, (-0.5, -0.4, -1.6), (0.15, 0.35, 0.45))  #: ten times more curved
+STRONG = Place(2.07, 2.07, (-0.5, -0.4, -1.6), (0.15, 0.35, 0.45))  #: ten times the curvature
 FOLDED = Place(1.2, -2.9, (-0.55, -0.15, -0.15), (0.15, 0.9, 0.5))  #: for the task (x, y)
 
 INTERLEAVED: Moves = ({"x": 0.25}, {"xi1": 0.3}, {"x": 0.0}, {"xi1": -0.3}, {"x": 0.25}, {"xi1": 0.0})  #: 22, 23, 25
@@ -61,7 +62,7 @@ SMALL: Moves = ({"x": 0.1}, {"xi1": 0.15}, {"x": 0.0}, {"xi1": 0.0})  #: Fig. 26
 ALL_OF_XY: Moves = ({"x": 0.25}, {"y": 0.25}, {"xi1": 0.4}, {"x": 0.0}, {"y": 0.0}, {"xi1": 0.0})  #: Fig. 30
 
 
-_GRID, _STARTS = 101, 5  # of the search for postures
+_GRID, _STARTS = 101, 5  # grid points and starts of the search for postures
 
 
 @dataclass(frozen=True)
@@ -81,26 +82,26 @@ class Arm:
         return np.array([np.pi / 2 - np.angle(tip), place.q2, place.q3])
 
     def box(self, place: Place) -> Box:
-        """Where coordinates are fitted and judged."""
+        """The box on which coordinates are fitted and evaluated."""
         low, high = np.array(place.low), np.array(place.high)
         return Box(self.base(place) + (low + high) / 2, (high - low) / 2)
 
     def linear(self, axes: Axes, place: Place) -> Chart:
-        """The coordinates (37) or (39), for all angles: they have no border at which a controller gives up."""
+        """The coordinates (37) or (39) for all angles, so that the controller never leaves the domain."""
         base = tuple(self.base(place).tolist())
         return fit(self.problem(axes, Torus(3)), Linear(base, "paper")).chart
 
     def fitted(self, axes: Axes, place: Place, quick: bool) -> Chart:
         """Polynomials fitted on the box of the place, in the combination that agrees with `linear` at the base.
 
-        Then the same steps begin with the same motion. A combination of coordinates is as orthogonal to the task.
+        The same steps then begin with the same motion. Linear combinations of coordinates stay orthogonal to the task.
         """
         return _fitted(self, axes, place, quick)
 
 
 @lru_cache(maxsize=16)
 def _fitted(arm: Arm, axes: Axes, place: Place, quick: bool) -> Chart:
-    """Several figures share a chart."""
+    """Fit a chart once, because several figures share it."""
     degree = 8 if axes == "x" and not quick else 6
     samples = 1500 if quick else 4000
     chart = fit(arm.problem(axes, arm.box(place)), Polynomial(degree), samples=samples).chart
@@ -109,7 +110,7 @@ def _fitted(arm: Arm, axes: Axes, place: Place, quick: bool) -> Chart:
 
 
 def combined(chart: Chart, base: Array, gradients: Array) -> Chart:
-    """The chart of B (xi - xi(base)), with the constant matrix B that brings J_xi(base) nearest to gradients (r, n)."""
+    """The chart of B (xi - xi(base)), with the constant B for which B J_xi(base) is nearest to `gradients` (r, n)."""
     old = chart.coordinates
     assert isinstance(old, Coordinates)
     B = gradients @ np.linalg.pinv(chart.jacobian(base)[chart.m :])
@@ -120,7 +121,7 @@ def combined(chart: Chart, base: Array, gradients: Array) -> Chart:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A chart, what was asked for, and what came."""
+    """A chart, a reference, and the measured trajectory."""
 
     chart: Chart
     reference: Reference
@@ -133,14 +134,14 @@ class Run:
 
     @property
     def missed(self) -> Array:
-        """Largest distance from the targets at the end of a step, (n,): stays large if they contradict each other."""
+        """Largest distance from the targets at the end of a step, (n,). It stays large if targets are contradictory."""
         times = self.trajectory.times
         ends = np.searchsorted(times, self.reference.times[1:] - 1e-9).clip(max=len(times) - 1)
         return np.asarray(np.abs(self.trajectory.value[ends] - self.reference.targets).max(axis=0))
 
     @property
     def share_not_ok(self) -> float:
-        """Share of instants at which the controller gave its fallback."""
+        """Share of instants at which the controller used its fallback."""
         return float(np.mean(self.trajectory.status != ControlStatus.OK))
 
     def numbers(self, prefix: str = "") -> dict[str, float]:
@@ -164,7 +165,7 @@ def follow(
     damping_ratio: ArrayLike = DAMPING_RATIO,
     damping: DampingDesign = "square_root",
 ) -> Run:
-    """Take one step after another from a start (n,), with tau_2 (35), or with feedback tau_1 (33) alone."""
+    """Follow the steps from a start (n,), with tau_2 (35) or with the feedback tau_1 (33) only."""
     labels, phi = chart.labels, chart.phi(start)
     changes = [
         (1 + PAUSE * k, {label: phi[labels.index(label)] + to for label, to in move.items()})
@@ -177,16 +178,16 @@ def follow(
 
 
 def task_angle_std(chart: Chart, box: Box, quick: bool) -> float:
-    """Standard deviation of the angles between task and coordinate gradients over a box [deg], held out."""
+    """Standard deviation of the angles between task and coordinate gradients over a box [deg], on held-out samples."""
     problem = Problem(chart.problem.robot, chart.problem.task, chart.problem.metric, box)
     return evaluate(Chart(problem, chart.coordinates), 5_000 if quick else 50_000).task_angle.std
 
 
 def out_of_reach(run: Run) -> float:
-    """How far the task stays from its target in the line or plane of postures where linear xi has its own [m].
+    """Smallest distance of the task from its target over all postures where linear xi meets its targets [m].
 
-    The worst step counts. The line (m = 1) or plane (m = 2) is searched for half a turn around the start: on a grid,
-    and from its best points on by least squares.
+    The worst step counts. These postures form a line (m = 1) or plane (m = 2), which is searched within half a turn
+    around the start, first on a grid and then by least squares from the best grid points.
     """
     chart, start = run.chart, run.trajectory.q[0]
     normals = chart.jacobian(start)[chart.m :]

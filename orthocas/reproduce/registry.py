@@ -1,4 +1,4 @@
-"""All figures that are drawn again, by name."""
+"""All reproduced figures, by name."""
 
 import re
 from collections.abc import Callable
@@ -39,10 +39,10 @@ from orthocas.reproduce.drawing import Drawing, save
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a figure is made."""
+    """The title of a figure, and the function that draws it."""
 
     title: str
-    draw: Callable[[bool], Drawing]  #: takes `quick`: coarser, for tests
+    draw: Callable[[bool], Drawing]  #: takes `quick`, for a coarser version in tests
 
 
 FIGURES: dict[str, Recipe] = {
@@ -74,10 +74,10 @@ FIGURES: dict[str, Recipe] = {
 
 
 def chosen(name: str) -> list[str]:
-    """Names of figures that a word means: "all", or one of "fig07", "fig7", "07" and "7".
+    """Names of the figures that a word selects: "all", or one figure as "fig07", "fig7", "07" or "7".
 
     Raises:
-        UnknownNameError: if there is no such figure.
+        UnknownNameError: if no figure has that name.
     """
     if name == "all":
         return list(FIGURES)
@@ -91,13 +91,13 @@ def chosen(name: str) -> list[str]:
 def reproduce(
     name: str, out: str | Path, quick: bool = False, monitor: Monitor = silent
 ) -> dict[str, dict[str, float]]:
-    """Draw figures of [AS2023] again and save pictures, numbers and meshes.
+    """Reproduce figures of [AS2023], and save pictures, numbers and meshes.
 
-    Ctrl-C leaves the files of the figures that are finished.
+    Ctrl-C keeps the files of the finished figures.
 
     Args:
         name: a figure, or "all".
-        out: folder for the files, made if need be.
+        out: folder for the files, created if needed.
         quick: coarser and faster, for tests.
         monitor: called before each figure and at the end.
 
@@ -105,8 +105,8 @@ def reproduce(
         The numbers of each figure.
 
     Raises:
-        UnknownNameError: if there is no such figure.
-        InvalidValueError: if the folder cannot be written.
+        UnknownNameError: if no figure has that name.
+        InvalidValueError: if the folder is not writable.
     """
     names, folder = chosen(name), made_folder("out", out)
     numbers = {}

@@ -1,6 +1,7 @@
-"""3-D scenes with right occlusion: everything becomes triangles of one collection that is sorted by depth as a whole.
+"""3-D scenes with correct occlusion: everything becomes triangles of one collection, which is sorted by depth.
 
-Matplotlib sorts within a collection only, so that a line drawn beside a surface is all in front of it or all behind.
+Matplotlib sorts only within a collection, so that a separate line is either completely in front of a surface or
+completely behind it.
 """
 
 from typing import Any
@@ -16,11 +17,11 @@ from orthocas.reproduce.painting import Isolines, Numbers, paint
 from orthocas.reproduce.style import GREY
 
 Colour = str | tuple[float, ...] | Array
-_AMBIENT = 0.6  # share of the light that comes from everywhere
+_AMBIENT = 0.6  # share of ambient light
 
 
 class Scene:
-    """Triangles with colours, gathered and then drawn."""
+    """Collects coloured triangles, and draws them."""
 
     def __init__(self) -> None:
         self._corners: list[Array] = []
@@ -50,9 +51,9 @@ class Scene:
         Args:
             vertices: (V, 3).
             faces: (F, 3).
-            colour: one, or RGB or RGBA per face (F, 3 or 4).
+            colour: one colour, or RGB or RGBA per face (F, 3 or 4).
             alpha: opacity.
-            lines: isolines to paint on it.
+            lines: isolines to paint on the mesh.
         """
         points, triples = np.asarray(vertices, dtype=float), np.asarray(faces)
         corners, normals = points[triples], _smooth_normals(points, triples)
@@ -69,7 +70,7 @@ class Scene:
         self.add_surface(*solids.tube(points, radius), colour)
 
     def add_arrow(self, start: ArrayLike, vector: ArrayLike, radius: float, colour: Colour) -> None:
-        """Add an arrow; `radius` is that of its shaft."""
+        """Add an arrow with a shaft of the given radius."""
         self.add_surface(*solids.arrow(start, vector, radius), colour)
 
     def add_ball(self, centre: ArrayLike, radius: float, colour: Colour) -> None:
@@ -86,13 +87,13 @@ class Scene:
                 self.add_surface(*solids.straight_tube(edge[0], edge[1], radius), colour)
 
     def draw(self, axes: Any, view: tuple[float, float], low: ArrayLike, high: ArrayLike, zoom: float = 1.0) -> None:
-        """Put everything into 3-D axes, seen from (elevation, azimuth) [deg], the same scale on all three axes.
+        """Draw the scene in 3-D axes with the same scale on all three axes.
 
         Args:
             axes: matplotlib axes with projection="3d".
-            view: where the camera stands; the light stands above its left shoulder.
-            low: lower corner of what is shown, one number or (3,).
-            high: upper corner.
+            view: elevation and azimuth of the camera [deg]; the light comes from above its left shoulder.
+            low: lower corner of the visible box, one number or (3,).
+            high: upper corner of the visible box.
             zoom: size of the picture within the axes.
         """
         shaded = _lit(np.concatenate(self._normals), self.colours, view)
@@ -119,7 +120,7 @@ def _face_colours(colour: Colour, alpha: float, count: int) -> Array:
 
 
 def _smooth_normals(points: Array, faces: Numbers) -> Array:
-    """Unit normal of each face, averaged over the faces it touches so that shading has no facets, (F, 3)."""
+    """Unit normal of each face, averaged over the neighbouring faces for smooth shading, (F, 3)."""
     corners = points[faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     at_vertices = np.zeros_like(points)

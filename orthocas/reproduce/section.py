@@ -1,4 +1,4 @@
-"""What Figs. 10 and 19 share: a box of joint space, task (x, y) of the planar arm with three joints, A = I."""
+"""The common part of Figs. 10 and 19: a box of joint space, task (x, y) of the planar arm with three joints, A = I."""
 
 import numpy as np
 
@@ -20,17 +20,17 @@ def section(low: Array, high: Array) -> Problem:
 
 
 def isosurface(chart: Chart, value: float, cells: int) -> TriangleMesh:
-    """The part in the domain of the leaf where a single coordinate has a value."""
+    """The leaf of a single coordinate at a value, as far as it lies in the domain."""
     domain, xi = chart.problem.domain, chart.coordinates
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
     return level_surface(lambda q: xi.xi(q)[:, 0], lambda q: xi.jacobian(q)[:, 0], value, low, high, cells)
 
 
 def curves_inside(problem: Problem, starts: Array, step: float) -> list[Array]:
-    """The parts in the domain of self-motion curves through points of it, (P, 3) each, as far as they hang together."""
+    """The connected parts in the domain of self-motion curves through points of the domain, (P, 3) each."""
     curves = []
     for curve in trace(problem.task, starts, step):
-        turns = curve[-1] - curve[0]  # of joints that go around
+        turns = curve[-1] - curve[0]  # whole turns of the joints
         line, at = np.concatenate([curve[:-1] - turns, curve]), len(curve) - 1
         inside = np.all(np.abs(line - problem.domain.centre) <= problem.domain.half_width, axis=1)
         before, after = np.append(inside[at::-1], False), np.append(inside[at:], False)

@@ -1,4 +1,4 @@
-"""Self-motion curves of three joints under a task of two numbers: level curves of h on the 3-torus."""
+"""Self-motion curves of three joints under a task with m = 2: level curves of h on the 3-torus."""
 
 import numpy as np
 
@@ -8,23 +8,23 @@ from orthocas.reproduce.style import TURN
 from orthocas.tasks import Task
 
 _CORRECTIONS = 3
-_SAME = 1e-9  # distance of equal points [rad]
+_SAME = 1e-9  # points closer than this are equal [rad]
 
 
 def trace(task: Task, starts: Array, step: float = 0.05, most: int = 2000) -> list[Array]:
     """Follow dq/ds = J_1 x J_2 / |J_1 x J_2| by Runge-Kutta steps, each corrected by Newton's method, until it closes.
 
     Args:
-        task: m = 2 task of a robot with n = 3 revolute joints.
+        task: task with m = 2 of a robot with n = 3 revolute joints.
         starts: one point of each curve, (N, 3) [rad].
         step: length of a step [rad].
         most: number of steps after which a curve counts as open.
 
     Returns:
-        One curve per start, (P, 3), not wrapped: the last point is the first one, up to whole turns.
+        One curve per start, (P, 3), not wrapped. The last point equals the first up to whole turns.
 
     Raises:
-        SolveError: if a curve does not close; it may run into a singular configuration.
+        SolveError: if a curve does not close, for example because it runs into a singular configuration.
     """
     goal, direction = task.batched(starts)[0], _tangents(task, starts)
     path, ahead = [starts], np.zeros(len(starts))
@@ -52,7 +52,7 @@ def wrapped(angles: Array) -> Array:
 
 
 def pieces_in_cube(curve: Array) -> list[Array]:
-    """A curve (P, 3), cut where it leaves the cube |q_i| <= pi and shifted back into it."""
+    """Pieces of a curve (P, 3), cut where it leaves the cube |q_i| <= pi and shifted back into the cube."""
     cells = np.floor((curve + np.pi) / TURN)
     pieces, piece = [], [curve[0] - TURN * cells[0]]
     for k in range(len(curve) - 1):
@@ -70,14 +70,14 @@ def pieces_in_cube(curve: Array) -> list[Array]:
 
 
 def _without_repeats(points: Array) -> Array:
-    """A polyline without points that follow an equal one, as when it crosses an edge of the cube."""
+    """A polyline without consecutive equal points, which occur where it crosses an edge of the cube."""
     moved = np.linalg.norm(np.diff(points, axis=0), axis=1) > _SAME
     kept: Array = points[np.concatenate([[True], moved])]
     return kept
 
 
 def _tangents(task: Task, q: Array) -> Array:
-    """Unit null vectors of J_x, (N, 3); their sense changes only where J_x loses rank."""
+    """Unit null vectors of J_x, (N, 3). Their orientation changes only where J_x loses rank."""
     J = task.batched_jacobian(q)[0]
     null = np.cross(J[:, 0], J[:, 1])
     unit: Array = null / np.linalg.norm(null, axis=1, keepdims=True)

@@ -9,16 +9,16 @@ from orthocas.reproduce.painting import Numbers
 
 Mesh = tuple[Array, Numbers]  #: vertices (V, 3) and faces (F, 3)
 _SIDES = 10
-_PIECES = 16  # of a straight line, so that its parts can be sorted by depth
+_PIECES = 16  # pieces of a straight line, so that its parts can be sorted by depth
 
 
 def tube(points: ArrayLike, radius: ArrayLike, sides: int = _SIDES) -> Mesh:
-    """A tube around a polyline, with flat ends: a closed surface.
+    """A closed tube around a polyline, with flat ends.
 
     Args:
         points: (P, 3), P >= 2.
         radius: one number, or one per point (P,).
-        sides: corners of its cross-section.
+        sides: number of corners of the cross-section.
     """
     path = np.asarray(points, dtype=float)
     radii = np.broadcast_to(np.asarray(radius, dtype=float), len(path))
@@ -46,7 +46,7 @@ def straight_tube(start: ArrayLike, end: ArrayLike, radius: float, sides: int = 
 
 
 def arrow(start: ArrayLike, vector: ArrayLike, radius: float) -> Mesh:
-    """A shaft with a cone at its end; from `start` to `start + vector`."""
+    """A shaft with a cone at its end, from `start` to `start + vector`."""
     base, along = np.asarray(start, dtype=float), np.asarray(vector, dtype=float)
     head = min(8 * radius / float(np.linalg.norm(along)), 0.6)  # share of the length
     shaft, cone = np.linspace(0, 1 - head, _PIECES + 1), np.linspace(1 - head, 1, 5)
@@ -61,7 +61,7 @@ def ball(centre: ArrayLike, radius: float) -> Mesh:
 
 
 def _frames(path: Array) -> tuple[Array, Array]:
-    """Two unit vectors across a polyline at each point, turned along it as little as possible, (P, 3) each."""
+    """Two unit vectors across a polyline at each point, with minimal rotation along it, (P, 3) each."""
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     side = np.empty_like(path)

@@ -1,4 +1,4 @@
-"""Looks that the figures share: colours, sizes, and axes in joint angles with ticks at multiples of pi."""
+"""Common style of the figures: colours, sizes, and axes in joint angles with ticks at multiples of pi."""
 
 from collections.abc import Mapping
 from fractions import Fraction
@@ -10,31 +10,31 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
 TASK = "#1f5fa8"  #: task coordinates and self-motion manifolds
-EXTRA = "#d95f02"  #: extra coordinates, and what stands out
+EXTRA = "#d95f02"  #: extra coordinates, and highlights
 THIRD = "#1b9e77"  #: a third kind of line
-GREY = "#8a8f98"  #: frames and things in the background
+GREY = "#8a8f98"  #: frames and background
 INK = "#222222"  #: text and black lines
 
-DPI = 300  #: of saved pictures
-WIDTH = 6.3  #: of a figure over the whole text [inch], 16 cm
+DPI = 300  #: resolution of saved pictures
+WIDTH = 6.3  #: of a figure across the full text width [inch], 16 cm
 LABEL, TICK = 9.0, 8.0  #: font sizes [pt]
 TURN = 2 * np.pi  #: [rad]
 
 
 def new_figure(height: float, width: float = WIDTH, layout: Literal["constrained"] | None = "constrained") -> Figure:
-    """An empty figure, sizes in inches; better without a layout if it has 3-D axes, see `add_3d`."""
+    """An empty figure, with sizes in inches. Use no layout for figures with 3-D axes, see `add_3d`."""
     return Figure(figsize=(width, height), layout=layout)
 
 
 def add_3d(figure: Figure, left: float, bottom: float, width: float, height: float) -> Any:
-    """3-D axes at a place in shares of the figure; things in them may reach beyond."""
+    """Add 3-D axes at a place in shares of the figure; drawings may extend beyond the axes."""
     axes: Any = figure.add_axes((left, bottom, width, height), projection="3d")
     axes.patch.set_visible(False)
     return axes
 
 
 def pi_text(angle: float) -> str:
-    """An angle as a fraction of pi, in mathematical text; exact for denominators up to 12."""
+    """An angle as a fraction of pi in mathematical text, exact for denominators up to 12."""
     part = Fraction(angle / np.pi).limit_denominator(12)
     if part == 0:
         return "$0$"
@@ -51,7 +51,7 @@ def joint_axis(
     parts: int = 4,
     margin: float = 0.0,
 ) -> None:
-    """Make one axis of 2-D or 3-D axes that of a joint angle.
+    """Turn one axis of 2-D or 3-D axes into the axis of a joint angle.
 
     Args:
         axes: matplotlib axes.
@@ -69,7 +69,7 @@ def joint_axis(
 
 
 def joint_plane(axes: Any, low: float = -np.pi, high: float = np.pi, parts: int = 4) -> None:
-    """Axes of the (q1, q2) plane, the same scale on both."""
+    """Set up axes of the (q1, q2) plane with equal scales."""
     joint_axis(axes, "x", 1, low, high, parts)
     joint_axis(axes, "y", 2, low, high, parts)
     axes.set_aspect("equal")
@@ -78,7 +78,7 @@ def joint_plane(axes: Any, low: float = -np.pi, high: float = np.pi, parts: int 
 def joint_cube(
     axes: Any, low: ArrayLike = -np.pi, high: ArrayLike = np.pi, parts: int = 2, margin: float = 0.0
 ) -> None:
-    """Axes of a box of (q1, q2, q3), without panes: `Scene.add_cube` draws its edges in depth."""
+    """Set up axes of a box of (q1, q2, q3) without panes; `Scene.add_cube` draws its edges with correct depth."""
     lower, upper = np.broadcast_to(low, 3), np.broadcast_to(high, 3)
     for k, letter in enumerate("xyz"):
         joint_axis(axes, letter, k + 1, lower[k], upper[k], parts, margin)
@@ -93,6 +93,6 @@ def joint_cube(
 
 
 def line_legend(figure: Figure, entries: Mapping[str, str]) -> None:
-    """One line of text -> colour below everything, for 3-D scenes, which matplotlib cannot make a legend of."""
+    """Add a legend line of text -> colour at the bottom, for 3-D scenes, which have no matplotlib legend."""
     handles = [Line2D([], [], color=colour, linewidth=3, label=text) for text, colour in entries.items()]
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=TICK, frameon=False, borderpad=0.2)

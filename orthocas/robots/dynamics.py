@@ -1,7 +1,7 @@
 """Mass matrix (composite rigid bodies) and inverse dynamics (recursive Newton-Euler) as CasADi expressions.
 
 Source: R. Featherstone, Rigid Body Dynamics Algorithms (docs/references.md [F2008]), chapters 5 and 6, written with
-3-vectors in body frames. `regroup` follows the base parameters of [KD2002].
+3-vectors in body frames. `_regroup` follows the base parameters of [KD2002].
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class _Body:
 
 
 def mass_matrix(tree: KinematicTree, q: ca.SX) -> ca.SX:
-    """M(q), (n, n), symmetric positive definite [kg m^2] for revolute rows, with rotor inertias on the diagonal."""
+    """M(q), (n, n), symmetric positive definite, [kg m^2] for revolute joints. The diagonal includes rotor inertias."""
     joints = _joint_transforms(tree, q)
     bodies = _regroup(tree)
     mass = [ca.SX(body.mass) for body in bodies]
@@ -53,7 +53,7 @@ def mass_matrix(tree: KinematicTree, q: ca.SX) -> ca.SX:
 
 
 def inverse_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, ddq: ca.SX, gravity: Array) -> ca.SX:
-    """Tau = M ddq + C dq + g, (n, 1) [N m] or [N], for the given gravity acceleration (3,) in the world."""
+    """tau = M ddq + C dq + g, (n, 1) [N m] or [N], for a gravity acceleration (3,) in the world."""
     joints = _joint_transforms(tree, q)
     bodies = _regroup(tree)
     states: list[tuple[ca.SX, ca.SX, ca.SX]] = []  # angular velocity, angular acceleration matrix, linear acceleration
@@ -69,7 +69,7 @@ def inverse_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, ddq: ca.SX, gravi
         else:
             alpha += ca.cross(omega, _Z) * dq[i] + _Z * ddq[i]
             omega += _Z * dq[i]
-        # U v = alpha x v + omega x (omega x v), one matrix for every vector fixed in the body
+        # U v = alpha x v + omega x (omega x v): one matrix for all vectors fixed in the body
         U = skew(alpha) + omega @ omega.T - ca.SX.eye(3) * ca.dot(omega, omega)
         states.append((omega, U, a))
         accelerations.append(alpha)
@@ -77,7 +77,7 @@ def inverse_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, ddq: ca.SX, gravi
 
 
 def forward_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, gravity: Array) -> ca.SX:
-    """Ddq = M^-1 (tau - C dq - g), (n, 1), with M = L D L^T."""
+    """ddq = M^-1 (tau - C dq - g), (n, 1), with M = L D L^T."""
     D, LT, order = ca.ldl(mass_matrix(tree, q), False)
     return ca.ldl_solve(tau - bias(tree, q, dq, gravity), D, LT, order)
 
@@ -90,7 +90,7 @@ def bias(tree: KinematicTree, q: ca.SX, dq: ca.SX, gravity: Array) -> ca.SX:
 def coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX) -> ca.SX:
     """C(q, v) w with the Christoffel form of C, (n, 1), by polarisation of the quadratic form C(q, v) v.
 
-    C(q, v) w = (c(v + w) - c(v - w)) / 4 with c(v) = C(q, v) v; bilinear and symmetric in (v, w).
+    C(q, v) w = (c(v + w) - c(v - w)) / 4 with c(v) = C(q, v) v. It is bilinear and symmetric in (v, w).
     """
     weightless = np.zeros(3)
     return (bias(tree, q, v + w, weightless) - bias(tree, q, v - w, weightless)) / 4
@@ -98,7 +98,7 @@ def coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX) -> ca.SX
 
 @dataclass
 class _JointTransform:
-    """Body i in its parent's frame, kept as a constant rotation and a turn about z: cheaper than their product."""
+    """Body i in its parent's frame: a constant rotation and a turn about z, which are cheaper than their product."""
 
     rotation: ca.SX  # constant, (3, 3)
     turn: ca.SX  # Rz(q) or the identity
@@ -140,7 +140,7 @@ def _joint_forces(
     states: list[tuple[ca.SX, ca.SX, ca.SX]],
     accelerations: list[ca.SX],
 ) -> ca.SX:
-    """Backward pass: body wrenches summed towards the base, projected on the joint axes."""
+    """Backward pass: sum body wrenches towards the base, and project them on the joint axes."""
     forces = [ca.SX(3, 1)] * tree.n
     torques = [ca.SX(3, 1)] * tree.n
     tau = ca.SX.zeros(tree.n)
@@ -164,17 +164,17 @@ def _along_joint(tree: KinematicTree, i: int, force: ca.SX, torque: ca.SX) -> ca
 def _unit_acceleration_wrench(
     tree: KinematicTree, i: int, mass: ca.SX, moment: ca.SX, inertia: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Force and torque about the origin that give body i unit acceleration along its joint."""
+    """Force, and torque about the origin, that give body i unit acceleration along its joint."""
     if tree.joint_kinds[i] == "prismatic":
         return mass * _Z, ca.cross(moment, _Z)
     return ca.cross(_Z, moment), inertia[:, 2]
 
 
 def _regroup(tree: KinematicTree) -> list[_Body]:
-    """Move the part of each body that its own revolute joint cannot see to the parent: fewer operations, same motion.
+    """Move inertial parameters from each body to its parent where this does not change the motion, to save operations.
 
-    Mass and first moment along the axis, and the inertia of a rod along the axis, do not change when the body
-    turns about that axis, so they may as well belong to the parent.
+    Mass, first moment along the axis, and the inertia of a rod along the axis do not change when the body turns about
+    that axis. So they can belong to the parent.
     """
     bodies = [_body(tree.masses[i], tree.centres[i], tree.inertias[i]) for i in range(tree.n)]
     for i in reversed(range(tree.n)):

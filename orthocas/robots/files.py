@@ -1,4 +1,4 @@
-"""Reading URDF files into Pinocchio models, and locking joints of any model."""
+"""Read URDF files into Pinocchio models, and lock joints of any model."""
 
 import os
 import tempfile
@@ -20,10 +20,10 @@ WORLD = "universe"  #: Pinocchio's name for what does not move
 
 
 def read_urdf(path: str | Path) -> pin.Model:
-    """Read a URDF file; mimic joints stay visible so that they can be refused or locked.
+    """Read a URDF file. Mimic joints are kept, so that they can be refused or locked later.
 
     Raises:
-        RobotError: if the file is missing or is not a URDF model, or a joint moves along no axis.
+        RobotError: if the file is missing or not a URDF model, or a joint has a zero axis.
     """
     check_urdf(path, read_xml(path, "URDF", "robot"))
     with _captured_stderr() as notes:
@@ -32,15 +32,15 @@ def read_urdf(path: str | Path) -> pin.Model:
         except (ValueError, RuntimeError) as error:
             raise RobotError(f"{path} is not a usable URDF model: {_text(notes) or error}") from None
         complaints = _text(notes)
-    if "Error:" in complaints:  # the parser goes on without what it could not read, a mass for example
+    if "Error:" in complaints:  # the parser skips what it cannot read, for example a mass
         raise RobotError(f"{path} is not a usable URDF model: {complaints}")
     return model
 
 
 def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
-    """Fix joints at the given positions [rad] or [m]; joints that mimic a locked joint follow it.
+    """Lock joints at the given positions [rad] or [m]. Joints that mimic a locked joint follow it.
 
-    A joint with several degrees of freedom (floating, spherical, planar) is fixed at its neutral position, which is 0.
+    A joint with several degrees of freedom (floating, spherical, planar) is locked at its neutral position, given as 0.
 
     Raises:
         UnknownNameError: if there is no such joint.
@@ -63,11 +63,11 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
 
 
 def lock_off_chain(model: pin.Model, tip: str) -> pin.Model:
-    """Fix every joint that does not move the tip, whatever its type, at neutral or the limit next to zero.
+    """Lock every joint that does not move the tip, of any type, at neutral or at the limit closest to zero.
 
     Raises:
-        UnknownNameError: if there is no frame called tip.
-        RobotError: if a joint that moves the tip is not revolute, continuous or prismatic (named in the message).
+        UnknownNameError: if there is no frame named `tip`.
+        RobotError: if a joint that moves the tip is not revolute, continuous or prismatic. The message names it.
     """
     chain = [i for i in model.supports[model.frames[frame_index(model, tip)].parentJoint] if i > 0]
     for i in chain:
@@ -86,19 +86,19 @@ def default_tip(model: pin.Model) -> str:
     """The last frame of a robot with a single chain.
 
     Raises:
-        RobotError: if the robot branches, with the frames to choose from.
+        RobotError: if the robot branches. The message lists the frames to choose from.
     """
     carriers = {model.parents[i] for i in range(1, model.njoints)}
     leaves = [i for i in range(1, model.njoints) if i not in carriers]
     last: dict[int, str] = {i: [frame.name for frame in model.frames if frame.parentJoint == i][-1] for i in leaves}
     if len(leaves) != 1:
-        raise RobotError(f"the robot ends in {len(leaves)} places, name the tip frame: {', '.join(last.values())}")
+        raise RobotError(f"the robot has {len(leaves)} chains, name the tip frame: {', '.join(last.values())}")
     return last[leaves[0]]
 
 
 @contextmanager
 def _captured_stderr() -> Iterator[IO[bytes]]:
-    """Catch what the C++ parser writes to standard error: it belongs in our message, not on the user's terminal."""
+    """Capture what the C++ parser writes to standard error. It belongs in our message, not on the user's terminal."""
     saved = os.dup(2)
     with tempfile.TemporaryFile() as sink:
         os.dup2(sink.fileno(), 2)
@@ -110,7 +110,7 @@ def _captured_stderr() -> Iterator[IO[bytes]]:
 
 
 def _text(notes: IO[bytes]) -> str:
-    """What was caught, on one line of at most 300 characters."""
+    """The captured text, on one line of at most 300 characters."""
     notes.seek(0)
     return " ".join(notes.read().decode(errors="replace").split())[:300]
 
@@ -140,7 +140,7 @@ def _without_joints(model: pin.Model, ids: list[int], position: Array) -> pin.Mo
 
 
 def _set_position(model: pin.Model, i: int, value: float, position: Array) -> None:
-    """Write a joint position into a configuration; Pinocchio keeps cos and sin of a continuous joint."""
+    """Write a joint position into a configuration. Pinocchio stores cos and sin of a continuous joint."""
     joint, name = model.joints[i], model.names[i]
     if i in set(model.mimicking_joints):
         leader = model.names[leader_of(model, i)]
@@ -149,7 +149,7 @@ def _set_position(model: pin.Model, i: int, value: float, position: Array) -> No
         if value != 0:
             raise RobotError(
                 f"locked position of joint '{name}' is {value:g}, expected 0: "
-                f"a joint with {joint.nv} degrees of freedom is locked at its neutral position only"
+                f"a joint with {joint.nv} degrees of freedom can only be locked at its neutral position"
             )
         return
     position[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(value), np.sin(value)) if joint.nq == 2 else value

@@ -1,4 +1,4 @@
-"""Postures that a robot's files name: group states of an SRDF file, keyframes of an MJCF file."""
+"""Named postures of a robot: group states of an SRDF file, or keyframes of an MJCF file."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,9 +14,9 @@ _NOT_IN_THE_FILE = "qpos0"  # Pinocchio's name for the zero posture of an MJCF f
 
 
 def srdf_states(urdf: str | Path) -> States:
-    """Group states of the SRDF file that belongs to a URDF file: same stem, beside it or in ../srdf; none without one.
+    """Group states of the SRDF file with the same stem, beside the URDF file or in ../srdf. Empty if there is none.
 
-    States of several groups with the same name are one posture. Joints with several degrees of freedom are left out.
+    States of several groups with the same name form one posture. Joints with several degrees of freedom are skipped.
 
     Raises:
         RobotError: if the SRDF file cannot be read.
@@ -52,7 +52,7 @@ def model_states(model: pin.Model) -> States:
 
 
 def postures(states: Mapping[str, Mapping[str, float]], joint_names: Sequence[str]) -> dict[str, Array]:
-    """States as joint positions (n,), less those that leave a joint out."""
+    """States as joint positions (n,). States that lack a joint are skipped."""
     return {
         name: np.array([joints[joint] for joint in joint_names])
         for name, joints in states.items()
@@ -69,5 +69,5 @@ def _number(text: str) -> float | None:
 
 
 def _joint_position(part: Array) -> float:
-    """Pinocchio keeps cos and sin of a continuous joint."""
+    """The position of a joint. Pinocchio stores cos and sin of a continuous joint."""
     return float(part[0]) if len(part) == 1 else float(np.arctan2(part[1], part[0]))

@@ -1,4 +1,4 @@
-"""From an MJCF file to a `pin.Model` with the mass matrix and bias that MuJoCo computes."""
+"""Convert an MJCF file to a `pin.Model` with the mass matrix and bias of MuJoCo."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,27 +15,26 @@ from orthocas.robots.mjcf_poses import Angles, pose, shape_pose
 from orthocas.robots.xml_files import MOST_LINKS
 from orthocas.robots.xml_values import Attributes
 
-_GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2] where <option> has none
-_LEAST_TOTAL = 1e-15  # [kg], MuJoCo's
-_SEEN = ("camera", "light")  # seen in pictures only
+_GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2], MuJoCo's default
+_LEAST_TOTAL = 1e-15  # [kg], as in MuJoCo
+_SEEN = ("camera", "light")  # elements without mass or motion
 _READ = ("inertial", "joint", "freejoint", "geom", "site", "body")
 
 
 def model_from_mjcf(path: str | Path) -> pin.Model:
     """Read the kinematics, masses, armatures, joint limits and gravity of an MJCF file.
 
-    The model has a frame for every body, named site and joint; where they share a name, `frame_index` takes the body
-    before the site and the site before the joint. Bodies and joints without a name are called body<i> and joint<i>,
-    with MuJoCo's indices i.
+    The model has a frame for every body, named site and joint. If they share a name, `frame_index` prefers the body to
+    the site, and the site to the joint. Bodies and joints without a name are called body<i> and joint<i>, with MuJoCo's
+    indices i.
 
-    The mass matrix and the bias are MuJoCo's (qM and qfrc_bias). What MuJoCo adds to them as passive or constraint
-    forces is not part of a `Robot`: springs, damping, friction, gravity compensation (gravcomp), fluids, actuators,
-    contacts and <equality>.
+    Mass matrix and bias are those of MuJoCo (qM and qfrc_bias). A `Robot` has no passive and constraint forces:
+    springs, damping, friction, gravity compensation (gravcomp), fluids, actuators, contacts and <equality>.
 
     Raises:
-        RobotError: with file, element and reason, if the file is not MJCF, or holds what cannot be read right:
-            masses that depend on meshes, armatures of tendons and actuators, scaled frames, flexible bodies, and
-            elements that stand for others (attach, replicate, composite, ...).
+        RobotError: if the file is not MJCF, or contains elements that are not supported: masses that depend on meshes,
+            armatures of tendons and actuators, scaled frames, flexible bodies, and elements that generate others
+            (attach, replicate, composite, ...). The message gives file, element and reason.
     """
     document = Document(path)
     _refuse_unread(document)
@@ -46,24 +45,24 @@ def model_from_mjcf(path: str | Path) -> pin.Model:
 
 
 def _refuse_unread(document: Document) -> None:
-    """Refuse what changes the mass matrix from outside the bodies."""
+    """Refuse elements outside the bodies that change the mass matrix."""
     for section in ("default", "tendon", "actuator"):
         for top in document.sections(section):
             for element in top.iter():
                 label = document.label(element)
                 if element.tag != "joint" and label.number("armature", 0) != 0:
-                    raise label.error("has an armature, which orthocas reads on joints only")
+                    raise label.error("has an armature, which orthocas supports on joints only")
     for top in document.sections("deformable"):
         for element in top.findall("flex"):
-            raise document.label(element).error("is a flexible body, which orthocas does not read")
+            raise document.label(element).error("is a flexible body, which orthocas does not support")
 
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """An element of a body, once the frames around it are resolved."""
+    """An element of a body, with the frames around it resolved."""
 
     element: Element
-    frame: pin.SE3  # of the frame around it, in the body
+    frame: pin.SE3  # pose of the frame around it, in the body
     childclass: str
 
 
@@ -73,7 +72,7 @@ class _Builder:
     def __init__(self, document: Document) -> None:
         compiler = document.settings("compiler")
         if compiler.text("coordinate", "local") != "local":
-            raise compiler.error("has global coordinates, which MuJoCo and orthocas no longer read")
+            raise compiler.error("has global coordinates, which MuJoCo and orthocas do not support")
         self._document = document
         self._angles = Angles.of(compiler)
         self._rules = MassRules.of(compiler)
@@ -83,7 +82,7 @@ class _Builder:
         self._masses: list[tuple[int, pin.SE3, pin.Inertia]] = []
 
     def build(self) -> pin.Model:
-        """The model of the whole file."""
+        """Build the model of the whole file."""
         off = self._document.settings("option/flag").keyword("gravity", ("enable", "disable"), "enable") == "disable"
         gravity = self._document.settings("option").numbers("gravity", 3, _GRAVITY)
         self._model.gravity.linear = np.zeros(3) if off else gravity
@@ -103,7 +102,7 @@ class _Builder:
         return self._model
 
     def _add_keyframes(self) -> None:
-        """Named postures, as reference configurations; the numbers of free and ball joints stay in MuJoCo's order."""
+        """Add keyframes as reference configurations. The numbers of free and ball joints stay in MuJoCo's order."""
         for section in self._document.sections("keyframe"):
             for key in section.findall("key"):
                 if "name" in key.attrib and "qpos" in key.attrib:
@@ -116,7 +115,7 @@ class _Builder:
                 self._add_body(part, joint, placement * part.frame)
 
     def _add_body(self, part: _Part, joint: int, placement: pin.SE3) -> None:
-        """Add a body with all that it carries to a joint; placement is that of the frame around it."""
+        """Add a body and all its children to a joint. `placement` is that of the frame around it."""
         body = self._document.attributes(part.element)
         name = self._take_name(body, "body", f"body{len(self._names['body'])}")
         if len(self._names["body"]) - 1 > MOST_LINKS:
@@ -129,29 +128,29 @@ class _Builder:
                 joint, placement = self._add_joint(child, joint, placement, name)
         self._model.addFrame(pin.Frame(name, joint, placement, pin.FrameType.BODY))
         self._add_sites(parts, joint, placement, name)
-        if joint or self._rules.total > 0:  # what is fixed to the world weighs on no joint
+        if joint or self._rules.total > 0:  # bodies fixed to the world load no joint
             self._masses.append((joint, placement, self._inertia(body, parts, name)))
         self._add_bodies(parts, joint, placement)
 
     def _parts(self, parent: Element, frame: pin.SE3, childclass: str, body: str) -> Iterator[_Part]:
-        """The elements of a body, those inside its frames among them."""
+        """The elements of a body, including those inside its frames."""
         for element in parent:
             if element.tag == "frame":
                 inner = self._document.attributes(element, body=body)
                 if any(name in inner.values for name in ("scale", "scaling", "massscale")):
-                    raise inner.error("scales what it holds, which orthocas does not read")
+                    raise inner.error("scales its content, which orthocas does not support")
                 below = frame * pose(inner, self._angles)
                 yield from self._parts(element, below, self._childclass(inner, childclass), body)
             elif element.tag in _READ:
                 yield _Part(element, frame, childclass)
             elif element.tag not in _SEEN:
-                raise self._document.label(element, body).error("is an element that orthocas does not read")
+                raise self._document.label(element, body).error("is an element that orthocas does not support")
 
     def _childclass(self, label: Attributes, inherited: str) -> str:
         return self._document.known_class(label.text("childclass", inherited), label)
 
     def _add_joint(self, part: _Part, parent: int, placement: pin.SE3, body: str) -> tuple[int, pin.SE3]:
-        """Add a joint to a body at placement; returns its index and the body's placement behind it."""
+        """Add a joint to a body at `placement`. Returns its index, and the placement of the body after the joint."""
         joint = self._document.attributes(part.element, part.childclass, body)
         name = self._take_name(joint, "joint", f"joint{len(self._names['joint'])}")
         kind = joint.keyword("type", ("hinge", "slide", "ball", "free"), "hinge")
@@ -174,7 +173,7 @@ class _Builder:
     def _add_axis(
         self, joint: Attributes, kind: str, turn: np.ndarray, parent: int, placement: pin.SE3, name: str
     ) -> int:
-        """Add a hinge or a slide, which stands at ref where the file draws it."""
+        """Add a hinge or a slide. In the pose of the file its position is `ref`."""
         axis = turn @ joint.direction("axis", (0, 0, 1))
         unit = self._angles.unit if kind == "hinge" else 1.0
         lower, upper = self._limits(joint, unit)
@@ -186,13 +185,13 @@ class _Builder:
         return int(self._model.addJoint(parent, make(axis), placement * shift, name, *limits))
 
     def _limits(self, joint: Attributes, unit: float) -> tuple[float, float]:
-        """Limits [rad] or [m]; a joint with a range is limited unless the file says otherwise."""
+        """Limits [rad] or [m]. A joint with a range is limited unless the file says otherwise."""
         limited = joint.keyword("limited", ("true", "false", "auto"), "auto")
         lower, upper = joint.numbers("range", 2, (0, 0)) * unit
         if limited == "false" or (limited == "auto" and lower == upper == 0):
             return -np.inf, np.inf
         if limited == "auto" and not self._autolimits:
-            raise joint.error("has range but not limited, expected both where the compiler's autolimits is 'false'")
+            raise joint.error("has range but not limited, expected both because the compiler's autolimits is 'false'")
         if lower >= upper:
             raise joint.error(f"has limits [{lower:g}, {upper:g}], expected the first below the second")
         return lower, upper

@@ -1,4 +1,4 @@
-"""An MJCF file as one tree: what it includes is put in place, and what its default classes say is filled in."""
+"""An MJCF file as one tree, with included files inserted and default classes applied."""
 
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -17,16 +17,17 @@ _Settings = dict[str, dict[str, str]]  # attributes by element
 class Document:
     """The tree of an MJCF file.
 
-    Includes and default classes follow the MuJoCo reference: an included file is found from the folder of the main
-    file and may be included once; a class starts from what its parent class says; an element's own attributes win.
+    Includes and default classes follow the MuJoCo reference. Paths of included files are relative to the folder of the
+    main file, and each file may be included once. A class inherits from its parent class. An element's own attributes
+    take precedence.
 
     Raises:
-        RobotError: if a file cannot be read, or an include or a default class makes no sense.
+        RobotError: if a file cannot be read, or an include or default class is invalid.
     """
 
     def __init__(self, path: str | Path) -> None:
         self._main = Path(path)
-        self._files: dict[Element, str] = {}  # the file each element came from
+        self._files: dict[Element, str] = {}  # the file of each element
         self._included = {self._main.resolve()}
         self._classes: dict[str, _Settings] = {MAIN: {}}
         self._root = self._read(self._main, "mujoco", 1)
@@ -38,23 +39,23 @@ class Document:
             self._define(section, MAIN, self._classes[MAIN])
 
     def sections(self, tag: str) -> Iterator[Element]:
-        """The elements of a name right below the root; a file may have several."""
+        """The elements with a tag directly below the root. A file may have several."""
         return (element for element in self._root if element.tag == tag)
 
     def settings(self, path: str) -> Attributes:
-        """What a global element such as compiler or option/flag says, a later one over an earlier one."""
+        """The attributes of a global element such as compiler or option/flag. Later elements override earlier ones."""
         found = self._root.findall(path)
         values = {name: value for element in found for name, value in _own(element, self.label(element)).items()}
         return Attributes(str(self._main), f"<{path.rsplit('/', maxsplit=1)[-1]}>", values)
 
     def label(self, element: Element, body: str | None = None) -> Attributes:
-        """An element's own attributes, under the name that messages use."""
+        """An element's own attributes, with the element's name for messages."""
         shown = [f" {key}='{element.attrib[key][:80]}'" for key in ("name", "class") if key in element.attrib]
         inside = f" of body '{body[:80]}'" if body else ""
         return Attributes(self._files[element], f"<{element.tag}{''.join(shown[:1])}>{inside}", element.attrib)
 
     def attributes(self, element: Element, childclass: str = MAIN, body: str | None = None) -> Attributes:
-        """An element's attributes over those of its default class, which is the one it names or childclass.
+        """An element's attributes, with those of its default class filled in: the class it names, or childclass.
 
         Raises:
             RobotError: if the class does not exist, or an attribute is unknown.
@@ -65,7 +66,7 @@ class Document:
         return Attributes(label.file, label.element, values)
 
     def known_class(self, name: str, label: Attributes) -> str:
-        """The name of a default class.
+        """Check the name of a default class.
 
         Raises:
             RobotError: if there is no such class.
@@ -77,7 +78,7 @@ class Document:
     def _require_names(self, parent: Element, known: Collection[str]) -> None:
         for element in parent:
             if element.tag not in known:
-                raise self.label(element).error(f"is an element that orthocas does not know in <{parent.tag}>")
+                raise self.label(element).error(f"is an unknown element in <{parent.tag}>")
 
     def _read(self, path: Path, tag: str | None, depth: int) -> Element:
         root = read_xml(path, "MJCF", tag)
@@ -88,9 +89,9 @@ class Document:
         return root
 
     def _expand(self, parent: Element, depth: int) -> None:
-        """Put the elements of included files in place of <include>."""
+        """Replace each <include> by the elements of its file."""
         if depth > MOST_DEPTH:
-            raise RobotError(f"{self._main} and what it includes nest more than {MOST_DEPTH} deep")
+            raise RobotError(f"elements of {self._main} and its included files nest more than {MOST_DEPTH} deep")
         children: list[Element] = []
         for child in parent:
             if child.tag == "include":
@@ -104,12 +105,12 @@ class Document:
         label = self.label(element)
         path = self._main.parent / label.text("file")
         if path.resolve() in self._included:
-            raise label.error(f"includes {path} a second time, expected every file once")
+            raise label.error(f"includes {path} a second time, expected each file once")
         self._included.add(path.resolve())
         return self._read(path, None, depth + 1)
 
     def _define(self, section: Element, name: str, inherited: _Settings) -> None:
-        """Take in a default class, then the classes inside it."""
+        """Add a default class, then the classes inside it."""
         self._require_names(section, DEFAULTS)
         settings = {tag: dict(values) for tag, values in inherited.items()}
         for child in section:
@@ -124,17 +125,17 @@ class Document:
 
 
 def _own(element: Element, label: Attributes) -> dict[str, str]:
-    """An element's attributes, all of them known."""
+    """An element's attributes, after a check that all are known."""
     for name in element.attrib:
         if name not in KNOWN.get(element.tag, element.attrib):
-            raise label.error(f"has an attribute '{name}' that orthocas does not know")
+            raise label.error(f"has an unknown attribute '{name}'")
     if sum(name in element.attrib for name in ORIENTATIONS) > 1:
         raise label.error(f"has several orientations, expected one of {', '.join(ORIENTATIONS)}")
     return dict(element.attrib)
 
 
 def _over(inherited: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
-    """Own attributes over inherited ones; one orientation replaces another, and a short size keeps what follows."""
+    """Merge own and inherited attributes. An orientation replaces any other; a short size keeps further numbers."""
     if any(name in own for name in ORIENTATIONS):
         inherited = {name: value for name, value in inherited.items() if name not in ORIENTATIONS}
     merged = {**inherited, **own}

@@ -11,32 +11,32 @@ from orthocas.robots.mjcf_poses import Angles, pose, shape_pose
 from orthocas.robots.mjcf_schema import ORIENTATIONS
 from orthocas.robots.xml_values import Attributes
 
-Placed = tuple[pin.SE3, Attributes]  # an element, and the pose in the body of the frame around it
+Placed = tuple[pin.SE3, Attributes]  # an element, with the pose of its frame in the body
 
 _SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
 _MASSLESS = ("plane", "hfield")
 _FROM_FILE = ("mesh", "sdf")
-_ROUNDING = 1e-10  # relative, of moments of inertia
-_DENSITY = 1000.0  # [kg/m^3] where a geom has neither mass nor density
+_ROUNDING = 1e-10  # relative rounding of moments of inertia
+_DENSITY = 1000.0  # [kg/m^3] of a geom without mass and density
 
 
 @dataclass(frozen=True, slots=True)
 class MassRules:
-    """What <compiler> says about masses."""
+    """The settings of <compiler> for masses."""
 
     source: str  #: inertiafromgeom
-    groups: tuple[float, float]  #: geom groups that carry mass, first and last
+    groups: tuple[float, float]  #: first and last geom group that has mass
     least_mass: float  #: [kg]
     least_inertia: float  #: [kg m^2]
-    balance: bool  #: whether impossible inertias are averaged
-    total: float  #: mass of all bodies [kg], not positive where it is left alone
+    balance: bool  #: whether to average inertias that violate the triangle inequality
+    total: float  #: mass to scale all bodies to [kg]; no scaling if not positive
 
     @classmethod
     def of(cls, compiler: Attributes) -> "MassRules":
-        """From the attributes of <compiler>.
+        """Read the attributes of <compiler>.
 
         Raises:
-            RobotError: if they are not what MJCF knows.
+            RobotError: if an attribute is invalid.
         """
         first, last = compiler.numbers("inertiagrouprange", 2, (0, 5))
         return cls(
@@ -58,7 +58,7 @@ def body_inertia(
         The MuJoCo reference, body/inertial, body/geom and compiler.
 
     Raises:
-        RobotError: if the numbers make no body, or the mass depends on a mesh.
+        RobotError: if the inertia is not physical, or the mass depends on a mesh.
     """
     inertia = pin.Inertia.Zero()
     if rules.source == "true" or (rules.source == "auto" and inertial is None):
@@ -78,7 +78,7 @@ def _given_inertia(element: Attributes, angles: Angles) -> pin.Inertia:
         raise element.error(f"has mass {mass:g} kg, expected >= 0")
     placement = pose(element, angles)
     if ("diaginertia" in element.values) == ("fullinertia" in element.values):
-        raise element.error("needs either diaginertia or fullinertia")
+        raise element.error("has no inertia, expected diaginertia or fullinertia")
     if "fullinertia" in element.values and any(name in element.values for name in ORIENTATIONS):
         raise element.error("has both fullinertia and an orientation, expected one of them")
     if "diaginertia" in element.values:
@@ -93,7 +93,7 @@ def _given_inertia(element: Attributes, angles: Angles) -> pin.Inertia:
 
 
 def _geom_inertia(geom: Attributes, rules: MassRules, angles: Angles) -> pin.Inertia:
-    """The inertia of a solid of uniform density, in the frame around it; zero for a geom that carries no mass."""
+    """The inertia of a solid of uniform density, in the frame around it. Zero for a geom without mass."""
     kind = geom.keyword("type", (*_SIZES, *_MASSLESS, *_FROM_FILE), "sphere")
     mass, density = geom.number("mass", -1), geom.number("density", _DENSITY)
     given = "mass" in geom.values
@@ -104,22 +104,22 @@ def _geom_inertia(geom: Attributes, rules: MassRules, angles: Angles) -> pin.Ine
     if (mass if given else density) == 0:
         return pin.Inertia.Zero()
     if kind in _FROM_FILE or "mesh" in geom.values:
-        raise geom.error("takes its inertia from a mesh, which orthocas does not read: give the body an <inertial>")
+        raise geom.error("takes its inertia from a mesh, which orthocas does not support: give the body an <inertial>")
     if geom.flag("shellinertia"):
-        raise geom.error("has shellinertia, which orthocas does not read: give the body an <inertial>")
+        raise geom.error("has shellinertia, which orthocas does not support: give the body an <inertial>")
     placement, half_length = shape_pose(geom, angles)
     sizes = _sizes(geom, kind, half_length)
     return placement.act(_solid(kind, sizes, mass if given else density * _volume(kind, sizes)))
 
 
 def _sizes(geom: Attributes, kind: str, half_length: float | None) -> Array:
-    """Radii and half lengths [m], as many as the shape has."""
+    """Radii and half lengths of the shape [m]."""
     words = geom.text("size", "").split()
     wanted = _SIZES[kind] if half_length is None else 1
     if not wanted <= len(words) <= 3:
         raise geom.error(f"has size '{' '.join(words)[:80]}', expected {wanted} numbers for a {kind}")
     sizes = geom.numbers("size", len(words))[:wanted]
-    if half_length is not None:  # equal across, and as long as the two points are apart
+    if half_length is not None:  # equal radii; the length is the distance of the two points
         sizes = np.append(np.repeat(sizes, _SIZES[kind] - 1), half_length)
     if sizes.min() <= 0:
         raise geom.error(f"has size '{' '.join(words)[:80]}', expected numbers > 0")
@@ -151,7 +151,7 @@ def _solid(kind: str, sizes: Array, mass: float) -> pin.Inertia:
 
 
 def _bounded(body: Attributes, inertia: pin.Inertia, rules: MassRules) -> pin.Inertia:
-    """The inertia after the compiler's bounds; it must be one that a body can have."""
+    """The inertia after the compiler's bounds, checked to be physical."""
     moments, axes = np.linalg.eigh(inertia.inertia)
     bounded = np.maximum(moments, rules.least_inertia)
     if bounded[0] + bounded[1] < (1 - _ROUNDING) * bounded[2]:

@@ -1,4 +1,4 @@
-"""Positions and orientations of MJCF elements, in the five ways that MJCF can say them."""
+"""Positions and orientations of MJCF elements, in the five notations of MJCF."""
 
 from dataclasses import dataclass
 
@@ -15,41 +15,41 @@ _TINY = 1e-10  # MuJoCo's limit below which a vector counts as parallel to z
 
 @dataclass(frozen=True, slots=True)
 class Angles:
-    """How a file writes angles."""
+    """The angle conventions of a file."""
 
-    unit: float  #: [rad], pi / 180 where the file has degrees
+    unit: float  #: one unit of the file [rad]: pi / 180 for degrees
     sequence: str  #: axes of the Euler angles, lower case moving and upper case fixed, such as xyz
 
     @classmethod
     def of(cls, compiler: Attributes) -> "Angles":
-        """From the attributes angle and eulerseq.
+        """Read the attributes angle and eulerseq.
 
         Raises:
-            RobotError: if they are not what MJCF knows.
+            RobotError: if an attribute is invalid.
         """
         unit = 1.0 if compiler.keyword("angle", ("degree", "radian"), "degree") == "radian" else np.pi / 180
         sequence = compiler.text("eulerseq", "xyz")
         if len(sequence) != 3 or not set(sequence) <= set("xyzXYZ"):
-            raise compiler.error(f"has eulerseq '{sequence}', expected three letters out of xyzXYZ")
+            raise compiler.error(f"has eulerseq '{sequence}', expected three letters of xyzXYZ")
         return cls(unit, sequence)
 
 
 def pose(element: Attributes, angles: Angles) -> pin.SE3:
-    """The pose that pos and one orientation describe, in the frame around the element.
+    """The pose of an element from pos and its orientation, in the frame around it.
 
     Raises:
-        RobotError: if a vector has another length than MJCF asks for, or no direction.
+        RobotError: if a vector has the wrong length, or is zero where a direction is needed.
     """
     return pin.SE3(_rotation(element, angles), element.numbers("pos", 3, (0, 0, 0)))
 
 
 def shape_pose(element: Attributes, angles: Angles) -> tuple[pin.SE3, float | None]:
-    """The pose of a geom or site, and half its length [m] where fromto gives two end points.
+    """The pose of a geom or site, and half its length [m] if fromto gives two end points.
 
     The z axis goes from the second point to the first, as in MuJoCo's compiler.
 
     Raises:
-        RobotError: as `pose`; and if fromto does not fit the shape, or stands beside pos.
+        RobotError: as `pose`. Also if fromto does not suit the shape, or is combined with pos.
     """
     if "fromto" not in element.values:
         return pose(element, angles), None
@@ -122,7 +122,7 @@ def _turn(axis: Array, angle: float) -> Array:
 
 
 def _turn_z_to(direction: Array) -> Array:
-    """The shortest rotation that takes the z axis to a unit vector; half a turn about x to -z."""
+    """The shortest rotation that takes the z axis to a unit vector. For -z it is half a turn about x."""
     axis = np.cross([0.0, 0.0, 1.0], direction)
     sine = float(np.linalg.norm(axis))
     return _turn(axis / sine if sine > _TINY else np.eye(3)[0], float(np.arctan2(sine, direction[2])))

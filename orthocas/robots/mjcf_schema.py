@@ -1,6 +1,6 @@
-"""Which attributes the elements of MJCF may have that decide about kinematics and mass."""
+"""The attributes of the MJCF elements that determine kinematics and mass."""
 
-ORIENTATIONS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")  #: at most one of them in an element
+ORIENTATIONS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")  #: an element has at most one of them
 
 _POSE = {"pos", *ORIENTATIONS}
 _SHAPE = {"class", "fromto", "group", "material", "mesh", "name", "rgba", "size", "type", "user", *_POSE}
@@ -10,7 +10,7 @@ def _words(text: str) -> set[str]:
     return set(text.split())
 
 
-#: Elements right below the root.
+#: Elements directly below the root.
 SECTIONS = _words(
     """asset compiler contact custom default deformable equality actuator extension keyframe option sensor size
     statistic tendon visual worldbody"""
@@ -22,7 +22,7 @@ DEFAULTS = _words(
     muscle orientation pair pid plugin position site skin tendon texture velocity"""
 )
 
-#: Attributes by element: those of MuJoCo 4.0 and a few older ones. Another is refused, so that a misspelt mass is seen.
+#: Attributes by element: those of MuJoCo 4.0 and a few older ones. Others are refused, so that typos are found.
 KNOWN = {
     "compiler": _words(
         """alignfree angle assetdir autolimits balanceinertia boundinertia boundmass conflict convexhull coordinate

@@ -1,4 +1,4 @@
-"""From a `pin.Model` to the numbers of a `KinematicTree`."""
+"""Convert a `pin.Model` to the numbers of a `KinematicTree`."""
 
 import numpy as np
 import pinocchio as pin
@@ -8,15 +8,15 @@ from orthocas.errors import RobotError
 from orthocas.robots.spatial import rotation_z_to, snap
 from orthocas.robots.tree import JointKind, KinematicTree
 
-_UNLIMITED = 1e10  # Pinocchio writes the largest double for "no limit"
+_UNLIMITED = 1e10  # Pinocchio uses the largest double for "no limit"
 
 
 def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
-    """Read joints, bodies, limits and the tip frame out of a Pinocchio model.
+    """Read joints, bodies, limits and the tip frame from a Pinocchio model.
 
     Raises:
-        UnknownNameError: if there is no frame called tip.
-        RobotError: if a joint is not revolute, continuous or prismatic (named in the message).
+        UnknownNameError: if there is no frame named `tip`.
+        RobotError: if a joint is not revolute, continuous or prismatic. The message names it.
     """
     frame = model.frames[frame_index(model, tip)]
     axes = [joint_axis(model, i) for i in range(1, model.njoints)]
@@ -49,7 +49,7 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
 
 
 def frame_index(model: pin.Model, name: str) -> int:
-    """Index of a frame; where a link, a site and a joint share a name, the link's before the site's before the joint's.
+    """Index of a frame. If they share a name, a link is preferred to a site, and a site to a joint.
 
     Raises:
         UnknownNameError: if there is no such frame.
@@ -61,10 +61,10 @@ def frame_index(model: pin.Model, name: str) -> int:
 
 
 def joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
-    """Kind and axis of joint i, read off its motion subspace.
+    """Kind and axis of joint i, from its motion subspace.
 
     Raises:
-        RobotError: if the joint is not revolute, continuous or prismatic; the message tells which joint to lock.
+        RobotError: if the joint is not revolute, continuous or prismatic. The message says which joint to lock.
     """
     joint, name = model.joints[i], model.names[i]
     if i in set(model.mimicking_joints):
@@ -92,17 +92,17 @@ def leader_of(model: pin.Model, mimic: int) -> int:
 
 
 def remedy(joint: str) -> str:
-    """How to lock a joint, in Python and on the command line."""
+    """Instructions for locking a joint, in Python and on the command line."""
     return f"lock it with locked={{'{joint}': 0.0}} or --lock {joint}=0"
 
 
 def _limits(model: pin.Model, limits: Array, continuous: list[bool], unlimited: float) -> Array:
-    """Position limits, one per joint; a continuous joint has none."""
+    """Position limits, one per joint. A continuous joint has none."""
     values = [unlimited if free else limits[model.joints[i + 1].idx_q] for i, free in enumerate(continuous)]
     return np.array([unlimited if abs(value) > _UNLIMITED else value for value in values])
 
 
 def _largest(model: pin.Model, limits: Array) -> Array:
-    """Limits of effort or velocity, one per joint; 0, which files write for want of a number, means none."""
+    """Limits of effort or velocity, one per joint. 0 means no limit: many files use it as a placeholder."""
     values = np.array([limits[joint.idx_v] for joint in model.joints[1:]])
     return np.where((values > 0) & (values < _UNLIMITED), values, np.inf)

@@ -1,4 +1,4 @@
-"""Planar arms with uniform links, built as the same `pin.Model` a URDF gives."""
+"""Planar arms with uniform links, as a `pin.Model` like that of a URDF file."""
 
 from collections.abc import Sequence
 
@@ -13,9 +13,9 @@ GRAVITY = 9.81  #: [m/s^2]
 
 
 def planar_model(lengths: Sequence[float], masses: Sequence[float]) -> pin.Model:
-    """A chain in the x-y plane, joints about z, zero posture along x, gravity along -y.
+    """A chain in the x-y plane with joints about z. At q = 0 it lies along x; gravity points along -y.
 
-    Each link is a thin rod: mass spread uniformly over its length, I = m l^2 / 12 about its centre.
+    Each link is a thin rod with uniform mass: I = m l^2 / 12 about its centre.
 
     Args:
         lengths: link lengths [m], > 0.

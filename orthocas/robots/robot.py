@@ -1,4 +1,4 @@
-"""The robot as users meet it: names, limits, and kinematics and dynamics for SX, MX and NumPy."""
+"""The robot: names, limits, kinematics and dynamics, for SX, MX and NumPy."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,20 +22,32 @@ from orthocas.robots.tool import with_tool
 from orthocas.robots.tree import KinematicTree
 from orthocas.showing import Shown, listed, number_list
 
-Locked = Mapping[str, float] | None  #: joint -> position where it stays [rad] or [m]
+Locked = Mapping[str, float] | None  #: joint -> position at which it is locked [rad] or [m]
 Tool = ArrayLike | None
 
 
 class Robot(Shown):
     """A fixed-base robot with n revolute or prismatic joints and one tip frame.
 
-    Methods take CasADi columns (n, 1), SX or MX, and return the same kind; or NumPy, one state (n,) or a set
-    (N, n), and return NumPy. Positions in rad or m, velocities in rad/s or m/s, forces in N m or N.
+    Methods take CasADi columns (n, 1), SX or MX, and return the same kind. Or they take NumPy arrays, one state (n,) or
+    a set (N, n), and return NumPy arrays. Positions are in rad or m, velocities in rad/s or m/s, forces in N m or N.
+
+    Example:
+        >>> import casadi as ca
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+        >>> robot.tip_position([0.0, np.pi / 2])[:2].round(3).tolist()
+        [1.0, 1.0]
+        >>> robot.mass_matrix(np.zeros((5, 2))).shape  # a set of 5 joint positions
+        (5, 2, 2)
+        >>> robot.gravity(ca.SX.sym("q", 2)).shape  # an expression
+        (2, 1)
     """
 
     def __init__(self, tree: KinematicTree, homes: Mapping[str, ArrayLike] | None = None) -> None:
         self.tree = tree
-        #: postures (n,) that the robot's files name: SRDF group states, MJCF keyframes. Chart files do not keep them.
+        #: named postures (n,) of the robot's files: SRDF group states, MJCF keyframes. Chart files do not store them.
         self.homes = {name: frozen_array(f"home '{name}'", q, (tree.n,)) for name, q in (homes or {}).items()}
 
     @classmethod
@@ -43,13 +55,13 @@ class Robot(Shown):
         """Build from a Pinocchio model, with all its joints.
 
         Args:
-            model: the model; joints left free must be revolute, continuous or prismatic.
+            model: the model. Joints that are not locked must be revolute, continuous or prismatic.
             tip: name of any frame of the model.
-            locked: joints to fix, with their positions [rad] or [m].
+            locked: joints to lock, with their positions [rad] or [m].
 
         Raises:
             UnknownNameError: if the frame or a locked joint does not exist.
-            RobotError: if a joint left free is of another type (floating base, spherical, mimic, ...).
+            RobotError: if a joint that is not locked is of another type (floating base, spherical, mimic, ...).
         """
         frame_index(model, tip)
         tree = tree_from_model(files.lock_joints(model, locked or {}), tip)
@@ -57,21 +69,21 @@ class Robot(Shown):
 
     @classmethod
     def from_file(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
-        """Build the chain that moves the tip from a robot file: MJCF if its name ends in .xml, else URDF.
+        """Build the chain that moves the tip from a robot file: MJCF if its name ends in .xml, otherwise URDF.
 
-        Every joint that does not move the tip, of any type, is locked at zero, or at the limit next to zero.
+        Every joint that does not move the tip, of any type, is locked at zero, or at the limit closest to zero.
 
         Args:
             path: the file. Named postures (`homes`) come from an SRDF file with the same stem, beside it or in ../srdf,
                 or from the keyframes of the MJCF file.
-            tip: name of any frame; without it, the last frame of a robot with a single chain.
-            locked: joints to fix elsewhere, or on the way to the tip, with their positions [rad] or [m]. Joints that
-                mimic them follow. A floating, spherical or planar joint is fixed at its neutral position, by 0.
-            tool: where the tip of a massless tool is in the tip frame; see `with_tool`.
+            tip: name of any frame. Default: the last frame of a robot with a single chain.
+            locked: joints to lock elsewhere, or on the chain to the tip, with their positions [rad] or [m]. Joints that
+                mimic them follow. A floating, spherical or planar joint is locked at its neutral position, given as 0.
+            tool: pose of the tip of a massless tool in the tip frame; see `with_tool`.
 
         Raises:
-            RobotError: if the file cannot be read, the robot branches and has no tip, or a joint on the way to the tip
-                is not revolute, continuous or prismatic (the message tells which one to lock).
+            RobotError: if the file cannot be read, the robot branches and no tip is given, or a joint on the chain to
+                the tip is not revolute, continuous or prismatic. The message says which one to lock.
             UnknownNameError: if the frame or a locked joint does not exist.
         """
         build = cls.from_mjcf if Path(path).suffix.lower() == ".xml" else cls.from_urdf
@@ -90,14 +102,14 @@ class Robot(Shown):
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
-        """A planar arm with uniform links, lengths [m] and masses [kg]; x horizontal, gravity along -y."""
+        """A planar arm with uniform links of given lengths [m] and masses [kg]. Gravity points along -y."""
         return cls(tree_from_model(planar.planar_model(lengths, masses), planar.TIP))
 
     def with_scaled_masses(self, factor: ArrayLike) -> Self:
-        """The same robot with other masses: mass and inertia of each body times a factor, (n,) or one number > 0.
+        """The same robot with scaled masses: mass and inertia of each body times a factor, (n,) or one number > 0.
 
         Raises:
-            ShapeError, InvalidValueError: for factors that do not fit.
+            ShapeError, InvalidValueError: if the factors are invalid.
         """
         factors = frozen_array("factor", np.broadcast_to(as_float_array("factor", factor), (self.n,)), (self.n,))
         if factors.min() <= 0:
@@ -106,29 +118,29 @@ class Robot(Shown):
         return type(self)(replace(self.tree, masses=masses, inertias=inertias), self.homes)
 
     def with_tool(self, tool: ArrayLike) -> Self:
-        """The same robot with its tip at the end of a massless tool: tip pose = old tip pose times the tool's.
+        """The same robot with its tip at the end of a massless tool: tip pose = old tip pose times tool pose.
 
         Args:
             tool: (3,) position in the tip frame [m], (6,) position and roll, pitch, yaw [rad] as in URDF, or a
                 homogeneous transform (4, 4).
 
         Raises:
-            InvalidValueError: if it is none of these.
+            InvalidValueError: if the tool has another form.
         """
         return type(self)(with_tool(self.tree, tool), self.homes)
 
     def home(self, name: str) -> Array:
-        """A posture (n,) that the robot's files name.
+        """A named posture (n,) of the robot's files.
 
         Raises:
-            UnknownNameError: if there is no such posture, with those that do exist.
+            UnknownNameError: if there is no such posture. The message lists the known ones.
         """
         require_known("home", name, self.homes or {"none, the robot's files name no posture": None})
         return self.homes[name]
 
     @classmethod
     def _chain(cls, model: pin.Model, tip: str | None, locked: Locked, tool: Tool) -> Self:
-        """The joints of a model that move the tip, less those the user locks."""
+        """The robot of the joints that move the tip, without those that the user locks."""
         tip = tip or files.default_tip(model)
         robot = cls.from_model(files.lock_off_chain(files.lock_joints(model, locked or {}), tip), tip)
         return robot if tool is None else robot.with_tool(tool)
@@ -155,12 +167,12 @@ class Robot(Shown):
 
     @property
     def effort_limits(self) -> Array:
-        """Largest joint torques [N m] or forces [N], (n,), inf where the file has none, or 0."""
+        """Largest joint torques [N m] or forces [N], (n,); inf where the file has no limit or 0."""
         return self.tree.effort_limits
 
     @property
     def velocity_limits(self) -> Array:
-        """Largest joint speeds [rad/s] or [m/s], (n,), inf where the file has none, or 0."""
+        """Largest joint speeds [rad/s] or [m/s], (n,); inf where the file has no limit or 0."""
         return self.tree.velocity_limits
 
     def facts(self) -> dict[str, str]:
@@ -180,7 +192,7 @@ class Robot(Shown):
         return self._call("mass_matrix", q)
 
     def gravity(self, q: Any) -> Any:
-        """g(q), (n,): the joint forces that hold the robot still."""
+        """g(q), (n,): the joint torques that hold the robot at rest."""
         return self._call("gravity", q)
 
     def bias(self, q: Any, dq: Any) -> Any:
@@ -188,15 +200,15 @@ class Robot(Shown):
         return self._call("bias", q, dq)
 
     def inverse_dynamics(self, q: Any, dq: Any, ddq: Any) -> Any:
-        """Tau = M ddq + C dq + g, (n,)."""
+        """tau = M ddq + C dq + g, (n,)."""
         return self._call("inverse_dynamics", q, dq, ddq)
 
     def forward_dynamics(self, q: Any, dq: Any, tau: Any) -> Any:
-        """Ddq = M^-1 (tau - C dq - g), (n,)."""
+        """ddq = M^-1 (tau - C dq - g), (n,)."""
         return self._call("forward_dynamics", q, dq, tau)
 
     def coriolis_product(self, q: Any, v: Any, w: Any) -> Any:
-        """C(q, v) w, (n,), with the Christoffel C (dM/dt - 2 C is skew): bilinear and symmetric in (v, w)."""
+        """C(q, v) w, (n,), with the Christoffel form of C (dM/dt - 2 C is skew). Bilinear and symmetric in (v, w)."""
         return self._call("coriolis_product", q, v, w)
 
     def tip_position(self, q: Any) -> Any:
@@ -212,7 +224,7 @@ class Robot(Shown):
         return self._call("tip_jacobian", q)
 
     def joint_points(self, q: Any) -> Array:
-        """Base, joint origins and tip along the chain to the tip, for drawing; q (N, n) -> (N, points, 3) [m]."""
+        """Base, joint origins and tip along the chain, for drawing: q (N, n) -> (N, points, 3) [m]."""
         points, single = as_point_set("q", q, self.n)
         flat = self._batched["joint_points"](points)[0].transpose(0, 2, 1)
         return flat[0] if single else flat
@@ -264,7 +276,7 @@ class Robot(Shown):
         }
 
     def _call(self, name: str, *arguments: Any) -> Any:
-        """Call a function with CasADi or NumPy arguments, same kind out."""
+        """Call a function with CasADi or NumPy arguments, and return the same kind."""
         function = self._functions[name]
         if any(isinstance(a, ca.SX | ca.MX) for a in arguments):
             for a in arguments:

@@ -1,4 +1,4 @@
-"""Small pieces of rigid-body algebra: on CasADi SX columns, and on numbers."""
+"""Rigid-body algebra on CasADi SX columns and on numbers."""
 
 import casadi as ca
 import numpy as np
@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from orthocas.checks import Array, frozen_array
 from orthocas.errors import InvalidValueError
 
-_ROUNDING = 1e-14  # rotation entries this close to 0 or +-1 come from rounding in rpy -> matrix
+_ROUNDING = 1e-14  # entries of rotations this close to 0 or +-1 are rounding of rpy -> matrix
 
 
 def skew(v: ca.SX) -> ca.SX:
@@ -31,19 +31,19 @@ def half_angle_vector(R: ca.SX) -> ca.SX:
 def tilt(R: ca.SX, axis: int) -> ca.SX:
     """2 sin(angle / 2) times the direction in which a rotation matrix tilts a coordinate axis, (2, 1).
 
-    With d = R e_axis, the two other entries of d times sqrt(2 / (1 + d_axis)): Lambert's equal-area map of the sphere.
+    With d = R e_axis, these are the two other entries of d times sqrt(2 / (1 + d_axis)): Lambert's equal-area map.
     """
     d = R[:, axis]
     return d[[k for k in range(3) if k != axis]] * ca.sqrt(2 / (1 + d[axis]))
 
 
 def constant(values: Array) -> ca.SX:
-    """A constant with its zeros dropped from the structure, so that products with them vanish."""
+    """A constant whose zeros are structural, so that products with them vanish."""
     return ca.SX(ca.sparsify(ca.DM(values)))
 
 
 def rotation_matrix(name: str, value: ArrayLike) -> Array:
-    """A rotation (3, 3), checked and read-only.
+    """Check a rotation (3, 3), and return a read-only copy.
 
     Raises:
         ShapeError, InvalidValueError: if it is not a rotation matrix.
@@ -55,7 +55,7 @@ def rotation_matrix(name: str, value: ArrayLike) -> Array:
 
 
 def rotation_z_to(axis: Array) -> Array:
-    """A rotation T with T z = axis; a signed permutation where axis is a coordinate axis, so that zeros stay zeros."""
+    """A rotation T with T z = axis. For a coordinate axis it is a signed permutation, so that zeros stay zeros."""
     z = snap(axis / np.linalg.norm(axis))
     helper = np.roll(np.eye(3)[int(np.argmax(np.abs(z)))], 1)
     y = np.cross(z, helper)
@@ -64,6 +64,6 @@ def rotation_z_to(axis: Array) -> Array:
 
 
 def snap(values: Array) -> Array:
-    """Round entries that are 0 or +-1 up to rounding, so that CasADi drops the terms."""
+    """Replace entries that are 0 or +-1 up to rounding by these, so that CasADi drops the terms."""
     rounded = np.round(values)
     return np.where(np.abs(values - rounded) < _ROUNDING, rounded, values) + 0.0

@@ -1,4 +1,4 @@
-"""The tip compared with a reference orientation: what orientation, pose and axis tasks are made of."""
+"""The tip's rotation from a reference orientation, for orientation, pose and axis tasks."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -16,10 +16,10 @@ _AXES = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class TipTurn:
-    """The tip's turn away from a reference, after its position where that belongs to it."""
+    """The tip's rotation from a reference. For pose-like tasks its position comes first."""
 
     with_position: bool
-    axis: str | None  #: of the tip whose direction counts: "x", "y" or "z"; None for the whole orientation
+    axis: str | None  #: axis of the tip to compare: "x", "y" or "z"; None for the whole orientation
 
     def __post_init__(self) -> None:
         if self.axis is not None:
@@ -27,7 +27,7 @@ class TipTurn:
 
     @classmethod
     def of_kind(cls, kind: str) -> Self | None:
-        """From a task's kind: orientation, pose, axis, axis:x, position+axis, ...; None for any other."""
+        """Build from a task's kind: orientation, pose, axis, axis:x, position+axis, .... None for other kinds."""
         what, _, axis = kind.partition(":")
         if what in ("axis", "position+axis"):
             return cls(what != "axis", axis or "z")
@@ -35,7 +35,7 @@ class TipTurn:
 
     @property
     def kind(self) -> str:
-        """The kind, in full."""
+        """The full name of the kind."""
         if self.axis is None:
             return "pose" if self.with_position else "orientation"
         return f"{'position+' if self.with_position else ''}axis:{self.axis}"
@@ -52,16 +52,16 @@ class TipTurn:
         return tuple("m" if label in _AXES else "rad" for label in self.labels)
 
     def components(self, turned: ca.SX, position: ca.SX) -> ca.SX:
-        """The task x, from the tip's rotation seen in the reference frame (3, 3) and its position (3, 1)."""
+        """The task value x, from the tip's rotation in the reference frame (3, 3) and its position (3, 1)."""
         x = tilt(turned, _AXES.index(self.axis)) if self.axis else half_angle_vector(turned)
         return ca.vertcat(position, x) if self.with_position else x
 
 
 def frame_along(direction: ArrayLike, axis: str) -> Array:
-    """A rotation (3, 3) that turns a coordinate axis to a direction (3,).
+    """A rotation (3, 3) that takes a coordinate axis to a direction (3,).
 
     Raises:
-        ShapeError, InvalidValueError: if it is not a direction in space.
+        ShapeError, InvalidValueError: if the direction is zero or not (3,).
     """
     wanted = frozen_array("reference", direction, (3,))
     if not wanted.any():

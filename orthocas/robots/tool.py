@@ -1,4 +1,4 @@
-"""A tool on the tip: where it is, without a robot file of its own."""
+"""Move the tip to the end of a tool, without another robot file."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def with_tool(tree: KinematicTree, tool: ArrayLike) -> KinematicTree:
         tool: (3,) position [m], (6,) position and roll, pitch, yaw [rad] as in URDF, or a homogeneous transform (4, 4).
 
     Raises:
-        InvalidValueError: if it is none of these.
+        InvalidValueError: if the tool has another form.
     """
     R, p = _transform(tool)
     return replace(

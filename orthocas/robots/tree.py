@@ -1,4 +1,4 @@
-"""The plain numbers of a kinematic tree: what a robot is once Pinocchio has read it, and what a chart file keeps."""
+"""The numbers of a kinematic tree: Pinocchio's robot as plain data, which chart files store."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -9,16 +9,16 @@ from orthocas.checks import Array, frozen_array, require_known, require_shape
 from orthocas.errors import InvalidValueError, RobotError
 
 JointKind = Literal["revolute", "prismatic"]
-REVOLUTE_ROOM = np.pi / 4  #: [rad] either side of a default posture, the hyper-cube of [AS2023] Sec. 9
+REVOLUTE_ROOM = np.pi / 4  #: [rad] on either side of a default posture, as the hypercube of [AS2023] Sec. 9
 PRISMATIC_ROOM = 0.25  #: [m]
 JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "prismatic")
 
 
 @dataclass(frozen=True, eq=False)
 class KinematicTree:
-    """Joints, bodies and one tip frame. Joint i moves body i; bodies come parents first.
+    """Joints, bodies and one tip frame. Joint i moves body i, and parents come before children.
 
-    Body frames are turned so that every joint axis is the body's z axis: joint i places its body at
+    Body frames are rotated so that every joint axis is the body's z axis. Joint i places its body at
     `rotations[i] Rz(q_i), translations[i]` (revolute) or `rotations[i], translations[i] + q_i rotations[i] z`
     (prismatic) in the parent body's frame.
     """
@@ -59,7 +59,7 @@ class KinematicTree:
         }
         for name, shape in shapes.items():
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
-        for name in ("lower", "upper", "effort_limits", "velocity_limits"):  # may be infinite
+        for name in ("lower", "upper", "effort_limits", "velocity_limits"):  # these may be infinite
             limits = np.array(getattr(self, name), dtype=float)
             require_shape(name, limits.shape, (n,))
             limits.setflags(write=False)
@@ -67,7 +67,7 @@ class KinematicTree:
         self._require_sense()
 
     def _require_sense(self) -> None:
-        """Lengths, limits, masses and the order of bodies."""
+        """Check lengths, limits, masses and the order of bodies."""
         require_shape("joint_kinds", (len(self.joint_kinds),), (self.n,))
         require_shape("parents", (len(self.parents),), (self.n,))
         for i, name in enumerate(self.joint_names):
@@ -95,7 +95,8 @@ class KinematicTree:
     def middle(self) -> Array:
         """A posture away from the joint limits, (n,) [rad] or [m].
 
-        Their middle; where there is one limit or none, the value next to 0 that leaves pi/4 rad (0.25 m) of room.
+        It is the middle of the limits. A joint without both limits has the value closest to 0 that is pi/4 rad (0.25 m)
+        away from its limit.
         """
         room = np.where(self.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
         posture = np.clip(np.zeros(self.n), self.lower + room, self.upper - room)
@@ -105,5 +106,5 @@ class KinematicTree:
 
     @property
     def prismatic(self) -> tuple[bool, ...]:
-        """Which joints slide."""
+        """Whether each joint is prismatic."""
         return tuple(kind == "prismatic" for kind in self.joint_kinds)

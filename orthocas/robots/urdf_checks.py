@@ -1,4 +1,4 @@
-"""What Pinocchio's URDF parser accepts although it makes no robot."""
+"""Checks of URDF files for errors that Pinocchio's parser accepts."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -11,12 +11,12 @@ _WITH_AXIS = ("revolute", "continuous", "prismatic")
 
 
 def check_urdf(path: str | Path, root: ElementTree.Element) -> None:
-    """Refuse joints that move along no axis, joints in loops, and files with more links than any robot has.
+    """Refuse joints with a zero axis, joints in loops, and files with more links than any robot has.
 
-    Lengths of vectors, numbers and limits are left to Pinocchio's parser, which checks them.
+    Pinocchio's parser checks lengths of vectors, numbers and limits.
 
     Raises:
-        RobotError: with the file and the joint.
+        RobotError: if a check fails. The message names the file and the joint.
     """
     links = len(root.findall("link"))
     if links > MOST_LINKS:

@@ -1,4 +1,4 @@
-"""Reading XML files that may be broken or hostile: bounded in size and depth, without document types."""
+"""Read XML files that may be broken or malicious: size and depth are bounded, document types are refused."""
 
 from pathlib import Path
 from typing import Any
@@ -6,10 +6,10 @@ from xml.etree import ElementTree
 
 from orthocas.errors import RobotError
 
-MOST_BYTES = 16 * 2**20  #: size of a file
-MOST_ELEMENTS = 200_000  #: elements of a file, and of a file with all that it includes
-MOST_DEPTH = 200  #: elements inside one another
-MOST_LINKS = 1000  #: links (URDF) or bodies (MJCF) of a robot
+MOST_BYTES = 16 * 2**20  #: largest size of a file
+MOST_ELEMENTS = 200_000  #: most elements of a file, including the files that it includes
+MOST_DEPTH = 200  #: deepest nesting of elements
+MOST_LINKS = 1000  #: most links (URDF) or bodies (MJCF) of a robot
 
 _ARTICLE = {"URDF": "a", "MJCF": "an", "SRDF": "an"}
 
@@ -19,8 +19,8 @@ def read_xml(path: str | Path, kind: str, tag: str | None = None) -> ElementTree
 
     Args:
         path: the file.
-        kind: what the file should be, for messages: "URDF" or "MJCF".
-        tag: what the root element must be called; None allows any name.
+        kind: expected kind of file for messages, "URDF" or "MJCF".
+        tag: expected name of the root element. None allows any name.
 
     Raises:
         RobotError: if the file is missing, is not XML, has another root element, declares a document type (entities
@@ -51,7 +51,7 @@ def _parse(data: bytes) -> ElementTree.Element:
 
 
 class _BoundedBuilder(ElementTree.TreeBuilder):
-    """Builds the tree as the parser goes, and stops it at what no robot needs."""
+    """Builds the tree during parsing, and stops at anything that no robot file needs."""
 
     def __init__(self) -> None:
         super().__init__()

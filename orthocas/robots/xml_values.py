@@ -1,4 +1,4 @@
-"""Attributes of XML elements, read strictly: a vector has its length, a number is not absurd, a keyword is known."""
+"""Strict reading of XML attributes: vectors have the right length, numbers are plausible, keywords are known."""
 
 import re
 from collections.abc import Collection, Mapping
@@ -10,19 +10,19 @@ from orthocas.checks import Array
 from orthocas.errors import RobotError
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-_LARGEST = 1e20  # no length, mass or angle is larger, and no volume overflows
+_LARGEST = 1e20  # no length, mass or angle is larger; volumes of such sizes do not overflow
 
 
 @dataclass(frozen=True, slots=True)
 class Attributes:
-    """The attributes of one element, with what it takes to complain about them."""
+    """The attributes of one element, with the file and element name for error messages."""
 
-    file: str  #: where the element stands
-    element: str  #: the element as messages name it, such as <joint name='j1'>
+    file: str  #: file of the element
+    element: str  #: name of the element in messages, such as <joint name='j1'>
     values: Mapping[str, str]
 
     def text(self, name: str, default: str | None = None) -> str:
-        """An attribute as it stands.
+        """An attribute as text.
 
         Raises:
             RobotError: if it is missing and has no default.
@@ -33,7 +33,7 @@ class Attributes:
         return value
 
     def keyword(self, name: str, known: Collection[str], default: str) -> str:
-        """An attribute that is one of a few words.
+        """An attribute that is one of the known words.
 
         Raises:
             RobotError: if it is another word.
@@ -60,7 +60,7 @@ class Attributes:
         return float(self.numbers(name, 1, None if default is None else [default])[0])
 
     def numbers(self, name: str, count: int, default: Collection[float] | None = None) -> Array:
-        """An attribute that is a vector of count numbers, (count,).
+        """An attribute that is a vector of `count` numbers, (count,).
 
         Raises:
             RobotError: if it is something else, or missing without a default.
@@ -80,7 +80,7 @@ class Attributes:
         """An attribute that is a vector of three numbers, scaled to length 1.
 
         Raises:
-            RobotError: if it is something else, or zero.
+            RobotError: if it is something else, or the zero vector.
         """
         vector = self.numbers(name, 3, default)
         length = float(np.linalg.norm(vector))
@@ -89,7 +89,7 @@ class Attributes:
         return np.asarray(vector / length)
 
     def error(self, complaint: str) -> RobotError:
-        """An error about this element, to raise: the complaint goes on where 'file: element' ends."""
+        """The error to raise for this element. The message is 'file: element complaint'."""
         return RobotError(f"{self.file}: {self.element} {complaint}")
 
     def _unfit(self, name: str, expected: str) -> RobotError:

@@ -1,4 +1,4 @@
-"""How objects show themselves: a few lines of text, and a small table in notebooks."""
+"""How objects are displayed: a few lines of text, and a small table in notebooks."""
 
 from orthocas.showing.facts import Shown, listed, number_list
 

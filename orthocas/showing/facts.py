@@ -1,25 +1,25 @@
-"""Facts about an object by name, as lines of text and as a table of HTML."""
+"""Facts about an object by name, as lines of text and as an HTML table."""
 
 import html
 from collections.abc import Iterable, Mapping
 
-_WIDTH = 100  # characters of a line
-_LINES = 9  # at the most, the heading among them
+_WIDTH = 100  # characters per line
+_LINES = 9  # at most, including the heading
 
 
 class Shown:
-    """An object that prints and shows its facts in notebooks. The first fact is the heading.
+    """An object that displays its facts when printed, and in notebooks. The first fact is the heading.
 
-    Data classes that derive from it ask for `repr=False`.
+    Dataclasses that derive from it need `repr=False`.
     """
 
     def facts(self) -> dict[str, str]:
-        """What to know about the object, by name, the most important first."""
+        """Facts about the object by name, the most important first."""
         raise NotImplementedError
 
     @property
     def heading(self) -> str:
-        """One line that says what it is."""
+        """One line that describes the object."""
         return next(iter(self.facts().values()))
 
     def __repr__(self) -> str:
@@ -30,7 +30,7 @@ class Shown:
 
 
 def as_text(title: str, facts: Mapping[str, str]) -> str:
-    """Title and heading in the first line, then one fact a line: at most 9 lines of 100 characters."""
+    """Title and heading in the first line, then one fact per line: at most 9 lines of 100 characters."""
     (_, heading), *others = facts.items()
     width = max((len(name) for name, _ in others), default=0) + 2
     lines = [f"{title}: {heading}", *(f"  {name:<{width}}{value}" for name, value in others[: _LINES - 1])]
@@ -38,7 +38,7 @@ def as_text(title: str, facts: Mapping[str, str]) -> str:
 
 
 def as_html(title: str, facts: Mapping[str, str]) -> str:
-    """A table with a caption; names and values are text, whatever they hold."""
+    """A table with a caption. Names and values are escaped, so they are shown as text."""
     rows = "".join(
         f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
         f"<td style='text-align:left'>{html.escape(value)}</td></tr>"
@@ -48,20 +48,20 @@ def as_html(title: str, facts: Mapping[str, str]) -> str:
 
 
 def listed(words: Iterable[str], most: int = 10) -> str:
-    """Words with commas between them, and how many more there are."""
+    """Join words with commas, and say how many more there are."""
     known = list(words)
     more = f", and {len(known) - most} more" if len(known) > most else ""
     return ", ".join(known[:most]) + more
 
 
 def number_list(values: Iterable[float], most: int = 10) -> str:
-    """Numbers with four digits, as `listed`; one number if all are equal."""
+    """Join numbers of four digits like `listed`. Equal numbers are shown once."""
     known = [f"{value:.4g}" for value in values]
     return known[0] if len(set(known)) == 1 else listed(known, most)
 
 
 def _cut(line: str) -> str:
-    """One line, whatever names hold, without what does not fit into it."""
+    """The line without control characters, cut to the width."""
     indent = line[: len(line) - len(line.lstrip())]
     words = "".join(letter if letter.isprintable() else " " for letter in line.strip())
     return indent + (words if len(words) <= _WIDTH else words[: _WIDTH - 3] + "...")

@@ -1,4 +1,4 @@
-"""Controllers run in closed loop on real dynamics, and what the runs tell."""
+"""Simulation of controllers in closed loop with the full dynamics, and evaluation of the runs."""
 
 from orthocas.simulation.breakdown import Breakdown, task_acceleration_breakdown
 from orthocas.simulation.coupling import Coupling, coupling_index

@@ -20,30 +20,31 @@ from orthocas.simulation.moving_picture import MovingPicture, Picture
 from orthocas.simulation.trajectory import Trajectory
 
 FORMATS = ("gif", "mp4")
-_RATE = 20  # pictures per second
-_MOST = 400  # pictures; longer runs are shown faster than in life
+_RATE = 20  # frames per second
+_MOST = 400  # frames; longer runs play faster than real time
 _COLOURS = 128
 
 
 def require_format(name: str) -> None:
-    """Check early that an animation of this format can be made here.
+    """Check early that an animation of this format can be made on this machine.
 
     Raises:
-        UnknownNameError: if it is none of gif and mp4.
+        UnknownNameError: if the format is neither gif nor mp4.
         InvalidValueError: for mp4 without ffmpeg on the PATH.
     """
     require_known("animation format", name, FORMATS)
     if name == "mp4" and shutil.which("ffmpeg") is None:
-        raise InvalidValueError("animation", "mp4", "gif, since MP4 needs ffmpeg and there is none on the PATH")
+        raise InvalidValueError("animation", "mp4", "gif, because mp4 needs ffmpeg, which is not on the PATH")
 
 
 def save_animation(path: str | Path, trajectory: Trajectory, problem: Problem, monitor: Monitor = silent) -> None:
-    """Write the arm and its controlled quantities, moving, to a file that appears whole or not at all.
+    """Write an animation of the arm and its controlled quantities. The file appears whole or not at all.
 
-    In 3-D, or in the plane of a planar arm; 20 pictures per second, in real time up to 20 s.
+    The arm is drawn in 3-D, or in its plane if it is planar. The animation has 20 frames per second and runs in real
+    time for runs of up to 20 s.
 
     Args:
-        path: ends in .gif or .mp4.
+        path: of the file, ending in .gif or .mp4.
         trajectory: the run.
         problem: robot and task.
         monitor: called with progress.
@@ -68,7 +69,7 @@ def save_animation(path: str | Path, trajectory: Trajectory, problem: Problem, m
 
 
 def _chosen(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], float]:
-    """Indices of the instants to show, and how much faster than in life."""
+    """Indices of the instants to show, and the factor by which they play faster than real time."""
     length = float(times[-1] - times[0])
     speed = max(1.0, length * _RATE / _MOST)
     wanted = np.arange(times[0], times[-1] + 1e-9, speed / _RATE)
@@ -78,26 +79,26 @@ def _chosen(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], float]:
 def _watched(pictures: Iterator[Picture], count: int, monitor: Monitor) -> Iterator[Picture]:
     for k, picture in enumerate(pictures, start=1):
         yield picture
-        monitor(Progress("draw animation", k / count, f"picture {k} of {count}"))
+        monitor(Progress("draw animation", k / count, f"frame {k} of {count}"))
 
 
 def _write_gif(path: Path, pictures: Iterator[Picture], samples: Picture) -> None:
-    """Pictures in the colours of the samples; in each only what changes."""
+    """Write frames in the palette of the samples; each frame stores only what changes."""
     palette = Image.fromarray(samples).quantize(_COLOURS)
     frames = (Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
     first = next(frames)
-    with path.open("wb") as file:  # closed also after Ctrl-C, unlike what Pillow opens itself
+    with path.open("wb") as file:  # unlike a file that Pillow opens, this one is closed even after Ctrl-C
         first.save(file, "GIF", save_all=True, append_images=frames, duration=1000 // _RATE, loop=0, optimize=True)
 
 
 def _write_mp4(path: Path, pictures: Iterator[Picture], size: tuple[int, int]) -> None:
-    """Raw pictures of a size (height, width) through a pipe to ffmpeg."""
+    """Send raw frames of size (height, width) to ffmpeg through a pipe."""
     come = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[1]}x{size[0]}", "-r", str(_RATE), "-i", "-"]
     command = ["ffmpeg", "-loglevel", "error", "-y", *come, "-pix_fmt", "yuv420p", str(path)]
     with tempfile.TemporaryFile() as said:
         ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said, stderr=said)
         try:
-            with suppress(BrokenPipeError), ffmpeg:  # if it gave up, what it said tells why
+            with suppress(BrokenPipeError), ffmpeg:  # if ffmpeg gives up, its messages tell why
                 assert ffmpeg.stdin is not None
                 for picture in pictures:
                     ffmpeg.stdin.write(picture.tobytes())

@@ -1,4 +1,4 @@
-"""Where unwanted task acceleration comes from ([AS2023] Fig. 25b)."""
+"""The sources of unwanted task acceleration ([AS2023] Fig. 25b)."""
 
 from dataclasses import dataclass, field
 
@@ -13,32 +13,34 @@ from orthocas.simulation.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Breakdown:
-    """Parts of the task acceleration dd_x along a run, each (N, m). They add up to dd_x."""
+    """Terms of the task acceleration dd_x along a run, each (N, m). They add up to dd_x."""
 
     labels: tuple[str, ...]  #: of x
-    own: Array = field(repr=False)  #: J_x M^-1 J_x^T f_x: what the force in the task does
-    error: Array = field(repr=False)  #: J_x M^-1 J_xi^T f_xi, [AS2023] eq. (38): 0 where (5) holds with A = M
+    own: Array = field(repr=False)  #: J_x M^-1 J_x^T f_x, the effect of the task force
+    error: Array = field(repr=False)  #: J_x M^-1 J_xi^T f_xi, [AS2023] eq. (38); 0 where (5) holds with A = M
     curvature: Array = field(repr=False)  #: dJ_x/dt dq
     coriolis: Array = field(repr=False)  #: -J_x M^-1 C dq
 
     @property
     def total(self) -> Array:
-        """Dd_x, (N, m)."""
+        """dd_x, (N, m)."""
         return self.own + self.error + self.curvature + self.coriolis
 
 
 def task_acceleration_breakdown(chart: Chart, trajectory: Trajectory) -> Breakdown:
-    """Split dd_x as the first rows of [AS2023] eq. (34), with f_phi = J^-T (tau - g) for any torque controller.
+    """Split dd_x into the terms of the first rows of [AS2023] eq. (34), with f_phi = J^-T (tau - g).
+
+    The terms use the controller's model of the robot and leave out pushes and friction.
 
     Args:
-        chart: coordinates to split by, on the controller's model of the robot; no pushes, no friction.
-        trajectory: of a torque controller.
+        chart: the chart whose coordinates define the terms.
+        trajectory: a run of any torque controller.
 
     Raises:
-        InvalidValueError: if the trajectory is one of a velocity controller.
+        InvalidValueError: if the trajectory belongs to a velocity controller.
     """
     if trajectory.kind != "torque":
-        raise InvalidValueError("trajectory", f"one of '{trajectory.controller}'", "one of a torque controller")
+        raise InvalidValueError("trajectory", f"a run of '{trajectory.controller}'", "a run of a torque controller")
     require_kind("chart", chart, Chart)
     require_kind("trajectory", trajectory, Trajectory)
     parts = Batched(_parts(chart))(trajectory.q, trajectory.dq, trajectory.command)

@@ -23,7 +23,7 @@ class ClosedLoop:
     """A controller on a plant. The state is [q; dq] for torque controllers and q for velocity controllers."""
 
     controller: Controller
-    plant: Robot  #: the robot as it is, which the controller's model may not match
+    plant: Robot  #: the true robot, which may differ from the controller's model
     friction: Friction
 
     @property
@@ -38,12 +38,12 @@ class ClosedLoop:
 
     @property
     def stiff(self) -> bool:
-        """Whether friction asks for an implicit method."""
+        """Whether friction makes an implicit method necessary."""
         return bool(np.any(np.asarray(self.friction.coulomb)))
 
     @cached_property
     def plant_rate(self) -> ca.Function:
-        """State, command (n, 1), load (3 + n, 1) -> rate of the state."""
+        """state, command (n, 1), load (3 + n, 1) -> rate of the state."""
         n = self.n
         q, dq, command, load = (
             ca.SX.sym(name, size) for name, size in (("q", n), ("dq", n), ("u", n), ("load", 3 + n))
@@ -55,14 +55,14 @@ class ClosedLoop:
         return ca.Function("plant", [ca.vertcat(q, dq), command, load], [ca.vertcat(dq, ddq)])
 
     def commanded(self, state: ca.MX, reference: Sequence[ca.MX]) -> tuple[ca.MX, ca.MX]:
-        """Command and status for a (measured) state and the reference with two derivatives."""
+        """Command and status for a (measured) state and a reference with two derivatives."""
         dq = state[self.n :] if self.torque else ca.MX(self.n, 1)
         gains = [ca.DM(gain) for gain in self.controller.gains.values()]
         command, status = self.controller.function.call([state[: self.n], dq, *reference, *gains])
         return command, status
 
     def rate(self, reference: Reference) -> ca.Function:
-        """State, time since the start of a segment, its parameters, load -> rate of the state."""
+        """state, time since the start of a segment, parameters of the segment, load -> rate of the state."""
         state = ca.MX.sym("state", self.plant_rate.size1_in(0))
         t, parameters = ca.MX.sym("t"), ca.MX.sym("parameters", reference.profile.size1_in(1))
         load = ca.MX.sym("load", 3 + self.n)
@@ -73,15 +73,17 @@ class ClosedLoop:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of a run: N instants, each at the end of a step."""
+    """A part of a run: N instants, each at the end of a time step."""
 
     times: Array  #: (N,) [s]
     states: Array  #: (N, s)
-    held: tuple[Array, Array] | None = None  #: sampled controllers: commands (N, n) held until then, their status (N,)
+    held: tuple[Array, Array] | None = (
+        None  #: sampled controllers: commands (N, n) held until each instant, and their status (N,)
+    )
 
 
 def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:
-    """Call a function that integrates; Ctrl-C waits until it returns.
+    """Call a function that integrates; Ctrl-C is deferred until it returns.
 
     Raises:
         SimulationError: if CVODES gives up.
@@ -94,7 +96,7 @@ def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:
 
 
 def cvodes_options(tolerance: float, stiff: bool) -> dict[str, Any]:
-    """Adams with functional iteration, which needs no Jacobian; BDF with Newton's where Coulomb friction is stiff."""
+    """Adams with functional iteration, which needs no Jacobian, or BDF with Newton's if Coulomb friction is stiff."""
     return {
         "linear_multistep_method": "bdf" if stiff else "adams",
         "nonlinear_solver_iteration": "newton" if stiff else "functional",

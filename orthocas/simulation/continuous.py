@@ -1,4 +1,4 @@
-"""Closed loops in continuous time, by CVODES, segment by segment, so that it never steps over a jump."""
+"""Closed loops in continuous time. CVODES integrates segment by segment, so that it never steps across a jump."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -12,19 +12,19 @@ from orthocas.control.reference import Reference
 from orthocas.simulation.closed_loop import ClosedLoop, Piece, cvodes_options, run_compiled
 from orthocas.simulation.disturbances import Push, loads_at
 
-_OUTPUTS = 25  # instants of one integrator call: one object serves all, and Ctrl-C waits no longer than that
+_OUTPUTS = 25  # instants per integrator call: one integrator serves all calls, and Ctrl-C waits for one call at most
 
 
-_SAME = 1e-9  # [s]: events closer than that differ by rounding
+_SAME = 1e-9  # [s]: events closer than this differ only by rounding
 
 
 def integrate(
     loop: ClosedLoop, reference: Reference, pushes: tuple[Push, ...], start: Array, step: float, tolerance: float
 ) -> Iterator[Piece]:
-    """Pieces of 25 instants in turn, from after the start to the end of the reference.
+    """Yield pieces of 25 instants, from just after the start to the end of the reference.
 
     Raises:
-        SimulationError: when CVODES gives up.
+        SimulationError: if CVODES gives up.
     """
     run = _integrator(loop, reference, tolerance)
     state = start
@@ -39,7 +39,7 @@ def integrate(
 
 
 def _pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> Iterator[tuple[float, float]]:
-    """Intervals no longer than that, without a step of the reference or a change of load inside."""
+    """Intervals of at most the given length, without a step of the reference or a change of load inside."""
     edges = np.array([*reference.times, *(t for push in pushes for t in (push.start, push.end))])
     borders = np.unique(edges[edges <= reference.duration])
     borders = borders[np.diff(borders, prepend=-1.0) > _SAME]
@@ -50,7 +50,7 @@ def _pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> I
 
 
 def _integrator(loop: ClosedLoop, reference: Reference, tolerance: float) -> ca.Function:
-    """x0, p = [length; time since the start of the segment; its parameters; load] -> states at 25 even instants."""
+    """x0, p = [length; time since segment start; parameters; load] -> states at 25 equally spaced instants."""
     rate = loop.rate(reference)
     state_size, _, p_size, load_size = (rate.size1_in(i) for i in range(4))
     kind: Any = ca.SX if rate.is_a("SXFunction") else ca.MX

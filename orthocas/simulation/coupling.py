@@ -1,4 +1,4 @@
-"""How much a commanded coordinate disturbs the others."""
+"""Coupling indices: how much a commanded coordinate disturbs the others."""
 
 from dataclasses import dataclass
 
@@ -11,22 +11,22 @@ from orthocas.errors import InvalidValueError
 from orthocas.showing import Shown
 from orthocas.simulation.trajectory import Trajectory
 
-_NO_STEP = 1e-9  # differences of targets that come from rounding
+_NO_STEP = 1e-9  # smaller differences of targets are rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Coupling(Shown):
-    """Coupling indices: rows are disturbed coordinates, columns the commanded ones."""
+    """Coupling indices. Rows are disturbed coordinates, columns are commanded coordinates."""
 
     labels: tuple[str, ...]  #: of phi = [x; xi]
     index: Array  #: (n, n) [unit of the row / unit of the column]; NaN where a coordinate was never commanded alone
 
     def of(self, disturbed: str, commanded: str) -> float:
-        """The index of one pair, by labels: how much the first suffers from steps of the second."""
+        """The index of one pair of labels: how much steps of the second coordinate disturb the first."""
         return float(self.index[self.labels.index(disturbed), self.labels.index(commanded)])
 
     def facts(self) -> dict[str, str]:
-        """For every commanded coordinate the one it disturbs most."""
+        """The coordinate that each commanded coordinate disturbs most."""
         known = [j for j in range(len(self.labels)) if np.isfinite(self.index[:, j]).any()]
         worst = {j: int(np.nanargmax(self.index[:, j])) for j in known}
         found = {f"steps of {self.labels[j]}": f"{self.index[i, j]:.3g} in {self.labels[i]}" for j, i in worst.items()}
@@ -34,13 +34,14 @@ class Coupling(Shown):
 
 
 def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -> Coupling:
-    """Largest excursion of each coordinate from its reference while only another is commanded, over the commanded step.
+    """Largest deviation of each coordinate while only one other is commanded, divided by the commanded step.
 
-    Steps that change several targets at once are left out; of several steps in one coordinate the worst counts. What a
-    step before has left counts too: let the arm come to rest in between.
+    Deviations are measured from the reference. Steps that change several targets at once are left out; of several steps
+    in one coordinate, the worst counts. Motion left over from an earlier step counts too, so let the arm come to rest
+    between steps.
 
     Args:
-        chart: the coordinates that are judged, also for controllers that do not use them.
+        chart: the chart whose coordinates are evaluated, even if the controller does not use them.
         reference: steps in phi = [x; xi], `Reference.steps` with `chart.labels`.
         trajectory: the run.
 

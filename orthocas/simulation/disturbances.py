@@ -1,4 +1,4 @@
-"""What a real robot adds to the model: pushes, friction, noisy sensors."""
+"""Disturbances that the model leaves out: pushes, friction and sensor noise."""
 
 from dataclasses import dataclass
 
@@ -10,18 +10,18 @@ from orthocas.checks import Array, as_float_array, frozen_array, require_count, 
 from orthocas.control.gains import non_negative_gains
 from orthocas.errors import InvalidValueError
 
-_STICTION_SPEED = 0.01  # [rad/s] or [m/s]: Coulomb friction is nearly full above twice that
+_STICTION_SPEED = 0.01  # [rad/s] or [m/s]: above twice this speed, Coulomb friction is nearly at its full value
 
 
 @dataclass(frozen=True, eq=False)
 class Push:
-    """A constant external load for some time.
+    """An external load that is constant for some time.
 
     Args:
         start: [s], >= 0.
         duration: [s], > 0.
-        force: at the tip, in the world, (3,) [N]; default none.
-        torque: at the joints, (n,) [N m] or [N]; default none.
+        force: at the tip, in world axes, (3,) [N]; default no force.
+        torque: at the joints, (n,) [N m] or [N]; default no torque.
     """
 
     start: float
@@ -44,7 +44,7 @@ class Push:
 
     @property
     def end(self) -> float:
-        """When it stops [s]."""
+        """Time at which the push ends [s]."""
         return self.start + self.duration
 
     def load(self, n: int) -> Array:
@@ -55,7 +55,7 @@ class Push:
 
 
 def loads_at(pushes: tuple[Push, ...], times: Array, n: int) -> Array:
-    """Sum of the loads at times (N,), (N, 3 + n); a push acts from its start until just before its end."""
+    """Sum of the loads at times (N,), (N, 3 + n). A push acts from its start until just before its end."""
     loads = np.zeros((len(times), 3 + n))
     for push in pushes:
         loads[(times >= push.start) & (times < push.end)] += push.load(n)
@@ -63,7 +63,7 @@ def loads_at(pushes: tuple[Push, ...], times: Array, n: int) -> Array:
 
 
 def mean_loads(pushes: tuple[Push, ...], starts: Array, length: float, n: int) -> Array:
-    """Time means of the loads over intervals of one length, (N, 3 + n): a short push keeps its impulse."""
+    """Mean loads over time intervals of equal length, (N, 3 + n), so that a short push keeps its impulse."""
     loads = np.zeros((len(starts), 3 + n))
     for push in pushes:
         overlap = np.minimum(starts + length, push.end) - np.maximum(starts, push.start)
@@ -73,7 +73,7 @@ def mean_loads(pushes: tuple[Push, ...], starts: Array, length: float, n: int) -
 
 @dataclass(frozen=True, eq=False)
 class Friction:
-    """Joint friction tau_f = viscous dq + coulomb tanh(dq / 0.01), against the motion.
+    """Joint friction tau_f = viscous dq + coulomb tanh(dq / 0.01), which opposes the motion.
 
     Args:
         viscous: >= 0, (n,) or one number [N m s/rad].
@@ -84,7 +84,7 @@ class Friction:
     coulomb: ArrayLike = 0.0
 
     def torque(self, dq: ca.SX) -> ca.SX:
-        """What friction takes from the joint torque, (n, 1)."""
+        """Friction torque, to be subtracted from the joint torque, (n, 1)."""
         viscous = ca.DM(non_negative_gains("viscous", self.viscous, dq.shape[0]))
         coulomb = ca.DM(non_negative_gains("coulomb", self.coulomb, dq.shape[0]))
         friction: ca.SX = viscous * dq + coulomb * ca.tanh(dq / _STICTION_SPEED)
@@ -93,7 +93,7 @@ class Friction:
 
 @dataclass(frozen=True)
 class Noise:
-    """White Gaussian noise on what the controller measures, new at every control tick.
+    """White Gaussian noise on the measurements of the controller, drawn anew at every control tick.
 
     Args:
         position: standard deviation >= 0 [rad] or [m].
@@ -113,6 +113,6 @@ class Noise:
                 raise InvalidValueError(f"{name} noise", getattr(self, name), "a finite number >= 0")
 
     def sample(self, ticks: int, n: int) -> Array:
-        """Errors of q and dq, (ticks, 2 n)."""
+        """Measurement errors of q and dq, (ticks, 2 n)."""
         rng = np.random.default_rng(self.seed)
         return np.asarray(rng.normal(size=(ticks, 2 * n)) * np.repeat([self.position, self.velocity], n))

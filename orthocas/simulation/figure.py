@@ -1,4 +1,4 @@
-"""A picture of a run: controlled quantities with their references, joints, commands and storage over time."""
+"""Figure of a run: controlled quantities with their references, joints, commands and storage over time."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,11 +15,11 @@ from orthocas.simulation.trajectory import Trajectory
 ACTUAL, FALLBACK = "#3d85c6", "#d62728"
 _WANTED, _STORAGE = "#222222", "#1b9e77"
 _SMALL = 8.0  # font size [pt]
-_NARROWEST = 1e-2  # height of a panel, as a share of the widest range of all: what rests looks at rest
+_NARROWEST = 1e-2  # smallest range of a panel, relative to the widest, so that a quantity at rest looks at rest
 
 
 def units_of(problem: Problem) -> dict[str, str]:
-    """Units of task components and joints, by label; coordinates have none."""
+    """Units of task components and joints, by label. Extra coordinates have none."""
     joints = {"revolute": "rad", "prismatic": "m"}
     tree = problem.robot.tree
     units = {name: joints[kind] for name, kind in zip(tree.joint_names, tree.joint_kinds, strict=True)}
@@ -27,11 +27,11 @@ def units_of(problem: Problem) -> dict[str, str]:
 
 
 def trajectory_figure(trajectory: Trajectory, units: Mapping[str, str] | None = None) -> Figure:
-    """Left a panel for each controlled quantity, right joints, commands and storage; red where the law gave way.
+    """Draw controlled quantities on the left; joints, commands and storage on the right. Red marks the fallback.
 
     Args:
         trajectory: the run.
-        units: of the quantities, by label, see `units_of`; others are shown without.
+        units: units of the quantities by label, see `units_of`; quantities without an entry are shown without a unit.
     """
     k = len(trajectory.labels)
     figure = Figure(figsize=(10.5, max(5.4, 1.05 * k + 0.9)), layout="constrained")
@@ -56,9 +56,11 @@ def trajectory_figure(trajectory: Trajectory, units: Mapping[str, str] | None = 
 
 
 def draw_quantities(panels: Array, trajectory: Trajectory, units: Mapping[str, str], drawn: bool = True) -> None:
-    """Reference and, if drawn, actual value of each quantity, one axes each."""
+    """Draw the reference and, if `drawn`, the actual value of each quantity in its own axes."""
     good = (trajectory.status == ControlStatus.OK) & np.isfinite(trajectory.value).all(axis=1)
-    seen = np.vstack([trajectory.value[good], trajectory.reference])  # charts mean nothing outside their domain
+    seen = np.vstack(
+        [trajectory.value[good], trajectory.reference]
+    )  # chart coordinates are meaningless outside the domain
     lows, highs = seen.min(axis=0), seen.max(axis=0)
     spans = np.maximum(highs - lows, max(_NARROWEST * (highs - lows).max(), 1e-9))
     middles = (lows + highs) / 2
@@ -73,7 +75,7 @@ def draw_quantities(panels: Array, trajectory: Trajectory, units: Mapping[str, s
 
 
 def shade_fallback(axes: Axes, trajectory: Trajectory) -> None:
-    """Red where the controller gave its fallback."""
+    """Shade in red where the controller used its fallback."""
     edges = np.flatnonzero(np.diff(trajectory.status)) + 1
     for start, end in zip([0, *edges], [*edges, len(trajectory.times) - 1], strict=True):
         status = ControlStatus(int(trajectory.status[start]))
@@ -82,7 +84,7 @@ def shade_fallback(axes: Axes, trajectory: Trajectory) -> None:
 
 
 def _draw_others(panels: Array, trajectory: Trajectory, units: Mapping[str, str]) -> None:
-    """Joints, commands, and the storage of torque controllers."""
+    """Draw joints, commands and, for torque controllers, the storage."""
     torque = trajectory.kind == "torque"
     unit = " or ".join(sorted({units.get(name, "rad or m") for name in trajectory.joint_names}, reverse=True))
     force = " or ".join({"rad": "N m", "m": "N"}[part] for part in unit.split(" or "))
@@ -111,16 +113,14 @@ def _style(axes: Axes, trajectory: Trajectory) -> None:
 def _title(trajectory: Trajectory) -> str:
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
-        text += f": {trajectory.outcome.value}, the run ends early"
+        text += f": {trajectory.outcome.value}, run ended early"
     reasons = {ControlStatus(int(status)) for status in np.unique(trajectory.status)} - {ControlStatus.OK}
     if reasons:
-        text += "\nred: the law gave way to its fallback, " + ", ".join(
-            reason.name.lower().replace("_", " ") for reason in sorted(reasons)
-        )
+        text += "\nred: fallback, " + ", ".join(reason.name.lower().replace("_", " ") for reason in sorted(reasons))
     return text
 
 
 def _in_mathematics(label: str) -> str:
-    """xi1 as a symbol; other labels as they are."""
+    """A label such as xi1 as a mathematical symbol; other labels unchanged."""
     number = label.removeprefix("xi")
     return rf"$\xi_{{{number}}}$" if label.startswith("xi") and number.isdigit() else label

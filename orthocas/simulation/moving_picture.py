@@ -1,4 +1,4 @@
-"""A run as a sequence of pictures: the arm beside the controlled quantities, with a cursor that moves."""
+"""A run as a sequence of frames: the arm next to the controlled quantities, with a moving cursor."""
 
 from collections.abc import Iterator
 from typing import Any, cast
@@ -24,18 +24,18 @@ _FLAT = 1e-9  # range of a coordinate of a planar arm [m]
 
 
 class MovingPicture:
-    """What moves is drawn over a background that is drawn once: a picture takes milliseconds.
+    """Draws the moving parts over a background that is drawn once, so that a frame takes milliseconds.
 
     Args:
         trajectory: the run.
         problem: robot and task.
-        speed: how much faster than in life it will be shown, for the title.
+        speed: playback speed relative to real time, for the title.
     """
 
     def __init__(self, trajectory: Trajectory, problem: Problem, speed: float = 1.0) -> None:
         k = len(trajectory.labels)
         height = max(4.2, _PANEL * k + 0.8)
-        figure = Figure(figsize=(_WIDTH, round(height * _DPI / 2) * 2 / _DPI), dpi=_DPI)  # even: MP4 wants that
+        figure = Figure(figsize=(_WIDTH, round(height * _DPI / 2) * 2 / _DPI), dpi=_DPI)  # even height: MP4 needs it
         self._canvas = cast(Any, FigureCanvasAgg(figure))
         self._times, self._values = trajectory.times, trajectory.value
         self._arm = _Arm(figure, trajectory, problem)
@@ -53,14 +53,14 @@ class MovingPicture:
         handles = [self._lines[0], *panels[0].lines[:1]]
         figure.legend(handles=handles, loc=(0.605, 1 - 0.34 / height), **_LEGEND)
         self.title = trajectory.controller + ("" if speed == 1 else f", {speed:.3g} x real time")
-        self.axes = tuple(figure.axes)  #: the arm's, then one for each quantity
+        self.axes = tuple(figure.axes)  #: the axes of the arm, then those of each quantity
         figure.text(0.02, 1 - 0.25 / height, self.title, fontsize=10)
         self._clock = figure.text(0.42, 1 - 0.25 / height, "", fontsize=10, animated=True)
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(figure.bbox)
 
     def pictures(self, instants: NDArray[np.int_]) -> Iterator[Picture]:
-        """The run at some of its instants, by index."""
+        """Frames of the run at the given instants, by index."""
         for index in instants:
             self._canvas.restore_region(self._background)
             for artist in self._moved(int(index)):
@@ -68,7 +68,7 @@ class MovingPicture:
             yield np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def _moved(self, index: int) -> list[Artist]:
-        """Everything that moves, put where it is at an instant."""
+        """All moving artists, placed as they are at an instant."""
         now = self._times[index]
         for i in range(self._values.shape[1]):
             done, cursor = self._lines[2 * i : 2 * i + 2]
@@ -79,7 +79,7 @@ class MovingPicture:
 
 
 class _Arm:
-    """The arm, the way of its tip, and where the tip is wanted, in 2-D axes for planar arms, else in 3-D."""
+    """The arm, the path of its tip and the target of the tip, in 2-D axes for planar arms, otherwise in 3-D."""
 
     def __init__(self, figure: Figure, trajectory: Trajectory, problem: Problem) -> None:
         points = problem.robot.joint_points(trajectory.q)  # (N, points, 3)
@@ -91,7 +91,7 @@ class _Arm:
         zero = np.zeros((len(shown), 0))
         axes.plot(*self._points[0, :1].T, "s", color=_ARM, markersize=9)
         self._lines: list[Any] = [
-            *axes.plot(*zero, color=_TRAIL, linewidth=1.5, animated=True, label="way of the tip"),
+            *axes.plot(*zero, color=_TRAIL, linewidth=1.5, animated=True, label="tip path"),
             *axes.plot(*zero, "-o", color=_ARM, linewidth=3.5, markersize=5.5, animated=True),
             *axes.plot(
                 *zero,
@@ -100,7 +100,7 @@ class _Arm:
                 markersize=13,
                 markeredgewidth=1.6,
                 animated=True,
-                label="where the task wants it",
+                label="target",
             ),
         ]
         self._shadow: list[Any] = [] if flat.size else axes.plot(*zero, color=_SHADOW, linewidth=3, animated=True)
@@ -108,7 +108,7 @@ class _Arm:
         figure.legend(handles=known[: 1 + np.isfinite(self._targets).all()], loc=(0.02, 0.01), **_LEGEND)
 
     def moved(self, index: int) -> list[Artist]:
-        """The lines, put where they are at an instant."""
+        """The lines, placed as they are at an instant."""
         now = self._points[index]
         shapes = [self._points[: index + 1, -1], now, self._targets[index : index + 1]]
         for line, shape in zip(self._lines, shapes, strict=True):
@@ -119,7 +119,7 @@ class _Arm:
 
 
 def _tip_targets(trajectory: Trajectory, problem: Problem) -> Array:
-    """Where the reference wants the tip, (N, 3): free coordinates are the tip's own; NaN if the task is no position."""
+    """Target of the tip, (N, 3). Axes that the task leaves free follow the tip; NaN if the task is not a position."""
     if not problem.task.name.startswith("position:"):
         return np.full((len(trajectory.times), 3), np.nan)
     target = problem.robot.joint_points(trajectory.q)[:, -1].copy()
@@ -129,7 +129,7 @@ def _tip_targets(trajectory: Trajectory, problem: Problem) -> Array:
 
 
 def _axes_around(figure: Figure, low: Array, high: Array, names: list[str]) -> Any:
-    """Axes for the arm with the same scale in all directions."""
+    """Axes for the arm, with the same scale in all directions."""
     longest = (high - low).max()
     middle, extent = (low + high) / 2, high - low + 2 * _MARGIN * longest
     if len(names) == 2:

@@ -1,4 +1,4 @@
-"""`simulate`: a controller, a reference and a robot, run in closed loop."""
+"""`simulate`: runs a controller, a reference and a robot in closed loop."""
 
 from collections.abc import Sequence
 
@@ -37,33 +37,45 @@ def simulate(
     tolerance: float = TOLERANCE,
     monitor: Monitor = silent,
 ) -> Trajectory:
-    """Run a closed loop by SUNDIALS (CVODES) for as long as the reference lasts.
+    """Simulate a closed loop with SUNDIALS (CVODES) for the duration of the reference.
 
-    Torque controllers move M ddq + C dq + g = tau + loads - friction ([AS2023] eq. (26)); velocity controllers move
-    dq = command, as a robot that follows its commands perfectly.
+    With a torque controller, the robot obeys M ddq + C dq + g = tau + loads - friction ([AS2023] eq. (26)). With a
+    velocity controller it follows its commands perfectly, dq = command.
 
     Args:
         controller: see `orthocas.control`.
-        reference: with the labels of the controller.
+        reference: the motion to follow, with the labels of the controller.
         q_start: joint positions at t = 0, (n,) [rad] or [m].
-        dq_start: joint velocities at t = 0, (n,); default at rest. Torque controllers only.
+        dq_start: joint velocities at t = 0, (n,); default at rest. For torque controllers only.
         step: longest time between two instants of the result [s].
-        control_rate: ticks per second of a sampled controller, whose command is held between them; instants of the
-            result are then those ticks. Default: a controller in continuous time.
-        plant: the robot as it is, for example `robot.with_scaled_masses(1.1)`; default the controller's model.
+        control_rate: ticks per second of a sampled controller, which holds its command between ticks. The instants of
+            the result are then the ticks. Default: a controller in continuous time.
+        plant: the true robot, for example `robot.with_scaled_masses(1.1)`; default the controller's model.
         pushes: external loads.
-        friction: in the joints.
-        noise: on what a sampled controller measures.
-        must_be_reachable: whether to refuse a reference that leaves the domain, before the run.
+        friction: friction in the joints.
+        noise: noise on the measurements of a sampled controller.
+        must_be_reachable: whether to raise an error, before the run, if the reference leaves the domain.
         tolerance: relative and absolute tolerance of CVODES.
         monitor: called with progress.
 
     Returns:
-        The trajectory. Its outcome tells whether it ended early, by Ctrl-C or because the integrator gave up.
+        The trajectory. Its outcome tells whether the run ended early, by Ctrl-C or because the integrator gave up.
 
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.
-        ShapeError, InvalidValueError: for what does not fit.
+        ShapeError, InvalidValueError: for arguments of the wrong shape, value or type.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> problem = problems.get("planar_3r_xy")
+        >>> chart = oc.fit(problem, oc.Polynomial(degree=2), samples=300).chart
+        >>> controller = oc.control.PDPlus(chart, stiffness=50.0)
+        >>> start = chart.phi(problem.domain.centre)
+        >>> reference = oc.control.Reference.steps(chart.labels, start, [(0.1, {"x": start[0] + 0.05})], duration=0.5)
+        >>> trajectory = oc.simulate(controller, reference, problem.domain.centre)
+        >>> trajectory.outcome.value, bool(abs(trajectory.value - trajectory.reference).max() < 0.01)
+        ('complete', True)
     """
     _require_kinds(controller, reference, plant, pushes, friction, noise)
     loop = ClosedLoop(controller, plant or controller.problem.robot, friction or Friction())
@@ -96,7 +108,7 @@ def simulate(
         outcome = Outcome.DIVERGED
     try:
         return _trajectory(loop, reference, start, pieces, outcome)
-    except KeyboardInterrupt:  # late, but nothing need be lost
+    except KeyboardInterrupt:  # keep the run up to here
         return _trajectory(loop, reference, start, pieces, Outcome.INTERRUPTED)
 
 
@@ -108,7 +120,7 @@ def _require_kinds(
     friction: Friction | None,
     noise: Noise | None,
 ) -> None:
-    """Refuse objects of another class."""
+    """Raise InvalidValueError for objects of the wrong class."""
     require_controller(controller)
     require_kind("reference", reference, Reference)
     for name, value, kind in (("plant", plant, Robot), ("friction", friction, Friction), ("noise", noise, Noise)):
@@ -127,7 +139,9 @@ def _start_state(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | Non
     q = as_point("q_start", q_start, loop.n)
     if not loop.torque:
         if dq_start is not None:
-            raise InvalidValueError("dq_start", dq_start, "nothing: velocity controllers have no velocity as a state")
+            raise InvalidValueError(
+                "dq_start", dq_start, "None, because velocity is not a state with a velocity controller"
+            )
         return q
     return np.concatenate([q, np.zeros(loop.n) if dq_start is None else as_point("dq_start", dq_start, loop.n)])
 
@@ -140,29 +154,33 @@ def _require_fitting(
     noise: Noise | None,
     control_rate: float | None,
 ) -> None:
-    """Refuse what would be ignored, or fail later with a worse message."""
+    """Raise InvalidValueError for arguments that would be ignored, or fail later with a less clear message."""
     controller = loop.controller
     if reference.labels != controller.labels:
         raise InvalidValueError(
             "labels of the reference", reference.labels, f"those of the controller {controller.labels}"
         )
     if loop.n != controller.problem.n:
-        raise InvalidValueError("joints of the plant", loop.n, f"{controller.problem.n}, as the controller's robot")
+        raise InvalidValueError("joints of the plant", loop.n, f"{controller.problem.n}, as in the controller's robot")
     if not loop.torque and (pushes or friction is not None or loop.plant is not controller.problem.robot):
-        raise InvalidValueError("pushes, friction or plant", "given", "none: a velocity controller sees no forces")
+        raise InvalidValueError(
+            "pushes, friction or plant", "given", "none of them, because forces do not affect a velocity controller"
+        )
     late = [push.start for push in pushes if push.start >= reference.duration]
     if late:
-        raise InvalidValueError("start of a push", late[0], f"before the end at {reference.duration:g} s")
+        raise InvalidValueError("start of a push", late[0], f"a time before the end at {reference.duration:g} s")
     if control_rate is not None and as_float_array("control_rate", control_rate) * reference.duration < 1:
         raise InvalidValueError("control_rate", control_rate, f"at least one tick in {reference.duration:g} s")
     if noise is not None and control_rate is None:
-        raise InvalidValueError("noise", noise, "none without a control_rate: white noise needs ticks")
+        raise InvalidValueError(
+            "noise", noise, "no noise without control_rate, because white noise needs control ticks"
+        )
 
 
 def _trajectory(
     loop: ClosedLoop, reference: Reference, start: Array, pieces: Sequence[Piece], outcome: Outcome
 ) -> Trajectory:
-    """Put the pieces in a row, and add what follows from states and reference."""
+    """Join the pieces, and add what follows from the states and the reference."""
     controller, n = loop.controller, loop.n
     times = np.concatenate([[0.0], *(piece.times for piece in pieces)])
     states = np.vstack([start, *(piece.states for piece in pieces)])
@@ -172,7 +190,7 @@ def _trajectory(
     arguments = [q, dq, *wanted, *(np.tile(gain, (len(times), 1)) for gain in controller.gains.values())]
     command, status = Batched(controller.function)(*arguments)
     held = [piece.held for piece in pieces if piece.held is not None]
-    if held:  # commands come from noisy measurements: take those that were sent, the last one also for the end
+    if held:  # noisy measurements: use the commands that were sent, and the last one also for the end
         command = np.vstack([*(sent for sent, _ in held), held[-1][0][-1:]])
         status = np.concatenate([*(known for _, known in held), held[-1][1][-1:]])[:, None]
     unknown = [np.full((len(times), 1), np.nan)] * 2

@@ -1,4 +1,4 @@
-"""Closed loops with a sampled controller: the command is held between ticks, the plant moves on under CVODES."""
+"""Closed loops with a sampled controller: the command is held between ticks while CVODES integrates the plant."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from orthocas.control.reference import Reference
 from orthocas.simulation.closed_loop import ClosedLoop, Piece, cvodes_options, run_compiled
 from orthocas.simulation.disturbances import Noise, Push, mean_loads
 
-_TICKS = 50  # of one call
+_TICKS = 50  # ticks per integrator call
 
 
 def run_ticks(
@@ -22,10 +22,10 @@ def run_ticks(
     noise: Noise,
     tolerance: float,
 ) -> Iterator[Piece]:
-    """Pieces of 50 ticks in turn, with the commands that were held.
+    """Yield pieces of 50 ticks, with the commands that were held.
 
     Raises:
-        SimulationError: when CVODES gives up.
+        SimulationError: if CVODES gives up.
     """
     ticks = int(np.floor(reference.duration * rate + 1e-9))  # whole ticks: the reference ends with its last segment
     times = np.arange(ticks) / rate
@@ -46,12 +46,12 @@ def run_ticks(
 
 
 def _filled(rows: Array) -> Array:
-    """Repeat the last row until there are as many as one call takes."""
+    """Repeat the last row until there are as many rows as one call takes."""
     return np.vstack([rows, np.repeat(rows[-1:], _TICKS - len(rows), axis=0)])
 
 
 def _tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Function:
-    """State, reference with derivatives (3 k, 1), noise, load -> state after the tick, command, status."""
+    """state, reference with derivatives (3 k, 1), noise, load -> state after the tick, command, status."""
     size = loop.plant_rate.size1_in(0)
     x, u, w = ca.SX.sym("x", size), ca.SX.sym("u", loop.n), ca.SX.sym("load", 3 + loop.n)
     plant = ca.integrator(

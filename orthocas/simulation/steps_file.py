@@ -1,4 +1,4 @@
-"""Steps files: what a simulated robot is to do, as JSON. The format is described in docs/simulate.md."""
+"""Steps files: JSON files that describe the motion of a simulated robot. Format: docs/simulate.md."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,19 +21,19 @@ _WITH_POINTS = ("points", "start", "pushes")
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a steps file asks for."""
+    """The contents of a steps file."""
 
     reference: Reference  #: in phi = [x; xi], with the labels of the chart
     q_start: Array  #: (n,) [rad] or [m]
     pushes: tuple[Push, ...]
-    has_steps: bool  #: a reference of steps, not through points
+    has_steps: bool  #: whether the reference consists of steps rather than points
 
 
 def read_steps(path: str | Path, chart: Chart) -> Plan:
-    """Read a steps file for a chart. Whether its reference can be reached shows only in the run.
+    """Read a steps file for a chart. Does not check that the reference is reachable.
 
     Raises:
-        StepsFileError: names the file, the place in it, what came and what was wanted.
+        StepsFileError: names the file, the place in it, the value there and what was expected.
     """
     reader = Reader(Path(path))
     data = reader.parsed()
@@ -80,7 +80,7 @@ def _points(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], st
     for k, entry in enumerate(reader.items(data["points"], "points")):
         time, values = _change(reader, entry, f"points[{k}]", targets[-1])
         if time < times[-1] + _SHORTEST:
-            want = f"at least {times[-1] + _SHORTEST:g}: the start is the point at 0"
+            want = f"at least {times[-1] + _SHORTEST:g}, because the start is the point at 0"
             raise reader.wrong(f"points[{k}].time", time, want)
         times.append(time)
         targets.append(values)
@@ -90,7 +90,7 @@ def _points(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], st
 
 
 def _change(reader: Reader, data: object, where: str, before: Mapping[str, float]) -> tuple[float, dict[str, float]]:
-    """Time and targets of one step or point; what it does not name keeps the target it had before."""
+    """Time and targets of one step or point. Quantities that it does not name keep their previous targets."""
     entry = reader.fields(data, where, ("time", "move", "to"))
     targets, named = dict(before), set()
     for key in ("move", "to"):

@@ -1,4 +1,4 @@
-"""Reading a JSON file that a person wrote: strict, with errors that name the file and the place in it."""
+"""Strict reader for JSON files that people write. Errors name the file and the place in it."""
 
 import json
 from collections.abc import Collection
@@ -12,18 +12,18 @@ import numpy as np
 from orthocas.checks import Array
 from orthocas.errors import StepsFileError
 
-_LARGEST = 1e6  # larger numbers are mistakes, and overflow later
-_LONGEST = 80  # characters of what came that an error repeats
+_LARGEST = 1e6  # larger numbers are mistakes and would overflow later
+_LONGEST = 80  # most characters of the input that an error repeats
 
 
 @dataclass(frozen=True)
 class Reader:
-    """Takes values out of JSON data. Every method raises StepsFileError for what does not fit."""
+    """Reads values from JSON data. Every method raises StepsFileError for data of the wrong kind."""
 
     path: Path
 
     def parsed(self) -> object:
-        """The data of the file: no NaN, no key twice."""
+        """The data of the file. NaN and duplicate keys are errors."""
         try:
             text = self.path.read_text(encoding="utf-8-sig")
             return json.loads(text, parse_constant=self._refused_constant, object_pairs_hook=self._without_doubles)
@@ -33,7 +33,10 @@ class Reader:
             raise self.fault(
                 f"truncated or not JSON, {error.msg} (line {error.lineno}, column {error.colno})"
             ) from None
-        except (RecursionError, ValueError) as error:  # nested too deep; not text; a number of thousands of digits
+        except (
+            RecursionError,
+            ValueError,
+        ) as error:  # nested too deeply, not text, or a number with thousands of digits
             raise self.fault(f"not JSON, {str(error)[:_LONGEST]}") from None
         except OSError as error:
             raise self.fault(f"cannot be read, {error.strerror}") from None
@@ -43,11 +46,11 @@ class Reader:
         return StepsFileError(f"steps file {self.path}: {text}")
 
     def wrong(self, where: str, got: object, want: str) -> StepsFileError:
-        """An error that says where something came, and what was wanted."""
+        """An error that names the place, the value there and what was expected."""
         return self.fault(f"{where} is {json.dumps(got)[:_LONGEST]}, expected {want}")
 
     def fields(self, data: object, where: str, known: Collection[str], what: str = "key") -> dict[str, Any]:
-        """An object that has no other keys than those known."""
+        """An object that has only known keys."""
         if not isinstance(data, dict):
             raise self.wrong(where, data, "an object")
         for key in data:
@@ -63,7 +66,7 @@ class Reader:
         return data
 
     def number(self, data: object, where: str, least: float = -_LARGEST, above: float = -inf) -> float:
-        """A number that is at least something, or above something, and no larger than 1e6."""
+        """A number that is at least `least` or above `above`, and at most 1e6."""
         if data is None:
             raise self.fault(f"{where} is missing, expected a number")
         low = f"above {above:g}" if isfinite(above) else f"from {least:g}"
@@ -76,7 +79,7 @@ class Reader:
         return float(data)
 
     def numbers(self, data: object, where: str, length: int) -> Array:
-        """A list of that many finite numbers, (length,)."""
+        """A list of finite numbers, (length,)."""
         items = self.items(data, where)
         if len(items) != length:
             raise self.wrong(where, items, f"a list of {length} numbers")
@@ -90,5 +93,5 @@ class Reader:
         if len(data) < len(pairs):
             keys = [key for key, _ in pairs]
             twice = next(key for key in keys if keys.count(key) > 1)
-            raise self.fault(f"the key '{twice[:_LONGEST]}' comes twice in one object, expected once")
+            raise self.fault(f"the key '{twice[:_LONGEST]}' appears twice in one object, expected once")
         return data

@@ -1,4 +1,4 @@
-"""What a simulation returns: arrays over time, with names and units, in and out of NPZ files."""
+"""The result of a simulation: arrays over time with names and units, stored in NPZ files."""
 
 import json
 import zipfile
@@ -26,7 +26,7 @@ _ARRAYS = {  #: array fields and their units
     "dq": "rad/s or m/s",
     "command": "N m or N (torque), rad/s or m/s (velocity)",
     "status": "orthocas.control.ControlStatus",
-    "value": "as labels: m or rad of the task, coordinates as charted",
+    "value": "per label: m or rad for the task, the chart's unit for extra coordinates",
     "reference": "as value",
     "reference_velocity": "value / s",
     "reference_acceleration": "value / s^2",
@@ -39,8 +39,8 @@ class Outcome(Enum):
     """How a run ended."""
 
     COMPLETE = "complete"
-    INTERRUPTED = "interrupted"  #: by Ctrl-C; the arrays end there
-    DIVERGED = "diverged"  #: the integrator gave up; the arrays end there
+    INTERRUPTED = "interrupted"  #: by Ctrl-C; the arrays end at that point
+    DIVERGED = "diverged"  #: the integrator gave up; the arrays end at that point
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,35 +51,35 @@ class Trajectory(Shown):
     """
 
     controller: str
-    kind: str  #: of the command, 'torque' or 'velocity'
+    kind: str  #: kind of the command, 'torque' or 'velocity'
     outcome: Outcome
     labels: tuple[str, ...]  #: names of the k quantities
     joint_names: tuple[str, ...]
     times: Array  #: (N,) [s]
     q: Array  #: (N, n)
     dq: Array  #: (N, n)
-    command: Array  #: (N, n) torques, or velocities
+    command: Array  #: (N, n) torques or velocities
     status: Array  #: (N,) of the controller, `orthocas.control.ControlStatus`
     value: Array  #: (N, k) the controlled quantities
-    reference: Array  #: (N, k) what they should be
+    reference: Array  #: (N, k) their references
     reference_velocity: Array  #: (N, k)
     reference_acceleration: Array  #: (N, k)
     storage: Array  #: (N,) V [J]; NaN for velocity controllers
-    dissipated_power: Array  #: (N,) taken by the controller's damping [W]; NaN for velocity controllers
+    dissipated_power: Array  #: (N,) dissipated by the controller's damping [W]; NaN for velocity controllers
 
     @property
     def energy_balance(self) -> Array:
         """V(t) - V(0) + the energy dissipated until t, (N,) [J].
 
-        0 for impedance and PD+ (coupled) in continuous time with the right model, without friction, pushes, noise, and
-        commands that were cut or replaced by the fallback, while the reference rests.
+        It is 0 for impedance control and PD+ (coupled) while the reference is at rest, in continuous time with the true
+        model and without friction, pushes, noise, or commands that were clipped or replaced by the fallback.
         """
         lost = cumulative_simpson(self.dissipated_power, x=self.times, initial=0.0)
         return np.asarray(self.storage - self.storage[0] + lost)
 
     @property
     def storage_rise(self) -> float:
-        """How far V ever climbs above an earlier value [J]: 0 for a passive controller at a resting reference."""
+        """Largest rise of V above an earlier value [J]; 0 for a passive controller and a reference at rest."""
         return float((self.storage - np.minimum.accumulate(self.storage)).max())
 
     @property
@@ -88,7 +88,7 @@ class Trajectory(Shown):
         return np.asarray(np.abs(self.value - self.reference).max(axis=0))
 
     def facts(self) -> dict[str, str]:
-        """How it ended, errors and commands, and whether the law gave way."""
+        """Outcome, errors, commands, and whether the controller used its fallback."""
         errors = zip(self.labels, self.tracking_error, strict=True)
         bad = np.count_nonzero(self.status)
         facts = {
@@ -101,10 +101,10 @@ class Trajectory(Shown):
         return facts if np.isnan(self.storage).any() else facts | {"storage rise": f"{self.storage_rise:.3g} J"}
 
     def save(self, path: str | Path) -> None:
-        """Write an NPZ file with every array, names and units; it appears whole or not at all.
+        """Write an NPZ file with all arrays, names and units. The file appears whole or not at all.
 
         Raises:
-            TrajectoryFileError: if the folder is missing or cannot be written.
+            TrajectoryFileError: if the folder is missing or not writable.
         """
         target = Path(path)
         require_writable(target, TrajectoryFileError)
@@ -123,14 +123,14 @@ class Trajectory(Shown):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file of `save`; never runs code.
+        """Read a file that `save` wrote. Loading never runs code.
 
         Raises:
             TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
         """
         damaged = TrajectoryFileError(f"{path} is truncated, damaged or not a trajectory file")
         try:
-            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # np.load leaks bad ones
+            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # np.load leaks bad handles
                 header: dict[str, Any] = json.loads(str(file["header"]))
                 arrays: dict[str, Any] = {name: file[name] for name in _ARRAYS}
             version = header["version"]

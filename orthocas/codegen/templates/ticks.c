@@ -1,8 +1,9 @@
 /* Times calls of control functions, one library after the other, in one process.
  *
- * Arguments: file of numbers, calls, joints, then for every library: path, function, size of the reference, of gains.
- * The file holds, for every library, STATES rows q, dq, reference, and the gains. Prints for every library the median,
- * the 99 % quantile and the largest time in microseconds, and the time of the slowest state at its best. */
+ * Arguments: data file, number of calls, number of joints; then, for every library: path, function, number of reference
+ * values, number of gains. For every library, the data file holds STATES rows of q, dq and reference, then the gains.
+ * For every library, the program prints the median, the 99 % quantile and the largest time, and the best time of the
+ * slowest state, in microseconds. */
 #define _POSIX_C_SOURCE 199309L
 #include <dlfcn.h>
 #include <stdio.h>

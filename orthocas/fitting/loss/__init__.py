@@ -1,4 +1,4 @@
-"""The loss of a fit: terms, one module each, with weights; residuals of one sample and their derivatives."""
+"""The loss of a fit: one module per term, weights, and the residuals of one sample with their derivatives."""
 
 from orthocas.fitting.loss.angles import mutual_cosines, pairs, task_cosines
 from orthocas.fitting.loss.length import log_lengths

@@ -1,4 +1,4 @@
-"""The loss of the paper: cosines between gradients ([AS2023] eq. (24))."""
+"""The task term and the mutual term: cosines between gradients ([AS2023] eq. (24))."""
 
 from dataclasses import dataclass
 from itertools import combinations
@@ -72,14 +72,14 @@ class TaskTerm:
 
 @dataclass(frozen=True)
 class MutualTerm:
-    """Mean over pairs of coordinates of the squared `mutual_cosines`; nothing for r = 1."""
+    """Mean over pairs of coordinates of the squared `mutual_cosines`. It is empty for r = 1."""
 
     name: str = "mutual"
     data: tuple[str, ...] = ("metric_inverse",)
     hinge: bool = False
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
-        """Cosines over the root of the number of pairs, (r (r - 1) / 2, 1)."""
+        """Cosines over the square root of the number of pairs, (r (r - 1) / 2, 1)."""
         count = max(1, len(pairs(sizes.r)))
         rho: ca.SX = (1 / count) ** 0.5 * mutual_cosines(coordinate_jacobian, data.get("metric_inverse"))
         return rho

@@ -1,4 +1,4 @@
-"""The length term: gradients of even length, so that a gain means the same all over the domain (ours)."""
+"""The length term: gradients of even length, so that a controller gain means the same everywhere (ours)."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from orthocas.fitting.loss.term import Data, Sizes
 def log_lengths(coordinate_jacobian: ca.SX) -> ca.SX:
     """Logarithms of the lengths of the coordinate gradients, (r, 1).
 
-    Angles leave free how fast a coordinate grows along itself: xi^7 is as orthogonal as xi, and flat at 0.
+    Angles do not fix how fast a coordinate grows along itself: xi^7 is as orthogonal as xi, but flat at 0.
 
     Source:
         ours, docs/derivations.md#lengths.

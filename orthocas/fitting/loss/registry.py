@@ -1,4 +1,4 @@
-"""The terms of the loss by name, and how to add your own."""
+"""The registry of loss terms, to which you can add your own."""
 
 from orthocas.checks import require_known
 from orthocas.errors import InvalidValueError
@@ -11,24 +11,42 @@ _TERMS: dict[str, LossTerm] = {}
 
 
 def register(term: LossTerm) -> None:
-    """Make a term known by its name: `Weights(extra={name: weight})` then adds it to the loss.
+    """Register a loss term. `Weights(extra={name: weight})` then adds it to the loss.
 
     Raises:
-        UnknownNameError: if samples cannot tell what it needs.
+        UnknownNameError: if the term needs data that samples do not have.
         InvalidValueError: if the name belongs to another term.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> @dataclass(frozen=True)
+        ... class FirstJoint:  # coordinates should depend little on joint 1
+        ...     name: str = "first joint"
+        ...     data: tuple[str, ...] = ()
+        ...     hinge: bool = False
+        ...
+        ...     def residuals(self, coordinate_jacobian, data, sizes):
+        ...         return coordinate_jacobian[:, 0]
+        >>> oc.register_loss_term(FirstJoint())
+        >>> weights = oc.Weights(extra={"first joint": 100.0})
+        >>> fit = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), weights=weights, samples=300)
+        >>> fit.status.value
+        'converged'
     """
     for name in term.data:
         require_sample_data(name)
     if _TERMS.get(term.name, term) != term:
-        raise InvalidValueError("name", repr(term.name), "a name that no other term has")
+        raise InvalidValueError("name", repr(term.name), "a name that no other term uses")
     _TERMS[term.name] = term
 
 
 def term_of(name: str) -> LossTerm:
-    """The term of that name.
+    """The term with this name.
 
     Raises:
-        UnknownNameError: if there is none.
+        UnknownNameError: if there is no such term.
     """
     require_known("loss term", name, _TERMS)
     return _TERMS[name]

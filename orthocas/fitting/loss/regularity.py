@@ -1,4 +1,4 @@
-"""The regularity term: coordinates whose gradients keep their volume make a chart without folds (ours)."""
+"""The regularity term: it keeps the volume of the coordinate gradients, so that the chart does not fold (ours)."""
 
 from dataclasses import dataclass
 
@@ -12,8 +12,8 @@ REGULAR_VOLUME = 0.9  #: volume of the gradients below which the term acts
 def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
     """Signed volume of the coordinate gradients across the task, det(D) with D_jk = v_xi,j . z_k / |v_xi,j|_A^-1.
 
-    The z_k are an A-orthonormal basis of ker J_x, so D holds the parts of the unit gradients that the task does not
-    see. |det D| is 1 for perfect coordinates, and the chart phi is regular exactly where det D is not 0.
+    The z_k are an A-orthonormal basis of ker J_x, so D holds the components of the unit gradients that do not change
+    the task. |det D| is 1 for perfect coordinates, and the chart phi is regular exactly where det D is not 0.
 
     Args:
         coordinate_jacobian: J_xi, (r, n).
@@ -31,7 +31,7 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
 
 @dataclass(frozen=True)
 class RegularityTerm:
-    """max(0.9 - det D, 0)^2, with det D the `gradient_volume`."""
+    """max(0.9 - det D, 0)^2, where det D is the `gradient_volume`."""
 
     name: str = "regularity"
     data: tuple[str, ...] = ("metric_inverse", "null_basis")

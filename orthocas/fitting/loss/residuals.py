@@ -14,20 +14,20 @@ from orthocas.fitting.loss.term import SAMPLE_DATA, LossTerm, Sizes
 
 @dataclass(frozen=True)
 class Loss:
-    """The loss of one sample: L = |rho|^2 / 2, with the residuals of all terms that have a weight.
+    """The loss of one sample: L = |rho|^2 / 2, with the residuals of all terms with a positive weight.
 
-    Rows come in the order of the terms, those of hinge terms last.
+    Rows are in the order of the terms, with those of hinge terms last.
     """
 
     sizes: Sizes
-    weights: tuple[tuple[str, float], ...]  #: positive weights by the names of terms
+    weights: tuple[tuple[str, float], ...]  #: names of terms and their positive weights
 
     @classmethod
     def of(cls, sizes: Sizes, weights: Mapping[str, float]) -> "Loss":
         """The terms with a positive weight.
 
         Raises:
-            UnknownNameError: if a weight belongs to no term.
+            UnknownNameError: if there is no term for a weight.
         """
         return cls(sizes, tuple((name, weight) for name, weight in weights.items() if weight > 0 and term_of(name)))
 
@@ -39,7 +39,7 @@ class Loss:
 
     @cached_property
     def data(self) -> tuple[str, ...]:
-        """What the terms need of a sample, in the order in which the functions of this module take it."""
+        """The sample data that the terms need, in the order of the inputs of this module's functions."""
         needed = {name for term, _ in self.terms for name in term.data}
         if self.sizes.identity_metric:
             needed.discard("metric_inverse")
@@ -47,7 +47,7 @@ class Loss:
 
     @cached_property
     def oriented(self) -> bool:
-        """Whether it needs a null basis, whose orientation has to be that of the coordinates."""
+        """Whether the loss needs a null basis with the orientation of the coordinates."""
         return "null_basis" in self.data
 
     def symbols(self) -> list[ca.SX]:
@@ -64,7 +64,7 @@ class Loss:
 
     @cached_property
     def smooth_rows(self) -> tuple[tuple[int, ...], ...]:
-        """For every coordinate j, the rows that depend on it, hinge rows left out."""
+        """For every coordinate j, the rows that depend on it, without hinge rows."""
         touched = self._touched
         return tuple(
             tuple(row for row, coordinates in enumerate(touched) if j in coordinates and row not in self.hinge_rows)
@@ -73,7 +73,7 @@ class Loss:
 
     @cached_property
     def shared_rows(self) -> tuple[tuple[int, int, int], ...]:
-        """(i, j, row) with i > j for every row that depends on both coordinates, hinge rows left out."""
+        """(i, j, row) with i > j for every row that depends on both coordinates, without hinge rows."""
         return tuple(
             (i, j, row)
             for row, coordinates in enumerate(self._touched)
@@ -84,7 +84,7 @@ class Loss:
 
     @cached_property
     def hinge_rows(self) -> range:
-        """Rows of hinge terms: the last ones."""
+        """Rows of the hinge terms, which are the last ones."""
         J, data = self.arguments()
         named = dict(zip(self.data, data, strict=True))
         counts = [term.residuals(J, named, self.sizes).shape[0] for term, _ in self.terms if not term.hinge]
@@ -107,14 +107,14 @@ class Loss:
 
 @cache
 def sample_loss(loss: Loss) -> ca.Function:
-    """Loss of one sample, (1, 1), of J_xi (r, n) and the data of `Loss.symbols`."""
+    """Loss of one sample (1, 1) as a function of J_xi (r, n) and the data in `Loss.symbols`."""
     J, data = loss.arguments()
     return ca.Function("sample_loss", [J, *data], [ca.sumsqr(loss.residuals(J, data)) / 2])
 
 
 @cache
 def loss_columns(loss: Loss) -> ColumnFunction:
-    """Loss of one sample (1, 1) and its slopes dL/dJ_xi (r, n); inputs as for `sample_loss`."""
+    """Loss of one sample (1, 1) and its derivative dL/dJ_xi (r, n), with the inputs of `sample_loss`."""
     J, data = loss.arguments()
     value = ca.sumsqr(loss.residuals(J, data)) / 2
     return ColumnFunction(ca.Function("loss", [J, *data], [value, ca.gradient(value, J)]))
@@ -122,7 +122,7 @@ def loss_columns(loss: Loss) -> ColumnFunction:
 
 @cache
 def value_columns(loss: Loss) -> ColumnFunction:
-    """Loss of one sample; inputs as for `sample_loss`."""
+    """Loss of one sample, with the inputs of `sample_loss`."""
     return ColumnFunction(sample_loss(loss))
 
 
@@ -130,13 +130,14 @@ def value_columns(loss: Loss) -> ColumnFunction:
 def residual_columns(loss: Loss) -> ColumnFunction:
     """Derivatives of the residuals of one sample with respect to J_xi, for the Gauss-Newton matrix.
 
-    Inputs as for `sample_loss`. Outputs: for every coordinate j the derivative of `smooth_rows[j]` with respect to row
-    j of J_xi, (rows, n); then for every hinge row the residual (1, 1) and its derivative with respect to J_xi, (r, n).
+    The inputs are those of `sample_loss`. The outputs are, for every coordinate j, the derivative of `smooth_rows[j]`
+    with respect to row j of J_xi, (rows, n); then, for every hinge row, the residual (1, 1) and its derivative with
+    respect to J_xi, (r, n).
     """
     J, data = loss.arguments()
     r, n = loss.sizes.r, loss.sizes.n
     rho = loss.residuals(J, data)
-    by_entry = ca.jacobian(rho, ca.vec(J))  # columns: J_xi column by column
+    by_entry = ca.jacobian(rho, ca.vec(J))  # its columns are the entries of J_xi, column by column
     outputs = [by_entry[list(loss.smooth_rows[j]), j::r] for j in range(r)]
     for row in loss.hinge_rows:
         outputs += [rho[row], ca.reshape(by_entry[row, :], r, n)]
@@ -147,7 +148,7 @@ def residual_columns(loss: Loss) -> ColumnFunction:
 def curvature_columns(loss: Loss) -> ColumnFunction:
     """Second derivatives of the loss of one sample with respect to J_xi column by column, (n r, n r).
 
-    Inputs as for `sample_loss`.
+    The inputs are those of `sample_loss`.
     """
     J, data = loss.arguments()
     column = ca.SX.sym("v", loss.sizes.r * loss.sizes.n)

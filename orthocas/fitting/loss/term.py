@@ -1,4 +1,4 @@
-"""What a term of the loss is, and what it may ask of a sample."""
+"""The interface of a loss term, and the sample data that it may use."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,15 +11,15 @@ from orthocas.checks import require_known
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of a problem, as the loss of one sample sees it."""
+    """Sizes of a problem, for the loss of one sample."""
 
     n: int  #: joints
     m: int  #: task components
     r: int  #: coordinates
-    identity_metric: bool  #: whether A = I: then there is no A^-1 to multiply with
+    identity_metric: bool  #: whether A = I; then products with A^-1 are omitted
 
 
-Data = Mapping[str, ca.SX]  #: what a sample tells, by name; there is no 'metric_inverse' for A = I
+Data = Mapping[str, ca.SX]  #: data of a sample by name; there is no 'metric_inverse' for A = I
 
 SAMPLE_DATA: dict[str, Callable[[Sizes], tuple[int, int]]] = {  #: shapes of the properties of `Samples` a term may need
     "unit_task_gradients": lambda s: (s.m, s.n),
@@ -32,28 +32,28 @@ SAMPLE_DATA: dict[str, Callable[[Sizes], tuple[int, int]]] = {  #: shapes of the
 
 
 class LossTerm(Protocol):
-    """A sum of squared residuals of the coordinate gradients at a sample; its weight is in `Weights`."""
+    """A sum of squared residuals of the coordinate gradients at a sample. `Weights` holds its weight."""
 
     @property
     def name(self) -> str:
-        """Short name, as `Weights` has it."""
+        """Short name, as used in `Weights`."""
         ...
 
     @property
     def data(self) -> tuple[str, ...]:
-        """What it needs to know of a sample: names in `SAMPLE_DATA`."""
+        """Sample data that the term needs: names in `SAMPLE_DATA`."""
         ...
 
     @property
     def hinge(self) -> bool:
-        """Whether it is zero at most samples of a good fit, and couples all coordinates where it is not."""
+        """Whether the term is zero at most samples of a good fit, and couples all coordinates elsewhere."""
         ...
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
-        """rho (k, 1) of J_xi (r, n): the term adds weight |rho|^2 / 2 to the loss of a sample. k may be 0."""
+        """J_xi (r, n) -> rho (k, 1), where k may be 0. The term adds weight |rho|^2 / 2 to the loss of a sample."""
         ...
 
 
 def require_sample_data(name: str) -> None:
-    """Raise UnknownNameError unless samples can tell this."""
+    """Raise UnknownNameError unless samples have this data."""
     require_known("data of a sample", name, SAMPLE_DATA)

@@ -1,4 +1,4 @@
-"""Weights of the loss: one number for each of its terms."""
+"""Weights of the loss: one number for each term."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,19 +13,26 @@ WeightNumbers = Sequence[float]  #: two to four numbers: task, mutual, regularit
 class Weights:
     """lambda1 (task) and lambda2 (mutual) of [AS2023] eq. (24); lambda3 (regularity) and lambda4 (length) are ours.
 
-    The ratio of the first two picks a point on the front of task angles against mutual angles. At the paper's 1000 : 1
-    the optimum can lose rank. The regularity term keeps the gradients of the coordinates from collapsing anywhere, the
-    length term keeps their lengths even, which controllers want.
+    The ratio of the first two selects a point on the Pareto front of task angles and mutual angles. At the paper's
+    1000 : 1 the optimum can lose rank. The regularity term prevents the gradients of the coordinates from collapsing
+    anywhere. The length term keeps their lengths even, which helps controllers.
 
     Args:
         task: lambda1 > 0.
         mutual: lambda2 >= 0.
         regularity: lambda3 >= 0.
         length: lambda4 >= 0.
-        extra: weights >= 0 of terms added by `orthocas.fitting.loss.register`, by name.
+        extra: weights >= 0 of registered terms, by name; see `orthocas.register_loss_term`.
 
     Raises:
-        InvalidValueError: if a weight is negative or not finite, or no term has one.
+        InvalidValueError: if a weight is negative or not finite, or all weights are zero.
+
+    Example:
+        >>> import orthocas as oc
+        >>> oc.Weights(mutual=300.0).by_name
+        {'task': 1000.0, 'mutual': 300.0, 'regularity': 150.0, 'length': 0.0}
+        >>> oc.Weights.of([1000.0, 1.0]).regularity
+        0.0
     """
 
     task: float = 1000.0
@@ -44,10 +51,10 @@ class Weights:
 
     @classmethod
     def of(cls, weights: "Weights | WeightNumbers") -> "Weights":
-        """Weights as they are, or from two to four numbers in the order of the fields; those left out are 0.
+        """Convert two to four numbers in the order of the fields; missing ones are 0. Weights stay as they are.
 
         Raises:
-            ShapeError, InvalidValueError: for numbers that do not fit; a fit needs a positive task weight.
+            ShapeError, InvalidValueError: if the numbers are invalid, or the task weight is not positive.
         """
         if not isinstance(weights, Weights):
             values = as_float_array("weights", weights)
@@ -60,7 +67,7 @@ class Weights:
 
     @property
     def by_name(self) -> dict[str, float]:
-        """The weight of every term that has one here, by the name of the term."""
+        """The weights by the names of their terms."""
         own = {"task": self.task, "mutual": self.mutual, "regularity": self.regularity, "length": self.length}
         return own | dict(self.extra)
 
@@ -71,4 +78,4 @@ def _weight(name: str, value: float) -> float:
     return float(value)
 
 
-DEFAULT_WEIGHTS = Weights()  #: what a fit takes unless told otherwise
+DEFAULT_WEIGHTS = Weights()  #: weights of a fit by default
