@@ -49,6 +49,7 @@ def template_values(
         "domain_upper": _numbers(upper),
         "domain_centre": _numbers(domain.centre),
         "domain_reach": _numbers(reach(domain)),
+        "phi_sizes": _numbers(chart.phi_sizes),
         "max_evaluations": str(_MAX_EVALUATIONS),
         "stack_bytes": str(stack_bytes),
         "check_q": _numbers(somewhere),

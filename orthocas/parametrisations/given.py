@@ -11,11 +11,13 @@ from orthocas.casadi_tools.batch import dense_function
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.tape import Tape, replay, to_tape
 from orthocas.casadi_tools.user_expression import expression_of
-from orthocas.checks import Array, require_shape
+from orthocas.checks import Array, require_count, require_shape
 from orthocas.parametrisations.family import ClosedForm, Expression, JointSpace, component_gradients
 
 if TYPE_CHECKING:
     from orthocas.problem import Problem
+
+_MOST_JOINTS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,7 @@ class Given:
             >>> chart.labels
             ('x', 'y', 'xi1')
         """
-        q = ca.SX.sym("q", n)
+        q = ca.SX.sym("q", require_count("n", n, most=_MOST_JOINTS))
         xi = expression_of(f"coordinates '{name}'", function, q)
         require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
         return cls(name, n, to_tape(dense_function("xi", [q], [xi])))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any
 
-from orthocas.checks import require_known
+from orthocas.checks import require_kind, require_known
 from orthocas.errors import InvalidValueError, NotSavableWarning
 from orthocas.parametrisations.family import Parametrisation
 from orthocas.parametrisations.fourier import Fourier
@@ -105,8 +105,9 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
     Raises:
         UnknownNameError: if no such parametrisation is registered.
     """
+    require_kind("data of a parametrisation", data, Mapping)
     kinds = {known.kind.__name__: known.kind for known in _REGISTERED.values()}
-    require_known("parametrisation", data["parametrisation"], kinds)
+    require_known("parametrisation", data.get("parametrisation", ""), kinds)
     return kinds[data["parametrisation"]](**data["settings"])
 
 
@@ -117,6 +118,7 @@ def parse_parametrisation(label: str) -> Parametrisation:
         UnknownNameError: if there is no such parametrisation.
         InvalidValueError: if the text after the colon is invalid.
     """
+    require_kind("parametrisation", label, str)
     name, _, text = label.partition(":")
     require_known("parametrisation", name, parametrisation_names())
     parse = _REGISTERED[name].parse

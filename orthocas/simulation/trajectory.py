@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.integrate import cumulative_simpson
 
-from orthocas.checks import Array
+from orthocas.checks import Array, as_path
 from orthocas.errors import TrajectoryFileError
 from orthocas.files.atomic import published, require_writable
 from orthocas.showing import Shown, listed, number_list
@@ -106,7 +106,7 @@ class Trajectory(Shown):
         Raises:
             TrajectoryFileError: if the folder is missing or not writable.
         """
-        target = Path(path)
+        target = as_path("path", path)
         require_writable(target, TrajectoryFileError)
         header = {
             "version": _VERSION,
@@ -128,6 +128,7 @@ class Trajectory(Shown):
         Raises:
             TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
         """
+        path = as_path("path", path)
         damaged = TrajectoryFileError(f"{path} is truncated, damaged or not a trajectory file")
         try:
             with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # np.load leaks bad handles

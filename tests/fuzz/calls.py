@@ -68,16 +68,14 @@ def _bent(rng: Rng, good: np.ndarray) -> Any:
         )
         return flat.reshape(good.shape).tolist()
     if bend == 1:
-        return good[:-1].tolist() if good.ndim else good
-    if bend == 2:
-        return np.append(flat, 0.0)
-    if bend == 3:
-        return good[None, None]
-    if bend == 4:
-        return pick(rng, (tuple, set, iter, str, repr))(map(str, flat))  # type: ignore[arg-type]
-    if bend == 5:
-        return good.T.tolist()[::-1] if good.ndim else [good]
-    return [good.tolist(), good.tolist()] if bend == 6 else {i: value for i, value in enumerate(flat)}
+        return pick(rng, (tuple, set, iter, str, repr))(map(str, flat))
+    shapes = (
+        good[:-1] if good.ndim else good,
+        np.append(flat, 0.0),
+        good[None, None],
+        good.T[::-1] if good.ndim else [good],
+    )
+    return pick(rng, (*shapes, good.tolist() * 2 if good.ndim else [], dict(enumerate(flat))))
 
 
 @cache
@@ -122,23 +120,28 @@ def _objects() -> dict[str, Any]:
     """Public objects, to be passed where others are wanted."""
     robot = planar().robot
     return {
-        "chart": fitted().chart, "fit": fitted(), "grown": circle(), "problem": planar(), "robot": robot,
-        "task": planar().task, "metric": planar().metric, "box": planar().domain, "torus": oc.Torus(3),
-
-            "law": impedance(),
-            "steps": steps(),
-            "run": trajectory(),
-            "polynomial": oc.Polynomial(2),
-            "mlp": oc.MLP((3,))
-        ,
-
-            "solver": solvers.GaussNewton(),
-            "lbfgs": solvers.LBFGS(3),
-            "class": oc.Chart,
-            "module": oc,
-            "sew": oc.SEW()
-        ,
-        "other robot": problems.get("iiwa").robot, "weights": oc.Weights(), "push": simulation.Push(0.1, 0.1),
+        "chart": fitted().chart,
+        "fit": fitted(),
+        "grown": circle(),
+        "problem": planar(),
+        "robot": robot,
+        "task": planar().task,
+        "metric": planar().metric,
+        "box": planar().domain,
+        "torus": oc.Torus(3),
+        "law": impedance(),
+        "steps": steps(),
+        "run": trajectory(),
+        "polynomial": oc.Polynomial(2),
+        "mlp": oc.MLP((3,)),
+        "solver": solvers.GaussNewton(),
+        "lbfgs": solvers.LBFGS(3),
+        "class": oc.Chart,
+        "module": oc,
+        "sew": oc.SEW(),
+        "other robot": problems.get("iiwa").robot,
+        "weights": oc.Weights(),
+        "push": simulation.Push(0.1, 0.1),
     }
 
 
@@ -259,14 +262,15 @@ def _methods() -> dict[str, Call]:
     phi = chart.phi(q)
     states = {
         **{name: {"q": q} for name in ("mass_matrix", "gravity", "tip_position", "tip_rotation", "tip_jacobian")},
-        "joint_points": {"q": q}, "bias": {"q": q, "dq": q}, "inverse_dynamics": {"q": q, "dq": q, "ddq": q},
-        "forward_dynamics": {"q": q, "dq": q, "tau": q}, "coriolis_product": {"q": q, "v": q, "w": q},
-
-            "with_scaled_masses": {"factor": q},
-            "with_tool": {"tool": q},
-            "home": {"name": "h"},
-            "function": {"name": "bias"}
-        ,
+        "joint_points": {"q": q},
+        "bias": {"q": q, "dq": q},
+        "inverse_dynamics": {"q": q, "dq": q, "ddq": q},
+        "forward_dynamics": {"q": q, "dq": q, "tau": q},
+        "coriolis_product": {"q": q, "v": q, "w": q},
+        "with_scaled_masses": {"factor": q},
+        "with_tool": {"tool": q},
+        "home": {"name": "h"},
+        "function": {"name": "bias"},
     }
     evaluations = ("xi", "task", "phi", "jacobian")
     return {
