@@ -14,17 +14,18 @@ from orthocas.casadi_tools.batch import evaluate_columns
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.scalar_code import scalar_code
-from orthocas.checks import Array, as_point_set, require_kind, require_known, require_shape
+from orthocas.checks import Array, as_path, as_point_set, require_at_least, require_kind, require_known, require_shape
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap, InvertibleMap
 from orthocas.errors import InvalidValueError, InverseError, ShapeError
 from orthocas.files.chart_file import read_chart, write_chart
 from orthocas.growing import GrownCoordinates
-from orthocas.problem import Problem, task_jacobians
+from orthocas.problem import Problem, task_jacobians, task_sizes
 from orthocas.showing import Shown, listed
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
+_ROUNDING = 1e-5  # of phi: 1e-9 of it are 45 units in the last place
 _SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
 
 
@@ -55,6 +56,10 @@ class Chart(Shown):
 
     def __post_init__(self) -> None:
         require_kind("problem", self.problem, Problem)
+        methods = [getattr(type(self.coordinates), name, None) for name in ("xi", "jacobian", "size")]
+        if None in methods:
+            raise InvalidValueError("coordinates", f"a {type(self.coordinates).__name__}", "those of a chart")
+        require_kind("notes", self.notes, Mapping)
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
 
     def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
@@ -155,7 +160,7 @@ class Chart(Shown):
             phi: target values, (n,) or (N, n).
             q_start: initial guess (n,), or (N, n) with one guess per row of phi. For grown coordinates it selects the
                 number of full turns and the sheet of a linear leaf.
-            tolerance: largest residual |phi(q) - phi|.
+            tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
 
         Returns:
             q, (n,) or (N, n). It may lie outside the domain; check with `orthocas.contains`.
@@ -164,6 +169,7 @@ class Chart(Shown):
             InverseError: if there is no solution near q_start, or J becomes singular on the way. The message names the
                 rows.
         """
+        require_at_least("tolerance", tolerance, 0)
         targets, single = as_point_set("phi", phi, self.n)
         starts, _ = as_point_set("q_start", q_start, self.n)
         if len(starts) not in (1, len(targets)):
@@ -203,7 +209,7 @@ class Chart(Shown):
         Raises:
             ChartFileError: if the folder is missing or cannot be written.
         """
-        write_chart(path, self.problem, self.coordinates, self.notes)
+        write_chart(as_path("path", path), self.problem, self.coordinates, self.notes)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -212,7 +218,7 @@ class Chart(Shown):
         Raises:
             ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
         """
-        return cls(*read_chart(path))
+        return cls(*read_chart(as_path("path", path)))
 
     @cached_property
     def _functions(self) -> dict[str, ca.Function]:
@@ -234,9 +240,14 @@ class Chart(Shown):
         return functions
 
     @cached_property
+    def phi_sizes(self) -> Array:
+        """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
+        return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
+
+    @cached_property
     def _rootfinder(self) -> ca.Function:
         q, target = ca.MX.sym("q", self.n), ca.MX.sym("phi", self.n)
-        residual = self._functions["phi"](q) - target
+        residual = (self._functions["phi"](q) - target) / (self.phi_sizes + _ROUNDING * ca.fabs(target))
         options: dict[str, Any] = {"error_on_fail": False, "abstol": 1e-12, "max_iter": 100, "line_search": True}
         equations: dict[str, Any] = {"x": q, "p": target, "g": residual}
         return ca.rootfinder("inverse", "newton", equations, options)
@@ -257,15 +268,16 @@ class Chart(Shown):
         if isinstance(self.coordinates, InvertibleMap) and self.coordinates.turn:
             turn = self.coordinates.turn
             difference[:, self.m :] -= turn * np.round(difference[:, self.m :] / turn)
-        error = np.where(finite, np.abs(difference).max(axis=1), np.inf)
+        scale = self.phi_sizes + _ROUNDING * np.abs(targets)
+        error = np.where(finite, np.abs(difference / scale).max(axis=1), np.inf)
         bad = np.flatnonzero(~(error <= tolerance))
         if bad.size:
             rows = f"rows {bad[:5].tolist()}" if len(targets) > 1 else "phi"
             raise InverseError(
-                f"no q with phi(q) = phi found near q_start for {rows}: error is {error[bad].max():.3g}, "
+                f"no q with phi(q) = phi found near q_start for {rows}: relative error is {error[bad].max():.3g}, "
                 f"expected <= {tolerance:.1g}. The target may be out of reach, or the path to it singular"
             )
-        values = np.linalg.svd(self.jacobian(safe), compute_uv=False)
+        values = np.linalg.svd(self.jacobian(safe) / self.phi_sizes[:, None], compute_uv=False)
         singular = np.flatnonzero(values[:, -1] < _SINGULAR * values[:, 0])
         if singular.size:
             raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}: q is not unique there")
@@ -282,7 +294,11 @@ class GrownChart(Chart):
 
     def __post_init__(self) -> None:
         if not isinstance(self.coordinates, GrownCoordinates):
-            raise InvalidValueError("chart", f"one with {self.coordinates.label} coordinates", "a grown chart")
+            raise InvalidValueError(
+                "chart",
+                f"one with {getattr(self.coordinates, 'label', type(self.coordinates).__name__)} coordinates",
+                "a grown chart",
+            )
         Chart.__post_init__(self)
 
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,10 +30,12 @@ def require_known(what: str, name: str, known: Collection[str]) -> None:
         raise UnknownNameError(what, str(name), known)
 
 
-def require_count(name: str, value: int, least: int = 1) -> int:
-    """Return the value as a Python int. Raise InvalidValueError unless it is a whole number >= least."""
+def require_count(name: str, value: int, least: int = 1, most: int | None = None) -> int:
+    """Return the value as a Python int. Raise InvalidValueError unless it is a whole number from least to most."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise InvalidValueError(name, value, f"a whole number >= {least}")
+    if most is not None and value > most:
+        raise InvalidValueError(name, value, f"a whole number from {least} to {most}")
     return int(value)
 
 
@@ -95,9 +98,32 @@ def as_float_array(name: str, value: Any) -> Array:
         kind = array.dtype.kind
         if kind in _REAL or (kind == "O" and not any(isinstance(entry, _NO_NUMBER) for entry in array.flat)):
             return np.asarray(array, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: CasADi expressions inside lists
         pass
     raise InvalidValueError(name, repr(value)[:80], "an array of numbers")
+
+
+def as_number(name: str, value: Any) -> float:
+    """Convert one number, or an array that holds just one, to a float.
+
+    Raises:
+        InvalidValueError: for anything else.
+    """
+    array = as_float_array(name, value)
+    if array.size != 1:
+        raise InvalidValueError(name, repr(value)[:80], "a number")
+    return float(array.item())
+
+
+def as_path(name: str, value: Any) -> Path:
+    """Convert a file name to a path.
+
+    Raises:
+        InvalidValueError: for anything but text or a path, and for text that no file system accepts.
+    """
+    if isinstance(value, str | os.PathLike) and "\0" not in (text := os.fspath(value)):
+        return Path(text)
+    raise InvalidValueError(name, repr(value)[:80], "a path")
 
 
 def require_finite(name: str, array: Array) -> None:
@@ -149,5 +175,5 @@ def require_kind(name: str, value: object, kind: type) -> None:
 
 def require_at_least(name: str, value: float, least: float) -> None:
     """Raise InvalidValueError unless `value` is a finite number >= least."""
-    if not least <= value < float("inf"):
+    if not least <= as_number(name, value) < float("inf"):
         raise InvalidValueError(name, value, f"a finite number >= {least:g}")

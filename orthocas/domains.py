@@ -6,11 +6,20 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_count
+from orthocas.checks import (
+    Array,
+    as_float_array,
+    as_point_set,
+    frozen_array,
+    require_count,
+    require_kind,
+    require_memory,
+)
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
 from orthocas.robots import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
 
+_MOST_JOINTS = 1000
 _WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes, and overflow later
 
 
@@ -112,7 +121,7 @@ class Torus:
     name: str = "torus"
 
     def __init__(self, n: int) -> None:
-        require_count("n", n)
+        require_count("n", n, most=_MOST_JOINTS)
         object.__setattr__(self, "n", n)
 
     @property
@@ -152,6 +161,7 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
     require_count("samples", samples)
     _require_seed(seed)
     n = len(domain.centre)
+    require_memory(f"{samples} samples", 32.0 * samples * n)
     g = 1.5
     for _ in range(64):
         g = (1 + g) ** (1 / (n + 1))
@@ -163,9 +173,16 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
 
 def contains(domain: Domain, q: ArrayLike) -> Array:
     """Whether points (n,) or (N, n) lie in the domain. Finite angles always lie on a torus."""
+    require_domain(domain)
     points, single = as_point_set("q", q, len(domain.centre))
     inside: Array = np.all(np.abs(points - domain.centre) <= reach(domain), axis=1)
     return inside[0] if single else inside
+
+
+def require_domain(domain: Domain) -> None:
+    """Raise InvalidValueError unless the object is a domain."""
+    if isinstance(domain, type) or not isinstance(domain, Domain):
+        raise InvalidValueError("domain", f"a {type(domain).__name__}", "a Box or a Torus")
 
 
 def borders(domain: Domain) -> tuple[Array, Array]:
@@ -194,6 +211,7 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: Array
         half_width: another half-width (n,), or one for all joints. It is not clipped, so a `Problem` rejects a box that
             leaves the limits.
     """
+    require_kind("robot", robot, Robot)
     middle = robot.tree.middle if centre is None else frozen_array("centre", centre, (robot.n,))
     if half_width is not None:
         return Box(middle, half_width)

@@ -9,7 +9,7 @@ _MOST_NAMES = 30  # the most names that a message lists: those closest to the gi
 
 
 def one_line(text: str) -> str:
-    """Text of others on one line of bounded length; what is not printable (control and bidi characters) as escapes."""
+    """The text on one line of bounded length, with escapes for control and bidi characters."""
     line = " ".join(text.split())
     if not line.isprintable():
         line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
@@ -17,7 +17,7 @@ def one_line(text: str) -> str:
 
 
 class OrthocasError(Exception):
-    """Base of every error raised on purpose; its message is one printable line, whatever files and users wrote."""
+    """Base class of all errors that orthocas raises on purpose. The message is one printable line."""
 
     def __str__(self) -> str:
         return one_line(super().__str__())

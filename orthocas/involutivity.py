@@ -9,7 +9,7 @@ import numpy as np
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.checks import Array, require_count, require_kind, require_memory, require_shape
 from orthocas.domains import sample_uniform
-from orthocas.errors import SingularTaskError
+from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.problem import NEAR_SINGULAR, Problem, check, relative_singular_values
 from orthocas.showing import Shown, number_list
 
@@ -174,7 +174,11 @@ def lie_bracket(f: ca.SX, g: ca.SX, q: ca.SX) -> ca.SX:
         >>> oc.lie_bracket(ca.vertcat(1, 0), ca.vertcat(0, q[0]), q)
         SX([0, 1])
     """
+    for name, field in (("f", f), ("g", g), ("q", q)):
+        require_kind(name, field, ca.SX)
     require_shape("q", q.shape, (None, 1))
+    if not q.is_valid_input():
+        raise InvalidValueError("q", q, "a column of different symbols")
     require_shape("f", f.shape, q.shape)
     require_shape("g", g.shape, q.shape)
     return ca.jtimes(g, q, f) - ca.jtimes(f, q, g)

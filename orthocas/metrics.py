@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.user_expression import expression_of
-from orthocas.checks import Array, frozen_array, require_known, require_text
+from orthocas.checks import Array, frozen_array, require_kind, require_known, require_text
 from orthocas.errors import MetricError, ShapeError
 from orthocas.robots import Robot
 from orthocas.robots.pinocchio_model import remedy
@@ -39,6 +39,7 @@ class Metric:
             MetricError: if a constant A is not symmetric positive definite, or M(q) is singular everywhere. The message
                 names the joint.
         """
+        require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
         if isinstance(spec, str):
             require_known("metric", spec, METRIC_KINDS)
@@ -77,6 +78,7 @@ class Metric:
             'stiff elbow'
         """
         require_text("name of a metric", str(name))
+        require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
         A = expression_of("metric", function, q)
         if A.shape != (robot.n, robot.n):

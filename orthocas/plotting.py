@@ -8,18 +8,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.checks import Array, require_at_least, require_count, require_kind
 from orthocas.comparing.figures import convergence_figure, front_figure
 from orthocas.quality import AngleStatistics, Report
 from orthocas.simulation.figure import trajectory_figure
 
 __all__ = ["convergence_figure", "front_figure", "quality_figure", "self_motion_figure", "trajectory_figure"]
 
+_MOST_POSTURES = 1000
 _TASK, _EXTRA = "#1f5fa8", "#d95f02"
 
 
 def quality_figure(report: Report) -> Figure:
     """Histograms of task and mutual angles [deg], with mean and standard deviation, as [AS2023] Figs. 20 and 27."""
+    require_kind("report", report, Report)
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True)
     _draw_angles(left, report.task_angle, _TASK, r"task angle $\angle(\mathrm{d}\xi_j, \nabla_A h_i)$")
@@ -40,6 +42,9 @@ def self_motion_figure(chart: Chart, postures: int = 9, reach: float = 0.4) -> F
     Raises:
         InverseError: if a posture of the sweep cannot be reached.
     """
+    require_kind("chart", chart, Chart)
+    require_count("postures", postures, most=_MOST_POSTURES)
+    require_at_least("reach", reach, 0)
     figure = Figure(figsize=(3.0 * chart.r, 3.6), layout="constrained")
     values = np.linspace(-reach, reach, postures)
     sweeps = [_sweep(chart, j, values) for j in range(chart.r)]

@@ -171,6 +171,17 @@ def relative_singular_values(problem: Problem, points: Array) -> Array:
     return np.asarray(np.linalg.svd(J / scale[:, None], compute_uv=False)[:, -1])
 
 
+def task_sizes(problem: Problem) -> Array:
+    """How far the task components move over the domain, (m,): the mean of sum_j |dh_i/dq_j| half_width_j at 32 samples.
+
+    1 for a component that does not move, or whose gradient is not finite.
+    """
+    points = sample_uniform(problem.domain, 32, 0)
+    J = problem.task.batched_jacobian(points)[0].reshape(-1, problem.m, problem.n)
+    sizes = (np.abs(J) @ problem.domain.half_width).mean(axis=0)
+    return np.where(np.isfinite(sizes) & (sizes > 0), sizes, 1.0)
+
+
 def task_jacobians(problem: Problem, points: Array) -> Array:
     """J_x at points (N, n), as an array (N, m, n).
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_kind
+from orthocas.checks import Array, require_at_least, require_kind
 from orthocas.domains import contains, sample_evenly
 from orthocas.errors import GrowError
 from orthocas.growing.grown import GrownCoordinates
@@ -85,6 +85,7 @@ def jumps(chart: Chart, radius: float = 0.02) -> tuple[Jump, ...]:
         GrowError: if the chart is not grown from a circle, or n is not 2.
     """
     require_kind("chart", chart, Chart)
+    require_at_least("radius", radius, 1e-9)
     grown = chart.coordinates
     if not isinstance(grown, GrownCoordinates) or grown.leaf.kind != "circle" or chart.n != 2:
         raise GrowError("jumps are defined only for charts with n = 2 that are grown from a circle")

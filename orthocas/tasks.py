@@ -56,6 +56,7 @@ class Task(Shown):
             >>> task.m, task.labels, task.units
             (2, ('x', 'y'), ('m', 'm'))
         """
+        require_kind("axes", axes, str)
         if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
             raise InvalidValueError("axes", repr(axes), "different letters of 'xyz'")
         rows = ["xyz".index(a) for a in axes]
@@ -151,6 +152,8 @@ class Task(Shown):
         x = expression_of(f"task '{name}'", function, q)
         if x.shape[1] != 1 or x.shape[0] == 0:
             raise ShapeError(f"task '{name}'", x.shape, (None, 1))
+        require_kind("labels", labels, Sequence)
+        require_kind("units", units, Sequence)
         labels = tuple(str(label) for label in labels) or tuple(f"{name}[{i}]" for i in range(x.shape[0]))
         units = tuple(str(unit) for unit in units) or ("",) * x.shape[0]
         for argument, texts in (("labels", labels), ("units", units)):
@@ -170,6 +173,7 @@ class Task(Shown):
             kind: the short name.
             q_reference: posture (n,) that defines the reference of orientation, pose and axis tasks.
         """
+        require_kind("kind", kind, str)
         if kind == "position" or kind.startswith("position:"):
             return cls.position(robot, kind.partition(":")[2] or "xyz")
         if kind == "polar":

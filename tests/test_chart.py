@@ -95,3 +95,32 @@ def test_bad_arguments_are_refused(iiwa_fit: Fit) -> None:
         chart.jacobian(np.full(7, np.nan))
     with pytest.raises(UnknownNameError, match="known: xi, phi"):
         chart.function("psi")
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e6])
+def test_inverse_is_as_accurate_in_any_unit_of_the_task(planar_x: oc.Problem, unit: float) -> None:
+    """The same postures come back, whether the task is in m, nm or Mm."""
+    task = oc.Task.custom(planar_x.robot, "scaled", lambda q: unit * planar_x.task.function(q))
+    problem = oc.Problem(planar_x.robot, task, "euclidean", planar_x.domain)
+    chart = oc.Chart(problem, oc.fit(planar_x, oc.Linear()).chart.coordinates)
+    centre, half_width = problem.domain.centre, problem.domain.half_width
+    q = centre + half_width * np.random.default_rng(5).uniform(-0.5, 0.5, (50, 3))
+    np.testing.assert_allclose(chart.inverse(chart.phi(q), q + 1e-3), q, atol=1e-8)
+
+
+def test_inverse_of_a_task_far_from_zero_needs_no_more_than_rounding_allows(planar_x: oc.Problem) -> None:
+    task = oc.Task.custom(planar_x.robot, "far", lambda q: 1e7 + planar_x.task.function(q))
+    chart = oc.Chart(
+        oc.Problem(planar_x.robot, task, "euclidean", planar_x.domain), oc.fit(planar_x, oc.Linear()).chart.coordinates
+    )
+    q = planar_x.domain.centre + 0.1
+    np.testing.assert_allclose(chart.inverse(chart.phi(q), q + 1e-3), q, atol=1e-7)
+
+
+def test_inverse_still_refuses_values_out_of_reach_in_any_unit(planar_x: oc.Problem) -> None:
+    task = oc.Task.custom(planar_x.robot, "nm", lambda q: 1e-9 * planar_x.task.function(q))
+    problem = oc.Problem(planar_x.robot, task, "euclidean", planar_x.domain)
+    chart = oc.Chart(problem, oc.fit(planar_x, oc.Linear()).chart.coordinates)
+    phi = chart.phi(problem.domain.centre)
+    with pytest.raises(InverseError, match="relative error is"):
+        chart.inverse([4e-9, *phi[1:]], problem.domain.centre)

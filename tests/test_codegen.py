@@ -1,9 +1,11 @@
 """Generated C: equal to Python, told in its header, and refused where it cannot be right."""
 
+import dataclasses
 import json
 import re
 import shlex
 import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,9 @@ from programs import Run, needs_c, needs_cmake, output_of
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared
-from orthocas.codegen.library import compilers
+from orthocas.codegen.library import STRICT, compilers
 from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector
-from orthocas.errors import CompileError, InvalidValueError, NoExpressionError, ProofError
+from orthocas.errors import CompileError, InvalidValueError, NoExpressionError, ProofError, one_line
 from orthocas.fitting.fit import Fit
 
 pytestmark = needs_c
@@ -185,6 +187,43 @@ def test_words_of_others_do_not_become_code(tmp_path: Path) -> None:
     check_c(generated, chart, None, states=100)
     assert "evil" not in output_of(compilers()[0], "-E", "-P", tmp_path / "arm.c").replace("evil_", "")
     assert re.fullmatch(r"[a-z]\w*", oc.generate_c(chart, tmp_path / "unnamed").name, flags=re.ASCII)
+
+
+HOSTILE = (
+    "int",
+    'quo"te',
+    "it's",
+    "end\\",
+    "??/",
+    "a??/\nint evil;",
+    "\u202egnp\u2066",
+    "*/ int evil; /*",
+    "//",
+    "%s$n@N@",
+    "\x1b[2J",
+)
+
+
+def test_names_from_robot_files_stay_in_comments(tmp_path: Path) -> None:
+    """Keywords, quotes, trigraphs, bidi characters and backslashes at ends of lines, with trigraphs switched on too."""
+    robot = oc.Robot.planar([0.5] * len(HOSTILE), [1.0] * len(HOSTILE))
+    names = tuple(one_line(name) for name in HOSTILE)
+    robot = oc.Robot(dataclasses.replace(robot.tree, joint_names=names))
+    task = oc.Task.custom(robot, "x??/", lambda q: ca.sin(q[0]) + q[1], ["x\\"])
+    chart = oc.fit(oc.Problem(robot, task, name="a??/\\"), oc.Linear(), samples=100).chart
+    generated = oc.generate_c(chart, tmp_path, None, "arm")
+    source = tmp_path / "arm.c"
+    for path in (source, tmp_path / "arm.h"):
+        text = path.read_text()
+        assert not set(text) & {"\u202e", "\u2066", "\x1b"}
+        assert "??" not in text
+        comments = re.findall(r"/\*.*?\*/", text, flags=re.DOTALL)
+        assert not any("\\" in comment for comment in comments)
+        assert not any("evil" in part for part in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL).splitlines())
+    for dialect in ("-std=c99", "-std=gnu17"):  # strict C99 reads trigraphs
+        command = [compilers()[0], *STRICT, dialect, "-Wtrigraphs", "-Wcomment", "-c", str(source), "-o", "/dev/null"]
+        assert subprocess.run(command, capture_output=True, text=True, check=False).stderr == ""
+    assert check_c(generated, chart, None, states=20).differences["phi"] < 1e-10
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import orthocas as oc
@@ -47,3 +48,44 @@ def test_urdf_with_more_links_than_any_robot_is_refused(tmp_path: Path) -> None:
     path.write_text(f'<robot name="snake"><link name="l0"/>{joints}</robot>')
     with pytest.raises(RobotError, match=r"snake\.urdf has 5000 links, expected at most 1000"):
         oc.Robot.from_urdf(path)
+
+
+JOINT = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/><axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"""
+
+
+def write_joints(folder: Path, *joints: tuple[str, str, str]) -> Path:
+    links = sorted({link for _, *ends in joints for link in ends})
+    path = folder / "arm.urdf"
+    parts = [*(f'<link name="{link}"/>' for link in links), *(JOINT.format(*joint) for joint in joints)]
+    path.write_text(f'<robot name="r">{"".join(parts)}</robot>')
+    return path
+
+
+def test_joint_that_hangs_from_its_own_child_is_named(tmp_path: Path) -> None:
+    """Pinocchio's parser leaves such joints out, and all that they carry."""
+    path = write_joints(tmp_path, ("j", "a", "b"), ("k", "c", "c"), ("l", "c", "d"))
+    with pytest.raises(
+        RobotError, match="joint 'k' hangs from link 'c' to link 'c' in a loop of joints, expected a tree"
+    ):
+        oc.Robot.from_urdf(path)
+    path = write_joints(tmp_path, ("j", "a", "b"), ("k", "c", "d"), ("l", "d", "c"))
+    with pytest.raises(RobotError, match="joint 'k' hangs from link 'c' to link 'd' in a loop"):
+        oc.Robot.from_urdf(path)
+
+
+def test_joint_that_shares_its_name_with_a_link_can_be_locked(tmp_path: Path) -> None:
+    """The same robot comes out as with names that differ."""
+    shared = oc.Robot.from_urdf(write_joints(tmp_path, ("b", "a", "b"), ("c", "b", "c"), ("d", "c", "d")), "c")
+    assert shared.joint_names == ("b", "c")
+    shared = oc.Robot.from_urdf(write_joints(tmp_path, ("b", "a", "b"), ("universe!", "b", "c")), "c", {"b": 0.3})
+    other = oc.Robot.from_urdf(write_joints(tmp_path, ("j", "a", "b"), ("universe!", "b", "c")), "c", {"j": 0.3})
+    assert shared.tree.tip_name == other.tree.tip_name == "c"
+    np.testing.assert_array_equal(shared.tip_rotation([0.1]), other.tip_rotation([0.1]))
+
+
+def test_joint_with_the_name_of_the_world_cannot_be_locked(tmp_path: Path) -> None:
+    path = write_joints(tmp_path, ("universe", "a", "b"), ("j", "b", "c"))
+    assert oc.Robot.from_urdf(path).joint_names == ("universe", "j")
+    with pytest.raises(RobotError, match="a joint is called 'universe'"):
+        oc.Robot.from_urdf(path, locked={"j": 0.0})

@@ -9,7 +9,7 @@ import casadi as ca
 
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.chart import Chart
-from orthocas.checks import require_kind
+from orthocas.checks import as_path, require_kind
 from orthocas.codegen.interface import filled, template_values
 from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.control import Controller
@@ -79,7 +79,7 @@ def generate_c(
     values = template_values(chart, controller, name, kernels, stack_bytes)
     names = {"robot.h": f"{name}.h", "robot.c": f"{name}.c", "pkgconfig.pc": f"{name}.pc.in"}
     contents = {names.get(template, template): filled(template, values) for template in _TEMPLATES}
-    folder = _folder(Path(out), name, contents)
+    folder = _folder(as_path("out", out), name, contents)
     _write(folder, contents)
     return GeneratedC(folder, name, stack_bytes)
 
@@ -108,7 +108,11 @@ def _stack_bytes(kernels: Kernels, n: int) -> int:
 
 def _require_matching(chart: Chart, controller: Controller | None, name: str) -> None:
     """Raise InvalidValueError for a name that C does not allow, or a controller of another chart."""
-    if not re.fullmatch(r"[A-Za-z]\w{0,99}", name, flags=re.ASCII) or name.lower() in _TAKEN:
+    if (
+        not isinstance(name, str)
+        or not re.fullmatch(r"[A-Za-z]\w{0,99}", name, flags=re.ASCII)
+        or name.lower() in _TAKEN
+    ):
         raise InvalidValueError(
             "name", repr(name), "a C identifier that is not a C header or library, such as arm_controller"
         )

@@ -49,6 +49,7 @@ def template_values(
         "domain_upper": _numbers(upper),
         "domain_centre": _numbers(domain.centre),
         "domain_reach": _numbers(reach(domain)),
+        "phi_sizes": _numbers(chart.phi_sizes),
         "max_evaluations": str(_MAX_EVALUATIONS),
         "stack_bytes": str(stack_bytes),
         "check_q": _numbers(somewhere),
@@ -66,8 +67,12 @@ def template_values(
 
 
 def _words(names: Iterable[str]) -> list[str]:
-    """Names from user files, made safe for C comments and for CMake substitution."""
-    return [re.sub(r"[\x00-\x1f\x7f@]+|/(?=\*)|\*(?=/)", " ", name) for name in names]
+    """Names on one printable line each, safe in C comments (also with trigraphs) and in CMake templates."""
+    return [re.sub(r"[@\\]+|/(?=\*)|\*(?=/)|\?(?=\?)", " ", _printable(name)) for name in names]
+
+
+def _printable(text: str) -> str:
+    return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def _title(chart: Chart, controller: Controller | None) -> str:

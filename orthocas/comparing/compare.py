@@ -6,7 +6,7 @@ from concurrent.futures import Executor
 from itertools import product
 from pathlib import Path
 
-from orthocas.checks import require_count, require_kind
+from orthocas.checks import as_path, require_count, require_kind
 from orthocas.comparing.cells import Cell, CellResult, run_cells
 from orthocas.comparing.report import Comparison
 from orthocas.comparing.ticks import with_control_ticks
@@ -83,7 +83,7 @@ def compare(
     jobs = None if jobs is None else require_count("jobs", jobs)
     held_out = require_count("held_out", held_out)
     _require_grid(parametrisations, solvers)
-    folder = None if charts is None else Path(charts)
+    folder = None if charts is None else as_path("charts", charts)
     if folder is not None:
         require_writable(folder / "chart", ChartFileError)
         for parametrisation in parametrisations:
@@ -135,6 +135,7 @@ def _require_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence
         ("parametrisations", parametrisations, Parametrisation, "Polynomial(degree=4)"),
         ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
     ):
+        require_kind(name, members, Sequence)
         if not members:
             raise InvalidValueError(name, "empty", f"at least one, such as [{example}]")
         for member in members:

@@ -12,7 +12,7 @@ from scipy.interpolate import make_interp_spline
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.cached import cached_property
-from orthocas.checks import Array, as_float_array, frozen_array, require_known, require_shape
+from orthocas.checks import Array, as_float_array, frozen_array, require_kind, require_known, require_shape
 from orthocas.control.low_pass import low_pass_response
 from orthocas.errors import InvalidValueError
 from orthocas.showing import Shown, listed, number_list
@@ -70,7 +70,8 @@ class Reference(Shown):
             >>> value.round(2).tolist()
             [[1.0, 0.0], [1.2, 0.0]]
         """
-        names, value = tuple(labels), frozen_array("start", start, (len(labels),))
+        names = _names(labels)
+        value = frozen_array("start", start, (len(labels),))
         _require_number("natural_frequency", natural_frequency, above=0.0)
         _require_number("duration", duration, above=0.0)
         _require_number("damping_ratio", damping_ratio, above=-np.finfo(float).tiny)
@@ -95,7 +96,7 @@ class Reference(Shown):
         Raises:
             InvalidValueError, ShapeError: for arguments of the wrong value or shape.
         """
-        names = tuple(labels)
+        names = _names(labels)
         t = frozen_array("times", times, (None,))
         values = frozen_array("points", points, (len(t), len(names)))
         if len(t) < 2 or t[0] != 0 or np.diff(t).min() <= 0:
@@ -149,14 +150,30 @@ class Reference(Shown):
         return Batched(self.profile)
 
 
+def _names(labels: Sequence[str]) -> tuple[str, ...]:
+    require_kind("labels", labels, Sequence)
+    if isinstance(labels, str) or not all(isinstance(label, str) for label in labels):
+        raise InvalidValueError("labels", repr(labels)[:80], "a sequence of names")
+    return tuple(labels)
+
+
+def _pairs(changes: Sequence[Change]) -> Sequence[Change]:
+    require_kind("changes", changes, Sequence)
+    for change in changes:
+        if not isinstance(change, Sequence) or len(change) != 2:
+            raise InvalidValueError("an entry of changes", repr(change)[:80], "a time and targets, (0.5, {'x': 0.1})")
+    return changes
+
+
 def _stairs(labels: tuple[str, ...], start: Array, changes: Sequence[Change], duration: float) -> tuple[Array, Array]:
     """Segment borders (S + 1,) and targets (S, k)."""
     times, targets = [0.0], [start]
-    for time, moves in changes:
-        at = float(as_float_array("time of a step", time))
+    for time, moves in _pairs(changes):
+        at = _require_number("time of a step", time)
         if not times[-1] <= at < duration:
             raise InvalidValueError("time of a step", at, f"from {times[-1]:g} to below the duration {duration:g} s")
         target = targets[-1].copy()
+        require_kind("targets of a step", moves, Mapping)
         for label, value in moves.items():
             require_known("quantity", label, labels)
             target[labels.index(label)] = _require_number(f"target of {label}", value)

@@ -16,6 +16,8 @@ def register(law: type[Law]) -> None:
     Raises:
         InvalidValueError: if another law has that name.
     """
+    if not isinstance(law, type) or not hasattr(law, "name"):
+        raise InvalidValueError("law", repr(law)[:80], "the class of a law")
     if _LAWS.get(law.name, law) is not law:
         raise InvalidValueError("name", repr(law.name), f"a free name, because {_LAWS[law.name].__name__} has this one")
     _LAWS[law.name] = law

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from orthocas.chart import Chart
+from orthocas.checks import as_path
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.gauge import aligned, in_closed_form, in_gauge, normalised
@@ -126,7 +127,7 @@ def fit(
         coordinates = in_closed_form(problem, settings.parametrisation, first)
     else:
         idle = tuple(idle_joints(problem, first)[-problem.r :])
-        file = Checkpoint(None if checkpoint is None else Path(checkpoint), settings.identity(problem))
+        file = Checkpoint(None if checkpoint is None else as_path("checkpoint", checkpoint), settings.identity(problem))
         stages, coordinates = _minimised(problem, settings, idle, monitor, file, first)
         if stages:
             centre = problem.domain.centre

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocas.checks import require_count
+from orthocas.checks import as_number, require_count
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.loss import WeightNumbers, Weights
 from orthocas.minimising.solver import Solver
@@ -94,7 +94,7 @@ def require_solver(value: object) -> None:
 def _require_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> None:
     if parametrisation.closed_form is not None:
         raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", "a parametrisation to fit")
-    if not 0 < max_mutual_deg < 90:
+    if not 0 < as_number("max_mutual_deg", max_mutual_deg) < 90:
         raise InvalidValueError("max_mutual_deg", max_mutual_deg, "an angle between 0 and 90 degrees")
 
 

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_point_set, frozen_array, require_count
+from orthocas.checks import Array, as_point_set, frozen_array, require_count, require_kind
 from orthocas.domains import sample_evenly
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, Loss, Sizes, WeightNumbers, Weights
 from orthocas.fitting.loss.residuals import sample_loss
@@ -55,6 +55,7 @@ def loss(
         >>> H.shape
         (9, 9)
     """
+    require_kind("problem", problem, Problem)
     require_parametrisation(parametrisation)
     family = parametrisation.for_problem(problem).family(JointSpace.of(problem), problem.r)
     drawn = _drawn(problem, samples, seed)

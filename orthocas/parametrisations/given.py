@@ -17,6 +17,8 @@ from orthocas.parametrisations.family import ClosedForm, Expression, JointSpace,
 if TYPE_CHECKING:
     from orthocas.problem import Problem
 
+_MOST_JOINTS = 1000
+
 
 @dataclass(frozen=True, eq=False)
 class Given:
@@ -55,7 +57,7 @@ class Given:
             >>> chart.labels
             ('x', 'y', 'xi1')
         """
-        q = ca.SX.sym("q", n)
+        q = ca.SX.sym("q", require_count("n", n, most=_MOST_JOINTS))
         xi = expression_of(f"coordinates '{name}'", function, q)
         require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
         return cls(name, n, to_tape(dense_function("xi", [q], [xi])))

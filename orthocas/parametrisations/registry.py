@@ -105,9 +105,11 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
     Raises:
         UnknownNameError: if no such parametrisation is registered.
     """
+    require_kind("data of a parametrisation", data, Mapping)
     kinds = {known.kind.__name__: known.kind for known in _REGISTERED.values()}
-    require_known("parametrisation", data["parametrisation"], kinds)
-    kind, settings = kinds[data["parametrisation"]], data["settings"]
+    name, settings = data.get("parametrisation", ""), data.get("settings")
+    require_known("parametrisation", name, kinds)
+    kind = kinds[name]
     require_kind("settings", settings, dict)
     known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
     if not settings.keys() <= known:
@@ -122,6 +124,7 @@ def parse_parametrisation(label: str) -> Parametrisation:
         UnknownNameError: if there is no such parametrisation.
         InvalidValueError: if the text after the colon is invalid.
     """
+    require_kind("parametrisation", label, str)
     name, _, text = label.partition(":")
     require_known("parametrisation", name, parametrisation_names())
     parse = _REGISTERED[name].parse

@@ -16,6 +16,8 @@ from orthocas.robots.pinocchio_model import frame_index, joint_axis, leader_of, 
 from orthocas.robots.urdf_checks import check_urdf
 from orthocas.robots.xml_files import read_xml
 
+WORLD = "universe"  #: Pinocchio's name for what does not move
+
 
 def read_urdf(path: str | Path) -> pin.Model:
     """Read a URDF file. Mimic joints are kept, so that they can be refused or locked later.
@@ -57,7 +59,7 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
         ids.append(model.getJointId(name))
         _set_position(model, ids[-1], float(value), position)
     ids += [i for i in model.mimicking_joints if leader_of(model, i) in ids]
-    return pin.buildReducedModel(model, ids, position) if ids else model
+    return _without_joints(model, ids, position) if ids else model
 
 
 def lock_off_chain(model: pin.Model, tip: str) -> pin.Model:
@@ -77,7 +79,7 @@ def lock_off_chain(model: pin.Model, tip: str) -> pin.Model:
         if joint.nq == joint.nv == 1 and i not in mimics:
             limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
             position[joint.idx_q] = np.clip(0.0, *limits)
-    return pin.buildReducedModel(model, ids, position) if ids else model
+    return _without_joints(model, ids, position) if ids else model
 
 
 def default_tip(model: pin.Model) -> str:
@@ -111,6 +113,30 @@ def _text(notes: IO[bytes]) -> str:
     """The captured text, on one line of at most 300 characters."""
     notes.seek(0)
     return " ".join(notes.read().decode(errors="replace").split())[:300]
+
+
+def _without_joints(model: pin.Model, ids: list[int], position: Array) -> pin.Model:
+    """The model with joints fixed at a position.
+
+    Pinocchio finds joints by name among all frames, so others get names of their own meanwhile: bodies, sites and
+    joints may share one.
+
+    Raises:
+        RobotError: if a joint has the name of Pinocchio's world.
+    """
+    if WORLD in list(model.names)[1:]:
+        raise RobotError(
+            f"a joint is called '{WORLD}', which no joint can be called while joints are locked: rename it"
+        )
+    renamed, names = model.copy(), {}
+    for i, frame in enumerate(renamed.frames):
+        if i > 0 and frame.type != pin.FrameType.JOINT:
+            unique = f"{i}\n{frame.name}"
+            names[unique], frame.name = frame.name, unique
+    reduced = pin.buildReducedModel(renamed, ids, position)
+    for frame in reduced.frames:
+        frame.name = names.get(frame.name, frame.name)
+    return reduced
 
 
 def _set_position(model: pin.Model, i: int, value: float, position: Array) -> None:

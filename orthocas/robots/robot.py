@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.cached import BuiltOnUse, cached_property
-from orthocas.checks import Array, as_float_array, as_point_set, frozen_array, require_known
+from orthocas.checks import Array, as_float_array, as_path, as_point_set, frozen_array, require_kind, require_known
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
 from orthocas.robots.homes import model_states, postures, srdf_states
@@ -46,6 +46,8 @@ class Robot(Shown):
     """
 
     def __init__(self, tree: KinematicTree, homes: Mapping[str, ArrayLike] | None = None) -> None:
+        require_kind("tree", tree, KinematicTree)
+        require_kind("homes", homes or {}, Mapping)
         self.tree = tree
         #: named postures (n,) of the robot's files: SRDF group states, MJCF keyframes. Chart files do not store them.
         self.homes = {name: frozen_array(f"home '{name}'", q, (tree.n,)) for name, q in (homes or {}).items()}
@@ -63,6 +65,7 @@ class Robot(Shown):
             UnknownNameError: if the frame or a locked joint does not exist.
             RobotError: if a joint that is not locked is of another type (floating base, spherical, mimic, ...).
         """
+        require_kind("model", model, pin.Model)
         frame_index(model, tip)
         tree = tree_from_model(files.lock_joints(model, locked or {}), tip)
         return cls(tree, postures(model_states(model), tree.joint_names))
@@ -86,19 +89,19 @@ class Robot(Shown):
                 the tip is not revolute, continuous or prismatic. The message says which one to lock.
             UnknownNameError: if the frame or a locked joint does not exist.
         """
-        build = cls.from_mjcf if Path(path).suffix.lower() == ".xml" else cls.from_urdf
+        build = cls.from_mjcf if as_path("path", path).suffix.lower() == ".xml" else cls.from_urdf
         return build(path, tip, locked, tool)
 
     @classmethod
     def from_urdf(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
         """Build the chain that moves the tip from a URDF file; see `from_file`."""
-        robot = cls._chain(files.read_urdf(path), tip, locked, tool)
+        robot = cls._chain(files.read_urdf(as_path("path", path)), tip, locked, tool)
         return cls(robot.tree, postures(srdf_states(path), robot.joint_names))
 
     @classmethod
     def from_mjcf(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
         """Build the chain that moves the tip from a MuJoCo MJCF file; see `from_file`."""
-        return cls._chain(model_from_mjcf(path), tip, locked, tool)
+        return cls._chain(model_from_mjcf(as_path("path", path)), tip, locked, tool)
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
@@ -111,7 +114,8 @@ class Robot(Shown):
         Raises:
             ShapeError, InvalidValueError: if the factors are invalid.
         """
-        factors = frozen_array("factor", np.broadcast_to(as_float_array("factor", factor), (self.n,)), (self.n,))
+        given = as_float_array("factor", factor)
+        factors = frozen_array("factor", np.full(self.n, given) if given.ndim == 0 else given, (self.n,))
         if factors.min() <= 0:
             raise InvalidValueError("factor", factors.min(), "numbers > 0")
         masses, inertias = self.tree.masses * factors, self.tree.inertias * factors[:, None, None]

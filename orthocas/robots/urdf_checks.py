@@ -11,7 +11,7 @@ _WITH_AXIS = ("revolute", "continuous", "prismatic")
 
 
 def check_urdf(path: str | Path, root: ElementTree.Element) -> None:
-    """Refuse joints with a zero axis, and files with more links than any robot has.
+    """Refuse joints with a zero axis, joints in loops, and files with more links than any robot has.
 
     Pinocchio's parser checks lengths of vectors, numbers and limits.
 
@@ -25,3 +25,31 @@ def check_urdf(path: str | Path, root: ElementTree.Element) -> None:
         axis = joint.find("axis")
         if axis is not None and joint.get("type") in _WITH_AXIS:
             Attributes(str(path), f"<axis> of joint '{joint.get('name')}'", axis.attrib).direction("xyz")
+    _require_tree(path, root)
+
+
+def _require_tree(path: str | Path, root: ElementTree.Element) -> None:
+    """Every joint hangs on a link that no joint carries; Pinocchio's parser leaves out loops without a word."""
+    joints = [(joint, _link(joint, "parent"), _link(joint, "child")) for joint in root.findall("joint")]
+    children: dict[str, list[str]] = {}
+    for _, parent, child in joints:
+        children.setdefault(parent, []).append(child)
+    carried = {child for _, _, child in joints if child}
+    waiting = [link.get("name", "") for link in root.findall("link") if link.get("name", "") not in carried]
+    reached = set(waiting)
+    while waiting:
+        found = [child for child in children.get(waiting.pop(), ()) if child not in reached]
+        reached.update(found)
+        waiting += found
+    for joint, parent, child in joints:
+        if parent in carried and parent not in reached:
+            raise RobotError(
+                f"{path}: joint '{joint.get('name')}' hangs from link '{parent}' to link '{child}' "
+                "in a loop of joints, expected a tree of links"
+            )
+
+
+def _link(joint: ElementTree.Element, end: str) -> str:
+    """The link at one end of a joint; whether it is there is left to Pinocchio's parser."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")

@@ -39,10 +39,10 @@ def task_acceleration_breakdown(chart: Chart, trajectory: Trajectory) -> Breakdo
     Raises:
         InvalidValueError: if the trajectory belongs to a velocity controller.
     """
-    if trajectory.kind != "torque":
-        raise InvalidValueError("trajectory", f"a run of '{trajectory.controller}'", "a run of a torque controller")
     require_kind("chart", chart, Chart)
     require_kind("trajectory", trajectory, Trajectory)
+    if trajectory.kind != "torque":
+        raise InvalidValueError("trajectory", f"a run of '{trajectory.controller}'", "a run of a torque controller")
     parts = Batched(_parts(chart))(trajectory.q, trajectory.dq, trajectory.command)
     return Breakdown(chart.problem.task.labels, *parts)
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched
-from orthocas.checks import Array, as_float_array, as_point, require_kind
+from orthocas.checks import Array, as_float_array, as_number, as_point, require_kind
 from orthocas.control.controller import Controller, require_controller
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, SimulationError
@@ -19,6 +19,8 @@ from orthocas.simulation.sampled import run_ticks
 from orthocas.simulation.trajectory import Outcome, Trajectory
 
 TOLERANCE = 1e-8  #: relative and absolute, of CVODES
+
+_MOST_TICKS = 1e7  # of a sampled run
 
 
 def simulate(
@@ -171,6 +173,10 @@ def _require_fitting(
         raise InvalidValueError("start of a push", late[0], f"a time before the end at {reference.duration:g} s")
     if control_rate is not None and as_float_array("control_rate", control_rate) * reference.duration < 1:
         raise InvalidValueError("control_rate", control_rate, f"at least one tick in {reference.duration:g} s")
+    if control_rate is not None and as_number("control_rate", control_rate) * reference.duration > _MOST_TICKS:
+        raise InvalidValueError(
+            "control_rate", control_rate, f"at most {_MOST_TICKS:g} ticks in {reference.duration:g} s"
+        )
     if noise is not None and control_rate is None:
         raise InvalidValueError(
             "noise", noise, "no noise without control_rate, because white noise needs control ticks"

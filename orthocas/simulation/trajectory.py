@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from scipy.integrate import cumulative_simpson
 
-from orthocas.checks import Array, as_float_array, frozen_indices, require_known, require_shape, require_text
+from orthocas.checks import Array, as_float_array, as_path, frozen_indices, require_known, require_shape, require_text
 from orthocas.control.status import ControlStatus
 from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
 from orthocas.files.atomic import published, require_writable
@@ -122,7 +122,7 @@ class Trajectory(Shown):
         Raises:
             TrajectoryFileError: if the folder is missing or not writable.
         """
-        target = Path(path)
+        target = as_path("path", path)
         require_writable(target, TrajectoryFileError)
         header = {
             "version": _VERSION,
@@ -144,7 +144,8 @@ class Trajectory(Shown):
         Raises:
             TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
         """
-        header, arrays = read_run_file(Path(path), _VERSION, tuple(_ARRAYS))
+        path = as_path("path", path)
+        header, arrays = read_run_file(path, _VERSION, tuple(_ARRAYS))
         try:
             return cls(
                 controller=require_text("controller", header["controller"]),

@@ -1,16 +1,20 @@
-"""All campaigns by name: functions of the number of mutants that return what they found."""
+"""The campaigns by name."""
 
 from collections.abc import Callable
 
+from fuzz.calls import calls
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
+from fuzz.robots import robots
 from fuzz.runs import runs
 from fuzz.steps import steps
 
 CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
+    "calls": calls,
     "charts": charts,
     "checkpoints": checkpoints,
+    "robots": robots,
     "runs": runs,
     "steps": steps,
 }

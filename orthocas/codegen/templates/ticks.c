@@ -42,9 +42,9 @@ int main(int argc, char **argv) {
     void *library = dlopen(argv[c], RTLD_NOW);
     int row = 2 * n + atoi(argv[c + 2]);
     double *states = numbers(file, (size_t)(STATES * row)), *gains = numbers(file, (size_t)atoi(argv[c + 3]));
-    double command[64], best[STATES], slowest = 0.0;
+    double *command = malloc(sizeof(double) * (size_t)n), best[STATES], slowest = 0.0;
     control run;
-    if (library == NULL) return 2;
+    if (library == NULL || command == NULL) return 2;
     *(void **)&run = dlsym(library, argv[c + 1]);
     for (k = 0; k < STATES; ++k) best[k] = 1e300;
     for (k = -WARM_UP; k < calls; ++k) {
@@ -58,6 +58,7 @@ int main(int argc, char **argv) {
     for (k = 0; k < STATES; ++k) slowest = best[k] > slowest ? best[k] : slowest;
     qsort(times, (size_t)calls, sizeof(double), order);
     printf("%.4f %.4f %.4f %.4f\n", times[calls / 2], times[calls * 99 / 100], times[calls - 1], slowest);
+    free(command);
     free(states);
     free(gains);
   }

@@ -35,6 +35,8 @@ def register(term: LossTerm) -> None:
         >>> fit.status.value
         'converged'
     """
+    if isinstance(term, type) or not isinstance(term, LossTerm):
+        raise InvalidValueError("term", f"a {type(term).__name__}", "an object with the members of LossTerm")
     for name in term.data:
         require_sample_data(name)
     if _TERMS.get(term.name, term) != term:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import casadi as ca
 
@@ -31,6 +31,7 @@ SAMPLE_DATA: dict[str, Callable[[Sizes], tuple[int, int]]] = {  #: shapes of the
 }
 
 
+@runtime_checkable
 class LossTerm(Protocol):
     """A sum of squared residuals of the coordinate gradients at a sample. `Weights` holds its weight."""
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from orthocas.checks import as_float_array
+from orthocas.checks import as_float_array, as_number, require_kind
 from orthocas.errors import InvalidValueError, ShapeError
 
 WeightNumbers = Sequence[float]  #: two to four numbers: task, mutual, regularity, length
@@ -44,6 +44,7 @@ class Weights:
     def __post_init__(self) -> None:
         for k, name in enumerate(("task", "mutual", "regularity", "length")):
             object.__setattr__(self, name, _weight(f"lambda{k + 1}", getattr(self, name)))
+        require_kind("extra", self.extra, Mapping)
         extra = {name: _weight(f"weight of {name}", value) for name, value in self.extra.items()}
         object.__setattr__(self, "extra", extra)
         if not any(self.by_name.values()):
@@ -73,7 +74,7 @@ class Weights:
 
 
 def _weight(name: str, value: float) -> float:
-    if not 0 <= value < float("inf"):
+    if not 0 <= as_number(name, value) < float("inf"):
         raise InvalidValueError(name, value, "a finite number >= 0")
     return float(value)
 

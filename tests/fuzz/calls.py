@@ -1,0 +1,344 @@
+"""Calls of the public functions, classes and methods with arguments of wrong classes, shapes and sizes."""
+
+import os
+import warnings
+from collections.abc import Callable
+from fractions import Fraction
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from public_objects import circle, fitted, impedance, planar, steps, trajectory
+
+import orthocas as oc
+from fuzz.child import Finding, run, verdict
+from fuzz.words import NAMES, NUMBERS, Rng, pick
+from orthocas import control, parametrisations, plotting, problems, simulation, solvers
+
+Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments that it takes
+
+
+def calls(count: int) -> list[Finding]:
+    """The campaign."""
+    return run("calls", judge, range(count))
+
+
+def judge(seed: int) -> str | None:
+    """Call something with one or two arguments replaced, in an empty folder."""
+    rng = np.random.default_rng(seed)
+    table = good_calls()
+    name = pick(rng, sorted(table))
+    function, arguments = table[name]
+    with TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numbers that overflow
+        os.chdir(folder)
+        changed = dict(arguments)
+        shown = []
+        for _ in range(int(rng.integers(1, 3))):
+            argument = pick(rng, sorted(arguments))
+            changed[argument] = hostile(rng, arguments[argument])
+            shown.append(f"{argument}={changed[argument]!r:.60}")
+        found = verdict(partial(function, **changed))
+        os.chdir("/")
+    return None if found is None else f"{name}({', '.join(shown)}): {found}"
+
+
+def hostile(rng: Rng, good: Any) -> Any:
+    """A value that a careless user, or a careless program, may pass in place of a good one."""
+    kind = rng.random()
+    if kind < 0.25 and isinstance(good, np.ndarray | list | tuple):
+        return _bent(rng, np.array(good, dtype=object))
+    if kind < 0.35:
+        return pick(rng, tuple(_objects().values()))
+    if kind < 0.45:
+        return pick(rng, (*NAMES, *NUMBERS, "x", "xyz", "position", "inertia", "phi", "decoupled"))
+    return pick(rng, _values())
+
+
+def _bent(rng: Rng, good: np.ndarray) -> Any:
+    """A good array with a wrong entry, shape or size."""
+    flat = good.ravel()
+    bend = int(rng.integers(8))
+    if bend == 0 and flat.size:
+        flat[int(rng.integers(flat.size))] = pick(
+            rng, (np.nan, np.inf, None, "x", 1j, 1e300, -1, ca.SX.sym("q"), [1], True)
+        )
+        return flat.reshape(good.shape).tolist()
+    if bend == 1:
+        return pick(rng, (tuple, set, iter, str, repr))(map(str, flat))
+    shapes = (
+        good[:-1] if good.ndim else good,
+        np.append(flat, 0.0),
+        good[None, None],
+        good.T[::-1] if good.ndim else [good],
+    )
+    return pick(rng, (*shapes, good.tolist() * 2 if good.ndim else [], dict(enumerate(flat))))
+
+
+@cache
+def _values() -> tuple[Any, ...]:
+    numbers = (0, 1, 2, -1, 10**6, 10**9, 10**18, 10**400, 1.5, -0.0, 1e-320, 1e9, 1e300, np.nan, np.inf, -np.inf, 1j)
+    numpies = (np.float32(1), np.int8(3), np.array(2.0), np.zeros(0), np.zeros(3), np.ones((3, 3)), np.zeros((2, 0)))
+    more = (
+        np.full(3, np.nan),
+        np.array(["1", "2", "3"]),
+        np.array([None]),
+        np.ones((4, 3), dtype=complex),
+        np.eye(3) > 0,
+    )
+    plain = (None, True, False, b"bytes", [], (), {}, set(), object(), type, len, print, range(3), Fraction(1, 3), ...)
+    nested = (
+        [[1], [1, 2]],
+        [[[]]],
+        [1, "a"],
+        {"x": 1},
+        {1: 2},
+        {"x": None},
+        [None],
+        [[]],
+        ["x"] * 3,
+        [(0.1, {"x": 1})],
+    )
+    symbols = (ca.SX.sym("q", 3), ca.MX.sym("q", 3), ca.DM([1, 2, 3]), ca.SX(3, 3), ca.Function("f", [], []))
+    functions = (
+        lambda q: q,
+        lambda q: None,
+        lambda q: 1 / 0,
+        lambda: 1,
+        lambda q: q[7],
+        lambda q: ca.if_else(q[0] > 0, 1, 2),
+    )
+    paths = (Path("nowhere/x"), Path("/dev/full"), Path("/proc/x"), Path("/dev/null/x"), Path(), Path(".."))
+    return (*numbers, *numpies, *more, *plain, *nested, *symbols, *functions, *paths)
+
+
+@cache
+def _objects() -> dict[str, Any]:
+    """Public objects, to be passed where others are wanted."""
+    robot = planar().robot
+    return {
+        "chart": fitted().chart,
+        "fit": fitted(),
+        "grown": circle(),
+        "problem": planar(),
+        "robot": robot,
+        "task": planar().task,
+        "metric": planar().metric,
+        "box": planar().domain,
+        "torus": oc.Torus(3),
+        "law": impedance(),
+        "steps": steps(),
+        "run": trajectory(),
+        "polynomial": oc.Polynomial(2),
+        "mlp": oc.MLP((3,)),
+        "solver": solvers.GaussNewton(),
+        "lbfgs": solvers.LBFGS(3),
+        "class": oc.Chart,
+        "module": oc,
+        "sew": oc.SEW(),
+        "other robot": problems.get("iiwa").robot,
+        "weights": oc.Weights(),
+        "push": simulation.Push(0.1, 0.1),
+    }
+
+
+@cache
+def good_calls() -> dict[str, Call]:
+    """What can be called, with arguments that work and take little time."""
+    return {**_makers(), **_functions(), **_methods(), **_control()}
+
+
+def _makers() -> dict[str, Call]:
+    robot, problem, q = planar().robot, planar(), np.array([0.3, 0.4, 0.5])
+    column = ca.vertcat
+    return {
+        "Robot.planar": (oc.Robot.planar, {"lengths": [1.0, 1.0], "masses": [1.0, 2.0]}),
+        "Robot.from_urdf": (oc.Robot.from_urdf, {"path": "no.urdf", "tip": "a", "locked": {"a": 1.0}, "tool": q}),
+        "Robot.from_mjcf": (oc.Robot.from_mjcf, {"path": "no.xml", "tip": "a", "locked": {"a": 1.0}, "tool": q}),
+        "Robot.from_file": (oc.Robot.from_file, {"path": "no.xml", "tip": None}),
+        "Robot.from_model": (oc.Robot.from_model, {"model": None, "tip": "tip", "locked": {}}),
+        "Robot": (oc.Robot, {"tree": robot.tree, "homes": {"a": q}}),
+        "Box": (oc.Box, {"centre": q, "half_width": 0.3}),
+        "Box.from_limits": (oc.Box.from_limits, {"lower": -q, "upper": q}),
+        "Torus": (oc.Torus, {"n": 3}),
+        "Polynomial": (oc.Polynomial, {"degree": 2}),
+        "Fourier": (oc.Fourier, {"degree": 2}),
+        "MLP": (oc.MLP, {"hidden": (3, 3)}),
+        "SEW": (oc.SEW, {"kind": "stereographic"}),
+        "Linear": (oc.Linear, {"base": (0.1, 0.2, 0.3), "normals": "orthonormal"}),
+        "Given.from_function": (
+            oc.Given.from_function,
+            {"name": "g", "n": 3, "function": lambda q: column(q[0], q[1])},
+        ),
+        "Metric.from_spec": (oc.Metric.from_spec, {"robot": robot, "spec": np.eye(3)}),
+        "Metric.custom": (oc.Metric.custom, {"robot": robot, "name": "m", "function": lambda q: ca.diag(2 + q**2)}),
+        "Problem": (
+            oc.Problem,
+            {"robot": robot, "task": problem.task, "metric": "inertia", "domain": problem.domain, "name": "p"},
+        ),
+        "Chart": (oc.Chart, {"problem": problem, "coordinates": fitted().chart.coordinates, "notes": {"a": 1.0}}),
+        "GrownChart": (oc.GrownChart, {"problem": circle().problem, "coordinates": circle().coordinates, "notes": {}}),
+        "Weights": (oc.Weights, {"task": 1.0, "mutual": 1.0, "regularity": 1.0, "length": 1.0, "extra": {}}),
+        "Task.position": (oc.Task.position, {"robot": robot, "axes": "x"}),
+        "Task.polar": (oc.Task.polar, {"robot": robot}),
+        "Task.orientation": (oc.Task.orientation, {"robot": robot, "reference": np.eye(3)}),
+        "Task.pose": (oc.Task.pose, {"robot": robot, "reference": np.eye(3)}),
+        "Task.axis": (oc.Task.axis, {"robot": robot, "axis": "z", "reference": q}),
+        "Task.position_and_axis": (oc.Task.position_and_axis, {"robot": robot, "axis": "z", "reference": q}),
+        "Task.named": (oc.Task.named, {"robot": robot, "kind": "position:x", "q_reference": q}),
+        "Task.custom": (
+            oc.Task.custom,
+            {"robot": robot, "name": "t", "function": lambda q: q[0], "labels": ["a"], "units": ["m"]},
+        ),
+        **{
+            f"{kind.__name__}": (kind, {"max_iterations": 5, "tolerance": 1e-3})
+            for kind in (solvers.GaussNewton, solvers.LBFGS, solvers.Ipopt)
+        },
+    }
+
+
+def _functions() -> dict[str, Call]:
+    problem, chart, q = planar(), fitted().chart, np.array([0.3, 0.4, 0.5])
+    symbol = ca.SX.sym("q", 3)
+    box = {"problem": problem, "parametrisation": oc.Polynomial(1)}
+    return {
+        "fit": (
+            oc.fit,
+            {
+                **box,
+                "solver": solvers.GaussNewton(3),
+                "weights": (10, 1, 1),
+                "samples": 50,
+                "seed": 0,
+                "checkpoint": None,
+            },
+        ),
+        "bounded fit": (oc.fit, {**box, "solver": None, "samples": 50, "max_mutual_deg": None}),
+        "check": (oc.check, {"problem": problem, "samples": 50, "seed": 1}),
+        "contains": (oc.contains, {"domain": problem.domain, "q": q}),
+        "default_box": (oc.default_box, {"robot": problem.robot, "centre": q, "half_width": 0.2}),
+        "distil": (
+            oc.distil,
+            {"chart": circle(), "parametrisation": oc.Polynomial(1), "solver": None, "samples": 30, "seed": 0},
+        ),
+        "evaluate": (oc.evaluate, {"chart": chart, "samples": 50, "seed": 1}),
+        "generate_c": (oc.generate_c, {"chart": chart, "out": "c", "controller": impedance(), "name": "arm"}),
+        "grow": (
+            oc.grow,
+            {"problem": problems.get("planar_2r"), "level": 1.0, "leaf": None, "origin": [1.0, 0.0], "cells": None},
+        ),
+        "grow linear": (oc.grow, {"problem": planar("euclidean"), "leaf": "linear", "level": 0.5, "region": None}),
+        "involutivity": (oc.involutivity, {"problem": problem, "samples": 30, "seed": 1}),
+        "jumps": (oc.jumps, {"chart": circle(), "radius": 0.02}),
+        "lie_bracket": (oc.lie_bracket, {"f": symbol, "g": symbol**2, "q": symbol}),
+        "load": (oc.load, {"path": "no.orthocas"}),
+        "Chart.load": (oc.Chart.load, {"path": "no.orthocas"}),
+        "loss": (oc.loss, {**box, "weights": (1, 1), "samples": 20, "seed": 0, "start": None}),
+        "compare": (
+            oc.compare,
+            {"problem": problem, "parametrisations": [], "solvers": None, "seeds": 1, "samples": 50, "held_out": 50},
+        ),
+        "singular_points": (oc.singular_points, {"problem": problems.get("planar_2r"), "seed": 0}),
+        "register_parametrisation": (
+            oc.register_parametrisation,
+            {"name": "polynomial", "kind": oc.MLP, "parse": None},
+        ),
+        "register_loss_term": (oc.register_loss_term, {"term": None}),
+        "parse": (parametrisations.parse_parametrisation, {"label": "polynomial:2"}),
+        "from data": (parametrisations.parametrisation_from_data, {"data": {"name": "polynomial", "degree": 2}}),
+        "to data": (parametrisations.parametrisation_to_data, {"parametrisation": oc.Polynomial(2)}),
+        "solvers.get": (solvers.get, {"name": "lbfgs"}),
+        "problems.get": (problems.get, {"name": "planar_2r"}),
+        "self_motion_figure": (plotting.self_motion_figure, {"chart": chart, "postures": 2, "reach": 0.1}),
+        "quality_figure": (plotting.quality_figure, {"report": None}),
+    }
+
+
+def _methods() -> dict[str, Call]:
+    robot, chart, grown, q = planar().robot, fitted().chart, circle(), np.array([0.3, 0.4, 0.5])
+    phi = chart.phi(q)
+    states = {
+        **{name: {"q": q} for name in ("mass_matrix", "gravity", "tip_position", "tip_rotation", "tip_jacobian")},
+        "joint_points": {"q": q},
+        "bias": {"q": q, "dq": q},
+        "inverse_dynamics": {"q": q, "dq": q, "ddq": q},
+        "forward_dynamics": {"q": q, "dq": q, "tau": q},
+        "coriolis_product": {"q": q, "v": q, "w": q},
+        "with_scaled_masses": {"factor": q},
+        "with_tool": {"tool": q},
+        "home": {"name": "h"},
+        "function": {"name": "bias"},
+    }
+    evaluations = ("xi", "task", "phi", "jacobian")
+    return {
+        **{f"robot.{name}": (getattr(robot, name), arguments) for name, arguments in states.items()},
+        **{f"chart.{name}": (getattr(chart, name), {"q": q}) for name in evaluations},
+        **{f"grown.{name}": (getattr(grown, name), {"q": q[:2]}) for name in evaluations},
+        "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "tolerance": 1e-9}),
+        "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
+        "chart.function": (chart.function, {"name": "phi"}),
+        "chart.save": (chart.save, {"path": "chart.orthocas"}),
+        "run.save": (trajectory().save, {"path": "run.npz"}),
+        "run.load": (simulation.Trajectory.load, {"path": "run.npz"}),
+        "box.contains": (planar().domain.contains, {"q": q}),
+        "task.with_reference_at": (oc.Task.axis(robot).with_reference_at, {"q": q}),
+        "check_damping": (impedance().check_damping, {"samples": 10}),
+    }
+
+
+def _control() -> dict[str, Call]:
+    chart, problem, reference, law = fitted().chart, planar(), steps(), impedance()
+    centre = planar().domain.centre
+    gains = {"chart": chart, "stiffness": 50.0, "damping_ratio": 0.7, "coupling": "coupled", "damping": "square_root"}
+    changes = [(0.1, {"x": 0.5})]
+    return {
+        "Impedance": (control.Impedance, {**gains, "limit": None}),
+        "PDPlus": (control.PDPlus, {**gains, "limit": [1.0, 2.0, 3.0]}),
+        "Kinematic": (control.Kinematic, {"chart": chart, "feedback": 1.0, "limit": None}),
+        "Projector": (
+            control.Projector,
+            {"problem": problem, "stiffness": 1.0, "posture_stiffness": 1.0, "damping_ratio": 0.7, "limit": None},
+        ),
+        "KinematicProjector": (
+            control.KinematicProjector,
+            {"problem": problem, "feedback": 1.0, "posture_feedback": 1.0, "limit": None},
+        ),
+        "Reference.steps": (
+            control.Reference.steps,
+            {"labels": ("x", "y"), "start": [0.0, 0.0], "changes": changes, "duration": 0.5, "natural_frequency": 6.0},
+        ),
+        "Reference.through": (
+            control.Reference.through,
+            {"labels": ("x", "y"), "times": [0.0, 1.0, 2.0], "points": [[0.0, 1.0], [1.0, 1.0], [2.0, 0.0]]},
+        ),
+        "reference.sample": (reference.sample, {"times": np.array([0.1, 0.2])}),
+        "joint_path": (control.joint_path, {"chart": chart, "reference": reference, "q_start": centre}),
+        "posture_reference": (control.posture_reference, {"chart": chart, "reference": reference, "q_start": centre}),
+        "matched_stiffness": (control.matched_stiffness, {"chart": chart}),
+        "matched_posture_stiffness": (control.matched_posture_stiffness, {"problem": problem}),
+        "law_of": (control.law_of, {"name": "impedance"}),
+        "control.register": (control.register, {"law": None}),
+        "Push": (simulation.Push, {"start": 0.1, "duration": 0.1, "force": [1.0, 0, 0], "torque": [0.0, 0, 0]}),
+        "Friction": (simulation.Friction, {"viscous": [1.0, 1, 1], "coulomb": 0.1}),
+        "Noise": (simulation.Noise, {"position": 0.1, "velocity": 0.1, "seed": 0}),
+        "simulate": (
+            oc.simulate,
+            {"controller": law, "reference": reference, "q_start": centre, "step": 0.1, "pushes": (), "friction": None},
+        ),
+        "simulate sampled": (
+            oc.simulate,
+            {"controller": law, "reference": reference, "q_start": centre, "control_rate": 50.0, "dq_start": centre * 0}
+            | {"noise": None, "plant": None},
+        ),
+        "coupling_index": (
+            simulation.coupling_index,
+            {"chart": chart, "reference": reference, "trajectory": trajectory()},
+        ),
+        "task_acceleration_breakdown": (
+            simulation.task_acceleration_breakdown,
+            {"chart": chart, "trajectory": trajectory()},
+        ),
+    }
