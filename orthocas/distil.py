@@ -89,6 +89,7 @@ def distil(
     Raises:
         InvalidValueError: if the chart is not grown, or the parametrisation is none to fit.
         GrowError: if the grown chart has no values on its domain.
+        KeyboardInterrupt: after Ctrl-C, also from within the minimiser.
     """
     parametrisation = Polynomial(degree=6) if parametrisation is None else parametrisation
     if not isinstance(parametrisation, Parametrisation) or parametrisation.closed_form is not None:
@@ -172,7 +173,7 @@ def _least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tup
 
 def _minimised(family: Family, targets: _Targets, solver: Solver, seed: int, watch: Watch) -> tuple[Array, Array]:
     """Parameters by a minimiser; the output bias of a network takes up the offset, so that stays 0."""
-    result = solver.minimise(_Distance(family, targets), family.initial(seed), watch).raise_if_failed()
+    result = solver.minimise(_Distance(family, targets), family.initial(seed), watch).finished()
     return result.theta, np.zeros(family.outputs)
 
 

@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 _FEW_NAMES = 10  # names that are read at a glance, in their own order
 _MOST_NAMES = 30  # names an error lists at the most: those nearest to what came
@@ -9,6 +10,27 @@ _MOST_NAMES = 30  # names an error lists at the most: those nearest to what came
 
 class OrthocasError(Exception):
     """Base of every error raised on purpose."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C ended a long call early; `result` is what it has found so far.
+
+    It ends a program as every Ctrl-C does, loops around the call included, unless the caller takes the result:
+
+        try:
+            fit = oc.fit(problem)
+        except oc.errors.Interrupted as stop:
+            fit = stop.result
+
+    In an interactive session `sys.last_value.result` has it afterwards.
+    """
+
+    def __init__(self, result: Any) -> None:
+        super().__init__(result)
+        self.result = result
+
+    def __str__(self) -> str:
+        return f"the {type(self.result).__name__} found so far is the attribute `result` of this exception"
 
 
 class NotSavableWarning(UserWarning):

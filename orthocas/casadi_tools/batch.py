@@ -21,7 +21,7 @@ _THREADED = 512  # chunks of this size are worth starting threads for
 def _threads() -> int:
     """All cores this process may use, or what OMP_NUM_THREADS says, as other libraries do."""
     wanted = os.environ.get("OMP_NUM_THREADS", "")
-    if wanted.isdigit() and int(wanted) > 0:
+    if wanted.isascii() and wanted.isdigit() and int(wanted) > 0:
         return int(wanted)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

@@ -29,6 +29,8 @@ _UNEVEN = 30.0  # gains in a coordinate mean something else where its gradient i
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
+Force = Annotated[bool, typer.Option("--force", help="Replace files of the same names that orthocas did not write.")]
+
 
 def print_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object."""

@@ -10,8 +10,10 @@ from orthocas.checks import require_count, require_kind
 from orthocas.comparing.cells import Cell, CellResult, run_cells
 from orthocas.comparing.report import Comparison
 from orthocas.comparing.ticks import with_control_ticks
-from orthocas.errors import ChartFileError, InvalidValueError
+from orthocas.errors import ChartFileError, Interrupted, InvalidValueError
+from orthocas.files.archive import require_free
 from orthocas.files.atomic import require_writable
+from orthocas.files.chart_file import CHART
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.fitting.settings import default_solver
 from orthocas.minimising.solver import Solver
@@ -35,11 +37,12 @@ def compare(
     charts: str | Path | None = None,
     control_ticks: bool = False,
     monitor: Monitor = silent,
+    force: bool = False,
 ) -> Comparison:
     """Fit every parametrisation with every solver and seed, and judge all on the same held-out samples.
 
-    A fit that fails is reported as such; the others go on. Ctrl-C returns the fits that are done. Coordinates in closed
-    form need no solver and no seed, and come once.
+    A fit that fails is reported as such; the others go on. Coordinates in closed form need no solver and no seed, and
+    come once.
 
     Args:
         problem: robot, task, metric and domain.
@@ -56,12 +59,14 @@ def compare(
         control_ticks: measure, after all fits, how long a control tick takes with each parametrisation: decoupled PD+
             as generated C, on a chart of the folder. NaN where there is no C compiler.
         monitor: called with progress.
+        force: replace files in the folder for charts that are no charts.
 
     Call it under `if __name__ == "__main__"` in scripts, as all that starts processes.
 
     Raises:
         InvalidValueError: if the grid is empty, or two of its parametrisations or solvers have the same name.
-        ChartFileError: if the folder for charts cannot be written.
+        ChartFileError: if the folder for charts cannot be written, or has another file of a chart's name.
+        Interrupted: after Ctrl-C; its `result` is the comparison of the fits that are done.
     """
     require_kind("problem", problem, Problem)
     count, loss = require_count("seeds", seeds), Weights.of(weights)
@@ -76,9 +81,12 @@ def compare(
     elif control_ticks:
         raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
     cells = [
-        Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file)
+        Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file, force)
         for parametrisation, solver, seed, file in _fits(parametrisations, solvers, count, folder)
     ]
+    for cell in cells:
+        if cell.chart_file is not None:
+            require_free(cell.chart_file, CHART, force)
     return _run_grid(cells, executor, jobs, control_ticks, monitor)
 
 
@@ -111,7 +119,10 @@ def _run_grid(
     except KeyboardInterrupt:
         interrupted = True
     results.sort(key=lambda result: order[result.parametrisation, result.solver, result.seed])
-    return Comparison(tuple(results), interrupted)
+    found = Comparison(tuple(results), interrupted)
+    if interrupted:
+        raise Interrupted(found)
+    return found
 
 
 def _require_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence[Solver] | None) -> None:

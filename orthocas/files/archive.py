@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from orthocas.errors import ArchiveError
 from orthocas.files.atomic import published, require_writable
+from orthocas.files.ours import is_archive, require_replaceable
 
 Stored = NDArray[Any]  #: an array in a file, of floats or integers
 
@@ -37,14 +38,17 @@ class Kind:
         return f"orthocas-{self.name}"
 
 
-def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, Stored]) -> None:
+def write_archive(
+    path: str | Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, Stored], force: bool = False
+) -> None:
     """Write header and arrays to a file that appears whole or not at all.
 
     Raises:
-        ArchiveError: the kind's own, if the folder is missing or cannot be written.
+        ArchiveError: the kind's own, if the folder is missing or cannot be written, or there is another kind of file
+            (unless `force`) or a symbolic link.
     """
-    require_writable(Path(path), kind.error)
-    target = Path(path).resolve()  # a link stays a link
+    target = Path(path)
+    require_free(target, kind, force)
     entries = {f"{name}.npy": _npy_bytes(array) for name, array in arrays.items()}
     full = {
         "format": kind.format,
@@ -63,6 +67,16 @@ def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], array
                 draft.writestr(zipfile.ZipInfo(name), content)
     except OSError as error:
         raise kind.error(f"cannot write {target}: {error.strerror}") from None
+
+
+def require_free(path: Path, kind: Kind, force: bool) -> None:
+    """Check early, before long work, that a file can be written and replaces none but one of its kind.
+
+    Raises:
+        ArchiveError: the kind's own, if it cannot, or would.
+    """
+    require_writable(path, kind.error)
+    require_replaceable(path, is_archive(path, kind.format), force, kind.error)
 
 
 def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str, Stored]]:

@@ -27,11 +27,13 @@ Notes = Mapping[str, str | float]
 _LEAF = "leaf_"  # of the names of arrays that belong to a base leaf
 
 
-def write_chart(path: str | Path, problem: Problem, coordinates: CoordinateMap, notes: Notes) -> None:
+def write_chart(
+    path: str | Path, problem: Problem, coordinates: CoordinateMap, notes: Notes, force: bool = False
+) -> None:
     """Write a chart; see `orthocas.files.archive` for the container.
 
     Raises:
-        ChartFileError: if the file cannot be written.
+        ChartFileError: if the file cannot be written, or would replace something other than a chart without `force`.
     """
     tree = problem.robot.tree
     numbers = {f.name: getattr(tree, f.name) for f in fields(tree)}
@@ -50,7 +52,7 @@ def write_chart(path: str | Path, problem: Problem, coordinates: CoordinateMap, 
         "coordinates": description,
         "notes": dict(notes),
     }
-    write_archive(path, CHART, header, arrays)
+    write_archive(path, CHART, header, arrays, force)
 
 
 def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from orthocas.chart import Chart
 from orthocas.coordinates.fitted import Coordinates
+from orthocas.errors import Interrupted
 from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.gauge import aligned, in_closed_form, in_gauge, normalised
 from orthocas.fitting.idle_joints import idle_joints
@@ -70,7 +71,8 @@ def fit(
 
     Minimises the mean of [AS2023] eq. (24) over uniform samples of the domain. Joints that the task does not feel
     become coordinates themselves; families linear in their parameters start from a spectral solution of low degree
-    and climb degree by degree. Ctrl-C returns the best coordinates so far, with status INTERRUPTED.
+    and climb degree by degree. Ctrl-C raises `Interrupted`, whose `result` is the fit with the best coordinates so far
+    and with status INTERRUPTED: callers that want a finished fit, and loops around them, end as well.
 
     Args:
         problem: robot, task, metric and domain.
@@ -95,6 +97,7 @@ def fit(
         InvalidValueError, SolveError: if settings do not fit together, or the loss is not finite.
         InfeasibleError: if max_mutual_deg cannot be met.
         CheckpointError: if the checkpoint is damaged, or belongs to another fit.
+        Interrupted: after Ctrl-C, once there are coordinates; before that, KeyboardInterrupt.
     """
     start = time.perf_counter()
     wanted = Polynomial(degree=4) if parametrisation is None else parametrisation
@@ -113,13 +116,16 @@ def fit(
         if stages:
             centre = problem.domain.centre
             coordinates = in_gauge(coordinates, centre) if align_to is None else aligned(coordinates, align_to, first)
-    return Fit(
+    result = Fit(
         chart=Chart(problem, coordinates, _notes(stages, settings)),
         stages=stages,
         problem_check=found,
         idle_joints=tuple(problem.robot.joint_names[i] for i in idle),
         seconds=time.perf_counter() - start,
     )
+    if result.status is Status.INTERRUPTED:
+        raise Interrupted(result)
+    return result
 
 
 def _minimised(

@@ -22,7 +22,7 @@ class Drawing:
     meshes: Mapping[str, trimesh.Trimesh] = field(default_factory=dict)  #: suffix -> printable solid [mm]
 
 
-def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
+def save(drawing: Drawing, name: str, out: str | Path, force: bool = False) -> list[Path]:
     """Write `<name><suffix>.png`, `<name>_<suffix>.stl` and `<name>.json`; each appears whole or not at all.
 
     Figures without 3-D axes are written as `<name><suffix>.pdf` too, in vectors. In 3-D these would be large files with
@@ -32,12 +32,14 @@ def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
         drawing: what to write.
         name: how file names begin, for example "fig07".
         out: a folder that exists.
+        force: replace files that orthocas did not write, too.
 
     Returns:
         The files, numbers last.
 
     Raises:
         ValueError: if a number is not finite.
+        ArchiveError: if there is a file that orthocas did not write, or a symbolic link.
         OSError: if a file cannot be written.
     """
     folder = Path(out)
@@ -50,7 +52,9 @@ def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
     for suffix, mesh in drawing.meshes.items():
         writers[f"{name}_{suffix}.stl"] = mesh.export
     writers[f"{name}.json"] = lambda draft: draft.write_text(text)
-    with published(folder) as drafts:  # all at once, so that numbers belong to the picture beside them
+    with published(
+        folder, listed=True, force=force
+    ) as drafts:  # all at once, so that numbers belong to the picture beside them
         for file, write in writers.items():
             write(drafts / file)
     return [folder / file for file in writers]

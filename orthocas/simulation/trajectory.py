@@ -15,6 +15,7 @@ from scipy.integrate import cumulative_simpson
 from orthocas.checks import Array
 from orthocas.errors import TrajectoryFileError
 from orthocas.files.atomic import published, require_writable
+from orthocas.files.ours import is_numpy_archive, require_replaceable
 from orthocas.showing import Shown, listed, number_list
 
 _VERSION = 1
@@ -100,14 +101,18 @@ class Trajectory(Shown):
         }
         return facts if np.isnan(self.storage).any() else facts | {"storage rise": f"{self.storage_rise:.3g} J"}
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, force: bool = False) -> None:
         """Write an NPZ file with every array, names and units; it appears whole or not at all.
 
+        It replaces a trajectory file of that name, and with `force` any other file.
+
         Raises:
-            TrajectoryFileError: if the folder is missing or cannot be written.
+            TrajectoryFileError: if the folder is missing or cannot be written, if there is a file that is no
+                trajectory, or a symbolic link.
         """
         target = Path(path)
         require_writable(target, TrajectoryFileError)
+        require_replaceable(target, is_numpy_archive(target, ("header", *_ARRAYS)), force, TrajectoryFileError)
         header = {
             "version": _VERSION,
             "controller": self.controller,
