@@ -212,9 +212,9 @@ def _in_pools(files: Mapping[Cell, Path], jobs: int | None) -> Iterator[CellResu
 
     with single_threaded():
         with pool_of(jobs or THREADS) as pool:
-            with _signals_blocked():  # in the processes that this starts, too
-                futures = {pool.submit(_run_stored, file): cell for cell, file in files.items()}
             try:
+                with _signals_blocked():  # in the processes that this starts, too
+                    futures = {pool.submit(_run_stored, file): cell for cell, file in files.items()}
                 for future in as_completed(futures):
                     if isinstance(future.exception(), BrokenExecutor):
                         left.append(futures[future])
@@ -222,7 +222,7 @@ def _in_pools(files: Mapping[Cell, Path], jobs: int | None) -> Iterator[CellResu
                         yield _outcome(future, futures[future])
             except BaseException:  # Ctrl-C, or nobody wants the rest: fits that are running end at their next step
                 stop.set()
-                pool.shutdown(wait=False, cancel_futures=True)
+                pool.shutdown(cancel_futures=True)
                 raise
         for cell in left:
             with pool_of(1) as pool:

@@ -2,6 +2,9 @@
 
 from collections.abc import Callable
 
+from fuzz import signals
 from fuzz.child import Finding
 
-CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {}
+CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
+    "signals": signals.campaign,
+}
