@@ -4,6 +4,12 @@ from importlib import import_module as _import_module
 from pathlib import Path as _Path
 from typing import TYPE_CHECKING
 
+from orthocas.cli.entry import is_command_line as _is_command_line
+from orthocas.cli.entry import leave_on_ctrl_c as _leave_on_ctrl_c
+
+if _is_command_line():
+    _leave_on_ctrl_c()  # the imports below take a second
+
 # In a checkout, problems/ and solvers/ lie beside this folder, not inside it. Looking one level up keeps
 # `orthocas.problems` importable there, whether or not an installed copy exists; a wheel does not run this line.
 if not (_Path(__file__).parent / "problems").is_dir():

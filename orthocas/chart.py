@@ -203,13 +203,14 @@ class Chart(Shown):
         require_shape("q", q.shape, (self.n, 1))
         return self.function(name)(q)
 
-    def save(self, path: str | Path) -> None:
-        """Write a self-contained chart file.
+    def save(self, path: str | Path, force: bool = False) -> None:
+        """Write a self-contained chart file. It replaces a chart file of that name, and with `force` any other file.
 
         Raises:
-            ChartFileError: if the folder is missing or cannot be written.
+            ChartFileError: if the folder is missing or cannot be written, if there is a file that is no chart, or a
+                symbolic link.
         """
-        write_chart(as_path("path", path), self.problem, self.coordinates, self.notes)
+        write_chart(as_path("path", path), self.problem, self.coordinates, self.notes, force)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -89,6 +89,7 @@ def distil(
     Raises:
         InvalidValueError: if the chart is not grown, or the parametrisation cannot be fitted.
         GrowError: if the grown chart has no values on its domain.
+        KeyboardInterrupt: after Ctrl-C, also within the minimiser.
 
     Example:
         >>> import orthocas as oc
@@ -184,7 +185,7 @@ def _least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tup
 
 def _minimised(family: Family, targets: _Targets, solver: Solver, seed: int, watch: Watch) -> tuple[Array, Array]:
     """Parameters by a minimiser. The offset stays 0, because the output bias of a network includes it."""
-    result = solver.minimise(_Distance(family, targets), family.initial(seed), watch).raise_if_failed()
+    result = solver.minimise(_Distance(family, targets), family.initial(seed), watch).finished()
     return result.theta, np.zeros(family.outputs)
 
 

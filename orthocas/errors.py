@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 _FEW_NAMES = 10  # names that are read at a glance, in their own order
 _LONGEST = 1500  # characters of a message
@@ -21,6 +22,27 @@ class OrthocasError(Exception):
 
     def __str__(self) -> str:
         return one_line(super().__str__())
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C ended a long call early; `result` is what it has found so far.
+
+    It ends a program as every Ctrl-C does, loops around the call included, unless the caller takes the result:
+
+        try:
+            fit = oc.fit(problem)
+        except oc.errors.Interrupted as stop:
+            fit = stop.result
+
+    In an interactive session `sys.last_value.result` has it afterwards.
+    """
+
+    def __init__(self, result: Any) -> None:
+        super().__init__(result)
+        self.result = result
+
+    def __str__(self) -> str:
+        return f"the {type(self.result).__name__} found so far is the attribute `result` of this exception"
 
 
 class NotSavableWarning(UserWarning):

@@ -158,12 +158,18 @@ def test_numpy_numbers_in_settings_do_not_reach_the_file(planar_x: oc.Problem, t
     assert oc.load(tmp_path / "numpy").notes["seed"] == 3
 
 
-def test_links_are_followed_and_odd_targets_refused(planar_fit: Fit, tmp_path: Path) -> None:
+def test_links_other_files_and_odd_targets_are_refused(planar_fit: Fit, tmp_path: Path) -> None:
     (tmp_path / "real").write_text("old")
     (tmp_path / "link").symlink_to(tmp_path / "real")
-    planar_fit.chart.save(tmp_path / "link")
-    assert (tmp_path / "link").is_symlink()
-    assert oc.load(tmp_path / "real").n == 3
+    for force in (False, True):
+        with pytest.raises(ChartFileError, match="it is a symbolic link"):
+            planar_fit.chart.save(tmp_path / "link", force)
+    with pytest.raises(ChartFileError, match=r"orthocas did not write the file that is there.*force"):
+        planar_fit.chart.save(tmp_path / "real")
+    assert (tmp_path / "real").read_text() == "old"
+    for _ in range(2):  # the second time it replaces a chart, which needs no force
+        planar_fit.chart.save(tmp_path / "real", force=not zipfile.is_zipfile(tmp_path / "real"))
+        assert oc.load(tmp_path / "real").n == 3
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ChartFileError, match="not a writable file"):
         planar_fit.chart.save(tmp_path / "pipe")

@@ -11,7 +11,7 @@ from programs import python
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.errors import CheckpointError
+from orthocas.errors import CheckpointError, Interrupted
 from orthocas.fitting import checkpoint
 from orthocas.fitting.checkpoint import Checkpoint
 from orthocas.minimising.solver import Status
@@ -78,8 +78,9 @@ def test_interrupted_fit_can_go_on(planar_x: oc.Problem, tmp_path: Path) -> None
         if progress.stage == "polynomial:3" and progress.fraction > 0:
             raise KeyboardInterrupt
 
-    stopped = oc.fit(planar_x, oc.Polynomial(4), checkpoint=file, monitor=press)
-    assert stopped.status is Status.INTERRUPTED
+    with pytest.raises(Interrupted) as stop:
+        oc.fit(planar_x, oc.Polynomial(4), checkpoint=file, monitor=press)
+    assert stop.value.result.status is Status.INTERRUPTED
     resumed = oc.fit(planar_x, oc.Polynomial(4), checkpoint=file)
     assert resumed.status is Status.CONVERGED
     assert resumed.chart.coordinates.parametrisation.label == "polynomial:4"

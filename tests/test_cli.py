@@ -15,6 +15,7 @@ from programs import Run, output_of
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.files.ours import LIST
 from orthocas.fitting.fit import Fit
 
 
@@ -328,7 +329,7 @@ def test_compare_writes_tables_pictures_and_charts(run: Run, tmp_path: Path) -> 
     assert "failed: InvalidValueError" in out
     assert err == "note: 1 of 3 fits failed, see comparison.csv\n"
     names = {path.name for path in (tmp_path / "grid").iterdir()}
-    assert names == {"charts", "comparison.csv", "comparison.json", "front.png", "convergence.png"}
+    assert names == {LIST, "charts", "comparison.csv", "comparison.json", "front.png", "convergence.png"}
     assert oc.load(tmp_path / "grid" / "charts" / "mlp-3_lbfgs_0.orthocas").r == 2
     code, out, err = run(*words, "--jobs", "1", "--json")
     assert (code, err) == (0, "")

@@ -19,6 +19,8 @@ import orthocas as oc
 from orthocas.cli import simulate as command
 from orthocas.cli.controller_argument import ControllerOptions, build_controller
 from orthocas.domains import sample_uniform
+from orthocas.files.atomic import published
+from orthocas.files.ours import LIST
 from orthocas.fitting.fit import Fit
 from orthocas.minimising.watch import Monitor, Progress
 from orthocas.simulation import Trajectory
@@ -54,7 +56,8 @@ def blank(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def written() -> set[str]:
-    return {path.name for path in Path("out").iterdir()}
+    """What is in the folder, apart from the list of it."""
+    return {path.name for path in Path("out").iterdir()} - {LIST}
 
 
 def report_of(run: Run, *words: str, **more: str) -> dict[str, Any]:
@@ -256,7 +259,8 @@ def interrupting(stage: str) -> Callable[[], Any]:
 @pytest.mark.usefixtures("blank")
 def test_ctrl_c_in_the_run_keeps_what_was_simulated(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("out").mkdir()
-    Path("out/animation.gif").write_text("of an earlier run")
+    with published(Path("out"), listed=True) as drafts:
+        (drafts / "animation.gif").write_text("of an earlier run")
     monkeypatch.setattr(command, "terminal_monitor", interrupting("simulate"))
     code, out, err = run("pd_plus", "--json")
     assert code == 130
@@ -267,6 +271,22 @@ def test_ctrl_c_in_the_run_keeps_what_was_simulated(run: Run, monkeypatch: pytes
     assert 0.5 <= report["duration"] < 0.8
     assert report["coupling_index"] is None
     assert Trajectory.load("out/trajectory.npz").times[-1] == report["duration"]
+
+
+@pytest.mark.usefixtures("blank")
+def test_files_of_others_stay_unless_forced(run: Run) -> None:
+    Path("out").mkdir()
+    Path("out/animation.gif").write_text("my holidays")
+    for words in (("pd_plus",), ("pd_plus", "--force", "--animation", "none")):  # without one it is in nobody's way
+        code, _, err = run(*words)
+        assert (code, err.count("\n")) == ((0, 0) if "--force" in words else (2, 1)), err
+        assert Path("out/animation.gif").read_text() == "my holidays"
+    assert run("pd_plus", "--force")[0] == 0
+    assert Path("out/animation.gif").read_bytes().startswith(b"GIF")
+    Path("out/report.json").write_text("edited")
+    code, _, err = run("pd_plus")
+    assert (code, Path("out/report.json").read_text()) == (2, "edited")
+    assert "cannot write out/report.json: orthocas did not write the file" in err
 
 
 @pytest.mark.usefixtures("blank")

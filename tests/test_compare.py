@@ -23,7 +23,7 @@ from orthocas.comparing import cells
 from orthocas.comparing.cells import Cell, CellResult, run_cell, run_cells
 from orthocas.comparing.figures import convergence_figure, front_figure
 from orthocas.comparing.report import Comparison
-from orthocas.errors import ChartFileError, InvalidValueError
+from orthocas.errors import ChartFileError, Interrupted, InvalidValueError
 from orthocas.fitting.loss import Weights
 from orthocas.minimising.watch import Progress
 from orthocas.parametrisations import register
@@ -252,12 +252,14 @@ def test_executor_that_loses_a_cell_is_reported(planar_x: oc.Problem) -> None:
     assert result.error == "ConnectionError: worker is gone"
 
 
-def test_ctrl_c_returns_what_is_done(planar_x: oc.Problem) -> None:
+def test_ctrl_c_raises_with_what_is_done(planar_x: oc.Problem) -> None:
     def press(progress: Progress) -> None:
         if progress.fraction > 0.5:
             raise KeyboardInterrupt
 
-    found = oc.compare(planar_x, [oc.Linear(), oc.Polynomial(1)], executor=InThisThread(), monitor=press, **QUICK)
+    with pytest.raises(Interrupted) as stop:
+        oc.compare(planar_x, [oc.Linear(), oc.Polynomial(1)], executor=InThisThread(), monitor=press, **QUICK)
+    found = stop.value.result
     assert found.interrupted
     assert len(found.results) == 1
 
@@ -279,8 +281,8 @@ def test_ctrl_c_stops_running_processes_too(planar_x: oc.Problem) -> None:
     slow = solvers.Adam(epochs=2000, steps=50)
     start = time.monotonic()
     networks = [oc.MLP((8, 8)), oc.MLP((9, 9)), oc.MLP((10, 10)), oc.MLP((11, 11))]
-    found = oc.compare(planar_x, [oc.Linear(), *networks], [slow], jobs=2, monitor=press, **QUICK)
-    assert found.interrupted
+    with pytest.raises(Interrupted):
+        oc.compare(planar_x, [oc.Linear(), *networks], [slow], jobs=2, monitor=press, **QUICK)
     while multiprocessing.active_children() and time.monotonic() - start < 60:
         time.sleep(0.1)
     assert time.monotonic() - start < 60  # a single network would take longer

@@ -8,7 +8,7 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.errors import InvalidValueError, MemoryNeedError, ShapeError
+from orthocas.errors import Interrupted, InvalidValueError, MemoryNeedError, ShapeError
 from orthocas.fitting.fit import Fit
 from orthocas.minimising.objective import Objective
 from orthocas.minimising.solver import SolveResult, Status
@@ -168,8 +168,10 @@ class StopsAfterFirstStage:
         return SolveResult(result.theta, result.value, status, 1, 1, 0.0)
 
 
-def test_interrupted_fit_returns_the_best_chart_so_far(planar_x: oc.Problem) -> None:
-    fit = oc.fit(planar_x, oc.Polynomial(5), StopsAfterFirstStage())
+def test_interrupted_fit_raises_with_the_best_chart_so_far(planar_x: oc.Problem) -> None:
+    with pytest.raises(Interrupted, match="the Fit found so far") as stop:
+        oc.fit(planar_x, oc.Polynomial(5), StopsAfterFirstStage())
+    fit = stop.value.result
     assert fit.status is Status.INTERRUPTED
     assert fit.chart.coordinates.parametrisation.label == "polynomial:3"
     assert oc.evaluate(fit.chart, 500).task_angle.std < 10
@@ -188,7 +190,9 @@ def test_ctrl_c_inside_the_solver_keeps_the_chart(planar_x: oc.Problem) -> None:
         if progress.stage == "polynomial:3" and progress.fraction > 0:
             raise KeyboardInterrupt
 
-    fit = oc.fit(planar_x, oc.Polynomial(5), monitor=press)
+    with pytest.raises(Interrupted) as stop:
+        oc.fit(planar_x, oc.Polynomial(5), monitor=press)
+    fit = stop.value.result
     assert fit.status is Status.INTERRUPTED
     assert fit.chart.notes["status"] == "interrupted"
 

@@ -16,7 +16,7 @@ import orthocas as oc
 from orthocas.checks import Array
 from orthocas.control import ControlStatus, Impedance, Kinematic, KinematicProjector, PDPlus, Projector, Reference
 from orthocas.control.controller import Controller
-from orthocas.errors import InvalidValueError, ShapeError, TrajectoryFileError, UnreachableReferenceError
+from orthocas.errors import Interrupted, InvalidValueError, ShapeError, TrajectoryFileError, UnreachableReferenceError
 from orthocas.minimising.watch import Progress
 from orthocas.problems.iiwa import urdf_path
 from orthocas.robots.planar import planar_model
@@ -334,7 +334,9 @@ def test_interrupt_keeps_what_was_simulated(planar_chart: oc.Chart, steps: Refer
             if progress.fraction > 0.3:
                 raise KeyboardInterrupt
 
-        run = simulate(PDPlus(planar_chart, K), steps, q0, control_rate=rate, monitor=press)
+        with pytest.raises(Interrupted) as stop:
+            simulate(PDPlus(planar_chart, K), steps, q0, control_rate=rate, monitor=press)
+        run = stop.value.result
         assert run.outcome is Outcome.INTERRUPTED
         assert 0.3 * 8 < run.times[-1] < 0.4 * 8
         assert len(run.q) == len(run.times) == len(run.command) == len(run.storage)

@@ -14,6 +14,8 @@ from PIL import Image
 import orthocas as oc
 from orthocas.control import ControlStatus, Kinematic, PDPlus, Reference
 from orthocas.errors import ArchiveError, InvalidValueError, UnknownNameError
+from orthocas.files.atomic import published
+from orthocas.files.ours import LIST
 from orthocas.fitting.fit import Fit
 from orthocas.minimising.watch import Progress
 from orthocas.simulation import Outcome, Trajectory, animation
@@ -139,7 +141,7 @@ def test_gif_plays_in_real_time(planar_run: Trajectory, planar_fit: Fit, tmp_pat
     assert count == len(seen) == 41
     assert sum(lengths) == 41 * 50
     assert seen[-1].fraction == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["a.gif"]
+    assert {path.name for path in tmp_path.iterdir()} == {"a.gif", LIST}
 
 
 def test_long_runs_are_shown_faster(
@@ -204,7 +206,8 @@ def test_interrupted_animation_leaves_nothing_and_keeps_the_old_one(
     planar_run: Trajectory, planar_fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     fake_ffmpeg(tmp_path, monkeypatch, TAKE_ALL)
-    (tmp_path / name).write_text("old")
+    with published(tmp_path, listed=True) as drafts:
+        (drafts / name).write_text("old")
 
     def stop(progress: Progress) -> None:
         if progress.fraction > 0.5:
@@ -213,7 +216,7 @@ def test_interrupted_animation_leaves_nothing_and_keeps_the_old_one(
     with pytest.raises(KeyboardInterrupt):
         save_animation(tmp_path / name, planar_run, planar_fit.chart.problem, stop)
     assert (tmp_path / name).read_text() == "old"
-    assert {path.name for path in tmp_path.iterdir()} == {"bin", name}
+    assert {path.name for path in tmp_path.iterdir()} == {"bin", name, LIST}
 
 
 @pytest.mark.slow

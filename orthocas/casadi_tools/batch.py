@@ -21,7 +21,7 @@ _THREADED = 512  # from this chunk size on, starting threads pays off
 def _threads() -> int:
     """Number of cores this process may use, or OMP_NUM_THREADS if it is set, as in other libraries."""
     wanted = os.environ.get("OMP_NUM_THREADS", "")
-    if wanted.isdigit() and int(wanted) > 0:
+    if wanted.isascii() and wanted.isdigit() and int(wanted) > 0:
         return int(wanted)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

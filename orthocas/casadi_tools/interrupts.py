@@ -1,7 +1,8 @@
-"""Ctrl-C while compiled code runs: recorded at once, and raised where Python can handle it.
+"""Signals while compiled code runs: recorded at once, and raised where Python can handle them.
 
 An exception cannot pass through CasADi's compiled code: it comes out as another exception, or is lost. So while that
-code runs, SIGINT is only recorded. KeyboardInterrupt is raised when the code returns, or earlier by `check`.
+code runs, a signal is only recorded. When the code returns, or earlier where `check` is called, Ctrl-C becomes
+KeyboardInterrupt, and the signals of `ended_in_order` become SystemExit.
 """
 
 import signal
@@ -9,35 +10,86 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import NoReturn
 
-_notes: list[threading.Event] = []  # one for every `deferred` of the main thread
+_ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+
+class _Note:
+    """The signal that came during one `deferred` of the main thread."""
+
+    number: int | None = None
+
+    def take(self, number: int, frame: FrameType | None) -> None:
+        """The handler meanwhile; the first signal counts."""
+        self.number = self.number or number
+
+
+_notes: list[_Note] = []
 
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Hold Ctrl-C back until the end of the block. Only the main thread receives it, so other threads do nothing."""
+    """Hold signals back until the end of the block. Only the main thread gets them, so other threads do nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    note = threading.Event()
-
-    def take(number: int, frame: FrameType | None) -> None:
-        note.set()
-
-    before = signal.signal(signal.SIGINT, take)
+    note = _Note()
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *_ENDING)}
+    before = {number: handler for number, handler in handlers.items() if _held(number, handler)}
+    for number in before:
+        signal.signal(number, note.take)
     _notes.append(note)
     try:
         yield
     finally:
         _notes.remove(note)
-        signal.signal(signal.SIGINT, before)
-        if note.is_set():
-            for outer in _notes:  # compiled code further out may lose the exception
-                outer.set()
-            raise KeyboardInterrupt  # also replaces the exception that compiled code made of it
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if note.number is not None:
+            for outer in _notes:  # compiled code around this one may not pass the exception on
+                outer.number = outer.number or note.number
+            _raise(note.number)  # also instead of what compiled code made of it
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt if Ctrl-C is being held back. For Python code that compiled code calls."""
-    if threading.current_thread() is threading.main_thread() and any(note.is_set() for note in _notes):
+    """Raise what is being held back; for code that compiled code calls."""
+    if threading.current_thread() is threading.main_thread():
+        for note in _notes:
+            if note.number is not None:
+                _raise(note.number)
+
+
+@contextmanager
+def ended_in_order() -> Iterator[None]:
+    """Turn SIGTERM and SIGHUP into SystemExit with 128 + their number, so that drafts go away; for command lines.
+
+    What the program was told to ignore stays ignored, as by nohup.
+    """
+    before = {number: signal.getsignal(number) for number in _ENDING}
+    for number, handler in before.items():
+        if handler is signal.SIG_DFL:
+            signal.signal(number, _end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _end(number: int, frame: FrameType | None) -> NoReturn:
+    for each in _ENDING:
+        signal.signal(each, signal.SIG_IGN)  # the end is not to be disturbed
+    raise SystemExit(128 + number)
+
+
+def _held(number: int, handler: object) -> bool:
+    """Whether a signal would raise something: Ctrl-C unless it is ignored, others inside `ended_in_order`."""
+    ours = handler is _end or isinstance(getattr(handler, "__self__", None), _Note)
+    return callable(handler) if number == signal.SIGINT else ours
+
+
+def _raise(number: int) -> NoReturn:
+    if number == signal.SIGINT:
         raise KeyboardInterrupt
+    raise SystemExit(128 + number)

@@ -1,5 +1,5 @@
 """The command line: one module per command."""
 
-from orthocas.cli.main import main
+from orthocas.cli.entry import main
 
 __all__ = ["main"]

@@ -20,7 +20,7 @@ from orthocas.cli.controller_argument import (
     build_controller,
     require_options,
 )
-from orthocas.cli.output import AsJson, print_json, print_rows
+from orthocas.cli.output import AsJson, Force, print_json, print_rows
 from orthocas.codegen import GeneratedC, Proof, check_c, generate_c
 from orthocas.errors import InvalidValueError
 
@@ -42,6 +42,7 @@ def codegen(
     check: Annotated[
         bool, typer.Option("--check", help="Compile the C and compare it with Python on 1000 states.")
     ] = False,
+    force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
@@ -54,7 +55,7 @@ def codegen(
         loaded = Chart.load(chart)
         loaded.function("xi")  # raises for grown charts
         law = None if controller == _NONE else build_controller(controller, loaded, options, limit)
-        generated = generate_c(loaded, out, law, name)
+        generated = generate_c(loaded, out, law, name, force)
     proof = check_c(generated, loaded, law) if check else None
     report = _report(generated, proof)
     if json:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from orthocas.cli.fit import WEIGHTS_TEXT, parse_weights
-from orthocas.cli.output import AsJson, note, print_json, print_table, whole_number
+from orthocas.cli.output import AsJson, Force, note, print_json, print_table, whole_number
 from orthocas.cli.problem_argument import (
     CentreText,
     HalfWidth,
@@ -24,10 +24,12 @@ from orthocas.cli.progress import terminal_monitor
 from orthocas.comparing.compare import compare as compare_fits
 from orthocas.comparing.figures import convergence_figure, front_figure
 from orthocas.comparing.report import Comparison
-from orthocas.files.atomic import made_folder
+from orthocas.errors import Interrupted
+from orthocas.files.atomic import output_folder, published, require_replaceable_files
 from orthocas.parametrisations import parse_parametrisation
 from orthocas.solvers import get as get_solver
 
+_FILES = ("comparison.csv", "comparison.json", "front.png", "convergence.png")
 _PARAMETRISATIONS = ["linear", "polynomial:2", "polynomial:3", "polynomial:4", "mlp:32x32"]
 
 
@@ -68,6 +70,7 @@ def compare(
         typer.Option("--jobs", parser=whole_number, help="Number of processes, one thread each; default: all cores."),
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder for tables, pictures and charts.")] = Path("comparison"),
+    force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts."""
@@ -76,22 +79,32 @@ def compare(
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers = [get_solver(name) for name in solver] if solver else None
     loss = parse_weights(weights)
-    charts = made_folder("--out", made_folder("--out", out) / "charts")
-    with terminal_monitor() as monitor:
-        found = compare_fits(
-            built,
-            parametrisations,
-            minimisers,
-            seeds=seeds,
-            weights=loss,
-            samples=samples,
-            held_out=held_out,
-            jobs=jobs,
-            charts=charts,
-            control_ticks=True,
-            monitor=monitor,
-        )
-    save(found, out)
+    with output_folder("--out", out) as folder, output_folder("--out", folder / "charts") as charts:
+        require_replaceable_files(folder, _FILES, force)
+        try:
+            with terminal_monitor() as monitor:
+                found = compare_fits(
+                    built,
+                    parametrisations,
+                    minimisers,
+                    seeds=seeds,
+                    weights=loss,
+                    samples=samples,
+                    held_out=held_out,
+                    jobs=jobs,
+                    charts=charts,
+                    control_ticks=True,
+                    monitor=monitor,
+                    force=force,
+                )
+        except Interrupted as stop:
+            found = stop.result
+        save(found, folder, force)
+    _tell(found, out, json)
+
+
+def _tell(found: Comparison, out: Path, json: bool) -> None:
+    """Print the table, or all as JSON."""
     if json:
         print_json(found.as_dict())
     else:
@@ -105,10 +118,11 @@ def compare(
         raise typer.Exit(130)
 
 
-def save(found: Comparison, out: Path) -> None:
+def save(found: Comparison, out: Path, force: bool = False) -> None:
     """Write tables and pictures."""
-    found.write(out)
+    found.write(out, force)
     if all(result.failed for result in found.results):
         return
-    front_figure(found).savefig(out / "front.png", dpi=150)
-    convergence_figure(found).savefig(out / "convergence.png", dpi=150)
+    with published(out, listed=True, force=force) as drafts:
+        front_figure(found).savefig(drafts / "front.png", dpi=150)
+        convergence_figure(found).savefig(drafts / "convergence.png", dpi=150)

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.cli.output import AsJson, note, number, print_json, print_rows, report_rows, whole_number
+from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, report_rows, whole_number
 from orthocas.cli.problem_argument import (
     CentreText,
     HalfWidth,
@@ -21,8 +21,9 @@ from orthocas.cli.problem_argument import (
     parse_numbers,
 )
 from orthocas.cli.progress import terminal_monitor
-from orthocas.errors import ChartFileError, InvalidValueError
-from orthocas.files.atomic import require_writable
+from orthocas.errors import Interrupted, InvalidValueError
+from orthocas.files.archive import require_free
+from orthocas.files.chart_file import CHART
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, Weights
@@ -83,29 +84,33 @@ def fit(
     out: Annotated[
         Path | None, typer.Option("--out", help="Chart file; default: PROBLEM.orthocas in the current folder.")
     ] = None,
+    force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
     words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width)
     built = build_problem(problem, words)
     target = out or Path(f"{built.name}.orthocas")
-    require_writable(target, ChartFileError)
+    require_free(target, CHART, force)
     parametrisation = parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
     loss = parse_weights(weights)
-    with terminal_monitor() as monitor:
-        result = fit_chart(
-            built,
-            parametrisation,
-            minimiser,
-            weights=loss,
-            samples=samples,
-            seed=seed,
-            monitor=monitor,
-            max_mutual_deg=max_mutual_deg,
-            checkpoint=checkpoint,
-        )
-    result.chart.save(target)
+    try:
+        with terminal_monitor() as monitor:
+            result = fit_chart(
+                built,
+                parametrisation,
+                minimiser,
+                weights=loss,
+                samples=samples,
+                seed=seed,
+                monitor=monitor,
+                max_mutual_deg=max_mutual_deg,
+                checkpoint=checkpoint,
+            )
+    except Interrupted as stop:
+        result = stop.result
+    result.chart.save(target, force)
     report = evaluate(result.chart, seed=seed + 1)
     if json:
         print_json(_as_dict(result, report, target))

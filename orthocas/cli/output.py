@@ -29,6 +29,8 @@ _UNEVEN = 30.0  # ratio of gradient lengths above which the same gain means too 
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
+Force = Annotated[bool, typer.Option("--force", help="Replace files of the same names that orthocas did not write.")]
+
 
 def print_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object."""

@@ -23,14 +23,15 @@ from orthocas.cli.controller_argument import (
     build_controller,
     require_options,
 )
-from orthocas.cli.output import AsJson, note, number, print_json, print_rows, whole_number
+from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.cli.progress import terminal_monitor
 from orthocas.cli.run_report import fallback_text, run_report, run_rows
 from orthocas.control import Controller, Reference, posture_reference
-from orthocas.errors import ArchiveError, InvalidValueError
-from orthocas.files.atomic import published, require_writable
+from orthocas.errors import ArchiveError, Interrupted, InvalidValueError
+from orthocas.files.atomic import output_folder, published, require_replaceable_files, require_writable
 from orthocas.files.json import to_json
+from orthocas.files.ours import is_listed
 from orthocas.minimising.watch import Monitor
 from orthocas.simulation import Friction, Noise, Outcome, Trajectory
 from orthocas.simulation.animation import FORMATS, require_format, save_animation
@@ -38,6 +39,7 @@ from orthocas.simulation.figure import trajectory_figure, units_of
 from orthocas.simulation.run import simulate as run_closed_loop
 from orthocas.simulation.steps_file import Plan, read_steps
 
+_FILES = ("trajectory.npz", "coordinates.png", "report.json")
 _DIVERGED = 1  # exit code when the integrator gave up: the input was valid but the run failed
 
 
@@ -77,6 +79,7 @@ def simulate(
     animation: Annotated[
         str, typer.Option("--animation", help="Format of the animation: gif, mp4 (needs ffmpeg) or none.")
     ] = "gif",
+    force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
@@ -86,7 +89,7 @@ def simulate(
     require_options(controller, options)
     if animation != "none":
         require_format(animation)
-    _require_folder(out)
+    _require_folder(out, animation, force)
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         loaded = Chart.load(chart)
         loaded.function("xi")  # raises for grown charts
@@ -101,12 +104,12 @@ def simulate(
     begin = time.perf_counter()
     with terminal_monitor() as monitor:
         run = _run(law, loaded, plan, conditions, monitor)
-        finish = partial(_finish, law, loaded, plan, run, time.perf_counter() - begin, out)
+        finish = partial(_finish, law, loaded, plan, run, time.perf_counter() - begin, out, force)
         interrupted = run.outcome is Outcome.INTERRUPTED
         try:
             seen, report = finish()
             if animation != "none" and not interrupted:
-                save_animation(out / f"animation.{animation}", seen, loaded.problem, monitor)
+                save_animation(out / f"animation.{animation}", seen, loaded.problem, monitor, force)
         except KeyboardInterrupt:  # the run is complete: keep it
             seen, report = finish()
             interrupted = True
@@ -121,11 +124,13 @@ def simulate(
         raise typer.Exit(_DIVERGED)
 
 
-def _require_folder(out: Path) -> None:
-    """Check, before anything is written, that the output folder exists or can be made."""
+def _require_folder(out: Path, animation: str, force: bool) -> None:
+    """Check, before anything is written, that the output folder exists or can be made, and holds no files of others."""
     if out.exists() and not out.is_dir():
         raise InvalidValueError("--out", str(out), "a folder")
     require_writable(out / "report.json" if out.is_dir() else out, ArchiveError)
+    names = [*_FILES] if animation == "none" else [*_FILES, f"animation.{animation}"]
+    require_replaceable_files(out, names, force)
 
 
 def _pair(option: str, text: str) -> tuple[float, float]:
@@ -155,7 +160,11 @@ def _run(law: Controller, chart: Chart, plan: Plan, conditions: dict[str, Any], 
     reference = plan.reference
     if law.labels != chart.labels:
         reference = posture_reference(chart, reference, plan.q_start)
-    return run_closed_loop(law, reference, plan.q_start, pushes=plan.pushes, monitor=monitor, **conditions)
+    try:
+        return run_closed_loop(law, reference, plan.q_start, pushes=plan.pushes, monitor=monitor, **conditions)
+    except Interrupted as stop:
+        run: Trajectory = stop.result
+        return run
 
 
 def _in_chart(chart: Chart, reference: Reference, run: Trajectory) -> Trajectory:
@@ -172,7 +181,7 @@ def _in_chart(chart: Chart, reference: Reference, run: Trajectory) -> Trajectory
 
 
 def _finish(
-    law: Controller, chart: Chart, plan: Plan, run: Trajectory, seconds: float, out: Path
+    law: Controller, chart: Chart, plan: Plan, run: Trajectory, seconds: float, out: Path, force: bool
 ) -> tuple[Trajectory, dict[str, Any]]:
     """Write the run, its picture and its report, and remove the animation of an earlier run.
 
@@ -181,13 +190,13 @@ def _finish(
     """
     seen = _in_chart(chart, plan.reference, run)
     report = run_report(law, chart, plan, seen, seconds)
-    out.mkdir(exist_ok=True)
-    with published(out) as drafts:
+    with output_folder("--out", out) as folder, published(folder, listed=True, force=force) as drafts:
         run.save(drafts / "trajectory.npz")
         trajectory_figure(seen, units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
         (drafts / "report.json").write_text(to_json(report, indent=1) + "\n")
-    for kind in FORMATS:
-        (out / f"animation.{kind}").unlink(missing_ok=True)
+    for old in (out / f"animation.{kind}" for kind in FORMATS):
+        if is_listed(old):
+            old.unlink()
     return seen, report
 
 

@@ -1,6 +1,5 @@
 """`--check`: compares compiled C with the Python that it was generated from."""
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from orthocas.control import Controller, ControlStatus
 from orthocas.control.status import LARGEST
 from orthocas.domains import borders, contains
 from orthocas.errors import ProofError
+from orthocas.files.drafts import draft_folder
 
 TOLERANCE = 1e-10  #: largest accepted difference, relative to the largest entry of the result
 _REACH = 1.2  # random states lie in the domain enlarged by this factor
@@ -52,8 +52,8 @@ def check_c(
     q = domain.centre + domain.half_width * np.vstack([_REACH * places, _corner_cases(n)])
     differences: dict[str, float] = {}
     for compiler in compilers():
-        with tempfile.TemporaryDirectory() as folder:
-            path = compile_shared(generated, Path(folder), compiler=compiler)
+        with draft_folder() as folder:
+            path = compile_shared(generated, folder, compiler=compiler)
             found = _compared(CompiledLibrary(path, generated.name, n), chart, controller, q, seed)
         for name, value in found.items():
             if not value <= TOLERANCE:

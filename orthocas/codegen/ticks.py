@@ -4,8 +4,6 @@ import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -16,6 +14,7 @@ from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
 from orthocas.control import Controller, PDPlus
 from orthocas.errors import CompileError
+from orthocas.files.drafts import draft_folder
 
 _STATES = 64  # as in templates/ticks.c
 _MICROSECONDS = 3e5  # to spend on one measurement
@@ -37,11 +36,11 @@ def control_tick(chart: Chart) -> float:
     Raises:
         CompileError: if there is no C compiler.
     """
-    with TemporaryDirectory() as folder:
+    with draft_folder() as folder:
         with deferred():  # CasADi may lose Ctrl-C while it builds functions
             law = PDPlus(chart, 50.0, coupling="decoupled")
             generated = generate_c(chart, folder, law, "tick")
-        library = CompiledLibrary(compile_shared(generated, Path(folder)), "tick", chart.n)
+        library = CompiledLibrary(compile_shared(generated, folder), "tick", chart.n)
         about = time_ticks([(law, library)], 200)[0].median
         calls = int(np.clip(_MICROSECONDS / about, 1_000, 100_000))
         return time_ticks([(law, library)], calls)[0].slowest_state
@@ -53,12 +52,12 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
     Raises:
         CompileError: if there is no C compiler, or the timing program cannot be built or run.
     """
-    with TemporaryDirectory() as folder:
-        data, program = Path(folder) / "states", Path(folder) / "ticks"
+    with draft_folder() as folder:
+        data, program = folder / "states", folder / "ticks"
         np.concatenate([part.ravel() for law, _ in cases for part in (_states(law), gain_numbers(law))]).tofile(data)
         source = files("orthocas.codegen") / "templates" / "ticks.c"
-        (Path(folder) / "ticks.c").write_text(source.read_text())
-        _run([compilers()[0], "-O2", str(Path(folder) / "ticks.c"), "-o", str(program), "-ldl"])
+        (folder / "ticks.c").write_text(source.read_text())
+        _run([compilers()[0], "-O2", str(folder / "ticks.c"), "-o", str(program), "-ldl"])
         arguments = [str(program), str(data), str(calls), str(cases[0][0].problem.n)]
         for law, library in cases:
             sizes = (3 * len(law.labels), len(gain_numbers(law)))

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from orthocas.casadi_tools.batch import THREADS
+from orthocas.comparing.workers import end_with_parent
+from orthocas.files.drafts import draft_folder
 from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.loss import Weights
 from orthocas.minimising.solver import Solver, Status
@@ -40,6 +41,7 @@ class Cell:
     samples: int | None
     held_out: int
     chart_file: Path | None  #: file to save the chart in
+    force: bool = False  #: replace a file there that is not a chart
 
     @property
     def solver_name(self) -> str:
@@ -101,8 +103,12 @@ def run_cell(cell: Cell) -> CellResult:
             monitor=record,
         )
         if cell.chart_file is not None:
-            found.chart.save(cell.chart_file)
+            found.chart.save(cell.chart_file, cell.force)
         report = evaluate(found.chart, cell.held_out, HELD_OUT_SEED)
+    except KeyboardInterrupt:
+        if not _cancelled():
+            raise
+        return failure(cell, "cancelled")
     except Exception as error:
         return failure(cell, f"{type(error).__name__}: {error}")
     return _result(cell, found, report, history)
@@ -182,7 +188,7 @@ def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResu
 
     Cells are passed in files: a pool whose process dies while it receives a large argument hangs in Python 3.11.2.
     """
-    with TemporaryDirectory(prefix="orthocas-") as folder:
+    with draft_folder() as folder:
         files = {}
         for k, cell in enumerate(cells):
             try:
@@ -190,7 +196,7 @@ def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResu
             except (pickle.PicklingError, TypeError, AttributeError) as error:
                 yield failure(cell, f"{type(error).__name__}: {error}")
                 continue
-            files[cell] = Path(folder) / f"{k}.pickle"
+            files[cell] = folder / f"{k}.pickle"
             files[cell].write_bytes(content)
         yield from _in_pools(files, jobs)
 
@@ -202,12 +208,13 @@ def _in_pools(files: Mapping[Cell, Path], jobs: int | None) -> Iterator[CellResu
     stop = context.Event()
 
     def pool_of(size: int) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(size, mp_context=context, initializer=_begin, initargs=(stop,))
+        return ProcessPoolExecutor(size, mp_context=context, initializer=_begin, initargs=(stop, os.getpid()))
 
     with single_threaded():
         with pool_of(jobs or THREADS) as pool:
-            futures = {pool.submit(_run_stored, file): cell for cell, file in files.items()}
             try:
+                with _signals_blocked():  # in the processes that this starts, too
+                    futures = {pool.submit(_run_stored, file): cell for cell, file in files.items()}
                 for future in as_completed(futures):
                     if isinstance(future.exception(), BrokenExecutor):
                         left.append(futures[future])
@@ -215,11 +222,13 @@ def _in_pools(files: Mapping[Cell, Path], jobs: int | None) -> Iterator[CellResu
                         yield _outcome(future, futures[future])
             except BaseException:  # Ctrl-C, or the caller stops: running fits end at their next step
                 stop.set()
-                pool.shutdown(wait=False, cancel_futures=True)
+                pool.shutdown(cancel_futures=True)
                 raise
         for cell in left:
             with pool_of(1) as pool:
-                yield _outcome(pool.submit(_run_stored, files[cell]), cell)
+                with _signals_blocked():
+                    future = pool.submit(_run_stored, files[cell])
+                yield _outcome(future, cell)
 
 
 def _run_stored(file: Path) -> CellResult:
@@ -228,10 +237,24 @@ def _run_stored(file: Path) -> CellResult:
     return run_cell(cell)
 
 
-def _begin(stop: Event) -> None:
-    """Initialise a worker process: it ignores Ctrl-C, and the parent tells it when to stop."""
+def _begin(stop: Event, parent: int) -> None:
+    """Initialise a worker process: it ignores Ctrl-C, the parent tells it when to stop, and it ends with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent(parent)
     _stops.append(stop)
+
+
+@contextmanager
+def _signals_blocked() -> Iterator[None]:
+    """Ctrl-C waits until the end of the block; in processes that start meanwhile, for ever, imports included."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _cancelled() -> bool:

@@ -10,8 +10,10 @@ from orthocas.checks import as_path, require_count, require_kind
 from orthocas.comparing.cells import Cell, CellResult, run_cells
 from orthocas.comparing.report import Comparison
 from orthocas.comparing.ticks import with_control_ticks
-from orthocas.errors import ChartFileError, InvalidValueError
+from orthocas.errors import ChartFileError, Interrupted, InvalidValueError
+from orthocas.files.archive import require_free
 from orthocas.files.atomic import require_writable
+from orthocas.files.chart_file import CHART
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.fitting.settings import default_solver
 from orthocas.minimising.solver import Solver
@@ -35,11 +37,12 @@ def compare(
     charts: str | Path | None = None,
     control_ticks: bool = False,
     monitor: Monitor = silent,
+    force: bool = False,
 ) -> Comparison:
     """Fit every parametrisation with every solver and seed, and evaluate all on the same held-out samples.
 
-    If a fit fails, the result says so and the others continue. After Ctrl-C the finished fits are returned. Coordinates
-    in closed form need no solver and no seed, so they are evaluated once.
+    If a fit fails, the result says so and the others continue. Coordinates in closed form need no solver and no seed,
+    so they are evaluated once.
 
     In scripts, call it under `if __name__ == "__main__"`: it starts processes.
 
@@ -58,10 +61,12 @@ def compare(
         control_ticks: measure after all fits how long a control tick takes with each parametrisation. The tick is
             decoupled PD+ as generated C, on a saved chart. NaN if there is no C compiler.
         monitor: called with progress.
+        force: replace files in the folder for charts that are no charts.
 
     Raises:
         InvalidValueError: if the grid is empty, or two of its parametrisations or solvers have the same name.
-        ChartFileError: if the folder for charts cannot be written.
+        ChartFileError: if the folder for charts cannot be written, or has another file with the name of a chart.
+        Interrupted: after Ctrl-C; its `result` is the comparison of the finished fits.
 
     Example:
         >>> from concurrent.futures import ThreadPoolExecutor
@@ -91,9 +96,12 @@ def compare(
     elif control_ticks:
         raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
     cells = [
-        Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file)
+        Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file, force)
         for parametrisation, solver, seed, file in _fits(parametrisations, solvers, count, folder)
     ]
+    for cell in cells:
+        if cell.chart_file is not None:
+            require_free(cell.chart_file, CHART, force)
     return _run_grid(cells, executor, jobs, control_ticks, monitor)
 
 
@@ -126,7 +134,10 @@ def _run_grid(
     except KeyboardInterrupt:
         interrupted = True
     results.sort(key=lambda result: order[result.parametrisation, result.solver, result.seed])
-    return Comparison(tuple(results), interrupted)
+    found = Comparison(tuple(results), interrupted)
+    if interrupted:
+        raise Interrupted(found)
+    return found
 
 
 def _require_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence[Solver] | None) -> None:

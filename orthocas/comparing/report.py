@@ -50,15 +50,21 @@ class Comparison(Shown):
         summaries = [_summary(results) for results in groups.values()]
         return sorted(summaries, key=lambda s: (math.isnan(s.task_std_deg), s.task_std_deg))
 
-    def write(self, folder: Path) -> None:
-        """Write comparison.csv (one line per fit) and comparison.json (with histories)."""
+    def write(self, folder: Path, force: bool = False) -> None:
+        """Write comparison.csv (one line per fit) and comparison.json (with histories).
+
+        They replace files of these names that orthocas wrote there, and with `force` any others.
+
+        Raises:
+            ArchiveError: if there are others, or symbolic links.
+        """
         names = [field.name for field in fields(CellResult) if field.name != "history"]
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, names)
         writer.writeheader()
         for result in self.results:
             writer.writerow({name: getattr(result, name) for name in names})
-        with published(folder) as drafts:
+        with published(folder, listed=True, force=force) as drafts:
             (drafts / "comparison.csv").write_text(text.getvalue(), newline="")
             (drafts / "comparison.json").write_text(to_json(self.as_dict(), indent=1))
 

@@ -12,6 +12,7 @@ from orthocas.errors import ArchiveError
 from orthocas.files.atomic import published, require_writable
 from orthocas.files.json import from_strict_json
 from orthocas.files.npy import Stored, from_npy, to_npy
+from orthocas.files.ours import is_archive, require_replaceable
 from orthocas.files.zips import Unpacker, unpacking
 
 _HEADER, _DIGEST = "header.json", "digest.txt"
@@ -31,15 +32,17 @@ class Kind:
         return f"orthocas-{self.name}"
 
 
-def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, Stored]) -> None:
+def write_archive(
+    path: str | Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, Stored], force: bool = False
+) -> None:
     """Write header and arrays to a file that appears whole or not at all.
 
     Raises:
-        ArchiveError: if the folder is missing or not writable, or the header holds NaN or infinity. The error is
-            `kind.error`.
+        ArchiveError: if the folder is missing or not writable, the header holds NaN or infinity, or there is another
+            kind of file (unless `force`) or a symbolic link. The error is `kind.error`.
     """
-    require_writable(Path(path), kind.error)
-    target = Path(path).resolve()  # write through a symbolic link, and keep the link
+    target = Path(path)
+    require_free(target, kind, force)
     entries = {f"{name}.npy": to_npy(array) for name, array in arrays.items()}
     full = {
         "format": kind.format,
@@ -61,6 +64,16 @@ def write_archive(path: str | Path, kind: Kind, header: Mapping[str, Any], array
                 draft.writestr(zipfile.ZipInfo(name), content)
     except OSError as error:
         raise kind.error(f"cannot write {target}: {error.strerror}") from None
+
+
+def require_free(path: Path, kind: Kind, force: bool) -> None:
+    """Check early, before long work, that a file can be written and replaces none but one of its kind.
+
+    Raises:
+        ArchiveError: the kind's own, if it cannot, or would.
+    """
+    require_writable(path, kind.error)
+    require_replaceable(path, is_archive(path, kind.format), force, kind.error)
 
 
 def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str, Stored]]:

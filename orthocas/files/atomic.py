@@ -1,30 +1,55 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and replace nothing that orthocas did not write."""
 
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.files.drafts import draft_folder, sweep
+from orthocas.files.ours import LIST, is_listed, list_text, require_replaceable
 
 
 @contextmanager
-def published(folder: Path) -> Iterator[Path]:
+def published(folder: Path, listed: bool = False, force: bool = False) -> Iterator[Path]:
     """A draft folder. Its files move to `folder` when the block ends, and are deleted if the block raises.
 
     Each file appears whole or not at all: its content is on disk before its name is. Files of the same name are
     replaced.
+
+    Args:
+        folder: where the files go.
+        listed: keep a list there of what was written, and replace only files on it (`orthocas.files.ours`).
+        force: replace others too.
+
+    Raises:
+        ArchiveError: if files are listed and a file in the way is not; or if it is a symbolic link.
     """
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".orthocas-") as name:
-        drafts = Path(name)
+    with draft_folder(folder) as drafts:
         yield drafts
         files = sorted(drafts.iterdir())
+        for file in files:
+            require_replaceable(folder / file.name, not listed or is_listed(folder / file.name), force)
+        if listed:
+            text = list_text(folder, files)
+            files.insert(0, drafts / LIST)  # first: what it announces may be missing, but nothing that is there unknown
+            files[0].write_text(text, encoding="utf-8")
         for file in files:
             with file.open("rb") as stream:
                 os.fsync(stream.fileno())
         for file in files:
             os.replace(file, folder / file.name)
+
+
+def require_replaceable_files(folder: Path, names: Iterable[str], force: bool) -> None:
+    """Check early, before long work, that no file with one of these names is there that orthocas did not write.
+
+    Raises:
+        ArchiveError: if there is one, or a symbolic link.
+    """
+    for name in names:
+        require_replaceable(folder / name, is_listed(folder / name), force)
 
 
 def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) -> None:
@@ -36,6 +61,7 @@ def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) 
     try:
         if not path.parent.is_dir():
             raise error_type(f"cannot write {path}: folder {path.parent} does not exist")
+        sweep(path.parent)
         if path.is_dir():
             raise error_type(f"cannot write {path}: it is a folder, expected a file name")
         if path.exists() and not (path.is_file() and os.access(path, os.W_OK)):
@@ -55,8 +81,22 @@ def made_folder(name: str, out: str | Path) -> Path:
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        sweep(folder)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         raise InvalidValueError(name, str(folder), f"a folder that can be written ({error.strerror})") from None
     return folder
+
+
+@contextmanager
+def output_folder(name: str, out: str | Path) -> Iterator[Path]:
+    """`made_folder` for the time of a block; at its end, folders that it made and that stayed empty go away again."""
+    folder = Path(out)
+    new = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        yield made_folder(name, folder)
+    finally:
+        for place in new:
+            with suppress(OSError):  # it is not empty, as it should be
+                place.rmdir()

@@ -30,11 +30,13 @@ _PROBES = 8  # points of the domain where a chart that is read is evaluated
 _LEAF = "leaf_"  # prefix of the names of arrays that belong to a base leaf
 
 
-def write_chart(path: str | Path, problem: Problem, coordinates: CoordinateMap, notes: Notes) -> None:
+def write_chart(
+    path: str | Path, problem: Problem, coordinates: CoordinateMap, notes: Notes, force: bool = False
+) -> None:
     """Write a chart. `orthocas.files.archive` describes the container.
 
     Raises:
-        ChartFileError: if the file cannot be written.
+        ChartFileError: if the file cannot be written, or would replace something other than a chart without `force`.
     """
     tree = problem.robot.tree
     numbers = {f.name: getattr(tree, f.name) for f in fields(tree)}
@@ -53,7 +55,7 @@ def write_chart(path: str | Path, problem: Problem, coordinates: CoordinateMap, 
         "coordinates": description,
         "notes": _checked_notes(notes),
     }
-    write_archive(path, CHART, header, arrays)
+    write_archive(path, CHART, header, arrays, force)
 
 
 def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:

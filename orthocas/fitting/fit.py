@@ -10,6 +10,7 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.checks import as_path
 from orthocas.coordinates.fitted import Coordinates
+from orthocas.errors import Interrupted
 from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.gauge import aligned, in_closed_form, in_gauge, normalised
 from orthocas.fitting.idle_joints import idle_joints
@@ -79,8 +80,8 @@ def fit(
 
     The fit minimises the mean of [AS2023] eq. (24) over uniform samples of the domain. Joints that do not affect the
     task become coordinates themselves. Families linear in their parameters start from a spectral solution of low
-    degree, and the degree rises step by step. After Ctrl-C the fit returns the best coordinates so far, with status
-    INTERRUPTED.
+    degree, and the degree rises step by step. Ctrl-C raises `Interrupted`: its `result` is the fit with the best
+    coordinates so far and status INTERRUPTED. So callers that need a finished fit, and loops around them, end as well.
 
     Args:
         problem: robot, task, metric and domain.
@@ -105,6 +106,7 @@ def fit(
         InvalidValueError, SolveError: if settings are invalid or contradict each other, or the loss is not finite.
         InfeasibleError: if max_mutual_deg cannot be met.
         CheckpointError: if the checkpoint is damaged, or belongs to another fit.
+        Interrupted: after Ctrl-C, once there are coordinates; before that, KeyboardInterrupt.
 
     Example:
         >>> import orthocas as oc
@@ -132,13 +134,16 @@ def fit(
         if stages:
             centre = problem.domain.centre
             coordinates = in_gauge(coordinates, centre) if align_to is None else aligned(coordinates, align_to, first)
-    return Fit(
+    result = Fit(
         chart=Chart(problem, coordinates, _notes(stages, settings)),
         stages=stages,
         problem_check=found,
         idle_joints=tuple(problem.robot.joint_names[i] for i in idle),
         seconds=time.perf_counter() - start,
     )
+    if result.status is Status.INTERRUPTED:
+        raise Interrupted(result)
+    return result
 
 
 def _minimised(

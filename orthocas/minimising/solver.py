@@ -32,8 +32,19 @@ class SolveResult:
     evaluations: int
     seconds: float
 
+    def finished(self) -> "SolveResult":
+        """The result, for callers that cannot use an unfinished one: raises KeyboardInterrupt if Ctrl-C ended it.
+
+        Raises:
+            KeyboardInterrupt: after Ctrl-C.
+            SolveError: if no usable point was found.
+        """
+        if self.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        return self.raise_if_failed()
+
     def raise_if_failed(self) -> "SolveResult":
-        """Raise SolveError if no usable point was found. A point found when iterations ran out is usable."""
+        """Raise SolveError if no usable point was found. A point found before time or Ctrl-C is usable."""
         if self.status in (Status.FAILED, Status.INFEASIBLE):
             raise SolveError(
                 f"the minimiser ended after {self.iterations} iterations at loss {self.value:.6g}: {self.status.value}"

@@ -22,7 +22,7 @@ class Drawing:
     meshes: Mapping[str, trimesh.Trimesh] = field(default_factory=dict)  #: suffix -> printable solid [mm]
 
 
-def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
+def save(drawing: Drawing, name: str, out: str | Path, force: bool = False) -> list[Path]:
     """Write `<name><suffix>.png`, `<name>_<suffix>.stl` and `<name>.json`. Each file appears whole or not at all.
 
     Figures without 3-D axes are also written as vector graphics, `<name><suffix>.pdf`. In 3-D these files would be
@@ -32,12 +32,14 @@ def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
         drawing: the drawing to write.
         name: prefix of the file names, for example "fig07".
         out: an existing folder.
+        force: also replace files that orthocas did not write.
 
     Returns:
         The files, with the numbers last.
 
     Raises:
         ValueError: if a number is not finite.
+        ArchiveError: if there is a file that orthocas did not write, or a symbolic link.
         OSError: if a file cannot be written.
     """
     folder = Path(out)
@@ -50,7 +52,7 @@ def save(drawing: Drawing, name: str, out: str | Path) -> list[Path]:
     for suffix, mesh in drawing.meshes.items():
         writers[f"{name}_{suffix}.stl"] = mesh.export
     writers[f"{name}.json"] = lambda draft: draft.write_text(text)
-    with published(folder) as drafts:  # all at once, so that the numbers match the pictures
+    with published(folder, listed=True, force=force) as drafts:  # all at once, so that the numbers match the pictures
         for file, write in writers.items():
             write(drafts / file)
     return [folder / file for file in writers]

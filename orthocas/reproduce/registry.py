@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthocas.errors import UnknownNameError
-from orthocas.files.atomic import made_folder
+from orthocas.files.atomic import output_folder, require_replaceable_files
 from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.reproduce import (
     fig01,
@@ -89,7 +89,7 @@ def chosen(name: str) -> list[str]:
 
 
 def reproduce(
-    name: str, out: str | Path, quick: bool = False, monitor: Monitor = silent
+    name: str, out: str | Path, quick: bool = False, monitor: Monitor = silent, force: bool = False
 ) -> dict[str, dict[str, float]]:
     """Reproduce figures of [AS2023], and save pictures, numbers and meshes.
 
@@ -100,6 +100,7 @@ def reproduce(
         out: folder for the files, created if needed.
         quick: coarser and faster, for tests.
         monitor: called before each figure and at the end.
+        force: replace files that orthocas did not write, too.
 
     Returns:
         The numbers of each figure.
@@ -107,13 +108,18 @@ def reproduce(
     Raises:
         UnknownNameError: if no figure has that name.
         InvalidValueError: if the folder is not writable.
+        ArchiveError: if it has files with the name of a figure that orthocas did not write, or symbolic links.
+        KeyboardInterrupt: after Ctrl-C.
     """
-    names, folder = chosen(name), made_folder("out", out)
-    numbers = {}
-    for done, figure in enumerate(names):
-        monitor(Progress("reproducing", done / len(names), f"{figure}: {FIGURES[figure].title}"))
-        drawing = FIGURES[figure].draw(quick)
-        save(drawing, figure, folder)
-        numbers[figure] = dict(drawing.numbers)
+    names, numbers = chosen(name), {}
+    with output_folder("out", out) as folder:
+        for figure in names:
+            files = re.compile(rf"{figure}\w?(_\w+)?\.(png|pdf|stl|json)")
+            require_replaceable_files(folder, [f.name for f in folder.iterdir() if files.fullmatch(f.name)], force)
+        for done, figure in enumerate(names):
+            monitor(Progress("reproducing", done / len(names), f"{figure}: {FIGURES[figure].title}"))
+            drawing = FIGURES[figure].draw(quick)
+            save(drawing, figure, folder, force)
+            numbers[figure] = dict(drawing.numbers)
     monitor(Progress("reproducing", 1.0, f"{len(names)} figures"))
     return numbers

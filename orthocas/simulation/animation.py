@@ -13,7 +13,7 @@ from PIL import Image
 
 from orthocas.checks import require_known
 from orthocas.errors import ArchiveError, InvalidValueError
-from orthocas.files.atomic import published, require_writable
+from orthocas.files.atomic import published, require_replaceable_files, require_writable
 from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.problem import Problem
 from orthocas.simulation.moving_picture import MovingPicture, Picture
@@ -37,7 +37,9 @@ def require_format(name: str) -> None:
         raise InvalidValueError("animation", "mp4", "gif, because mp4 needs ffmpeg, which is not on the PATH")
 
 
-def save_animation(path: str | Path, trajectory: Trajectory, problem: Problem, monitor: Monitor = silent) -> None:
+def save_animation(
+    path: str | Path, trajectory: Trajectory, problem: Problem, monitor: Monitor = silent, force: bool = False
+) -> None:
     """Write an animation of the arm and its controlled quantities. The file appears whole or not at all.
 
     The arm is drawn in 3-D, or in its plane if it is planar. The animation has 20 frames per second and runs in real
@@ -48,19 +50,22 @@ def save_animation(path: str | Path, trajectory: Trajectory, problem: Problem, m
         trajectory: the run.
         problem: robot and task.
         monitor: called with progress.
+        force: replace any file of that name; default only those that the list `.orthocas.json` of the folder has, which
+            is kept there.
 
     Raises:
         UnknownNameError, InvalidValueError: if the format is unknown, or ffmpeg is missing.
-        ArchiveError: if the file cannot be written.
+        ArchiveError: if the file cannot be written, or there is one that orthocas did not write, or a symbolic link.
     """
     target = Path(path)
     require_format(target.suffix.removeprefix("."))
     require_writable(target, ArchiveError)
+    require_replaceable_files(target.parent, [target.name], force)
     instants, speed = _chosen(trajectory.times)
     film = MovingPicture(trajectory, problem, speed)
     samples = np.vstack(list(film.pictures(instants[[0, -1]])))
     pictures = _watched(film.pictures(instants), len(instants), monitor)
-    with published(target.parent) as folder:
+    with published(target.parent, listed=True, force=force) as folder:
         draft = folder / target.name
         if target.suffix == ".gif":
             _write_gif(draft, pictures, samples)

@@ -9,7 +9,7 @@ from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array, as_float_array, as_number, as_point, require_kind
 from orthocas.control.controller import Controller, require_controller
 from orthocas.control.reference import Reference
-from orthocas.errors import InvalidValueError, SimulationError
+from orthocas.errors import Interrupted, InvalidValueError, SimulationError
 from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.robots import Robot
 from orthocas.simulation.closed_loop import ClosedLoop, Piece
@@ -61,11 +61,12 @@ def simulate(
         monitor: called with progress.
 
     Returns:
-        The trajectory. Its outcome tells whether the run ended early, by Ctrl-C or because the integrator gave up.
+        The trajectory. Its outcome tells whether it ended early because the integrator gave up.
 
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.
         ShapeError, InvalidValueError: for arguments of the wrong shape, value or type.
+        Interrupted: after Ctrl-C; its `result` is the trajectory up to there, with outcome INTERRUPTED.
 
     Example:
         >>> import orthocas as oc
@@ -109,9 +110,12 @@ def simulate(
     except SimulationError:
         outcome = Outcome.DIVERGED
     try:
-        return _trajectory(loop, reference, start, pieces, outcome)
+        run = _trajectory(loop, reference, start, pieces, outcome)
     except KeyboardInterrupt:  # keep the run up to here
-        return _trajectory(loop, reference, start, pieces, Outcome.INTERRUPTED)
+        run = _trajectory(loop, reference, start, pieces, Outcome.INTERRUPTED)
+    if run.outcome is Outcome.INTERRUPTED:
+        raise Interrupted(run)
+    return run
 
 
 def _require_kinds(

@@ -13,6 +13,7 @@ from orthocas.checks import Array, as_float_array, as_path, frozen_indices, requ
 from orthocas.control.status import ControlStatus
 from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
 from orthocas.files.atomic import published, require_writable
+from orthocas.files.ours import is_numpy_archive, require_replaceable
 from orthocas.showing import Shown, listed, number_list
 from orthocas.simulation.run_file import read_run_file
 
@@ -116,14 +117,18 @@ class Trajectory(Shown):
         }
         return facts if np.isnan(self.storage).any() else facts | {"storage rise": f"{self.storage_rise:.3g} J"}
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, force: bool = False) -> None:
         """Write an NPZ file with all arrays, names and units. The file appears whole or not at all.
 
+        It replaces a trajectory file of that name, and with `force` any other file.
+
         Raises:
-            TrajectoryFileError: if the folder is missing or not writable.
+            TrajectoryFileError: if the folder is missing or not writable, or there is a file that is not a trajectory,
+                or a symbolic link.
         """
         target = as_path("path", path)
         require_writable(target, TrajectoryFileError)
+        require_replaceable(target, is_numpy_archive(target, ("header", *_ARRAYS)), force, TrajectoryFileError)
         header = {
             "version": _VERSION,
             "controller": self.controller,

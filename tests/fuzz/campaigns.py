@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from fuzz import signals
 from fuzz.calls import calls
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
@@ -16,5 +17,6 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "checkpoints": checkpoints,
     "robots": robots,
     "runs": runs,
+    "signals": signals.campaign,
     "steps": steps,
 }

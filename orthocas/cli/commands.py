@@ -1,0 +1,59 @@
+"""Collects the commands, and turns errors into one line and exit code 2."""
+
+import numpy as np
+import typer
+
+from orthocas.casadi_tools.interrupts import ended_in_order
+from orthocas.cli.codegen import codegen
+from orthocas.cli.compare import compare
+from orthocas.cli.entry import INTERRUPTED
+from orthocas.cli.evaluate import evaluate
+from orthocas.cli.fit import fit
+from orthocas.cli.info import info
+from orthocas.cli.reproduce import reproduce
+from orthocas.cli.simulate import simulate
+from orthocas.errors import OrthocasError
+
+app = typer.Typer(
+    name="orthocas",
+    help="Joint-space coordinates that a redundant robot's task does not disturb.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+app.command()(fit)
+app.command()(evaluate)
+app.command()(info)
+app.command()(compare)
+app.command()(reproduce)
+app.command()(simulate)
+app.command()(codegen)
+
+
+def _complain(text: str) -> None:
+    """Print an error as one line of bounded length on standard error."""
+    line = " ".join(text.split())
+    typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
+
+
+def run() -> int:
+    """Run the command line; bad input gives one line on standard error and exit code 2, a signal its own code."""
+    with ended_in_order():
+        try:
+            code = app(standalone_mode=False)
+        except (OrthocasError, typer.TyperException) as error:
+            _complain(error.format_message() if isinstance(error, typer.TyperException) else str(error))
+            code = 2
+        except (OSError, MemoryError, np.linalg.LinAlgError) as error:  # from below: still one line, not a traceback
+            _complain(f"{type(error).__name__}: {error}")
+            code = 2
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+        return interrupted() if code == INTERRUPTED else code or 0
+
+
+def interrupted() -> int:
+    """Say that it was Ctrl-C; the exit code."""
+    typer.echo("orthocas: interrupted", err=True)
+    return INTERRUPTED

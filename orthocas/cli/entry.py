@@ -1,0 +1,52 @@
+"""Where the command line begins: signals first, then the imports, which take a second."""
+
+import importlib
+import os
+import signal
+import sys
+from itertools import pairwise
+from pathlib import Path
+from types import FrameType
+
+INTERRUPTED = 130  #: exit code after Ctrl-C, as shells have it
+
+
+def is_command_line() -> bool:
+    """Whether this process is the command `orthocas` or `python -m orthocas`, not a program that imports orthocas."""
+    words = sys.orig_argv[1:]
+    as_script = bool(sys.argv) and Path(sys.argv[0]).stem == "orthocas" and sys.argv[0] in words
+    return as_script or ("-m", "orthocas") in pairwise(words)
+
+
+def leave_on_ctrl_c() -> None:
+    """Let Ctrl-C end the process at once, with one line, until `main` has imported what it needs.
+
+    `orthocas` calls it first of all in the command line: Python imports all of `orthocas` on its way to `main`. Nothing
+    is lost meanwhile, and an exception would come out of half-imported libraries as anything.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _leave)
+
+
+def main() -> None:
+    """Run the command line."""
+    watched = signal.getsignal(signal.SIGINT) is _leave
+    os.environ["MPLBACKEND"] = "agg"  # pictures go to files; a name that is none would stop matplotlib
+    commands = importlib.import_module("orthocas.cli.commands")  # not above, since it takes a second
+    try:
+        if watched:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        code = commands.run()
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        code = commands.interrupted()
+    finally:
+        if watched:
+            signal.signal(signal.SIGINT, _leave)  # while Python ends
+    sys.exit(code)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """End the process without any more Python."""
+    os.write(2, b"orthocas: interrupted\n")
+    os._exit(INTERRUPTED)

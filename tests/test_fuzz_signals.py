@@ -1,0 +1,13 @@
+"""Kills and Ctrl-C of the command line at random times: a part of the campaign `make fuzz CAMPAIGN=signals`."""
+
+import pytest
+
+pytest.importorskip("resource")
+
+from fuzz import signals
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["fit", "compare"])
+def test_stopped_commands_leave_nothing_broken(name: str) -> None:
+    assert signals.judge(list(signals.COMMANDS).index(name)) is None
