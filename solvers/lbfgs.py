@@ -15,7 +15,7 @@ from orthocas.solvers.line_search import Trial, wolfe_step
 
 @dataclass(frozen=True)
 class LBFGS:
-    """L-BFGS [NW2006, Alg. 7.5] with strong Wolfe steps.
+    """L-BFGS ([NW2006] Alg. 7.5) with strong Wolfe steps.
 
     A restored run has the memory of the one that was killed, which SciPy's L-BFGS-B could not hand over.
 
@@ -113,11 +113,12 @@ class _Run:
     def _direction(self) -> Array:
         """-H g with the approximation H of the inverse Hessian, by the two-loop recursion."""
         direction, factors = -self.gradient, []
-        for step, change in reversed(self.pairs):
-            factors.append((direction @ step) / (step @ change))
+        curvatures = [step @ change for step, change in self.pairs]
+        for (step, change), curvature in zip(reversed(self.pairs), reversed(curvatures), strict=True):
+            factors.append((direction @ step) / curvature)
             direction = direction - factors[-1] * change
-        step, change = self.pairs[-1]
-        direction *= (step @ change) / (change @ change)
-        for (step, change), factor in zip(self.pairs, reversed(factors), strict=True):
-            direction += (factor - (direction @ change) / (step @ change)) * step
+        newest = self.pairs[-1][1]
+        direction *= curvatures[-1] / (newest @ newest)
+        for (step, change), curvature, factor in zip(self.pairs, curvatures, reversed(factors), strict=True):
+            direction += (factor - (direction @ change) / curvature) * step
         return direction
