@@ -81,6 +81,8 @@ class _Run:
                 return Status.STALLED
             before, self.value = self.value, self.objective.value(self.theta)
             best.evaluations += 1
+            if not np.isfinite(self.value):
+                return Status.STALLED
             best.offer(self.theta, self.value)
             self.stretch *= 2
             self.converged = before - self.value <= self.settings.tolerance * before and best.iterations >= 5

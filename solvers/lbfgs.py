@@ -1,11 +1,14 @@
 """Limited-memory BFGS, for any parametrisation."""
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 
 from orthocas.checks import Array, require_at_least, require_count
+from orthocas.errors import CheckpointError
 from orthocas.minimising.best_point import BestPoint
 from orthocas.minimising.objective import Objective
 from orthocas.minimising.solver import SolveResult, Status
@@ -56,9 +59,8 @@ class _Run:
         self.value = float(kept.get("value", np.nan))
         self.gradient = np.array(kept.get("gradient", np.full_like(self.theta, np.nan)))
         self.converged = bool(kept.get("converged", False))
-        names = (f"pair_{k}" for k in range(settings.memory))
         #: changes of theta and of the gradient, (2, size) each, the newest last
-        self.pairs = deque((kept[name] for name in names if name in kept), maxlen=settings.memory)
+        self.pairs = deque(_restored_pairs(kept, self.theta.size), maxlen=settings.memory)
 
     def iterate(self) -> Status:
         best, limit = self.best, self.settings.max_iterations
@@ -122,3 +124,20 @@ class _Run:
         for (step, change), curvature, factor in zip(self.pairs, curvatures, reversed(factors), strict=True):
             direction += (factor - (direction @ change) / curvature) * step
         return direction
+
+
+def _restored_pairs(kept: State, size: int) -> Iterator[Array]:
+    """The correction pairs of an earlier run.
+
+    Raises:
+        CheckpointError: if they belong to another objective.
+    """
+    for name in map("pair_{}".format, count()):
+        if name not in kept:
+            return
+        pair = kept[name]
+        if pair.shape != (2, size) or not 0 < pair[0] @ pair[1] < np.inf:
+            raise CheckpointError(
+                f"{name} in the checkpoint has shape {pair.shape}, expected {(2, size)} with a positive product"
+            )
+        yield pair
