@@ -87,8 +87,8 @@ class _Run:
         """Take step k = 0, 1, ..., counted over all epochs."""
         total = self.settings.epochs * self.settings.steps
         rate = self.settings.learning_rate * 0.5 * (1 + np.cos(np.pi * k / total))
-        self.mean += (1 - _MOMENT) * (gradient - self.mean)
-        self.square += (1 - _SQUARE) * (gradient**2 - self.square)
+        self.mean = self.mean + (1 - _MOMENT) * (gradient - self.mean)
+        self.square = self.square + (1 - _SQUARE) * (gradient**2 - self.square)
         unbiased = np.sqrt(self.square / (1 - _SQUARE ** (k + 1))) + _SMALL
         self.theta = self.theta - rate / (1 - _MOMENT ** (k + 1)) * self.mean / unbiased
 

@@ -58,11 +58,13 @@ class _Run:
     def __init__(self, settings: GaussNewton, objective: LeastSquaresObjective, theta0: Array, watch: Watch) -> None:
         self.settings, self.objective = settings, objective
         self.best = BestPoint(objective, theta0, watch)
-        self.damping = float((self.best.restored or {}).get("damping", 1e-3))
+        kept = self.best.restored or {}
+        self.damping = float(kept.get("damping", 1e-3))
+        self.converged = bool(kept.get("converged", False))
 
     def iterate(self) -> Status:
         best = self.best
-        while best.iterations < self.settings.max_iterations:
+        while best.iterations < self.settings.max_iterations and not self.converged:
             before, gradient, H = self.objective.normal_equations(best.theta)
             best.evaluations += 1
             best.offer(best.theta, before)
@@ -71,13 +73,10 @@ class _Run:
             damping = self.damping
             if not self._step(gradient, H):
                 return Status.STALLED if np.any(gradient) else Status.CONVERGED
-            best.next_iteration(self.settings.max_iterations, damping=self.damping)
-            cautious = (
-                self.damping > damping
-            )  # a step after rejections is short, so its small gain does not mean convergence
-            if not cautious and before - best.value <= self.settings.tolerance * before:
-                return Status.CONVERGED
-        return Status.ITERATION_LIMIT
+            cautious = self.damping > damping  # a step after rejections is short: a small gain is no convergence
+            self.converged = not cautious and before - best.value <= self.settings.tolerance * before
+            best.next_iteration(self.settings.max_iterations, damping=self.damping, converged=self.converged)
+        return Status.CONVERGED if self.converged else Status.ITERATION_LIMIT
 
     def _step(self, gradient: Array, H: Array) -> bool:
         """Try steps with growing damping until the loss falls, and return whether it fell."""

@@ -22,9 +22,9 @@ _FIRST = 1e-3  # first time interval, in units of |theta0| / |grad L|
 class GradientFlow:
     """Follows the path of steepest descent: slow, but with the same limit as gradient descent with tiny steps.
 
-    Time is divided into intervals, each twice as long as the previous one. The flow is stiff, so CVODES takes implicit
-    BDF steps. Their Jacobian is the Gauss-Newton matrix if the objective has one; otherwise a Krylov method uses finite
-    differences of the gradient.
+    Time is divided into intervals, each twice as long as the previous one. The integrator starts anew in each of them,
+    so that a restored run takes the same steps. The flow is stiff, so CVODES takes implicit BDF steps. Their Jacobian is
+    the Gauss-Newton matrix if the objective has one; otherwise a Krylov method uses finite differences of the gradient.
 
     Args:
         max_iterations: largest number of intervals.
@@ -60,32 +60,48 @@ class _Run:
         self.best = BestPoint(objective, theta0, watch)
         kept = self.best.restored or {}
         self.theta = np.array(kept.get("theta", theta0), dtype=float)
+        self.value = float(kept.get("value", np.nan))
         self.stretch = float(kept.get("stretch", 0.0))
+        self.scale = float(kept.get("scale", np.abs(self.theta).max() or 1.0))  # of the theta that the flow starts from
+        self.converged = bool(kept.get("converged", False))
         self._last = np.full_like(self.theta, np.nan), self.theta
 
     def iterate(self) -> Status:
-        best = self.best
-        value, gradient = best.value_and_gradient(self.theta)
-        if not np.isfinite(value):
-            return Status.FAILED
-        if not np.any(gradient):
-            return Status.CONVERGED
+        best, limit = self.best, self.settings.max_iterations
         if not self.stretch:
-            self.stretch = _FIRST * max(float(np.linalg.norm(self.theta)), 1e-3) / float(np.linalg.norm(gradient))
+            status = self._start()
+            if status is not None:
+                return status
         with deferred():
             node = self._flow_node()
             integrator = self._integrator(node)
-        while best.iterations < self.settings.max_iterations:
+        while best.iterations < limit and not self.converged:
             if not self._advance(integrator, node):
                 return Status.STALLED
-            before, value = value, self.objective.value(self.theta)
+            before, self.value = self.value, self.objective.value(self.theta)
             best.evaluations += 1
-            best.offer(self.theta, value)
+            if not np.isfinite(self.value):
+                return Status.STALLED
+            best.offer(self.theta, self.value)
             self.stretch *= 2
-            best.next_iteration(self.settings.max_iterations, theta=self.theta, stretch=self.stretch)
-            if before - value <= self.settings.tolerance * before and best.iterations > 5:
-                return Status.CONVERGED
-        return Status.ITERATION_LIMIT
+            self.converged = before - self.value <= self.settings.tolerance * before and best.iterations >= 5
+            best.next_iteration(limit, **self._state())
+        return Status.CONVERGED if self.converged else Status.ITERATION_LIMIT
+
+    def _state(self) -> dict[str, Array | float]:
+        """All that a run needs to go on, besides the best point."""
+        numbers = {"value": self.value, "stretch": self.stretch, "scale": self.scale, "converged": self.converged}
+        return {"theta": self.theta, **numbers}
+
+    def _start(self) -> Status | None:
+        """Choose the first stretch; a status if there is nowhere to flow."""
+        self.value, gradient = self.best.value_and_gradient(self.theta)
+        if not np.isfinite(self.value):
+            return Status.FAILED
+        if not np.any(gradient):
+            return Status.CONVERGED
+        self.stretch = _FIRST * max(float(np.linalg.norm(self.theta)), 1e-3) / float(np.linalg.norm(gradient))
+        return None
 
     def _advance(self, integrator: ca.Function, node: ArrayNode) -> bool:
         """Follow the flow for one interval, and return whether the integrator reached the end."""
@@ -132,7 +148,7 @@ class _Run:
         direct = isinstance(self.objective, LeastSquaresObjective)
         options: dict[str, Any] = {
             "reltol": self.settings.accuracy,
-            "abstol": self.settings.accuracy * 1e-2 * float(np.abs(self.theta).max() or 1.0),
+            "abstol": self.settings.accuracy * 1e-2 * self.scale,
             "newton_scheme": "direct" if direct else "gmres",
             "max_num_steps": 5000,
             "disable_internal_warnings": True,

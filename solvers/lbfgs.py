@@ -1,23 +1,30 @@
-"""Limited-memory BFGS (SciPy), for any parametrisation."""
+"""Limited-memory BFGS, for any parametrisation."""
 
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 
-import scipy.optimize
+import numpy as np
 
 from orthocas.checks import Array, require_at_least, require_count
+from orthocas.errors import CheckpointError
 from orthocas.minimising.best_point import BestPoint
 from orthocas.minimising.objective import Objective
 from orthocas.minimising.solver import SolveResult, Status
-from orthocas.minimising.watch import UNWATCHED, Watch
+from orthocas.minimising.watch import UNWATCHED, State, Watch
+from orthocas.solvers.line_search import Trial, wolfe_step
 
 
 @dataclass(frozen=True)
 class LBFGS:
-    """SciPy's L-BFGS-B without bounds. A restored run starts with an empty memory.
+    """L-BFGS ([NW2006] Alg. 7.5) with strong Wolfe steps.
+
+    A restored run has the memory of the killed one. SciPy's L-BFGS-B cannot hand its memory over.
 
     Args:
         max_iterations: largest number of iterations.
-        tolerance: stop when an iteration reduces the loss by less than this fraction.
+        tolerance: stop when an iteration reduces the loss by less than this fraction of it, or of 1 if that is more.
         memory: number of stored correction pairs.
     """
 
@@ -37,20 +44,100 @@ class LBFGS:
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
         """Minimise from theta0."""
-        best = BestPoint(objective, theta0, watch)
-        left = self.max_iterations - best.iterations
-        if left <= 0:
-            return best.result(Status.ITERATION_LIMIT)
+        run = _Run(self, objective, theta0, watch)
+        return run.best.run(run.iterate)
 
-        def count(intermediate_result: scipy.optimize.OptimizeResult) -> None:
-            best.next_iteration(self.max_iterations)
 
-        options = {"maxiter": left, "maxfun": 2 * left, "ftol": self.tolerance, "maxcor": self.memory, "gtol": 0.0}
+class _Run:
+    """State of one minimisation."""
 
-        def iterate() -> Status:
-            outcome = scipy.optimize.minimize(
-                best.value_and_gradient, best.theta, jac=True, method="L-BFGS-B", callback=count, options=options
+    def __init__(self, settings: LBFGS, objective: Objective, theta0: Array, watch: Watch) -> None:
+        self.settings = settings
+        self.best = BestPoint(objective, theta0, watch)
+        kept: State = self.best.restored or {}
+        self.theta = np.array(kept.get("theta", self.best.theta))
+        self.value = float(kept.get("value", np.nan))
+        self.gradient = np.array(kept.get("gradient", np.full_like(self.theta, np.nan)))
+        self.converged = bool(kept.get("converged", False))
+        #: changes of theta and of the gradient, (2, size) each, the newest last
+        self.pairs = deque(_restored_pairs(kept, self.theta.size), maxlen=settings.memory)
+
+    def iterate(self) -> Status:
+        best, limit = self.best, self.settings.max_iterations
+        if best.iterations == 0:
+            self.value, self.gradient = best.value_and_gradient(self.theta)
+            if not np.isfinite(self.value):
+                return Status.FAILED
+        while best.iterations < limit and not self.converged:
+            if not np.any(self.gradient):
+                return Status.CONVERGED
+            before = self.value
+            if not self._step():
+                return Status.STALLED
+            least = self.settings.tolerance * max(abs(before), abs(self.value), 1.0)
+            self.converged = before - self.value <= least
+            best.next_iteration(limit, **self._state())
+        return Status.CONVERGED if self.converged else Status.ITERATION_LIMIT
+
+    def _state(self) -> dict[str, Array | float]:
+        """All that a run needs to go on, besides the best point."""
+        pairs = {f"pair_{k}": pair for k, pair in enumerate(self.pairs)}
+        numbers = {"value": self.value, "converged": self.converged}
+        return {"theta": self.theta, "gradient": self.gradient, **numbers, **pairs}
+
+    def _step(self) -> bool:
+        """Go on along the quasi-Newton direction or, where that fails, with an empty memory; whether a step did."""
+        if self.pairs and self._search(self._direction()):
+            return True
+        self.pairs.clear()
+        return self._search(-self.gradient / np.linalg.norm(self.gradient))
+
+    def _search(self, direction: Array) -> bool:
+        """Search along a direction; whether a step was found, which is then taken and its pair stored."""
+        slope = float(direction @ self.gradient)
+        if not slope < 0:
+            return False
+        newest = self.theta, self.value, self.gradient
+
+        def along(step: float) -> tuple[float, float]:
+            nonlocal newest
+            theta = self.theta + step * direction
+            newest = theta, *self.best.value_and_gradient(theta)
+            return newest[1], float(direction @ newest[2])
+
+        if not wolfe_step(along, Trial(0.0, self.value, slope), 1.0):
+            return False
+        theta, value, gradient = newest
+        self.pairs.append(np.array([theta - self.theta, gradient - self.gradient]))
+        self.theta, self.value, self.gradient = theta, value, gradient
+        return True
+
+    def _direction(self) -> Array:
+        """-H g with the approximation H of the inverse Hessian, by the two-loop recursion."""
+        direction, factors = -self.gradient, []
+        curvatures = [step @ change for step, change in self.pairs]
+        for (step, change), curvature in zip(reversed(self.pairs), reversed(curvatures), strict=True):
+            factors.append((direction @ step) / curvature)
+            direction = direction - factors[-1] * change
+        newest = self.pairs[-1][1]
+        direction *= curvatures[-1] / (newest @ newest)
+        for (step, change), curvature, factor in zip(self.pairs, curvatures, reversed(factors), strict=True):
+            direction += (factor - (direction @ change) / curvature) * step
+        return direction
+
+
+def _restored_pairs(kept: State, size: int) -> Iterator[Array]:
+    """The correction pairs of an earlier run.
+
+    Raises:
+        CheckpointError: if they belong to another objective.
+    """
+    for name in map("pair_{}".format, count()):
+        if name not in kept:
+            return
+        pair = kept[name]
+        if pair.shape != (2, size) or not 0 < pair[0] @ pair[1] < np.inf:
+            raise CheckpointError(
+                f"{name} in the checkpoint has shape {pair.shape}, expected {(2, size)} with a positive product"
             )
-            return {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}.get(outcome.status, Status.STALLED)
-
-        return best.run(iterate)
+        yield pair

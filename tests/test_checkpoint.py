@@ -1,5 +1,6 @@
 """A killed fit goes on from its checkpoint; files of other fits, damaged or foreign ones, are refused."""
 
+import signal
 import subprocess
 import sys
 import time
@@ -14,7 +15,7 @@ from orthocas import solvers
 from orthocas.errors import CheckpointError, Interrupted
 from orthocas.fitting import checkpoint
 from orthocas.fitting.checkpoint import Checkpoint
-from orthocas.minimising.solver import Status
+from orthocas.minimising.solver import Solver, Status
 from orthocas.minimising.watch import Progress
 
 
@@ -35,30 +36,43 @@ def kill_in(stage: str, fraction: float) -> object:
     return monitor
 
 
-@pytest.mark.parametrize(
-    ("parametrisation", "solver", "stage"),
-    [
-        (oc.Polynomial(4), solvers.GaussNewton(tolerance=1e-5), "polynomial:4"),
-        (oc.Polynomial(3), solvers.Adam(epochs=6, steps=10), "polynomial:3"),
-        (oc.MLP((6, 5)), solvers.Adam(epochs=6, steps=10), "mlp:6x5"),
-    ],
-    ids=["gauss_newton", "adam", "adam on a network"],
-)
+RESUMED = [
+    (oc.Polynomial(4), solvers.GaussNewton(max_iterations=12, tolerance=0.0), "polynomial:4"),
+    (oc.Polynomial(4), solvers.GaussNewton(), "polynomial:4"),
+    (oc.Polynomial(4), solvers.GaussNewton(), "polynomial:3"),
+    (oc.Polynomial(3), solvers.Adam(epochs=6, steps=10), "polynomial:3"),
+    (oc.MLP((6, 5)), solvers.Adam(epochs=6, steps=10), "mlp:6x5"),
+    (oc.Polynomial(3), solvers.GradientFlow(max_iterations=9), "polynomial:3"),
+    (oc.MLP((6, 5)), solvers.GradientFlow(max_iterations=9), "mlp:6x5"),
+    (oc.Polynomial(3), solvers.LBFGS(max_iterations=40), "polynomial:3"),
+    (oc.MLP((6, 5)), solvers.LBFGS(max_iterations=40), "mlp:6x5"),
+]
+NAMES = [f"{solver.name} in {stage} of {parametrisation.label}" for parametrisation, solver, stage in RESUMED]
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("parametrisation", "solver", "stage"), RESUMED, ids=NAMES)
 def test_killed_fit_ends_as_the_whole_one(
-    planar_x: oc.Problem, tmp_path: Path, parametrisation: object, solver: object, stage: str
+    planar_x: oc.Problem, tmp_path: Path, parametrisation: object, solver: Solver, stage: str, seed: int
 ) -> None:
-    settings = {"solver": solver, "samples": 300, "weights": (1000.0, 30.0)}
-    whole = oc.fit(planar_x, parametrisation, **settings)
-    file = tmp_path / "run.checkpoint"
-    with pytest.raises(Killed):
-        oc.fit(planar_x, parametrisation, **settings, checkpoint=file, monitor=kill_in(stage, 0.03))
-    started: list[str] = []
-    resumed = oc.fit(
-        planar_x, parametrisation, **settings, checkpoint=file, monitor=lambda progress: started.append(progress.stage)
-    )
-    assert set(started) == {stage}  # finished stages are not run again
-    np.testing.assert_array_equal(resumed.chart.coordinates.theta, whole.chart.coordinates.theta)
-    assert [s.result.iterations for s in resumed.stages] == [s.result.iterations for s in whole.stages]
+    """Killed after a random and after the last iteration of a stage: the same stages, bit by bit; none is run twice."""
+    settings = {"solver": solver, "samples": 300, "weights": (1000.0, 30.0), "seed": seed}
+    told: list[Progress] = []
+    whole = oc.fit(planar_x, parametrisation, **settings, monitor=told.append)
+    iterations = [progress.fraction for progress in told if progress.stage == stage and progress.fraction > 0]
+    some = np.random.default_rng([seed, len(iterations)]).choice(iterations)
+    for number, fraction in enumerate((some, iterations[-1])):
+        file = tmp_path / f"{number}.checkpoint"
+        with pytest.raises(Killed):
+            oc.fit(planar_x, parametrisation, **settings, checkpoint=file, monitor=kill_in(stage, fraction))
+        told.clear()
+        resumed = oc.fit(planar_x, parametrisation, **settings, checkpoint=file, monitor=told.append)
+        assert told[0].stage == stage
+        np.testing.assert_array_equal(resumed.chart.coordinates.theta, whole.chart.coordinates.theta)
+        for found, expected in zip(resumed.stages, whole.stages, strict=True):
+            assert found.result.iterations == expected.result.iterations
+            assert found.result.evaluations == expected.result.evaluations
+            assert (found.result.value, found.result.status) == (expected.result.value, expected.result.status)
 
 
 def test_finished_fit_is_not_run_again(planar_x: oc.Problem, tmp_path: Path) -> None:
@@ -160,3 +174,46 @@ def test_killed_process_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None
     assert header["running"] == "mlp:8x8"
     assert 0 < arrays["state_iterations"] < 150
     assert python(code).split() == ["150", str(1 + 150 * 21)]  # one start, 20 steps and one judgement an epoch
+
+
+CHILD = """
+import os, signal, threading, time
+import orthocas as oc
+from orthocas import problems, solvers
+from orthocas.fitting import checkpoint
+
+def die(progress, armed=[]):
+    if progress.fraction > 0 and not armed:
+        armed.append(threading.Timer({delay}, os.kill, (os.getpid(), signal.SIGKILL)))
+        armed[0].daemon = True
+        armed[0].start()
+
+checkpoint._SECONDS = 0.0
+oc.fit(problems.get("planar_3r_x"), {fit}, samples=2000, checkpoint={file!r}, monitor=die)
+"""
+LONG = [
+    "oc.Polynomial(8), solvers.GaussNewton(max_iterations=20, tolerance=0.0)",
+    "oc.MLP((16, 16)), solvers.Adam(epochs=20, steps=20, batch=300)",
+    "oc.MLP((16, 16)), solvers.GradientFlow(max_iterations=12)",
+    "oc.MLP((16, 16)), solvers.LBFGS(max_iterations=150)",
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fit", LONG, ids=["gauss_newton", "adam", "gradient_flow", "lbfgs"])
+def test_process_killed_at_any_time_loses_nothing(planar_x: oc.Problem, tmp_path: Path, fit: str) -> None:
+    """SIGKILL a random time after the first iteration, twice, in the middle of an iteration or of a write."""
+    parametrisation, solver = eval(fit, {"oc": oc, "solvers": solvers})
+    whole = oc.fit(planar_x, parametrisation, solver, samples=2000)
+    file = tmp_path / "run.checkpoint"
+    for delay in np.random.default_rng(len(fit)).uniform(0, 0.3 * whole.seconds, 2):
+        code = CHILD.format(delay=delay, fit=fit, file=str(file))
+        ended = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+        assert ended.returncode == -signal.SIGKILL, ended.stderr
+    header, _ = checkpoint.read_archive(file, checkpoint.CHECKPOINT)
+    assert header["running"] == parametrisation.label or len(header["stages"]) > 0
+    resumed = oc.fit(planar_x, parametrisation, solver, samples=2000, checkpoint=file)
+    theta = whole.chart.coordinates.theta
+    np.testing.assert_allclose(resumed.chart.coordinates.theta, theta, rtol=0, atol=1e-10 * np.abs(theta).max())
+    assert [s.result.iterations for s in resumed.stages] == [s.result.iterations for s in whole.stages]
+    assert [s.result.evaluations for s in resumed.stages] == [s.result.evaluations for s in whole.stages]

@@ -1,6 +1,6 @@
 """The loss of families linear in theta: basis gradients are sampled once, the rest is dense products (ours)."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import copy
 from itertools import combinations
 from typing import Self
@@ -8,14 +8,16 @@ from typing import Self
 import numpy as np
 
 from orthocas.casadi_tools.columns import blocked, by_sample, shares
+from orthocas.casadi_tools.threads import in_threads
 from orthocas.checks import Array
 from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.loss import Loss, Sizes, Weights
 from orthocas.fitting.loss.residuals import curvature_columns, loss_columns, residual_columns, value_columns
+from orthocas.fitting.normal_blocks import normal_blocks
 from orthocas.parametrisations import LinearFamily
 from orthocas.samples import Draw, Samples, even_parts
 
-_CHUNK = 512  # samples per block of the Gauss-Newton matrix, so that the rows stay in the cache
+_BLOCKS = 8  # blocks of samples per thread: a fixed number, so that sums do not depend on the number of threads
 _STRIDE = 2  # every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
 
 
@@ -80,13 +82,10 @@ class BasisObjective:
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        C, value, gradient = self._by_joint(theta), 0.0, np.zeros((self.n, self.r, self.G.shape[2]))
-        on_block = loss_columns(self._loss).on_one_block()
-        for G, share, *data in zip(self.G, self._share, *self._data, strict=True):  # reads G from memory once
-            losses, slopes = on_block((C @ G).reshape(self.n * self.r, -1), *data)
-            value += float(losses[0] @ share)
-            gradient += (slopes * share).reshape(self.n, self.r, -1) @ G.transpose(0, 2, 1)
-        return value, self._collected(gradient)
+        C, on_blocks = self._by_joint(theta), loss_columns(self._loss)
+        pieces = [(on_blocks.on_one_block(), part) for part in self._parts]  # not built in threads, see ColumnFunction
+        sums = list(in_threads(lambda piece: self._sums(C, *piece), pieces))
+        return sum(value for value, _ in sums), self._collected(np.sum([gradient for _, gradient in sums], axis=0))
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """L(theta), its gradient, and the Gauss-Newton matrix, computed with products in single precision."""
@@ -103,12 +102,17 @@ class BasisObjective:
         r, n, K = self.r, self.n, self.K
         (curvature,) = curvature_columns(self._loss)(self._jacobian_entries(theta), *self._data)
         W = by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
-        G, H = self._dense, np.empty((r, K, r, K))
-        for i in range(r):
-            for j in range(i + 1):
-                raised = W[:, :, i, :, j] @ G  # (N, n, K)
-                H[i, :, j] = G.reshape(-1, K).T @ raised.reshape(-1, K) / self.N
-                H[j, :, i] = H[i, :, j].T
+        G, H = self._dense, np.zeros((r, K, r, K))
+
+        def fill(pair: tuple[int, int]) -> None:
+            i, j = pair
+            for start in range(0, self.N, _CHUNK):
+                part = slice(start, start + _CHUNK)
+                raised = W[part, :, i, :, j] @ G[part]  # (chunk, n, K)
+                H[i, :, j] += G[part].reshape(-1, K).T @ raised.reshape(-1, K) / self.N
+            H[j, :, i] = H[i, :, j].T
+
+        list(in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)]))
         return H.reshape(r * K, r * K)
 
     def reweighted(self, weights: Weights) -> Self:
@@ -152,29 +156,35 @@ class BasisObjective:
             total[:, places[known]] += slopes[:, known]
         return total.ravel()
 
+    @property
+    def _parts(self) -> list[slice]:
+        """The blocks of samples in parts."""
+        return [slice(start, start + _BLOCKS) for start in range(0, len(self.G), _BLOCKS)]
+
+    def _sums(self, C: Array, on_block: Callable[..., list[Array]], part: slice) -> tuple[float, Array]:
+        """Share of some blocks in the loss, and in its slopes with respect to the coefficients of `_by_joint`."""
+        value, gradient = 0.0, np.zeros_like(C)
+        arrays = (self.G, self._share, *self._data)
+        for G, share, *data in zip(*(array[part] for array in arrays), strict=True):  # G leaves memory only once
+            losses, slopes = on_block((C @ G).reshape(self.n * self.r, -1), *data)
+            value += float(losses[0] @ share)
+            gradient += (slopes * share).reshape(self.n, self.r, -1) @ G.transpose(0, 2, 1)
+        return value, gradient
+
     def _jacobian_entries(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
-        J = self._by_joint(theta) @ self.G
+        C = self._by_joint(theta)
+        J = np.concatenate(list(in_threads(lambda part: C @ self.G[part], self._parts)))
         return J.reshape(len(J), self.n * self.r, -1)
 
     def _gauss_newton_matrix(self, derivatives: list[Array]) -> Array:
         """Gauss-Newton matrix of the smooth residuals, by blocks of coordinate pairs, from every second sample."""
-        r, K = self.r, self.K
-        blocks = np.zeros((r, r, K, K))
-        rows = self._loss.smooth_rows
-        D = [self._rows(derivative) for derivative in derivatives]
-        used = len(self._half)
-        for start in range(0, used, _CHUNK):
-            part = slice(start, start + _CHUNK)
-            X = [D[j][part] @ self._half[part] for j in range(r)]  # d rho / d C_j, (chunk, rows, K)
-            for j in range(r):
-                flat = X[j].reshape(-1, K)
-                blocks[j, j] += flat.T @ flat
-            for i, j, row in self._loss.shared_rows:
-                blocks[i, j] += X[i][:, rows[i].index(row)].T @ X[j][:, rows[j].index(row)]
+        r, K, rows = self.r, self.K, self._loss.smooth_rows
+        shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
+        blocks = normal_blocks([self._rows(derivative) for derivative in derivatives], self._half, shared)
         for i, j in combinations(range(r), 2):
             blocks[i, j] = blocks[j, i].T
-        return blocks.transpose(0, 2, 1, 3).reshape(r * K, r * K) / used
+        return blocks.transpose(0, 2, 1, 3).reshape(r * K, r * K) / len(self._half)
 
     def _rows(self, derivative: Array) -> Array:
         """Derivatives of residuals (B, n rows, c) at every second sample, (N / 2, rows, n), in single precision."""

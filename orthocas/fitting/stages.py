@@ -1,11 +1,13 @@
 """The stages of a fit. Each is a minimisation: samples, a start, an objective, a solver."""
 
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import ceil
 
 import numpy as np
 
 from orthocas.casadi_tools.interrupts import deferred
+from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.checks import Array, require_memory
 from orthocas.domains import sample_evenly
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
@@ -106,6 +108,14 @@ class StageRunner:
         done = self.checkpoint.finished(label)
         if done is not None:
             return done
+        # networks are few large products: they need the threads of BLAS more than the last digits
+        with one_blas_thread() if isinstance(family, LinearFamily) else nullcontext():
+            return self._minimised(label, family, theta, solver, degree, final)
+
+    def _minimised(
+        self, label: str, family: Family, theta: Array | None, solver: Solver, degree: int, final: bool
+    ) -> Stage:
+        """A stage that is not in the checkpoint."""
         count = self._sample_count(family)
         self.monitor(Progress(label, 0.0, f"sampling {count} points"))
         points = sample_evenly(self.problem.domain, count, (self.settings.seed, 1 + degree))

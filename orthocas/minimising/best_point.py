@@ -55,7 +55,11 @@ class BestPoint:
         return value, gradient
 
     def next_iteration(self, limit: int, **state: Array | float) -> None:
-        """Count an iteration, report it to the monitor, and offer the state to the keeper."""
+        """Count an iteration, report it to the monitor, and offer the state to the keeper.
+
+        The state holds everything that decides how the run goes on. The solver does not change its arrays in place
+        later.
+        """
         self.iterations += 1
         self.keep(**state)
         self.watch.report(self.iterations / limit, self.value)
@@ -89,4 +93,4 @@ class BestPoint:
             "seconds": self.seconds,
             **state,
         }
-        return {name: np.array(value, dtype=float) for name, value in numbers.items()}
+        return {name: np.asarray(value, dtype=float) for name, value in numbers.items()}

@@ -44,7 +44,7 @@ class SolveResult:
         return self.raise_if_failed()
 
     def raise_if_failed(self) -> "SolveResult":
-        """Raise SolveError if no usable point was found. A point found before time or Ctrl-C is usable."""
+        """Raise SolveError if no usable point was found. A point found at the limit or at Ctrl-C is usable."""
         if self.status in (Status.FAILED, Status.INFEASIBLE):
             raise SolveError(
                 f"the minimiser ended after {self.iterations} iterations at loss {self.value:.6g}: {self.status.value}"

@@ -1,0 +1,138 @@
+"""Fits of linear families give the same numbers for any number of threads, and BLAS has its own back afterwards."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+from threading import Barrier, Thread
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info
+
+import orthocas as oc
+from orthocas import solvers
+from orthocas.casadi_tools import columns, threads
+from orthocas.casadi_tools.threads import in_threads, one_blas_thread
+from orthocas.fitting import normal_blocks
+from orthocas.minimising.solver import Solver
+
+
+def use(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    for module in (threads, columns, normal_blocks):
+        monkeypatch.setattr(module, "THREADS", count)
+
+
+def blas_threads() -> list[int]:
+    return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_results_come_in_order(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    use(monkeypatch, count)
+
+    def late(k: int) -> int:
+        time.sleep(0.01 * (k == 0))
+        return k * k
+
+    assert list(in_threads(late, range(7))) == [k * k for k in range(7)]
+    assert list(in_threads(late, [])) == []
+    with pytest.raises(ZeroDivisionError):
+        list(in_threads(lambda k: 1 // k, range(3)))
+
+
+def test_normal_blocks_are_sums_of_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against the dense sum in double precision; and 1, 2 and 5 threads agree to the last bit."""
+    rng, K = np.random.default_rng(5), 23
+    gradients = rng.normal(size=(1300, 4, K)).astype(np.float32)
+    derivatives = [rng.normal(size=(1300, 3, 4)).astype(np.float32) for _ in range(2)]
+    X = [D.astype(float) @ gradients.astype(float) for D in derivatives]
+    found = []
+    for count in (1, 2, 5):
+        use(monkeypatch, count)
+        found.append(normal_blocks.normal_blocks(derivatives, gradients, [(1, 0, 2, 1)]))
+    for j in range(2):
+        np.testing.assert_allclose(found[0][j, j], np.einsum("srk,srl->kl", X[j], X[j]), rtol=0, atol=5e-2)
+    np.testing.assert_allclose(found[0][1, 0], X[1][:, 2].T @ X[0][:, 1], rtol=0, atol=5e-2)  # of sums near 1e4
+    assert not found[0][0, 1].any()
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [solvers.GaussNewton(), solvers.LBFGS(max_iterations=20), solvers.Adam(epochs=2), solvers.GradientFlow(8)],
+    ids=lambda solver: solver.name,
+)
+def test_threads_do_not_change_a_fit(planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch, solver: Solver) -> None:
+    found = []
+    for count in (1, 2, 5):
+        use(monkeypatch, count)
+        fit = oc.fit(planar_x, oc.Polynomial(3), solver, samples=3000, weights=(1000, 30, 150, 0.1))
+        found.append(fit.chart.coordinates.theta)
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+
+
+def test_threads_do_not_change_a_bounded_fit(planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for count in (1, 3):
+        use(monkeypatch, count)
+        fit = oc.fit(planar_x, oc.Polynomial(2), samples=1500, max_mutual_deg=3.0)
+        found.append(fit.chart.coordinates.theta)
+    np.testing.assert_array_equal(found[1], found[0])
+
+
+def test_blas_has_its_threads_back() -> None:
+    """Two blocks that overlap in two threads: one thread until the end of the second, whichever began first."""
+    before, gate, seen = blas_threads(), Barrier(2), []
+
+    def first() -> None:
+        with one_blas_thread():
+            gate.wait(60)  # the second has begun
+
+    other = Thread(target=first)
+    other.start()
+    with one_blas_thread():
+        gate.wait(60)
+        other.join()
+        seen = blas_threads()
+    assert seen == [1] * len(before)
+    assert blas_threads() == before
+    with pytest.raises(KeyError), one_blas_thread():
+        raise KeyError
+    assert blas_threads() == before
+
+
+CODE = """
+import os, sys
+os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = sys.argv[1]
+import numpy as np
+import orthocas as oc
+from orthocas import problems, solvers
+from orthocas.casadi_tools.batch import THREADS
+from threadpoolctl import threadpool_info
+
+assert THREADS == int(sys.argv[1])
+assert {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"} == {THREADS}
+iiwa = problems.get("iiwa")
+fits = [
+    oc.fit(iiwa, oc.Polynomial(4)),
+    oc.fit(iiwa, oc.Polynomial(3), solvers.GaussNewton(max_iterations=8), weights=(1000, 30, 150, 0.1)),
+    oc.fit(iiwa, oc.Polynomial(3), solvers.LBFGS(max_iterations=30)),
+    oc.fit(iiwa, oc.Polynomial(2), solvers.GradientFlow(max_iterations=6)),
+    oc.fit(iiwa, oc.Polynomial(2), solvers.Adam(epochs=3)),
+]
+np.savez(sys.argv[2], *(fit.chart.coordinates.theta for fit in fits))
+"""
+
+
+@pytest.mark.slow
+def test_processes_with_one_and_two_threads_find_the_same(tmp_path: Path) -> None:
+    """Whole processes, BLAS and all, to 1e-12: rounding in single precision would show at 1e-5."""
+    for count in ("1", "2"):
+        subprocess.run([sys.executable, "-c", CODE, count, str(tmp_path / f"{count}.npz")], check=True)
+    with np.load(tmp_path / "1.npz") as one, np.load(tmp_path / "2.npz") as two:
+        assert len(one.files) == 5
+        for name in one.files:
+            np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-12 * np.abs(one[name]).max())
