@@ -23,8 +23,9 @@ class GradientFlow:
     """Follows the path of steepest descent: slow, but with the same limit as gradient descent with tiny steps.
 
     Time is divided into intervals, each twice as long as the previous one. The integrator starts anew in each of them,
-    so that a restored run takes the same steps. The flow is stiff, so CVODES takes implicit BDF steps. Their Jacobian is
-    the Gauss-Newton matrix if the objective has one; otherwise a Krylov method uses finite differences of the gradient.
+    so that a restored run takes the same steps. The flow is stiff, so CVODES takes implicit BDF steps. Their Jacobian
+    is the Gauss-Newton matrix if the objective has one; otherwise a Krylov method uses finite differences of the
+    gradient.
 
     Args:
         max_iterations: largest number of intervals.

@@ -17,6 +17,7 @@ from orthocas.fitting.normal_blocks import normal_blocks
 from orthocas.parametrisations import LinearFamily
 from orthocas.samples import Draw, Samples, even_parts
 
+_CHUNK = 512  # samples per product of the Hessian, so that the rows stay in the cache
 _BLOCKS = 8  # blocks of samples per thread: a fixed number, so that sums do not depend on the number of threads
 _STRIDE = 2  # every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
 
