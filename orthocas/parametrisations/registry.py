@@ -107,7 +107,8 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
     """
     require_kind("data of a parametrisation", data, Mapping)
     kinds = {known.kind.__name__: known.kind for known in _REGISTERED.values()}
-    name, settings = data.get("parametrisation", ""), data.get("settings")
+    name: str = data.get("parametrisation", "")
+    settings: Any = data.get("settings")
     require_known("parametrisation", name, kinds)
     kind = kinds[name]
     require_kind("settings", settings, dict)
