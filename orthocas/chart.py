@@ -10,14 +10,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.casadi_tools.batch import evaluate_columns
 from orthocas.casadi_tools.cached import cached_property
-from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.checks import Array, as_path, as_point_set, require_at_least, require_kind, require_known, require_shape
 from orthocas.coordinates.fitted import Coordinates
+from orthocas.coordinates.inverse import NewtonInverse, error_scale, require_solved
 from orthocas.coordinates.map import CoordinateMap, InvertibleMap
-from orthocas.errors import InvalidValueError, InverseError, ShapeError
+from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.files.chart_file import read_chart, write_chart
 from orthocas.growing import GrownCoordinates
 from orthocas.problem import Problem, task_jacobians, task_sizes
@@ -25,8 +24,6 @@ from orthocas.showing import Shown, listed
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
-_ROUNDING = 1e-5  # of phi: 1e-9 of it are 45 units in the last place
-_SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -178,7 +175,7 @@ class Chart(Shown):
         if isinstance(self.coordinates, InvertibleMap):
             solutions = self.coordinates.inverse(targets, starts)
         else:
-            solutions = np.array([self._solve(x0, p) for x0, p in zip(starts, targets, strict=True)])
+            solutions = self._newton.solve(targets, starts)
         solutions = solutions.reshape(-1, self.n)
         self._require_solved(solutions, targets, tolerance)
         return solutions[0] if single else solutions
@@ -246,42 +243,19 @@ class Chart(Shown):
         return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
 
     @cached_property
-    def _rootfinder(self) -> ca.Function:
-        q, target = ca.MX.sym("q", self.n), ca.MX.sym("phi", self.n)
-        residual = (self._functions["phi"](q) - target) / (self.phi_sizes + _ROUNDING * ca.fabs(target))
-        options: dict[str, Any] = {"error_on_fail": False, "abstol": 1e-12, "max_iter": 100, "line_search": True}
-        equations: dict[str, Any] = {"x": q, "p": target, "g": residual}
-        return ca.rootfinder("inverse", "newton", equations, options)
-
-    def _solve(self, q_start: Array, phi: Array) -> Array:
-        """One solution, with its own scratch memory: threads that share the memory of a rootfinder crash."""
-        with deferred():  # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
-            try:
-                solution: Array = evaluate_columns(self._rootfinder, 1, q_start[None], phi[None])[0][0]
-                return solution
-            except RuntimeError:  # a singular linear system on the way
-                return np.full(self.n, np.nan)
+    def _newton(self) -> NewtonInverse:
+        return NewtonInverse(self._functions["phi"], self.phi_sizes)
 
     def _require_solved(self, solutions: Array, targets: Array, tolerance: float) -> None:
+        """Check solutions of the inverse map by evaluating them."""
         finite = np.asarray(np.isfinite(solutions).all(axis=1))
         safe = np.where(finite[:, None], solutions, self.problem.domain.centre)
         difference = self.phi(safe) - targets
         if isinstance(self.coordinates, InvertibleMap) and self.coordinates.turn:
             turn = self.coordinates.turn
             difference[:, self.m :] -= turn * np.round(difference[:, self.m :] / turn)
-        scale = self.phi_sizes + _ROUNDING * np.abs(targets)
-        error = np.where(finite, np.abs(difference / scale).max(axis=1), np.inf)
-        bad = np.flatnonzero(~(error <= tolerance))
-        if bad.size:
-            rows = f"rows {bad[:5].tolist()}" if len(targets) > 1 else "phi"
-            raise InverseError(
-                f"no q with phi(q) = phi found near q_start for {rows}: relative error is {error[bad].max():.3g}, "
-                f"expected <= {tolerance:.1g}. The target may be out of reach, or the path to it singular"
-            )
-        values = np.linalg.svd(self.jacobian(safe) / self.phi_sizes[:, None], compute_uv=False)
-        singular = np.flatnonzero(values[:, -1] < _SINGULAR * values[:, 0])
-        if singular.size:
-            raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}: q is not unique there")
+        relative = np.abs(difference / error_scale(targets, self.phi_sizes)).max(axis=1)
+        require_solved(np.where(finite, relative, np.inf), self.jacobian(safe), self.phi_sizes, tolerance)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
