@@ -11,6 +11,7 @@ import numpy as np
 from orthocas.errors import InvalidValueError
 
 T = TypeVar("T")
+_KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "text"}
 
 
 def plain(value: Any) -> Any:
@@ -55,7 +56,7 @@ def part(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
     Raises:
         InvalidValueError: if it is missing, or of another kind.
     """
-    want = {dict: "an object", list: "a list", str: "text"}.get(kind, "an array")
+    want = _KINDS.get(kind, "an array")
     if name not in data:
         raise InvalidValueError(f"field '{name}'", "missing", want)
     value = data[name]
