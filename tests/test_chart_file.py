@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import os
+import tracemalloc
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.errors import ChartFileError, InvalidValueError, NotSavableWarning, OrthocasError
-from orthocas.files import archive
+from orthocas.files import archive, npy
 from orthocas.fitting.fit import Fit
 
 
@@ -264,15 +265,18 @@ def test_edited_header_and_array_are_noticed(saved: Path) -> None:
     [
         ({"version": 99}, "version 99, this orthocas reads up to 1"),
         ({"format": "other"}, "has format 'other'"),
-        ({"robot": {}}, "incomplete"),
+        ({"robot": {}}, "inconsistent: field 'joint_names' is missing, expected a list"),
         ({"coordinates": {"parametrisation": "Spline"}}, "inconsistent: unknown parametrisation"),
         ({"coordinates": polynomial(9)}, "inconsistent: theta has shape"),
         ({"coordinates": polynomial(4, idle=[0.0])}, "idle joint is 0.0"),
         ({"coordinates": {"parametrisation": 3}}, "inconsistent: unknown parametrisation '3'"),
-        ({"robot": [1]}, "incomplete"),
+        ({"robot": [1]}, r"inconsistent: field 'robot' is \[1\], expected an object"),
         ({"version": 0}, "version 0, expected 1"),
         ({"version": 1e999}, "not an orthocas chart"),
-        ({"problem": {"name": "x", "task": {"kind": 3}, "metric": {}, "domain": "box"}}, "incomplete"),
+        (
+            {"problem": {"name": "x", "task": {"kind": 3}, "metric": {}, "domain": "box"}},
+            "field 'kind' is 3, expected text",
+        ),
         ({"problem": {"name": "x", "task": {}, "metric": {}, "domain": "sphere"}}, "unknown domain 'sphere'"),
         ({"coordinates": polynomial(4, idle=[77])}, "expected different indices below 3"),
         (
@@ -330,3 +334,137 @@ def test_bad_output_places_are_refused(planar_fit: Fit, tmp_path: Path) -> None:
         planar_fit.chart.save(tmp_path)
     with pytest.raises(ChartFileError, match="cannot write /proc/chart"):  # a folder where even root cannot write
         planar_fit.chart.save("/proc/chart")
+
+
+def resealed(path: Path, header: dict[str, object] | None = None, **arrays: object) -> Path:
+    """Another header, or other arrays, with checksums that match."""
+    contents = {
+        f"{name}.npy": value if isinstance(value, bytes) else npy.to_npy(value) for name, value in arrays.items()
+    }  # type: ignore[arg-type]
+    header = header or header_of(path)
+    sums = {**header["sha256"], **{name: archive._digest(text) for name, text in contents.items()}}  # type: ignore[dict-item]
+    return rewritten(path, {"header.json": json.dumps({**header, "sha256": sums}).encode(), **contents})
+
+
+def test_a_huge_degree_is_compared_with_the_parameters_before_a_basis_is_built(saved: Path) -> None:
+    header = header_of(saved) | {"coordinates": polynomial(10**9)}
+    with pytest.raises(ChartFileError, match="theta has shape"):  # building it would take gigabytes and hours
+        oc.load(resealed(saved, header))
+
+
+def test_entries_that_the_header_does_not_list_are_left_alone(saved: Path, planar_fit: Fit) -> None:
+    with zipfile.ZipFile(saved, "a", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("unlisted.npy", bytes(2**26))
+    tracemalloc.start()
+    chart = oc.load(saved)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**24
+    np.testing.assert_array_equal(chart.phi([0.6, 0.8, 0.8]), planar_fit.chart.phi([0.6, 0.8, 0.8]))
+
+
+def test_a_listed_entry_that_unpacks_to_far_more_than_the_file_is_refused(saved: Path) -> None:
+    resealed(saved, theta=np.zeros(2**22))
+    with zipfile.ZipFile(saved) as source:
+        entries = {name: source.read(name) for name in source.namelist()}
+    with zipfile.ZipFile(saved, "w", zipfile.ZIP_DEFLATED) as target:
+        for name, content in entries.items():
+            target.writestr(name, content)
+    with pytest.raises(ChartFileError, match="unpacks to 32 MiB, expected at most 8 MiB"):
+        oc.load(saved)
+
+
+def test_charts_stored_without_compression_are_read(saved: Path, planar_fit: Fit) -> None:
+    rewritten(saved, {})  # zipfile stores by default
+    np.testing.assert_array_equal(oc.load(saved).phi([0.6, 0.8, 0.8]), planar_fit.chart.phi([0.6, 0.8, 0.8]))
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_unusual_packings_and_entries_that_come_twice_are_refused(saved: Path, method: int) -> None:
+    with zipfile.ZipFile(saved) as source:
+        entries = {name: source.read(name) for name in source.namelist()}
+    with zipfile.ZipFile(saved, "w", method) as target:
+        for name, content in entries.items():
+            target.writestr(name, content)
+    with pytest.raises(ChartFileError, match="packed otherwise than stored or deflated"):
+        oc.load(saved)
+    with zipfile.ZipFile(saved, "a") as target, pytest.warns(UserWarning, match="Duplicate name"):
+        target.writestr("theta.npy", b"")
+    with pytest.raises(ChartFileError, match="entries, .* of them different"):
+        oc.load(saved)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('"notes": {"a": NaN', "it holds NaN, expected finite numbers"),
+        ('"notes": {"a": 1e999', "it holds 1e999, expected finite numbers"),
+        ('"notes": {"a": 1, "a": 2', "the key 'a' appears twice in one object"),
+        ('"notes": {"a": "\\ud800"', "it holds half a surrogate pair"),
+        ('"notes": {"a": [1]', r"note 'a' is \[1\], expected text or a number"),
+        ('"notes": {"\\u202e": 1', "name of a note is '.u202e', expected printable text"),
+    ],
+)
+def test_notes_hold_texts_and_finite_numbers(saved: Path, text: str, message: str) -> None:
+    header = json.dumps(header_of(saved) | {"notes": {}}).replace('"notes": {', text)
+    with pytest.raises(ChartFileError, match=message):
+        oc.load(rewritten(saved, {"header.json": header.encode()}))
+
+
+def test_notes_that_could_not_be_read_back_are_not_written(planar_fit: Fit, tmp_path: Path) -> None:
+    chart = dataclasses.replace(planar_fit.chart, notes={"loss": float("nan")})
+    with pytest.raises(InvalidValueError, match="note 'loss' is nan, expected a finite number"):
+        chart.save(tmp_path / "chart")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"robot_masses": [1.0, -1.0, 1.0]}, "has mass -1 kg, expected >= 0"),
+        ({"robot_armatures": [0.0, 0.0, -1.0]}, "joint 'q3' has armature -1, expected >= 0"),
+        ({"robot_inertias": -np.stack([np.eye(3)] * 3)}, "principal moment of inertia -1 kg m.2, expected >= 0"),
+        ({"robot_inertias": np.stack([np.triu(np.ones((3, 3)))] * 3)}, "inertia matrix that is not symmetric"),
+        ({"robot_rotations": np.zeros((3, 3, 3))}, r"rotations\[0\] is .*, expected a rotation matrix"),
+        ({"robot_rotations": -np.stack([np.eye(3)] * 3)}, r"rotations\[0\] is .*, expected a rotation matrix"),
+        ({"robot_translations": np.full((3, 3), 1e300)}, r"largest entry of translations is 1e\+300"),
+        ({"robot_lower": [np.inf] * 3, "robot_upper": [np.inf] * 3}, r"limits \[inf, inf\]"),
+        ({"theta": np.zeros(34, dtype=complex) * 2}, "holds an array that cannot be read: theta.npy"),
+        ({"theta": npy.to_npy(np.zeros(3))[:-1]}, "23 bytes for the shape"),
+        ({"scale": np.full(2, 1e308), "offset": np.full(2, -1e308)}, "xi is not finite at any of 8 points"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_numbers_that_no_chart_has_are_refused(saved: Path, arrays: dict[str, object], message: str) -> None:
+    with pytest.raises(ChartFileError, match=message):
+        oc.load(resealed(saved, **{k: v if isinstance(v, bytes) else np.array(v) for k, v in arrays.items()}))
+
+
+def test_tapes_of_given_coordinates_are_checked(planar_x: oc.Problem, tmp_path: Path) -> None:
+    given = oc.Given.from_function("hand", 3, lambda q: ca.vertcat(q[1], ca.sin(q[2])))
+    path = tmp_path / "chart"
+    for step, change in (("const", ["const", 0, 1e301]), ("input", ["input", 0, 3]), ("sin", ["sin", 0, 99])):
+        oc.fit(planar_x, given).chart.save(path)
+        header = header_of(path)
+        header["coordinates"]["settings"]["tape"]["steps"][0] = change  # type: ignore[index]
+        with pytest.raises(ChartFileError, match=rf"step 0 of a tape is \['{step}', .*, expected a known operation"):
+            oc.load(resealed(path, header))
+
+
+def test_tasks_that_are_nowhere_finite_are_refused(tmp_path: Path) -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    path = tmp_path / "chart"
+    oc.fit(oc.Problem(robot, oc.Task.custom(robot, "t", lambda q: q[0] - 99 + q[1])), oc.Polynomial(1)).chart.save(path)
+    header = header_of(path)
+    steps = header["problem"]["task"]["tape"]["steps"]  # type: ignore[index]
+    steps.insert(-1, ["log", steps[-1][2], steps[-1][2]])
+    with pytest.raises(ChartFileError, match="the task is not finite at any of 8 points"):
+        oc.load(resealed(path, header))
+
+
+def test_robot_functions_are_built_when_they_are_used() -> None:
+    robot = oc.Robot.planar([1.0] * 100, [1.0] * 100)
+    assert robot.tip_position(np.zeros(100))[0] == pytest.approx(100)
+    assert list(robot._functions._values) == ["tip_position"]
+    with pytest.raises(OrthocasError, match="200 movable joints, expected at most 150"):
+        oc.Robot.planar([1.0] * 200, [1.0] * 200)

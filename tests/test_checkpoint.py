@@ -144,6 +144,39 @@ def test_bad_files_are_refused(planar_x: oc.Problem, planar_fit: object, tmp_pat
             oc.fit(planar_x, oc.Polynomial(2), samples=100, checkpoint=file)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("theta", np.zeros(3), "theta has shape .*, expected .* with finite entries"),
+        ("best_theta", np.full(18, np.inf), "best_theta has shape .*, expected .* with finite entries"),
+        ("iterations", np.array(-1.0), r"iterations is \[-1.0\], expected one number >= 0"),
+        ("seconds", np.zeros(2), r"seconds is \[0.0, 0.0\], expected one number"),
+        ("best_value", np.array(np.nan), "state_best_value is NaN"),
+        ("best_theta", np.array(["a"]), "state_best_theta is .*, expected an array of numbers"),
+    ],
+)
+def test_states_that_do_not_fit_are_refused_with_file_and_field(
+    planar_x: oc.Problem, tmp_path: Path, field: str, value: np.ndarray, message: str
+) -> None:
+    file, settings = tmp_path / "run", {"solver": solvers.Adam(epochs=4, steps=2), "samples": 60}
+    with pytest.raises(Killed):
+        oc.fit(planar_x, oc.MLP((2,)), **settings, checkpoint=file, monitor=kill_in("mlp:2", 0.3))
+    header, arrays = checkpoint.read_archive(file, checkpoint.CHECKPOINT)
+    checkpoint.write_archive(file, checkpoint.CHECKPOINT, header, {**arrays, f"state_{field}": value})
+    with pytest.raises(CheckpointError, match=f"{file} is inconsistent: {message}"):
+        oc.fit(planar_x, oc.MLP((2,)), **settings, checkpoint=file)
+
+
+def test_stages_of_another_size_are_refused(planar_x: oc.Problem, tmp_path: Path) -> None:
+    file = tmp_path / "run"
+    oc.fit(planar_x, oc.Polynomial(1), samples=60, checkpoint=file)
+    header, arrays = checkpoint.read_archive(file, checkpoint.CHECKPOINT)
+    header["stages"][0]["parameters"] = 7
+    checkpoint.write_archive(file, checkpoint.CHECKPOINT, header, {**arrays, "stage_0": np.ones(7)})
+    with pytest.raises(CheckpointError, match="stage 'polynomial:1' has 7 parameters, expected 6"):
+        oc.fit(planar_x, oc.Polynomial(1), samples=60, checkpoint=file)
+
+
 def test_without_a_path_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     keeper = Checkpoint(None, {}).keeper("stage")

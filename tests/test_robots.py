@@ -10,7 +10,7 @@ import pytest
 from conftest import ROBOTS, arm, pinocchio_position, robot_data
 
 import orthocas as oc
-from orthocas.errors import InvalidValueError, RobotError, ShapeError, UnknownNameError
+from orthocas.errors import InvalidValueError, OrthocasError, RobotError, ShapeError, UnknownNameError
 from orthocas.problems.iiwa import robot as iiwa_robot
 from orthocas.robots import files
 from orthocas.robots.planar import planar_model
@@ -498,3 +498,28 @@ def test_homes_come_from_the_keyframes_of_an_mjcf_file(tmp_path: Path) -> None:
     robot = oc.Robot.from_mjcf(path, "hand", {"root": 0.0})
     assert list(robot.homes) == ["ready"]
     np.testing.assert_allclose(robot.home("ready"), [0.5, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joint_names": ("a", "b", 3)}, r"joint_names\[2\] is 3, expected printable text"),
+        ({"joint_names": ("a", "b", "a")}, "two joints are called 'a'"),
+        ({"joint_names": ("a", "b", "c\x1b[2J")}, r"joint_names\[2\] is .*, expected printable text"),
+        ({"parents": (-1, 0, 1.0)}, r"parents\[2\] is 1.0, expected an index from -1 to 1"),
+        ({"parents": (-1, 0, True)}, r"parents\[2\] is True, expected an index"),
+        ({"joint_kinds": ("revolute", "revolute", [])}, "unknown joint kind"),
+        ({"lower": np.array([1j, 0, 0])}, "lower is .*, expected an array of numbers"),
+    ],
+)
+def test_names_and_numbers_that_no_robot_has_are_refused(change: dict[str, object], message: str) -> None:
+    tree = oc.Robot.planar([1.0] * 3, [1.0] * 3).tree
+    with pytest.raises(OrthocasError, match=message):
+        dataclasses.replace(tree, **change)
+
+
+def test_slightly_indefinite_inertias_of_published_robots_are_accepted() -> None:
+    """The hip of romeo_laas_small has -7 % of its largest entry, and a positive definite mass matrix."""
+    robot = oc.Robot.from_urdf(robot_data("romeo_description/urdf/romeo_laas_small.urdf"), "RKneePitch_link")
+    assert np.linalg.eigvalsh(robot.tree.inertias)[:, 0].min() < -1e-3
+    assert np.linalg.eigvalsh(robot.mass_matrix(np.zeros(robot.n)))[0] > 0

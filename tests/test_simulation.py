@@ -1,5 +1,6 @@
 """Closed loops: against an independent integrator on Pinocchio's dynamics, energy books, and sampled control."""
 
+import json
 import zipfile
 from contextlib import suppress
 from dataclasses import replace
@@ -8,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+import public_objects
 import pytest
 from charts import with_metric
 from scipy.integrate import solve_ivp
@@ -401,10 +403,50 @@ def test_encrypted_and_garbled_arrays_are_damage(tmp_path: Path) -> None:
     file.write_bytes(whole[:flags] + b"\x01" + whole[flags + 1 :])
     with pytest.raises(TrajectoryFileError, match="not a trajectory file"):
         Trajectory.load(file)
+    public_objects.trajectory().save(file)
+    with np.load(file) as arrays:
+        names = arrays.files
     with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("header.npy", np.lib.format.magic(1, 0) + b"\x0b\x00{'descr': (")
-    with pytest.raises(TrajectoryFileError, match="not a trajectory file"):
+        for name in names:
+            archive.writestr(f"{name}.npy", np.lib.format.magic(1, 0) + b"\x0b\x00{'descr': (")
+    with pytest.raises(TrajectoryFileError, match="an array or a header that cannot be read"):
         Trajectory.load(file)
+
+
+def resealed(run: Trajectory, path: Path, header: dict[str, Any], **arrays: Any) -> Path:
+    """The file of a run with another header, or other arrays."""
+    run.save(path)
+    with np.load(path) as file:
+        known = {name: file[name] for name in file.files}
+    text = json.dumps(json.loads(str(known.pop("header"))) | header)
+    np.savez(path, header=text, **known | arrays)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("header", "arrays", "message"),
+    [
+        ({"labels": "xyz"}, {}, "field 'labels' is 'xyz', expected a list"),
+        ({"labels": []}, {}, "labels is empty, expected at least one name"),
+        ({"joint_names": [1, 2, 3]}, {}, r"joint_names\[0\] is 1, expected printable text"),
+        ({"kind": "force"}, {}, "unknown kind of command 'force'"),
+        ({"outcome": []}, {}, r"field 'outcome' is \[\], expected text"),
+        ({"controller": "a\u202eb"}, {}, "controller is 'a.u202eb', expected printable text"),
+        ({"version": 2}, {}, "has version 2, this orthocas reads 1"),
+        ({}, {"dq": np.zeros((2, 2))}, r"dq has shape \(2, 2\)"),
+        ({}, {"storage": np.zeros(0)}, r"storage has shape \(0,\)"),
+        ({}, {"status": np.full(51, 9)}, "status is 9, expected whole numbers from 0 to 3"),
+        ({}, {"times": np.zeros(51)}, "times is empty or not increasing"),
+        ({}, {"q": np.zeros((51, 3), dtype=complex)}, "holds an array or a header that cannot be read: no array"),
+    ],
+)
+def test_inconsistent_trajectory_files_are_refused_with_the_field(
+    tmp_path: Path, header: dict[str, Any], arrays: dict[str, Any], message: str
+) -> None:
+    run = public_objects.trajectory()
+    assert len(run.times) == 51
+    with pytest.raises(TrajectoryFileError, match=message):
+        Trajectory.load(resealed(run, tmp_path / "run.npz", header, **arrays))
 
 
 @pytest.mark.parametrize(

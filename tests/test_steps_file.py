@@ -158,6 +158,14 @@ def test_a_mistake_is_named_with_file_and_place(chart: oc.Chart, tmp_path: Path,
     assert len(str(caught.value)) < len(str(path)) + 300
 
 
+def test_runs_of_more_instants_than_a_machine_holds_are_refused(chart: oc.Chart, tmp_path: Path) -> None:
+    content = changed(STEPS, duration=1e6, natural_frequency=1e6)
+    with pytest.raises(StepsFileError, match=r"needs 3.33e\+12 instants .*, expected at most 1e"):
+        read_steps(written(tmp_path, content), chart)
+    with pytest.raises(StepsFileError, match="larger than 8 MiB"):
+        read_steps(written(tmp_path, " " * 2**24), chart)
+
+
 def test_what_cannot_be_read_is_a_steps_file_error(chart: oc.Chart, tmp_path: Path) -> None:
     with pytest.raises(StepsFileError, match="cannot be read, No such file"):
         read_steps(tmp_path / "none.json", chart)

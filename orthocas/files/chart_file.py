@@ -142,7 +142,7 @@ def _idle(joints: list[int], n: int) -> tuple[int, ...]:
     """The idle joints, checked against the number of joints."""
     idle = tuple(require_count("idle joint", k, least=0) for k in joints)
     if len(set(idle)) != len(idle) or any(k >= n for k in idle):
-        raise InvalidValueError("idle joints", str(idle)[:80], f"different numbers from 0 to {n - 1}")
+        raise InvalidValueError("idle joints", str(idle)[:80], f"different indices below {n}")
     return idle
 
 

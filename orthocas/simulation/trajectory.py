@@ -1,10 +1,11 @@
 """The result of a simulation: arrays over time with names and units, stored in NPZ files."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from scipy.integrate import cumulative_simpson
@@ -13,6 +14,7 @@ from orthocas.checks import Array, as_float_array, as_path, frozen_indices, requ
 from orthocas.control.status import ControlStatus
 from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
 from orthocas.files.atomic import published, require_writable
+from orthocas.files.json import part
 from orthocas.files.ours import is_numpy_archive, require_replaceable
 from orthocas.showing import Shown, listed, number_list
 from orthocas.simulation.run_file import read_run_file
@@ -66,23 +68,6 @@ class Trajectory(Shown):
     reference_acceleration: Array  #: (N, k)
     storage: Array  #: (N,) V [J]; NaN for velocity controllers
     dissipated_power: Array  #: (N,) dissipated by the controller's damping [W]; NaN for velocity controllers
-
-    def __post_init__(self) -> None:
-        require_known("kind of command", self.kind, ("torque", "velocity"))
-        for what, names in (("labels", self.labels), ("joint_names", self.joint_names)):
-            for name in names:
-                require_text(f"an entry of {what}", name)
-            if len(set(names)) < len(names) or not names:
-                raise InvalidValueError(what, names, "different names, at least one")
-        N, n, k = len(self.times), len(self.joint_names), len(self.labels)
-        for name in _ARRAYS:
-            array = as_float_array(name, getattr(self, name))
-            object.__setattr__(self, name, array)
-            width = n if name in _OF_JOINTS else k
-            require_shape(name, array.shape, (N,) if name in _SINGLE else (N, width))
-        object.__setattr__(self, "status", frozen_indices("status", self.status, (N,), len(ControlStatus)))
-        if N == 0 or not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
-            raise InvalidValueError("times", "empty or not increasing", "increasing instants, at least one")
 
     @property
     def energy_balance(self) -> Array:
@@ -152,18 +137,38 @@ class Trajectory(Shown):
         path = as_path("path", path)
         header, arrays = read_run_file(path, _VERSION, tuple(_ARRAYS))
         try:
-            return cls(
-                controller=require_text("controller", header["controller"]),
-                kind=header["kind"],
-                outcome=Outcome(header["outcome"]),
-                labels=tuple(header["labels"]),
-                joint_names=tuple(header["joint_names"]),
-                **arrays,
-            )
+            names = {name: tuple(part(header, name, list)) for name in ("labels", "joint_names")}
+            _require_names(names)
+            require_known("kind of command", part(header, "kind", str), ("torque", "velocity"))
+            require_known("outcome", part(header, "outcome", str), [outcome.value for outcome in Outcome])
+            controller = require_text("controller", part(header, "controller", str))
+            arrays = _checked_arrays(arrays, len(names["joint_names"]), len(names["labels"]))
+            return cls(controller, header["kind"], Outcome(header["outcome"]), **names, **arrays)
         except OrthocasError as error:
             raise TrajectoryFileError(f"{path} is inconsistent: {error}") from None
-        except (LookupError, TypeError, ValueError) as error:
-            raise TrajectoryFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
+
+
+def _require_names(names: Mapping[str, tuple[str, ...]]) -> None:
+    """Raise InvalidValueError unless there are names, all of them printable."""
+    for what, texts in names.items():
+        for k, text in enumerate(texts):
+            require_text(f"{what}[{k}]", text)
+        if not texts:
+            raise InvalidValueError(what, "empty", "at least one name")
+
+
+def _checked_arrays(arrays: Mapping[str, Any], n: int, k: int) -> dict[str, Any]:
+    """The arrays of a run of n joints and k quantities, with shapes that fit and instants that increase."""
+    N = arrays["times"].size
+    checked: dict[str, Any] = {}
+    for name, array in arrays.items():
+        checked[name] = as_float_array(name, array)
+        width = () if name in _SINGLE else (n,) if name in _OF_JOINTS else (k,)
+        require_shape(name, checked[name].shape, (N, *width))
+    checked["status"] = frozen_indices("status", checked["status"], (N,), len(ControlStatus))
+    if N == 0 or not np.isfinite(checked["times"]).all() or (np.diff(checked["times"]) <= 0).any():
+        raise InvalidValueError("times", "empty or not increasing", "increasing instants, at least one")
+    return checked
 
 
 assert set(_ARRAYS) < {field.name for field in fields(Trajectory)}

@@ -1,0 +1,27 @@
+"""A quick part of the campaigns of files: hundreds of mutants a kind. `make fuzz` runs as many as you like."""
+
+import pytest
+from fuzz.charts import charts
+from fuzz.checkpoints import checkpoints
+from fuzz.runs import runs
+from fuzz.steps import steps
+
+
+@pytest.mark.slow
+def test_mutated_charts_are_usable_or_refused_in_one_line() -> None:
+    assert charts(60) == []
+
+
+@pytest.mark.slow
+def test_mutated_checkpoints_are_resumed_or_refused_in_one_line() -> None:
+    assert checkpoints(60) == []
+
+
+@pytest.mark.slow
+def test_mutated_runs_are_usable_or_refused_in_one_line() -> None:
+    assert runs(100) == []
+
+
+@pytest.mark.slow
+def test_mutated_steps_files_are_references_or_refused_in_one_line() -> None:
+    assert steps(100) == []
