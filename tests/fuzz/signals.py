@@ -32,6 +32,7 @@ KILLS = 5  #: of one round
 _ROOT = Path(__file__).parent.parent.parent
 _SECONDS = 300.0  # for one round, on a busy machine
 _PATIENCE = 20.0  # seconds from a signal to the end of the process
+_LATE = 1.0  # seconds that a run may go on after a signal and end well
 _AFTERWARDS = 5.0  # seconds until the last process of a command has gone
 _SIGNALS = (signal.SIGINT, signal.SIGINT, signal.SIGINT, signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 _LOOP = """
@@ -118,7 +119,7 @@ def _complaint(code: int, number: int, late: float, err: str) -> str | None:
         return f"exit code {code}, expected one of {codes}: {err[-300:]}"
     if "Traceback" in err or "Exception ignored" in err or "Error" in err:
         return f"a traceback: {err[-600:]}"
-    return f"the signal was lost: the run went on for {late:.1f} s" if code == 0 and late > _AFTERWARDS else None
+    return f"the signal was lost: the run went on for {late:.1f} s" if code == 0 and late > _LATE else None
 
 
 def _difference(found: dict[str, Any], wanted: dict[str, Any]) -> str | None:
@@ -208,7 +209,7 @@ def _processes(session: int) -> list[str]:
 
 def numbers(folder: Path, out: str) -> dict[str, Any]:
     """All that a run says and writes as numbers, apart from times."""
-    found: dict[str, Any] = {path.name: json.loads(path.read_text()) for path in sorted(folder.glob("out/*.json"))}
+    found: dict[str, Any] = {path.name: json.loads(path.read_text()) for path in sorted(folder.glob("out/[!.]*.json"))}
     for path in sorted(folder.glob("out/*.csv")):
         found[path.name] = list(csv.DictReader(io.StringIO(path.read_text())))
     for path in sorted(folder.glob("out/*.[ch]")):

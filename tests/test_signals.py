@@ -1,0 +1,179 @@
+"""Signals from outside: nobody misses an interrupted result, and no process outlives its parent."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+from matplotlib.figure import Figure
+from programs import Run
+
+import orthocas as oc
+from orthocas.casadi_tools.interrupts import deferred, ended_in_order
+from orthocas.cli import entry
+from orthocas.comparing.cells import run_cells
+from orthocas.errors import Interrupted
+from orthocas.minimising.best_point import BestPoint
+from orthocas.minimising.solver import Status
+from orthocas.minimising.watch import Progress
+from orthocas.reproduce import Drawing, Recipe, registry
+
+
+def ctrl_c_in_the_solver(progress: Progress) -> None:
+    """A monitor that sends a real Ctrl-C once there is something to lose."""
+    if progress.fraction > 0 and progress.stage == "polynomial:2":
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_loops_around_fit_end_with_ctrl_c(planar_x: oc.Problem) -> None:
+    degrees = []
+
+    def loop() -> None:
+        for degree in (2, 3, 4):
+            degrees.append(degree)
+            oc.fit(planar_x, oc.Polynomial(degree), samples=300, monitor=ctrl_c_in_the_solver)
+
+    with pytest.raises(KeyboardInterrupt) as stop:
+        loop()
+    assert degrees == [2]
+    assert isinstance(stop.value, Interrupted)
+    assert stop.value.result.status is Status.INTERRUPTED
+    assert stop.value.result.chart.r == 2
+
+
+def test_what_needs_a_finished_minimisation_ends_with_ctrl_c(planar_x: oc.Problem) -> None:
+    """Distilling into a network: the minimiser would return its best point."""
+    grown = oc.grow(planar_x, leaf="linear")
+    step = BestPoint.next_iteration
+
+    def interrupted(self: BestPoint, limit: int, **state: float) -> None:
+        step(self, limit, **state)
+        signal.raise_signal(signal.SIGINT)
+
+    with patch.object(BestPoint, "next_iteration", interrupted), pytest.raises(KeyboardInterrupt):
+        oc.distil(grown, oc.MLP((4,)), samples=200)
+
+
+def test_reproduce_does_not_draw_an_interrupted_fit(run: Run, planar_x: oc.Problem) -> None:
+    def draw(quick: bool) -> Drawing:
+        return Drawing({"": Figure(figsize=(0.2, 0.2))}, {"one": 1.0})
+
+    def draw_fit(quick: bool) -> Drawing:
+        found = oc.fit(planar_x, oc.Polynomial(3), samples=300, monitor=ctrl_c_in_the_solver)
+        return Drawing({"": Figure()}, {"seconds": found.seconds})
+
+    recipes = {"fig06": Recipe("first", draw), "fig11": Recipe("second", draw_fit)}
+    with patch.dict(registry.FIGURES, recipes, clear=True):
+        code, out, err = run("reproduce", "all", "--out", "figures")
+    assert (code, out, err) == (130, "", "orthocas: interrupted\n")
+    assert {path.stem for path in Path("figures").glob("fig*")} == {"fig06"}
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_other_signals_end_in_order_after_compiled_code(name: str, tmp_path: Path) -> None:
+    """What compiled code would lose is raised behind it, and handlers are put back."""
+    number = getattr(signal, name)
+    before = signal.getsignal(number)
+    done = []
+
+    def work() -> None:
+        with ended_in_order(), deferred():
+            signal.raise_signal(number)
+            done.append("the block goes on")
+
+    with pytest.raises(SystemExit) as stop:
+        work()
+    assert (stop.value.code, done) == (128 + number, ["the block goes on"])
+    assert signal.getsignal(number) is before
+
+
+def test_ignored_signals_stay_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with ended_in_order():
+            signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_only_the_command_line_watches_its_imports() -> None:
+    assert not entry.is_command_line()
+    for words, yes in (
+        (["python", "-m", "orthocas", "info"], True),
+        (["python", "-X", "dev", "-m", "orthocas"], True),
+        (["python", "/usr/bin/orthocas", "info"], True),
+        (["python", "-m", "pytest", "orthocas"], False),
+        (["python", "-c", "from multiprocessing.spawn import spawn_main"], False),
+    ):
+        with patch.object(sys, "orig_argv", words), patch.object(sys, "argv", ["/usr/bin/orthocas"]):
+            assert entry.is_command_line() is yes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+def test_ctrl_c_during_imports_is_one_line(share: float) -> None:
+    command = [sys.executable, "-m", "orthocas", "--help"]
+    start = time.monotonic()
+    subprocess.run(command, capture_output=True, check=True)
+    seconds = time.monotonic() - start
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    time.sleep(share * seconds)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) in ((130, "orthocas: interrupted\n"), (0, ""))
+
+
+_GRID = """
+import sys, orthocas as oc
+from orthocas import solvers
+if __name__ == "__main__":
+    slow = solvers.Adam(epochs=10_000, steps=50)
+    networks = [oc.MLP((8, 8)), oc.MLP((9, 9))]
+    oc.compare(oc.problems.get("planar_3r_x"), networks, [slow], jobs=2, samples=200, held_out=200)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "grid.py").write_text(_GRID)
+    (tmp_path / "tmp").mkdir()
+    environment = os.environ | {"TMPDIR": str(tmp_path / "tmp")}
+    process = subprocess.Popen(
+        [sys.executable, "grid.py"], cwd=tmp_path, env=environment, start_new_session=True, stderr=subprocess.DEVNULL
+    )
+    wait_until(lambda: len(session_of(process.pid)) >= 3, 60)  # the parent, and workers at some point of their start
+    time.sleep(2)
+    process.kill()
+    process.wait()
+    wait_until(lambda: not session_of(process.pid), 5)
+    assert list((tmp_path / "tmp").glob("orthocas-*"))  # nobody could remove it ...
+    with patch("tempfile.tempdir", str(tmp_path / "tmp")):
+        assert list(run_cells([])) == []
+    assert not list((tmp_path / "tmp").glob("orthocas-*"))  # ... but the next comparison does
+
+
+def wait_until(condition: Callable[[], bool], seconds: float) -> None:
+    start = time.monotonic()
+    while not condition():
+        assert time.monotonic() - start < seconds
+        time.sleep(0.1)
+
+
+def session_of(leader: int) -> list[int]:
+    """Processes of a session that run."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            state, _, _, session = (path / "stat").read_text().rpartition(")")[2].split()[:4]
+        except (OSError, ValueError):
+            continue
+        if int(session) == leader and state != "Z":
+            found.append(int(path.name))
+    return found
