@@ -238,7 +238,7 @@ def test_array_that_numpy_cannot_read_is_an_error_of_ours(saved: Path) -> None:
     """Its checksum is right: whoever edited the file knew how."""
     garbled, header = np.lib.format.magic(1, 0) + b"\x0b\x00{'descr': (", header_of(saved)
     header["sha256"] = {**header["sha256"], "offset.npy": archive._digest(garbled)}  # type: ignore[dict-item]
-    with pytest.raises(ChartFileError, match="holds an array that cannot be read"):
+    with pytest.raises(ChartFileError, match="contains an array that cannot be read"):
         oc.load(rewritten(saved, {"offset.npy": garbled, "header.json": json.dumps(header).encode()}))
 
 

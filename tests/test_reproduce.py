@@ -200,7 +200,7 @@ def test_command_prints_rows_or_json(run: Run, two_figures: list[tuple[str, bool
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("fig99", "--out", "new"), "unknown figure 'fig99', known: fig11, fig06, all"),
+        (("fig99", "--out", "new"), "unknown figure 'fig99', known: fig06, fig11, all"),
         (("fig06", "--out", "file"), "--out is file, expected a folder that can be written"),
         (("fig06", "--out", "file/deeper"), "--out is file/deeper, expected a folder"),
         (("fig06",), "Missing option '--out'"),

@@ -55,7 +55,7 @@ def test_stuck_point_is_a_minimum_of_the_energy_along_the_curve(spring: HiddenSp
 
 
 def test_spring_without_a_second_minimum_is_an_error() -> None:
-    with pytest.raises(SolveError, match=r"no minimum between start and goal, at a radius of 0\.3"):
+    with pytest.raises(SolveError, match=r"no minimum between start and goal at radius 0\.3"):
         _ = HiddenSpring(0.3).stuck
 
 
