@@ -12,7 +12,7 @@ from orthocas.cli.fit import fit
 from orthocas.cli.info import info
 from orthocas.cli.reproduce import reproduce
 from orthocas.cli.simulate import simulate
-from orthocas.errors import OrthocasError
+from orthocas.errors import OrthocasError, one_line
 
 INTERRUPTED = 130  #: exit code after Ctrl-C, by the convention of shells
 
@@ -34,8 +34,8 @@ app.command()(codegen)
 
 
 def _complain(text: str) -> None:
-    """Print an error as one line of bounded length on standard error."""
-    line = " ".join(text.split())
+    """Print one line of bounded length on standard error."""
+    line = one_line(text)
     typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
 
 

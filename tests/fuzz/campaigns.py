@@ -4,9 +4,11 @@ from collections.abc import Callable
 
 from fuzz.calls import calls
 from fuzz.child import Finding
+from fuzz.commands import commands
 from fuzz.robots import robots
 
 CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "calls": calls,
+    "commands": commands,
     "robots": robots,
 }
