@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _LONGEST_TEXT = 500  # characters of a name
+_LONGEST_NAME = 255  # bytes in a file name, the limit of common file systems
 _REAL = "biuf"  # NumPy's kinds of numbers: bool, int, unsigned, float
 _NO_NUMBER = (str, bytes, complex, type(None))  # rejected although NumPy converts them
 
@@ -121,9 +122,11 @@ def as_path(name: str, value: Any) -> Path:
     Raises:
         InvalidValueError: for anything but text or a path, and for text that no file system accepts.
     """
-    if isinstance(value, str | os.PathLike) and "\0" not in (text := os.fspath(value)):
-        return Path(text)
-    raise InvalidValueError(name, repr(value)[:80], "a path")
+    if not isinstance(value, str | os.PathLike) or "\0" in (text := os.fspath(value)):
+        raise InvalidValueError(name, repr(value)[:80], "a path")
+    if any(len(os.fsencode(part)) > _LONGEST_NAME for part in Path(text).parts):
+        raise InvalidValueError(name, repr(text)[:80], f"a path with names of at most {_LONGEST_NAME} bytes")
+    return Path(text)
 
 
 def require_finite(name: str, array: Array) -> None:

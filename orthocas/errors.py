@@ -9,11 +9,16 @@ _LONGEST = 1500  # characters of a message
 _MOST_NAMES = 30  # the most names that a message lists: those closest to the given name
 
 
+def printable(text: str) -> str:
+    """The text with escapes for control and bidi characters, which could change what a terminal shows."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 def one_line(text: str) -> str:
-    """The text on one line of bounded length, with escapes for control and bidi characters."""
-    line = " ".join(text.split())
-    if not line.isprintable():
-        line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    """The text on one printable line of bounded length."""
+    line = printable(" ".join(text.split()))
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
 
 

@@ -12,7 +12,7 @@ from orthocas.cli.fit import fit
 from orthocas.cli.info import info
 from orthocas.cli.reproduce import reproduce
 from orthocas.cli.simulate import simulate
-from orthocas.errors import OrthocasError
+from orthocas.errors import OrthocasError, one_line
 
 app = typer.Typer(
     name="orthocas",
@@ -32,8 +32,8 @@ app.command()(codegen)
 
 
 def _complain(text: str) -> None:
-    """Print an error as one line of bounded length on standard error."""
-    line = " ".join(text.split())
+    """Print one line of bounded length on standard error."""
+    line = one_line(text)
     typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
 
 
@@ -45,7 +45,7 @@ def run() -> int:
         except (OrthocasError, typer.TyperException) as error:
             _complain(error.format_message() if isinstance(error, typer.TyperException) else str(error))
             code = 2
-        except (OSError, MemoryError, np.linalg.LinAlgError) as error:  # from below: still one line, not a traceback
+        except (OSError, MemoryError, np.linalg.LinAlgError) as error:  # from libraries: also one line, no traceback
             _complain(f"{type(error).__name__}: {error}")
             code = 2
         except KeyboardInterrupt:

@@ -24,7 +24,7 @@ from orthocas.cli.progress import terminal_monitor
 from orthocas.comparing.compare import compare as compare_fits
 from orthocas.comparing.figures import convergence_figure, front_figure
 from orthocas.comparing.report import Comparison
-from orthocas.errors import Interrupted
+from orthocas.errors import Interrupted, printable
 from orthocas.files.atomic import output_folder, published, require_replaceable_files
 from orthocas.parametrisations import parse_parametrisation
 from orthocas.solvers import get as get_solver
@@ -109,7 +109,7 @@ def _tell(found: Comparison, out: Path, json: bool) -> None:
         print_json(found.as_dict())
     else:
         print_table(found.rows())
-        typer.echo(f"\nTables, pictures and charts are in {out}.")
+        typer.echo(f"\nTables, pictures and charts are in {printable(str(out))}.")
     failed = sum(result.failed for result in found.results)
     if failed:
         note(f"{failed} of {len(found.results)} fits failed, see comparison.csv")

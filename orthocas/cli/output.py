@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from orthocas.errors import one_line, printable
 from orthocas.files.json import to_json
 from orthocas.quality import Report
 
@@ -41,7 +42,7 @@ def print_rows(rows: Mapping[str, str]) -> None:
     """Print names and values in two columns."""
     width = max(len(name) for name in rows) + 2
     for name, value in rows.items():
-        typer.echo(f"{name:<{width}}{value}")
+        typer.echo(printable(f"{name:<{width}}{value}"))
 
 
 def print_table(rows: Sequence[Sequence[str]]) -> None:
@@ -50,12 +51,13 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
     aligned = [row if len(row) == len(head) else row[:-1] for row in rows]
     widths = [max(len(row[k]) for row in aligned if k < len(row)) for k in range(len(head))]
     for row in rows:
-        typer.echo("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=False)).rstrip())
+        line = "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=False))
+        typer.echo(printable(line.rstrip()))
 
 
 def note(text: str) -> None:
     """Print a remark on standard error."""
-    typer.echo(f"note: {text}", err=True)
+    typer.echo(f"note: {one_line(text)}", err=True)
 
 
 def report_rows(report: Report) -> dict[str, str]:

@@ -8,6 +8,7 @@ import numpy as np
 from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array
 from orthocas.domains import Box, default_box, default_half_width, sample_evenly
+from orthocas.errors import NotRedundantError
 from orthocas.robots import Robot
 from orthocas.tasks import Task
 
@@ -32,9 +33,14 @@ def regular_box(robot: Robot, task: Task) -> Box:
         robot: the robot.
         task: a task of that robot. A missing reference is taken at the centre of each box.
 
+    Raises:
+        NotRedundantError: if the task has as many components as the robot has joints.
+
     Source:
         ours.
     """
+    if task.m >= robot.n:
+        raise NotRedundantError(task.m, robot.n)
     box = default_box(robot)
     judge = _Judge.of(robot, task, box)
     if np.quantile(judge.regularity(box.centre[None], _JUDGES), 0.05) >= _REGULAR:

@@ -7,6 +7,7 @@ from fuzz.calls import calls
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
+from fuzz.commands import commands
 from fuzz.robots import robots
 from fuzz.runs import runs
 from fuzz.steps import steps
@@ -15,6 +16,7 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "calls": calls,
     "charts": charts,
     "checkpoints": checkpoints,
+    "commands": commands,
     "robots": robots,
     "runs": runs,
     "signals": signals.campaign,

@@ -1,0 +1,172 @@
+"""Command lines of real commands and options with wrong values, run in this process."""
+
+import contextlib
+import io
+import json
+import os
+import shutil
+import sys
+import warnings
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from public_objects import circle, fitted
+
+from fuzz.child import Finding, run
+from fuzz.robots import text_of, urdf_chain
+from fuzz.words import NAMES, NUMBERS, Rng, pick
+from orthocas.cli import main
+
+_EXIT_CODES = (0, 1, 2, 130)
+_PROBLEMS = ("planar_2r", "planar_3r_x", "planar_3r_xy", "arm.urdf", "chart.orthocas", "grown.orthocas", "nothing.urdf")
+_FILES = ("chart.orthocas", "grown.orthocas", "cut.orthocas", "arm.urdf", "steps.json", ".", "nowhere/x", "/dev/null")
+_LISTS = ("0", "0.1,0.2,0.3", "1,2", "1,2,3,4,5", ",", "1,,2", "nan,0,0", "1e300,0,0", "0.1;0.2", "-1,-1,-1", "inf")
+_WORDS = (
+    "linear",
+    "polynomial:1",
+    "fourier:1",
+    "mlp:2x2",
+    "sew",
+    "given",
+    "polynomial:",
+    "polynomial:-1",
+    "mlp:0x9",
+    ":",
+)
+_SOLVERS = ("gauss_newton", "lbfgs", "adam", "ipopt", "newton")
+_LAWS = ("impedance", "pd_plus", "kinematic", "projector", "kinematic_projector", "none", "pid")
+_COUNTS = ("0", "1", "2", "-1", "20", "99999999999999999999", "1.5", "")
+_VALUES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("--tip", "--home"), ("l1", "tip", "nowhere", *NAMES)),
+    **dict.fromkeys(("--lock",), ("j1=0", "j1", "=", "j1=nan", "j1=x", "nowhere=1", "l1=0=1", "j1=1e300")),
+    **dict.fromkeys(("--tool", "--centre", "--half-width", "--weights", "--friction", "--noise"), _LISTS),
+    **dict.fromkeys(("--stiffness", "--damping-ratio", "--posture-stiffness", "--feedback", "--limit"), _LISTS),
+    **dict.fromkeys(("--seed", "--seeds", "--samples", "--held-out", "--jobs"), _COUNTS),
+    **dict.fromkeys(("--rate", "--mass-factor", "--max-mutual-deg"), (*NUMBERS, "50", "10")),
+    **dict.fromkeys(("--out", "--checkpoint"), ("out", "out/x/y", ".", "", "chart.orthocas", "/dev/null/x", "x" * 300)),
+    **dict.fromkeys(("--coupling", "--damping", "--animation"), ("coupled", "square_root", "none", "mp5", "")),
+    "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose", "position:xx", "position+axis", ""),
+    "--metric": ("euclidean", "inertia", "identity"),
+    "--param": _WORDS,
+    "--solver": _SOLVERS,
+    "--controller": _LAWS,
+    "--steps": _FILES,
+    "--name": ("arm", "int", "1arm", "a b", "math", "é", "x" * 200, "main"),
+}
+_PROBLEM_OPTIONS = ("--tip", "--lock", "--tool")
+_DOMAIN_OPTIONS = ("--task", "--metric", "--centre", "--home", "--half-width")
+_LAW_OPTIONS = (
+    "--stiffness",
+    "--damping-ratio",
+    "--coupling",
+    "--damping",
+    "--posture-stiffness",
+    "--feedback",
+    "--limit",
+)
+_RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--seed")
+_COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = {
+    "fit": (
+        _PROBLEMS,
+        {"--param": "polynomial:1", "--samples": "30", "--out": "new.orthocas"},
+        (*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, "--solver", "--seed", "--weights", "--max-mutual-deg", "--checkpoint"),
+    ),
+    "evaluate": (_FILES, {"--samples": "50"}, ("--seed",)),
+    "info": ((*_PROBLEMS, *_FILES), {}, _PROBLEM_OPTIONS),
+    "compare": (
+        _PROBLEMS,
+        {"--param": "polynomial:1", "--samples": "30", "--held-out": "50", "--jobs": "0"},
+        (*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, "--solver", "--seeds", "--weights", "--out"),
+    ),
+    "reproduce": (("fig01", "fig99", "all?", ""), {"--out": "chart.orthocas"}, ()),
+    "simulate": (
+        _FILES,
+        {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},
+        (*_LAW_OPTIONS, *_RUN_OPTIONS),
+    ),
+    "codegen": (_FILES, {"--controller": "pd_plus", "--out": "out"}, (*_LAW_OPTIONS, "--name")),
+}
+
+
+def commands(count: int) -> list[Finding]:
+    """The campaign."""
+    return run("commands", judge, range(count))
+
+
+def judge(seed: int) -> str | None:
+    """Run the command line of a seed in an empty folder."""
+    rng = np.random.default_rng(seed)
+    words = line(rng)
+    with TemporaryDirectory() as folder:
+        for path in _files().iterdir():
+            shutil.copy(path, folder)
+        Path(folder, "arm.urdf").write_bytes(text_of(rng, urdf_chain(rng, 2)))
+        os.chdir(folder)
+        found = _verdict(words)
+        os.chdir("/")
+    return None if found is None else f"{words}: {found}"
+
+
+def line(rng: Rng) -> list[str]:
+    """A command with its options, of which one or two have other values, or are missing, or belong elsewhere."""
+    command = pick(rng, sorted(_COMMANDS))
+    targets, options, others = _COMMANDS[command]
+    chosen = dict(options)
+    for _ in range(int(rng.integers(1, 4))):
+        option = pick(rng, (*options, *others))
+        if option in options and rng.random() < 0.1:
+            chosen.pop(option, None)
+        elif option not in ("--jobs",):
+            chosen[option] = pick(rng, _VALUES[option])
+    words = [command, *(word for pair in chosen.items() for word in pair), pick(rng, (targets[0], *targets))]
+    extras = ("--json", "--help", "--", "-x", "--nothing", *NAMES)
+    if rng.random() < 0.3:
+        words.insert(int(rng.integers(len(words) + 1)), pick(rng, extras))
+    return words
+
+
+@cache
+def _files() -> Path:
+    """A folder with charts and a plan, whole and damaged, for as long as this process lives."""
+    _kept.append(TemporaryDirectory())
+    folder = Path(_kept[0].name)
+    chart = fitted().chart
+    chart.save(folder / "chart.orthocas")
+    circle().save(folder / "grown.orthocas")
+    (folder / "cut.orthocas").write_bytes((folder / "chart.orthocas").read_bytes()[:500])
+    start = [round(float(value), 3) for value in chart.problem.domain.centre]
+    steps = [{"time": 0.1, "move": {"x": 0.01}}]
+    plan = json.dumps({"start": start, "duration": 0.2, "steps": steps})
+    (folder / "steps.json").write_text(plan)
+    return folder
+
+
+_kept: list[TemporaryDirectory[str]] = []
+
+
+def _verdict(words: list[str]) -> str | None:
+    """What is wrong with how a command line ends."""
+    out, err, argv = io.StringIO(), io.StringIO(), sys.argv
+    sys.argv = ["orthocas", *words]
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            main()
+    except SystemExit as stop:
+        code = stop.code or 0
+    except Exception as error:
+        return f"{type(error).__name__}: {str(error)[:200]}"
+    finally:
+        sys.argv = argv
+    complaints = [row for row in err.getvalue().splitlines() if not row.startswith("note: ")]
+    if code not in _EXIT_CODES:
+        return f"exit code {code}"
+    if len(complaints) != int(code != 0):
+        return f"exit code {code} with {len(complaints)} lines: {complaints[:3]}"
+    if code == 2 and any(name in complaints[0] for name in ("MemoryError", "LinAlgError")):
+        return complaints[0][:300]
+    shown = "".join((out.getvalue(), err.getvalue()))
+    bad = {letter for letter in shown if not letter.isprintable() and letter not in "\n"}
+    return f"prints {bad}" if bad else None
