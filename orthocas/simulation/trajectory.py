@@ -137,13 +137,18 @@ class Trajectory(Shown):
         path = as_path("path", path)
         header, arrays = read_run_file(path, _VERSION, tuple(_ARRAYS))
         try:
-            names = {name: tuple(part(header, name, list)) for name in ("labels", "joint_names")}
+            names: dict[str, Any] = {name: tuple(part(header, name, list)) for name in ("labels", "joint_names")}
             _require_names(names)
             require_known("kind of command", part(header, "kind", str), ("torque", "velocity"))
             require_known("outcome", part(header, "outcome", str), [outcome.value for outcome in Outcome])
             controller = require_text("controller", part(header, "controller", str))
-            arrays = _checked_arrays(arrays, len(names["joint_names"]), len(names["labels"]))
-            return cls(controller, header["kind"], Outcome(header["outcome"]), **names, **arrays)
+            checked = _checked_arrays(arrays, len(names["joint_names"]), len(names["labels"]))
+            own: dict[str, Any] = {
+                "controller": controller,
+                "kind": header["kind"],
+                "outcome": Outcome(header["outcome"]),
+            }
+            return cls(**own, **names, **checked)
         except OrthocasError as error:
             raise TrajectoryFileError(f"{path} is inconsistent: {error}") from None
 
