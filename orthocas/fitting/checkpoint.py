@@ -17,10 +17,10 @@ from orthocas.minimising.solver import SolveResult, Status
 from orthocas.minimising.watch import State
 
 CHECKPOINT = Kind("checkpoint", 1, CheckpointError)
-_NUMBERS = ("iterations", "evaluations", "seconds", "damping", "stretch")
-_VECTORS = ("best_theta", "theta", "mean", "square")
-_BEST = "best_value"  # of the loss
-_MOST = 1e15  # of counts, seconds, damping and stretch
+_NUMBERS = ("iterations", "evaluations", "seconds", "damping", "stretch", "scale", "converged")
+_VECTORS = ("best_theta", "theta", "gradient", "mean", "square")
+_LOSSES = ("best_value", "value")
+_MOST = 1e15  # of these numbers
 _SECONDS = 30.0  # least time between two writes of a running stage
 
 
@@ -74,7 +74,7 @@ class Checkpoint:
                 raise self._inconsistent(f"{name} has shape {value.shape}, expected ({size},) with finite entries")
             if name in _NUMBERS and (value.shape != () or not 0 <= value < _MOST):
                 raise self._inconsistent(f"{name} is {np.ravel(value)[:3].tolist()}, expected one number >= 0")
-            if name == _BEST and value.shape != ():
+            if name in _LOSSES and value.shape != ():
                 raise self._inconsistent(f"{name} has shape {value.shape}, expected one number")
 
     def _inconsistent(self, reason: str) -> CheckpointError:
