@@ -154,7 +154,7 @@ def changed_array(rng: Rng, content: bytes) -> bytes:
         array = np.load(io.BytesIO(content))
     except Exception:  # changed before; NumPy raises many kinds
         return content[:-1]
-    if array.dtype.kind == "U":
+    if array.dtype.kind not in "biufc":
         return flipped(rng, content)
     acts: tuple[Callable[[], bytes], ...] = (
         lambda: npy(_with_entries(rng, array, 1)),

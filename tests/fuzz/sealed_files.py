@@ -66,6 +66,8 @@ def mutant(original: Path, rng: Rng) -> bytes:
 
 def changed_arrays(rng: Rng, arrays: Entries) -> Entries:
     """One array changed, left out, put in place of another, or added."""
+    if not arrays:
+        return {"new.npy": b""}
     name, act = pick(rng, list(arrays)), rng.integers(12)
     if act == 0:
         return {key: value for key, value in arrays.items() if key != name}
