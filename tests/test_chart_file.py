@@ -262,7 +262,7 @@ def test_edited_header_and_array_are_noticed(saved: Path) -> None:
         ({"coordinates": {"parametrisation": "Spline"}}, "inconsistent: unknown parametrisation"),
         ({"coordinates": polynomial(9)}, "inconsistent: theta has shape"),
         ({"coordinates": polynomial(4, idle=[0.0])}, "idle joint is 0.0"),
-        ({"coordinates": {"parametrisation": 3}}, "incomplete"),
+        ({"coordinates": {"parametrisation": 3}}, "inconsistent: unknown parametrisation '3'"),
         ({"robot": [1]}, "incomplete"),
         ({"version": 0}, "version 0, expected 1"),
         ({"version": 1e999}, "not an orthocas chart"),

@@ -79,7 +79,10 @@ def generate_c(
     values = template_values(chart, controller, name, kernels, stack_bytes)
     names = {"robot.h": f"{name}.h", "robot.c": f"{name}.c", "pkgconfig.pc": f"{name}.pc.in"}
     contents = {names.get(template, template): filled(template, values) for template in _TEMPLATES}
-    folder = _folder(as_path("out", out), name, contents)
+    try:
+        folder = _folder(as_path("out", out), name, contents)
+    except OSError as error:  # a name that is too long, for example
+        raise ArchiveError(f"cannot write to {out}: {error.strerror}") from error
     _write(folder, contents)
     return GeneratedC(folder, name, stack_bytes)
 
