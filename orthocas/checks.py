@@ -14,7 +14,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _LONGEST_TEXT = 500  # characters of a name
-_LONGEST_NAME = 255  # bytes in a file name, the limit of common file systems
 _REAL = "biuf"  # NumPy's kinds of numbers: bool, int, unsigned, float
 _NO_NUMBER = (str, bytes, complex, type(None))  # rejected although NumPy converts them
 
@@ -124,8 +123,6 @@ def as_path(name: str, value: Any) -> Path:
     """
     if not isinstance(value, str | os.PathLike) or "\0" in (text := os.fspath(value)):
         raise InvalidValueError(name, repr(value)[:80], "a path")
-    if any(len(os.fsencode(part)) > _LONGEST_NAME for part in Path(text).parts):
-        raise InvalidValueError(name, repr(text)[:80], f"a path with names of at most {_LONGEST_NAME} bytes")
     return Path(text)
 
 

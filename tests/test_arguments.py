@@ -10,10 +10,10 @@ import pytest
 from public_objects import CHARTS, circle, fitted, impedance, planar, points_of, steps, trajectory
 
 import orthocas as oc
-from orthocas import control, simulation
+from orthocas import control, problems, simulation, solvers
 from orthocas.checks import as_float_array, as_point, as_point_set
 from orthocas.codegen import check_c
-from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError
+from orthocas.errors import InvalidValueError, NoExpressionError, OrthocasError, ShapeError, UnknownNameError
 
 EVALUATIONS = ("xi", "task", "phi", "jacobian")
 
@@ -129,6 +129,16 @@ WRONG: dict[str, Callable[[], Any]] = {
     "pushes of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], pushes=[1]),  # type: ignore[list-item]
     "friction of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], friction=1.0),  # type: ignore[arg-type]
     "plant of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], plant=planar()),  # type: ignore[arg-type]
+    "f of lie_bracket": lambda: oc.lie_bracket(planar(), 2, 3),  # type: ignore[arg-type]
+    "domain of contains": lambda: oc.contains(planar(), [0, 0, 0]),  # type: ignore[arg-type]
+    "robot of default_box": lambda: oc.default_box(planar()),  # type: ignore[arg-type]
+    "robot of a metric": lambda: oc.Metric.from_spec(planar(), "inertia"),  # type: ignore[arg-type]
+    "problem of loss": lambda: oc.loss("iiwa", oc.Linear()),  # type: ignore[arg-type]
+    "model of a robot": lambda: oc.Robot.from_model(planar(), "tip"),  # type: ignore[arg-type]
+    "coordinates of a chart": lambda: oc.Chart(planar(), planar()),  # type: ignore[arg-type]
+    "report of a figure": lambda: oc.plotting.quality_figure(planar()),  # type: ignore[arg-type]
+    "trajectory of a breakdown": lambda: simulation.task_acceleration_breakdown(fitted().chart, planar()),  # type: ignore[arg-type]
+    "labels of a reference": lambda: control.Reference.through(planar(), [0, 1], [[0], [1]]),  # type: ignore[arg-type]
     "chart of check_c": lambda: check_c(None, planar()),  # type: ignore[arg-type]
 }
 
@@ -136,7 +146,9 @@ WRONG: dict[str, Callable[[], Any]] = {
 @pytest.mark.parametrize("name", WRONG)
 def test_objects_of_another_class_are_refused_by_name(name: str) -> None:
     argument = name.partition(" ")[0]
-    with pytest.raises(InvalidValueError, match=rf"{argument} is ('\w+'|1|1\.0|None|a \w+), expected a ") as refusal:
+    with pytest.raises(
+        InvalidValueError, match=rf"{argument} is ('\w+'|1|1\.0|None|a \w+), expected (a|those) "
+    ) as refusal:
         WRONG[name]()
     assert "\n" not in str(refusal.value)
 
@@ -145,3 +157,32 @@ def test_objects_in_errors_take_one_line() -> None:
     with pytest.raises(InvalidValueError, match="expected an object such as Polynomial") as refusal:
         oc.fit(planar(), fitted().chart)  # type: ignore[arg-type]
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("value", [3, None, b"chart", ["a"], 1.5, "a\0b"])
+def test_only_texts_and_paths_name_files(value: Any) -> None:
+    """Also numbers, which Python would take for open files."""
+    readers = [oc.load, oc.Robot.from_urdf, oc.Robot.from_mjcf, oc.Robot.from_file, simulation.Trajectory.load]
+    for call in (*readers, fitted().chart.save, trajectory().save, lambda path: oc.generate_c(fitted().chart, path)):
+        with pytest.raises(InvalidValueError, match="expected a path"):
+            call(value)
+
+
+def test_names_of_another_class_are_unknown_names() -> None:
+    for call in (solvers.get, problems.get, control.law_of, fitted().chart.function, planar().robot.function):
+        for value in (3, None, ["a"], np.zeros(2)):
+            with pytest.raises(UnknownNameError):
+                call(value)  # type: ignore[arg-type]
+
+
+def test_numbers_too_large_to_work_with_are_refused_at_once() -> None:
+    calls = [
+        lambda: oc.Torus(10**18),
+        lambda: oc.Given.from_function("g", 10**18, lambda q: q),
+        lambda: oc.simulate(impedance(), steps(), [0, 0, 0], control_rate=1e18),
+        lambda: oc.loss(planar(), oc.Linear(), samples=10**18),
+        lambda: oc.Box([10**400], 1.0),
+    ]
+    for call in calls:
+        with pytest.raises(OrthocasError):
+            call()

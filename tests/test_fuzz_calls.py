@@ -4,4 +4,4 @@ from fuzz.calls import calls
 
 
 def test_calls_give_results_or_one_error() -> None:
-    assert calls(300) == []
+    assert calls(150) == []

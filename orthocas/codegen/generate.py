@@ -85,7 +85,10 @@ def generate_c(
     names = {"robot.h": f"{name}.h", "robot.c": f"{name}.c", "pkgconfig.pc": f"{name}.pc.in"}
     contents = {names.get(template, template): filled(template, values) for template in _TEMPLATES}
     folder = as_path("out", out)
-    _require_free(folder, name, contents, force)
+    try:
+        _require_free(folder, name, contents, force)
+    except OSError as error:  # a name that is too long, for example
+        raise ArchiveError(f"cannot write to {out}: {error.strerror}") from error
     _write(folder, contents)
     return GeneratedC(folder, name, stack_bytes)
 

@@ -52,6 +52,7 @@ def register(name: str, kind: type[Parametrisation], parse: Callable[[str], Para
         >>> oc.parametrisations.parse_parametrisation("cubic")
         Cubic(degree=3)
     """
+    require_kind("name", name, str)
     known = _REGISTERED.get(name)
     if known is not None and known.kind is not kind:
         raise InvalidValueError("name", repr(name), f"a name that {known.kind.__name__} does not use")

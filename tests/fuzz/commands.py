@@ -80,7 +80,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--param": "polynomial:1", "--samples": "30", "--held-out": "50", "--jobs": "0"},
         (*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, "--solver", "--seeds", "--weights", "--out"),
     ),
-    "reproduce": (("fig01", "fig99", "all?", ""), {"--out": "chart.orthocas"}, ()),
+    "reproduce": (("fig99", "fig", "all?", ""), {"--out": "chart.orthocas"}, ()),
     "simulate": (
         _FILES,
         {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},
@@ -116,7 +116,7 @@ def line(rng: Rng) -> list[str]:
     chosen = dict(options)
     for _ in range(int(rng.integers(1, 4))):
         option = pick(rng, (*options, *others))
-        if option in options and rng.random() < 0.1:
+        if option in options and _VALUES[option] is not _COUNTS and rng.random() < 0.1:
             chosen.pop(option, None)
         elif option not in ("--jobs",):
             chosen[option] = pick(rng, _VALUES[option])
