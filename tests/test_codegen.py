@@ -178,7 +178,7 @@ def test_coordinates_without_a_value_everywhere(planar_x: oc.Problem, tmp_path: 
 
 
 def test_words_of_others_do_not_become_code(tmp_path: Path) -> None:
-    evil = "a */ int evil; /* \n@x@ b /* ω"
+    evil = "a */ int evil; /* @x@ b /* ω"
     robot = oc.Robot.planar([1, 1, 1], [3, 3, 3])
     task = oc.Task.custom(robot, "custom", lambda q: ca.vertcat(ca.sin(q[0]) + q[1]), ["p*/"])
     problem = oc.Problem(robot, task, "inertia", oc.Box([0.5, 0.5, 0.5], 0.2), evil)

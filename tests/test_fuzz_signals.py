@@ -10,4 +10,5 @@ from fuzz import signals
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["fit", "compare"])
 def test_stopped_commands_leave_nothing_broken(name: str) -> None:
-    assert signals.judge(list(signals.COMMANDS).index(name)) is None
+    what = signals.judge(list(signals.COMMANDS).index(name))
+    assert what is None, what

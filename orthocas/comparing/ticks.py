@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from orthocas.casadi_tools.interrupts import deferred
 from orthocas.chart import Chart
 from orthocas.codegen import control_tick
 from orthocas.comparing.cells import Cell, CellResult
@@ -32,6 +33,8 @@ def with_control_ticks(results: Sequence[CellResult], cells: Sequence[Cell], mon
 
 def _control_tick(file: Path) -> float:
     try:
-        return control_tick(Chart.load(file))
+        with deferred():  # CasADi may make a RuntimeError of Ctrl-C while it builds functions
+            chart = Chart.load(file)
+        return control_tick(chart)
     except (OrthocasError, OSError, RuntimeError, MemoryError):  # never lose the fits because of a failed measurement
         return math.nan
