@@ -45,6 +45,7 @@ def self_motion_figure(chart: Chart, postures: int = 9, reach: float = 0.4) -> F
     require_kind("chart", chart, Chart)
     require_count("postures", postures, most=_MOST_POSTURES)
     require_at_least("reach", reach, 0)
+    reach = float(reach)
     figure = Figure(figsize=(3.0 * chart.r, 3.6), layout="constrained")
     values = np.linspace(-reach, reach, postures)
     sweeps = [_sweep(chart, j, values) for j in range(chart.r)]

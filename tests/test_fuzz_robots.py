@@ -4,4 +4,4 @@ from fuzz.robots import robots
 
 
 def test_robot_files_give_robots_or_one_error() -> None:
-    assert robots(200) == []
+    assert robots(120) == []

@@ -16,10 +16,11 @@ def register(law: type[Law]) -> None:
     Raises:
         InvalidValueError: if another law has that name.
     """
-    if not isinstance(getattr(law, "name", None), str):
-        raise InvalidValueError("law", repr(law)[:80], "the class of a law")
-    if _LAWS.get(law.name, law) is not law:
+    named = isinstance(getattr(law, "name", None), str)
+    if named and _LAWS.get(law.name, law) is not law:
         raise InvalidValueError("name", repr(law.name), f"a free name, because {_LAWS[law.name].__name__} has this one")
+    if not named or not callable(getattr(law, "on_chart", None)):
+        raise InvalidValueError("law", repr(law)[:80], "the class of a law")
     _LAWS[law.name] = law
 
 

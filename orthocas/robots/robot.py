@@ -260,8 +260,9 @@ class Robot(Shown):
         function = self._functions[name]
         if any(isinstance(a, ca.SX | ca.MX) for a in arguments):
             for a in arguments:
-                if a.shape != (self.n, 1):
-                    raise ShapeError("a CasADi joint vector", a.shape, (self.n, 1))
+                shape = tuple(a.shape) if hasattr(a, "shape") else np.shape(as_float_array("a joint vector", a))
+                if shape != (self.n, 1):
+                    raise ShapeError("a CasADi joint vector", shape, (self.n, 1))
             return function(*arguments)
         sets = [as_point_set(function.name_in(i), a, self.n) for i, a in enumerate(arguments)]
         points = [p for p, _ in sets]
