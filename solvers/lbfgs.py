@@ -137,7 +137,5 @@ def _restored_pairs(kept: State, size: int) -> Iterator[Array]:
             return
         pair = kept[name]
         if pair.shape != (2, size) or not 0 < pair[0] @ pair[1] < np.inf:
-            raise CheckpointError(
-                f"{name} in the checkpoint has shape {pair.shape}, expected {(2, size)} with a positive product"
-            )
+            raise CheckpointError(f"{name} has shape {pair.shape}, expected {(2, size)} with a positive product")
         yield pair

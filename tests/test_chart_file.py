@@ -429,7 +429,7 @@ def test_notes_that_could_not_be_read_back_are_not_written(planar_fit: Fit, tmp_
         ({"robot_rotations": -np.stack([np.eye(3)] * 3)}, r"rotations\[0\] is .*, expected a rotation matrix"),
         ({"robot_translations": np.full((3, 3), 1e300)}, r"largest entry of translations is 1e\+300"),
         ({"robot_lower": [np.inf] * 3, "robot_upper": [np.inf] * 3}, r"limits \[inf, inf\]"),
-        ({"theta": np.zeros(34, dtype=complex) * 2}, "holds an array that cannot be read: theta.npy"),
+        ({"theta": np.zeros(34, dtype=complex) * 2}, "contains an array that cannot be read: theta.npy"),
         ({"theta": npy.to_npy(np.zeros(3))[:-1]}, "23 bytes for the shape"),
         ({"scale": np.full(2, 1e308), "offset": np.full(2, -1e308)}, "xi is not finite at any of 8 points"),
     ],

@@ -17,16 +17,17 @@ from orthocas.quality import AngleStatistics, Conditioning
 from orthocas.showing import Shown, listed, number_list
 from orthocas.showing.facts import as_html, as_text
 
-EVIL = "<b>&'\"\n</td>"  # a name that a file of others may hold
+EVIL = "<b>&'\"\n</td>"  # a text that a file of others may hold
+NAME = EVIL.replace("\n", "")  # names are printable
 
 
 def wicked() -> oc.Chart:
     """A chart whose names are all hostile, for seven joints."""
     known = problems.get("iiwa")
-    tree = replace(known.robot.tree, joint_names=tuple(EVIL * 20 + str(i) for i in range(7)), tip_name=EVIL)
+    tree = replace(known.robot.tree, joint_names=tuple(NAME * 20 + str(i) for i in range(7)), tip_name=NAME)
     robot = oc.Robot(tree)
-    task = oc.Task.custom(robot, EVIL, lambda q: q[0] ** 2 + q[1] * q[2], [EVIL])
-    problem = oc.Problem(robot, task, domain=known.domain, name=EVIL * 50)
+    task = oc.Task.custom(robot, NAME, lambda q: q[0] ** 2 + q[1] * q[2], [NAME])
+    problem = oc.Problem(robot, task, domain=known.domain, name=NAME * 30)
     return oc.Chart(problem, oc.fit(problem, oc.Linear()).chart.coordinates, {EVIL: EVIL, "long": "word " * 100})
 
 

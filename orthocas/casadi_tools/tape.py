@@ -6,6 +6,7 @@ becomes that of all samples side by side.
 """
 
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -13,7 +14,7 @@ import casadi as ca
 from orthocas.checks import require_count
 from orthocas.errors import InvalidValueError, OrthocasError
 
-_LARGEST = 1e300  # constants: infinity and NaN are none
+_LARGEST = 1e300  # of finite constants
 Tape = dict[str, Any]
 Entry = TypeVar("Entry", ca.SX, ca.MX)
 
@@ -123,7 +124,7 @@ def _makes_sense(step: Any, inputs: int, written: set[int]) -> bool:
         return False
     name, _, *of = step
     if name == "const":
-        return len(of) == 1 and isinstance(of[0], int | float) and abs(of[0]) <= _LARGEST
+        return len(of) == 1 and isinstance(of[0], int | float) and (abs(of[0]) <= _LARGEST or abs(of[0]) == inf)
     if name == "input":
         return len(of) == 1 and _is_index(of[0]) and of[0] < inputs
     needs = 2 if name in _BINARY else 1

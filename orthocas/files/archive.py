@@ -102,7 +102,7 @@ def _array(zipped: Unpacker, name: str, digest: str) -> Stored:
     try:
         return from_npy(content)
     except ValueError as error:
-        raise zipped.error(f"{zipped.source} holds an array that cannot be read: {name}, {error}") from None
+        raise zipped.error(f"{zipped.source} contains an array that cannot be read: {name}, {error}") from None
 
 
 def _checked_header(source: Path, kind: Kind, text: bytes) -> dict[str, Any]:

@@ -68,16 +68,17 @@ class Checkpoint:
         """Raise CheckpointError unless what is kept of a stage belongs to a family with that many parameters."""
         done = self.finished(label)
         if done is not None and done.parameters != size:
-            raise self._inconsistent(f"stage '{label}' has {done.parameters} parameters, expected {size}")
+            raise self.inconsistent(f"stage '{label}' has {done.parameters} parameters, expected {size}")
         for name, value in (self._running[1] if self._running and self._running[0] == label else {}).items():
             if name in _VECTORS and (value.shape != (size,) or not np.isfinite(value).all()):
-                raise self._inconsistent(f"{name} has shape {value.shape}, expected ({size},) with finite entries")
+                raise self.inconsistent(f"{name} has shape {value.shape}, expected ({size},) with finite entries")
             if name in _NUMBERS and (value.shape != () or not 0 <= value < _MOST):
-                raise self._inconsistent(f"{name} is {np.ravel(value)[:3].tolist()}, expected one number >= 0")
+                raise self.inconsistent(f"{name} is {np.ravel(value)[:3].tolist()}, expected one number >= 0")
             if name in _LOSSES and value.shape != ():
-                raise self._inconsistent(f"{name} has shape {value.shape}, expected one number")
+                raise self.inconsistent(f"{name} has shape {value.shape}, expected one number")
 
-    def _inconsistent(self, reason: str) -> CheckpointError:
+    def inconsistent(self, reason: str) -> CheckpointError:
+        """The error for a file that contradicts itself, or the fit."""
         return CheckpointError(f"{self._path} is inconsistent: {reason}")
 
     def add(self, stage: Stage) -> None:

@@ -10,7 +10,7 @@ from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.checks import Array, require_memory
 from orthocas.domains import sample_evenly
-from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
+from orthocas.errors import CheckpointError, InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.bounded_mutual import BoundedMutual
 from orthocas.fitting.checkpoint import Checkpoint, Stage
@@ -124,7 +124,10 @@ class StageRunner:
             objective, theta = self._objective(label, family, samples, theta)
         keeper = self.checkpoint.keeper(label)
         watch = Watch(self.monitor, label, keeper)
-        result = solver.minimise(objective, theta, watch)
+        try:
+            result = solver.minimise(objective, theta, watch)
+        except CheckpointError as error:  # the solver's own part of the state
+            raise self.checkpoint.inconsistent(str(error)) from None
         if result.status is Status.INTERRUPTED:
             keeper.flush()
         if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):

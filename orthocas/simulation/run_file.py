@@ -25,7 +25,7 @@ def read_run_file(path: Path, version: int, names: Sequence[str]) -> tuple[dict[
         except ValueError as error:
             if isinstance(error, TrajectoryFileError):
                 raise
-            raise TrajectoryFileError(f"{path} holds an array or a header that cannot be read: {error}") from None
+            raise TrajectoryFileError(f"{path} contains an array or a header that cannot be read: {error}") from None
     if not isinstance(header, dict) or header.get("version") != version:
         found = header.get("version") if isinstance(header, dict) else None
         raise TrajectoryFileError(f"{path} has version {found}, this orthocas reads {version}")
