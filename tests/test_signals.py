@@ -126,7 +126,8 @@ def test_ctrl_c_during_imports_is_one_line(share: float) -> None:
     time.sleep(share * seconds)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) in ((130, "orthocas: interrupted\n"), (0, ""))
+    ended = -signal.SIGINT, ""  # the command is over, or Python has not begun it: nothing of ours runs
+    assert (process.returncode, err) in ((130, "orthocas: interrupted\n"), (0, ""), ended)
 
 
 _GRID = """
