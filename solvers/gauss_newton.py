@@ -102,7 +102,6 @@ class _Run:
 def _solved(H: Array, gradient: Array) -> Array:
     """H^-1 gradient: by Cholesky, or by LU where rounding in single precision has left H indefinite."""
     try:
-        step: Array = cho_solve(cho_factor(H), gradient)
+        return np.asarray(cho_solve(cho_factor(H), gradient), dtype=float)
     except np.linalg.LinAlgError:
-        step = np.linalg.solve(H, gradient)
-    return step
+        return np.asarray(np.linalg.solve(H, gradient), dtype=float)
