@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from orthocas.checks import Array, require_at_least, require_count
 from orthocas.errors import InvalidValueError
@@ -86,7 +87,7 @@ class _Run:
             damped = H.copy()
             damped[np.diag_indices_from(H)] += self.damping * scale
             try:
-                candidate = self.best.theta - np.linalg.solve(damped, gradient)
+                candidate = self.best.theta - _solved(damped, gradient)
             except np.linalg.LinAlgError:
                 self.damping *= 10
                 continue
@@ -96,3 +97,11 @@ class _Run:
                 return True
             self.damping *= 4
         return False
+
+
+def _solved(H: Array, gradient: Array) -> Array:
+    """H^-1 gradient: by Cholesky, or by LU where rounding in single precision has left H indefinite."""
+    try:
+        return np.asarray(cho_solve(cho_factor(H), gradient), dtype=float)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.solve(H, gradient), dtype=float)

@@ -5,6 +5,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: threads of BLAS that spin take other processes' cores
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import signal
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -22,6 +23,8 @@ from orthocas.control import PDPlus
 from orthocas.fitting.fit import Fit
 from orthocas.reproduce import FIGURES, Drawing
 from orthocas.robots import files
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job starts with SIGINT ignored
 
 ROBOTS = {
     "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),

@@ -40,7 +40,7 @@ def _add(
     gradients: Array,
     shared: Sequence[tuple[int, int, int, int]],
 ) -> None:
-    """Add the products of some chunks."""
+    """Add the products of some chunks: every block by one thread, in the order of the chunks."""
 
     def rows(piece: tuple[int, int]) -> Array:
         start, j = piece
@@ -48,16 +48,17 @@ def _add(
         product: Array = derivatives[j][part] @ gradients[part]  # (chunk, rows, K)
         return product
 
-    def product(piece: tuple[int, int, int, int, int]) -> Array:
-        start, i, j, row, other = piece
-        if i == j:
-            flat = X[start, j].reshape(-1, X[start, j].shape[2])
-            return np.asarray(flat.T @ flat)
-        return np.asarray(X[start, i][:, row].T @ X[start, j][:, other])
+    def product(pair: tuple[int, int, int, int]) -> None:
+        i, j, row, other = pair
+        for start in starts:
+            if i == j:
+                flat = X[start, j].reshape(-1, X[start, j].shape[2])
+                blocks[j, j] += flat.T @ flat
+            else:
+                blocks[i, j] += X[start, i][:, row].T @ X[start, j][:, other]
 
     r = len(derivatives)
     pieces = [(start, j) for start in starts for j in range(r)]
     X = dict(zip(pieces, in_threads(rows, pieces), strict=True))
-    products = [(start, *pair) for start in starts for pair in [*((j, j, 0, 0) for j in range(r)), *shared]]
-    for (_, i, j, _, _), found in zip(products, in_threads(product, products), strict=True):
-        blocks[i, j] += found
+    for _ in in_threads(product, [*((j, j, 0, 0) for j in range(r)), *shared]):
+        pass
