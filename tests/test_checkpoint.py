@@ -80,7 +80,7 @@ def test_finished_fit_is_not_run_again(planar_x: oc.Problem, tmp_path: Path) -> 
     first = oc.fit(planar_x, oc.Polynomial(3), checkpoint=file)
     told: list[Progress] = []
     again = oc.fit(planar_x, oc.Polynomial(3), checkpoint=file, monitor=told.append)
-    assert told == []
+    assert {progress.detail for progress in told} <= {"searching for folds"}
     assert again.status is first.status
     np.testing.assert_array_equal(again.chart.coordinates.theta, first.chart.coordinates.theta)
 

@@ -217,7 +217,7 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         ),
         (["fit", "iiwa", "--seed", "-1"], "seed is -1, expected a whole number >= 0"),
         (["fit", "iiwa", "--weights", "1000,nan"], "lambda2 is nan"),
-        (["fit", "iiwa", "--weights", "1000"], "two to four numbers"),
+        (["fit", "iiwa", "--weights", "1000"], "two to five numbers"),
         (["fit", "iiwa", "--weights", "0,1"], "lambda1 is 0.0"),
         (["fit", "iiwa", "--out", "no/such/folder/x.orthocas"], "folder no/such/folder does not exist"),
         (["fit", "iiwa", "--out", "/proc/x.orthocas"], "cannot write /proc/x.orthocas"),

@@ -22,7 +22,9 @@ def test_default_fit_of_the_iiwa_beats_the_papers_network(iiwa: oc.Problem) -> N
     report = oc.evaluate(fit.chart, samples=20_000)
     assert fit.status in (Status.CONVERGED, Status.ITERATION_LIMIT)
     assert report.task_angle.std <= 2.05
-    assert report.mutual_angle.std <= 3.0
+    assert report.mutual_angle.std <= 3.2
+    assert fit.worst is not None
+    assert fit.worst.least >= 0.2
     assert report.conditioning.mean >= 0.9
     assert report.conditioning.p01 >= 0.6
     assert abs(report.task_angle.mean - 90) < 0.5
@@ -51,8 +53,8 @@ def test_same_seed_same_result_and_another_seed_another(planar_x: oc.Problem) ->
 
 
 def test_degree_continuation_goes_through_every_degree(iiwa_fit: Fit) -> None:
-    assert [stage.label for stage in iiwa_fit.stages] == ["polynomial:2", "polynomial:3"]
-    assert [stage.parameters for stage in iiwa_fit.stages] == [3 * 27, 3 * 83]
+    assert [stage.label for stage in iiwa_fit.stages[:2]] == ["polynomial:2", "polynomial:3"]
+    assert [stage.parameters for stage in iiwa_fit.stages[:2]] == [3 * 27, 3 * 83]
     assert iiwa_fit.stages[1].result.value < iiwa_fit.stages[0].result.value
 
 
@@ -211,7 +213,7 @@ def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
         oc.fit(planar_x, "polynomial:3")  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match="solver is 'lbfgs'"):
         oc.fit(planar_x, solver="lbfgs")  # type: ignore[arg-type]
-    for weights in ((1.0,), (1.0, 2.0, 3.0, 4.0, 5.0)):
+    for weights in ((1.0,), (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)):
         with pytest.raises(ShapeError, match="weights"):
             oc.fit(planar_x, weights=weights)  # type: ignore[arg-type]
     for base in ((0.0,) * 5, (0.0,) * 2):

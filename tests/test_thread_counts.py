@@ -44,17 +44,17 @@ def test_results_come_in_order(monkeypatch: pytest.MonkeyPatch, count: int) -> N
 def test_normal_blocks_are_sums_of_products(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against the dense sum in double precision; and 1, 2 and 5 threads agree to the last bit."""
     rng, K = np.random.default_rng(5), 23
-    gradients = rng.normal(size=(1300, 4, K)).astype(np.float32)
+    gradients = [rng.normal(size=(1300, 4, width)).astype(np.float32) for width in (K, 9)]
     derivatives = [rng.normal(size=(1300, 3, 4)).astype(np.float32) for _ in range(2)]
-    X = [D.astype(float) @ gradients.astype(float) for D in derivatives]
+    X = [D.astype(float) @ G.astype(float) for D, G in zip(derivatives, gradients, strict=True)]
     found = []
     for count in (1, 2, 5):
         use(monkeypatch, count)
-        found.append(normal_blocks.normal_blocks(derivatives, gradients, [(1, 0, 2, 1)]))
-    for j in range(2):
-        np.testing.assert_allclose(found[0][j, j], np.einsum("srk,srl->kl", X[j], X[j]), rtol=0, atol=5e-2)
-    np.testing.assert_allclose(found[0][1, 0], X[1][:, 2].T @ X[0][:, 1], rtol=0, atol=5e-2)  # of sums near 1e4
-    assert not found[0][0, 1].any()
+        found.append(normal_blocks.normal_matrix(derivatives, gradients, [(1, 0, 2, 1)]))
+    for j, part in enumerate((slice(K), slice(K, None))):
+        np.testing.assert_allclose(found[0][part, part], np.einsum("srk,srl->kl", X[j], X[j]), rtol=0, atol=5e-2)
+    np.testing.assert_allclose(found[0][K:, :K], X[1][:, 2].T @ X[0][:, 1], rtol=0, atol=5e-2)  # of sums near 1e4
+    np.testing.assert_array_equal(found[0][:K, K:], found[0][K:, :K].T)
     for other in found[1:]:
         np.testing.assert_array_equal(other, found[0])
 

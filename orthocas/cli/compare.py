@@ -63,7 +63,7 @@ def compare(
         ),
     ] = 100_000,
     weights: Annotated[
-        str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3 and lambda4.')
+        str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3, lambda4 and lambda5.')
     ] = WEIGHTS_TEXT,
     jobs: Annotated[
         int | None,

@@ -32,7 +32,8 @@ from orthocas.parametrisations import parse_parametrisation
 from orthocas.quality import Report, evaluate
 from orthocas.solvers import get as get_solver
 
-WEIGHTS_TEXT = f"{DEFAULT_WEIGHTS.task:g},{DEFAULT_WEIGHTS.mutual:g},{DEFAULT_WEIGHTS.regularity:g}"
+_NUMBERS = ("task", "mutual", "regularity", "length", "folds")
+WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _NUMBERS)
 
 
 def fit(
@@ -43,8 +44,13 @@ def fit(
     task: TaskName = None,
     metric: MetricName = None,
     param: Annotated[
-        str, typer.Option("--param", help="Parametrisation: polynomial:4, fourier:2, mlp:64x64, linear or sew.")
-    ] = "polynomial:4",
+        str | None,
+        typer.Option(
+            "--param",
+            help="Parametrisation: polynomial:5, fourier:2, mlp:64x64, linear or sew; default: polynomial:5, "
+            "or polynomial:4 for more than seven joints.",
+        ),
+    ] = None,
     solver: Annotated[
         str | None,
         typer.Option(
@@ -65,7 +71,7 @@ def fit(
         int, typer.Option("--seed", parser=whole_number, help="Seed of the samples and of random starts.")
     ] = 0,
     weights: Annotated[
-        str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3 and lambda4.')
+        str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3, lambda4 and lambda5.')
     ] = WEIGHTS_TEXT,
     max_mutual_deg: Annotated[
         float | None,
@@ -92,7 +98,7 @@ def fit(
     built = build_problem(problem, words)
     target = out or Path(f"{built.name}.orthocas")
     require_free(target, CHART, force)
-    parametrisation = parse_parametrisation(param)
+    parametrisation = None if param is None else parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
     loss = parse_weights(weights)
     try:
@@ -122,10 +128,10 @@ def fit(
 
 
 def parse_weights(text: str) -> Weights:
-    """Read "1000,30", "1000,30,150" or "1000,30,150,0.01"."""
+    """Read two to five numbers, such as "1000,30" or "1000,30,150,0.01,1000"."""
     numbers = parse_numbers("--weights", text).tolist()
-    if not 2 <= len(numbers) <= 4:
-        raise InvalidValueError("--weights", repr(text), "two to four numbers")
+    if not 2 <= len(numbers) <= 5:
+        raise InvalidValueError("--weights", repr(text), "two to five numbers")
     return Weights.of(numbers)
 
 
@@ -135,6 +141,8 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
     if result.idle_joints:
         rows["exact"] = f"joints that do not move the task: {', '.join(result.idle_joints)}"
+    if result.worst is not None:
+        rows["searched"] = f"least conditioning {result.worst.told}"
     if result.problem_check.singular_samples:
         check = result.problem_check
         at = ", ".join(f"{value:.2f}" for value in check.most_singular_point)
@@ -151,6 +159,7 @@ def _as_dict(result: Fit, report: Report, target: Path) -> dict[str, Any]:
         "status": result.status.value,
         "seconds": result.seconds,
         "idle_joints": list(result.idle_joints),
+        "least_conditioning": None if result.worst is None else result.worst.least,
         "near_singular_share": check.singular_share,
         "most_singular_point": list(check.most_singular_point),
         "stages": [

@@ -1,11 +1,11 @@
 """The loss of families linear in theta: basis gradients are sampled once, the rest is dense products (ours)."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from copy import copy
-from itertools import combinations
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.casadi_tools.columns import blocked, by_sample, shares
 from orthocas.casadi_tools.threads import in_threads
@@ -13,7 +13,7 @@ from orthocas.checks import Array
 from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.loss import Loss, Sizes, Weights
 from orthocas.fitting.loss.residuals import curvature_columns, loss_columns, residual_columns, value_columns
-from orthocas.fitting.normal_blocks import normal_blocks
+from orthocas.fitting.normal_blocks import normal_matrix
 from orthocas.parametrisations import LinearFamily
 from orthocas.samples import Draw, Samples, even_parts
 
@@ -38,16 +38,27 @@ class BasisObjective:
         weights: weights of the loss.
         start: parameters, (size,), whose orientation the regularity term keeps.
         draw: draws fresh samples.
+        kept: the coefficients (r, K) that may differ from zero; theta holds only these. Default: all.
     """
 
-    def __init__(self, family: LinearFamily, samples: Samples, weights: Weights, start: Array, draw: Draw) -> None:
+    def __init__(
+        self,
+        family: LinearFamily,
+        samples: Samples,
+        weights: Weights,
+        start: Array,
+        draw: Draw,
+        kept: NDArray[np.bool_] | None = None,
+    ) -> None:
         self.family, self.weights, self._draw = family, weights, draw
         self.r, self.K = family.outputs, family.width
+        self.kept = np.ones((self.r, self.K), dtype=bool) if kept is None else kept
         m, self.n = samples.task_jacobian.shape[1:]
         self._gradients = BasisGradients(family, self.n)
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name)
         self._put(samples)
-        self._orientation = samples.orientation(self.coordinate_jacobians(start)) if self._loss.oriented else None
+        oriented = self._loss.oriented or weights.folds > 0
+        self._orientation = samples.orientation(self.coordinate_jacobians(start)) if oriented else None
         self._describe(samples)
 
     def _put(self, samples: Samples) -> None:
@@ -114,13 +125,27 @@ class BasisObjective:
             H[j, :, i] = H[i, :, j].T
 
         list(in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)]))
-        return H.reshape(r * K, r * K)
+        free = self.kept.ravel()
+        return H.reshape(r * K, r * K)[np.ix_(free, free)]
 
     def reweighted(self, weights: Weights) -> Self:
         """The same loss on the same samples with other weights. It cannot add terms that need other sample data."""
         other = copy(self)
         other.weights, other._loss = weights, Loss.of(self._loss.sizes, weights.by_name)
         assert set(other._loss.data) <= set(self._described)
+        return other
+
+    def elsewhere(self, samples: Samples, weights: Mapping[str, float]) -> Self:
+        """Other terms of the same coordinates at other samples, with the same orientation.
+
+        Args:
+            samples: the samples.
+            weights: weights of the terms by name.
+        """
+        other = copy(self)
+        other._loss = Loss.of(self._loss.sizes, weights)
+        other._put(samples)
+        other._describe(samples)
         return other
 
     @property
@@ -138,15 +163,18 @@ class BasisObjective:
         return self._expanded["all"]
 
     @property
-    def _half(self) -> Array:
-        """G at every second sample, (N / 2, n, K), in single precision."""
-        if "half" not in self._expanded:
-            self._expanded["half"] = self._gradients.dense(self.G.astype(np.float32), self.N, _STRIDE)
-        return self._expanded["half"]
+    def _halves(self) -> list[Array]:
+        """G of the coefficients of each coordinate at every second sample, (N / 2, n, K_j), in single precision."""
+        names = [row.tobytes().hex() for row in self.kept]
+        if not set(names) <= set(self._expanded):
+            half = self._gradients.dense(self.G.astype(np.float32), self.N, _STRIDE)
+            for name, row in zip(names, self.kept, strict=True):
+                self._expanded[name] = half if row.all() else np.ascontiguousarray(half[:, :, row])
+        return [self._expanded[name] for name in names]
 
     def _by_joint(self, theta: Array) -> Array:
         """Coefficients of the terms that depend on each joint, (n, r, W)."""
-        C = theta.reshape(self.r, self.K)[:, self._gradients.terms_of_joints]
+        C = expanded(theta, self.kept).reshape(self.r, self.K)[:, self._gradients.terms_of_joints]
         return np.ascontiguousarray(C.transpose(1, 0, 2))
 
     def _collected(self, gradient: Array) -> Array:
@@ -155,7 +183,7 @@ class BasisObjective:
         for places, slopes in zip(self._gradients.terms_of_joints, gradient, strict=True):
             known = places >= 0
             total[:, places[known]] += slopes[:, known]
-        return total.ravel()
+        return total[self.kept]
 
     @property
     def _parts(self) -> list[slice]:
@@ -180,12 +208,13 @@ class BasisObjective:
 
     def _gauss_newton_matrix(self, derivatives: list[Array]) -> Array:
         """Gauss-Newton matrix of the smooth residuals, by blocks of coordinate pairs, from every second sample."""
-        r, K, rows = self.r, self.K, self._loss.smooth_rows
+        rows = self._loss.smooth_rows
+        if not any(rows):
+            return np.zeros((self.kept.sum(), self.kept.sum()))
         shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
-        blocks = normal_blocks([self._rows(derivative) for derivative in derivatives], self._half, shared)
-        for i, j in combinations(range(r), 2):
-            blocks[i, j] = blocks[j, i].T
-        return blocks.transpose(0, 2, 1, 3).reshape(r * K, r * K) / len(self._half)
+        gradients = self._halves
+        H = normal_matrix([self._rows(derivative) for derivative in derivatives], gradients, shared)
+        return H / len(gradients[0])
 
     def _rows(self, derivative: Array) -> Array:
         """Derivatives of residuals (B, n rows, c) at every second sample, (N / 2, rows, n), in single precision."""
@@ -198,6 +227,13 @@ class BasisObjective:
         D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
         chosen: Array = self.G[block, :, :, column]  # (active, n, W)
         G = self._gradients.dense(chosen.transpose(1, 2, 0)[None], len(chosen))
-        rows = (D @ G.astype(np.float32)).reshape(-1, self.r * self.K)
+        rows = (D @ G.astype(np.float32))[:, self.kept]
         product: Array = (rows.T @ rows).astype(float) / self.N
         return product
+
+
+def expanded(theta: Array, kept: NDArray[np.bool_]) -> Array:
+    """All coefficients, (r K,), from those that may differ from zero."""
+    C = np.zeros(kept.shape)
+    C[kept] = theta
+    return C.ravel()

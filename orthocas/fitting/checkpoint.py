@@ -64,14 +64,20 @@ class Checkpoint:
         """The stage with this label, if an earlier run finished it."""
         return next((stage for stage in self._stages if stage.label == label), None)
 
-    def require_fitting(self, label: str, size: int) -> None:
-        """Raise CheckpointError unless what is kept of a stage belongs to a family with that many parameters."""
+    def require_fitting(self, label: str, size: int, free: int) -> None:
+        """Raise CheckpointError unless what is kept of a stage belongs to a family with that many parameters.
+
+        Args:
+            label: name of the stage.
+            size: number of parameters of the family.
+            free: number of those that the stage fits.
+        """
         done = self.finished(label)
         if done is not None and done.parameters != size:
             raise self.inconsistent(f"stage '{label}' has {done.parameters} parameters, expected {size}")
         for name, value in (self._running[1] if self._running and self._running[0] == label else {}).items():
-            if name in _VECTORS and (value.shape != (size,) or not np.isfinite(value).all()):
-                raise self.inconsistent(f"{name} has shape {value.shape}, expected ({size},) with finite entries")
+            if name in _VECTORS and (value.shape != (free,) or not np.isfinite(value).all()):
+                raise self.inconsistent(f"{name} has shape {value.shape}, expected ({free},) with finite entries")
             if name in _NUMBERS and (value.shape != () or not 0 <= value < _MOST):
                 raise self.inconsistent(f"{name} is {np.ravel(value)[:3].tolist()}, expected one number >= 0")
             if name in _LOSSES and value.shape != ():

@@ -12,17 +12,20 @@ from orthocas.checks import as_path
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.errors import Interrupted
 from orthocas.fitting.checkpoint import Checkpoint, Stage
+from orthocas.fitting.continuation import Continuation
+from orthocas.fitting.fold_search import FoldSearch
 from orthocas.fitting.gauge import aligned, in_closed_form, in_gauge, normalised
 from orthocas.fitting.idle_joints import idle_joints
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers, Weights
-from orthocas.fitting.settings import FitSettings
+from orthocas.fitting.settings import FitSettings, default_parametrisation
 from orthocas.fitting.stages import StageRunner
 from orthocas.minimising.solver import Solver, Status
 from orthocas.minimising.watch import Monitor, silent
-from orthocas.parametrisations import JointSpace, Parametrisation, Polynomial, warn_unless_savable
+from orthocas.parametrisations import JointSpace, Parametrisation, warn_unless_savable
 from orthocas.problem import Problem, ProblemCheck, check
 from orthocas.samples import Samples, sample_problem
 from orthocas.showing import Shown, listed
+from orthocas.worst_points import WorstPoints
 
 _FIRST_SAMPLES = 1000  # seed tag of the samples that scale coordinates; stages use other tags
 
@@ -43,6 +46,7 @@ class Fit(Shown):
     stages: tuple[Stage, ...]
     problem_check: ProblemCheck
     idle_joints: tuple[str, ...]  #: names of joints that are exact coordinates themselves
+    worst: WorstPoints | None  #: result of the last search for folds; None if there was none
     seconds: float  #: of this run; the seconds of stages include earlier runs of a checkpoint
 
     @property
@@ -59,6 +63,7 @@ class Fit(Shown):
             "loss": listed(stages) or "nothing to minimise",
             "samples": str(self.chart.notes.get("samples", "")),
             "idle joints": listed(self.idle_joints) or "none",
+            "least conditioning": "not searched" if self.worst is None else self.worst.told,
             "near singular": f"{self.problem_check.singular_share:.3%} of the domain",
         }
 
@@ -85,7 +90,8 @@ def fit(
 
     Args:
         problem: robot, task, metric and domain.
-        parametrisation: the family of coordinates. Default: Polynomial(degree=4).
+        parametrisation: the family of coordinates. Default: polynomials of degree 5; of degree 4 for more than
+            seven joints, or with a bound on mutual angles.
         solver: the minimiser. Default: GaussNewton for families linear in their parameters, LBFGS otherwise.
         weights: weights of the loss, as `Weights` or as two to four numbers (lambda1, lambda2, ...).
         samples: number of samples. Default: grows with the number of parameters.
@@ -118,7 +124,9 @@ def fit(
         (1,)
     """
     start = time.perf_counter()
-    wanted = Polynomial(degree=4) if parametrisation is None else parametrisation
+    wanted = (
+        default_parametrisation(problem, max_mutual_deg is not None) if parametrisation is None else parametrisation
+    )
     settings = FitSettings.checked(problem, wanted, solver, weights, samples, seed, max_mutual_deg)
     warn_unless_savable(settings.parametrisation)
     found = check(problem, seed=settings.seed)
@@ -126,19 +134,21 @@ def fit(
     if settings.parametrisation.closed_form is not None:
         idle: tuple[int, ...] = ()
         stages: tuple[Stage, ...] = ()
+        worst = None
         coordinates = in_closed_form(problem, settings.parametrisation, first)
     else:
         idle = tuple(idle_joints(problem, first)[-problem.r :])
         file = Checkpoint(None if checkpoint is None else as_path("checkpoint", checkpoint), settings.identity(problem))
-        stages, coordinates = _minimised(problem, settings, idle, monitor, file, first)
+        stages, coordinates, worst = _minimised(problem, settings, idle, monitor, file, first)
         if stages:
             centre = problem.domain.centre
             coordinates = in_gauge(coordinates, centre) if align_to is None else aligned(coordinates, align_to, first)
     result = Fit(
-        chart=Chart(problem, coordinates, _notes(stages, settings)),
+        chart=Chart(problem, coordinates, _notes(stages, settings, worst)),
         stages=stages,
         problem_check=found,
         idle_joints=tuple(problem.robot.joint_names[i] for i in idle),
+        worst=worst,
         seconds=time.perf_counter() - start,
     )
     if result.status is Status.INTERRUPTED:
@@ -153,20 +163,22 @@ def _minimised(
     monitor: Monitor,
     checkpoint: Checkpoint,
     samples: Samples,
-) -> tuple[tuple[Stage, ...], Coordinates]:
-    """Run the stages of the fit. Returns them and the coordinates."""
+) -> tuple[tuple[Stage, ...], Coordinates, WorstPoints | None]:
+    """Run the stages of the fit. Returns them, the coordinates, and their worst points."""
     space, r = JointSpace.of(problem), problem.r - len(idle)
     if r == 0:
-        return (), Coordinates(settings.parametrisation, space, idle, np.zeros(0), np.zeros(0), np.zeros(0))
+        return (), Coordinates(settings.parametrisation, space, idle, np.zeros(0), np.zeros(0), np.zeros(0)), None
     active = [i for i in range(problem.n) if i not in idle]
-    solved = StageRunner(problem, settings, active, monitor, checkpoint).run(r)
+    folds = FoldSearch(problem, active, settings.fold_weight(problem))
+    solved = Continuation(StageRunner(problem, settings, active, monitor, checkpoint, folds), r).run()
     raw = Coordinates(solved.parametrisation, space, idle, solved.theta, np.zeros(r), np.ones(r))
-    return solved.stages, normalised(raw, problem.domain.centre, samples)
+    return solved.stages, normalised(raw, problem.domain.centre, samples), solved.worst
 
 
-def _notes(stages: Sequence[Stage], settings: FitSettings) -> dict[str, str | float]:
+def _notes(stages: Sequence[Stage], settings: FitSettings, worst: WorstPoints | None) -> dict[str, str | float]:
     """Notes of the chart: how it was made."""
     weights = settings.weights
+    searched = {} if worst is None else {"least conditioning": worst.least}
     extra = {f"weight of {name}": weight for name, weight in weights.extra.items()}
     return {
         "solver": settings.solver.name if stages else "closed form",
@@ -174,7 +186,9 @@ def _notes(stages: Sequence[Stage], settings: FitSettings) -> dict[str, str | fl
         "lambda2": weights.mutual,
         "lambda3": weights.regularity,
         "lambda4": weights.length,
+        "lambda5": weights.folds,
         **extra,
+        **searched,
         "seed": settings.seed,
         "samples": stages[-1].samples if stages else 0,
         "status": stages[-1].result.status.value if stages else Status.CONVERGED.value,

@@ -1,6 +1,6 @@
 """The loss of a family of dense products as one CasADi graph, with its gradient by symbolic differentiation."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from math import ceil
@@ -35,8 +35,9 @@ class GraphObjective:
     def __init__(self, family: Family, samples: Samples, weights: Weights, start: Array, draw: Draw) -> None:
         m, n = samples.task_jacobian.shape[1:]
         loss = Loss.of(Sizes(n, m, family.outputs, samples.metric_inverse is None), weights.by_name)
+        oriented = loss.oriented or weights.folds > 0
         self._graphs, self._draw = _Graphs(family, loss), draw
-        self._orientation = _orientation(family, start, samples[:_ORIENTING]) if loss.oriented else None
+        self._orientation = _orientation(family, start, samples[:_ORIENTING]) if oriented else None
         self._put(samples, len(samples))
 
     def value(self, theta: Array) -> float:
@@ -54,6 +55,18 @@ class GraphObjective:
             other = copy(self)
             other._put(part, size)
             yield other
+
+    def elsewhere(self, samples: Samples, weights: Mapping[str, float]) -> Self:
+        """Other terms of the same coordinates at other samples, with the same orientation.
+
+        Args:
+            samples: the samples.
+            weights: weights of the terms by name.
+        """
+        other = copy(self)
+        other._graphs = _Graphs(self._graphs.family, Loss.of(self._graphs.loss.sizes, weights))
+        other._put(samples, len(samples))
+        return other
 
     def _put(self, samples: Samples, room: int) -> None:
         """Use these samples. Graphs are built for `room` samples, so that smaller sets share them."""

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocas.checks import as_number, require_count
+from orthocas.domains import Torus
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.loss import WeightNumbers, Weights
 from orthocas.minimising.solver import Solver
-from orthocas.parametrisations import Parametrisation
+from orthocas.parametrisations import Parametrisation, Polynomial
 from orthocas.problem import Problem
 from orthocas.samples import sample_problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt
@@ -61,6 +62,11 @@ class FitSettings:
         """Bound on the root mean square mutual angle's deviation from a right angle [rad]."""
         return None if self.max_mutual_deg is None else float(np.radians(self.max_mutual_deg))
 
+    def fold_weight(self, problem: Problem) -> float:
+        """Weight of the fold term; 0 on a torus, where every coordinate has critical points, and with a bound."""
+        free = not isinstance(problem.domain, Torus) and self.max_mutual_deg is None
+        return self.weights.folds if free else 0.0
+
     def identity(self, problem: Problem) -> dict[str, str]:
         """Settings that identify this fit, for its checkpoint."""
         return {
@@ -72,6 +78,11 @@ class FitSettings:
             "seed": repr(self.seed),
             "max_mutual_deg": repr(self.max_mutual_deg),
         }
+
+
+def default_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
+    """Polynomials of degree 5, and of degree 4 where the terms grow too many: for many joints, or with a bound."""
+    return Polynomial(degree=4 if bounded or problem.n > 7 else 5)
 
 
 def default_solver(parametrisation: Parametrisation) -> Solver:

@@ -1,27 +1,31 @@
-"""The stages of a fit. Each is a minimisation: samples, a start, an objective, a solver."""
+"""One stage of a fit is a minimisation: samples, a start, an objective, a solver."""
 
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import ceil
 
 import numpy as np
+from numpy.typing import NDArray
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.checks import Array, require_memory
 from orthocas.domains import sample_evenly
 from orthocas.errors import CheckpointError, InfeasibleError, InvalidValueError, SolveError
-from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.basis_objective import BasisObjective, expanded
 from orthocas.fitting.bounded_mutual import BoundedMutual
 from orthocas.fitting.checkpoint import Checkpoint, Stage
+from orthocas.fitting.fold_search import FoldSearch
 from orthocas.fitting.graph_objective import GraphObjective
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, pairs
+from orthocas.fitting.mirror import Mirror, find_mirror
 from orthocas.fitting.settings import FitSettings
 from orthocas.fitting.spectral_start import spectral_start
 from orthocas.minimising.objective import Objective
 from orthocas.minimising.solver import Solver, SolveResult, Status
 from orthocas.minimising.watch import Monitor, Progress, Watch
-from orthocas.parametrisations import Family, GradedParametrisation, JointSpace, LinearFamily, Parametrisation
+from orthocas.parametrisations import Family, GradedParametrisation, JointSpace, LinearFamily
 from orthocas.problem import Problem
 from orthocas.samples import Samples, sample_problem, samples_at
 from orthocas.solvers import GaussNewton
@@ -32,132 +36,106 @@ _FRESH = 2000  # seed tag of samples drawn while a solver runs; stages use other
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """Finished minimisations, and the parametrisation that they reached."""
+class Plan:
+    """What one stage does."""
 
-    stages: tuple[Stage, ...]
-    parametrisation: Parametrisation
-
-    @property
-    def theta(self) -> Array:
-        """Parameters found by the last minimisation."""
-        return self.stages[-1].result.theta
+    label: str  #: name of the stage, unique within a fit
+    family: Family
+    start: Array | None  #: parameters of the family, (size,); None: a start has to be found
+    solver: Solver
+    tag: int  #: seed tag of the samples
+    final: bool  #: whether a bound on mutual angles has to be met
 
 
 @dataclass(frozen=True, eq=False)
 class StageRunner:
-    """Runs the stages of one fit, and holds what they share."""
+    """Runs single stages of one fit, and holds what they share."""
 
     problem: Problem
     settings: FitSettings
     active: list[int]  #: joints that are not coordinates themselves
     monitor: Monitor
     checkpoint: Checkpoint
+    folds: FoldSearch
 
     @property
     def space(self) -> JointSpace:
         """The active joints."""
         return JointSpace.of(self.problem).restricted_to(self.active)
 
-    def run(self, r: int) -> Solved:
-        """Run all minimisations for r coordinates of the active joints."""
-        parametrisation, solver = self.settings.parametrisation, self.settings.solver
-        if isinstance(parametrisation, GradedParametrisation):
-            return self.graded(parametrisation, r, solver)
-        stage = self.stage(parametrisation, parametrisation.family(self.space, r), None, solver)
-        return Solved((stage,), parametrisation)
+    @cached_property
+    def mirror(self) -> Mirror | None:
+        """The symmetry that halves the coefficients; a bound on mutual angles is met without one."""
+        return None if self.settings.max_mutual is not None else find_mirror(self.problem, self.active)
 
-    def graded(self, target: GradedParametrisation, r: int, solver: Solver) -> Solved:
-        """Degree continuation: solve a low degree from a spectral start, embed the result, solve the next degree."""
-        self._require_memory(target, r)
-        stages: list[Stage] = []
-        lower = None
-        for degree in range(min(target.degree, 2), target.degree + 1):
-            current = target.of_degree(degree)
-            family = current.family(self.space, r)
-            start = None if lower is None else family.embed(stages[-1].result.theta, lower)
-            final = degree == target.degree
-            try:
-                minimiser = solver if final else solver.coarser()
-                stages.append(self.stage(current, family, start, minimiser, degree, final))
-            except KeyboardInterrupt:  # between minimisations: the last degree is the best result so far
-                if not stages:
-                    raise
-                return Solved((*stages[:-1], stages[-1].interrupted()), target.of_degree(degree - 1))
-            lower = family
-            if stages[-1].result.status is Status.INTERRUPTED:
-                return Solved(tuple(stages), current)
-        return Solved(tuple(stages), target)
-
-    def stage(
-        self,
-        parametrisation: Parametrisation,
-        family: Family,
-        theta: Array | None,
-        solver: Solver,
-        degree: int = 0,
-        final: bool = True,
-    ) -> Stage:
+    def run(self, plan: Plan) -> Stage:
         """Draw samples, find a start if none is given, and minimise. A finished stage comes from the checkpoint.
 
         Raises:
             SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
         """
-        label = parametrisation.label
-        self.checkpoint.require_fitting(label, family.size)
-        done = self.checkpoint.finished(label)
+        family = plan.family
+        kept = self.mirror.kept(family) if self.mirror is not None and isinstance(family, LinearFamily) else None
+        self.checkpoint.require_fitting(plan.label, family.size, family.size if kept is None else int(kept.sum()))
+        done = self.checkpoint.finished(plan.label)
         if done is not None:
             return done
         # networks are few large products: they need the threads of BLAS more than the last digits
         with one_blas_thread() if isinstance(family, LinearFamily) else nullcontext():
-            return self._minimised(label, family, theta, solver, degree, final)
+            stage = self._minimised(plan, kept)
+        self.checkpoint.add(stage)
+        return stage
 
-    def _minimised(
-        self, label: str, family: Family, theta: Array | None, solver: Solver, degree: int, final: bool
-    ) -> Stage:
+    def _minimised(self, plan: Plan, kept: NDArray[np.bool_] | None) -> Stage:
         """A stage that is not in the checkpoint."""
-        count = self._sample_count(family)
-        self.monitor(Progress(label, 0.0, f"sampling {count} points"))
-        points = sample_evenly(self.problem.domain, count, (self.settings.seed, 1 + degree))
+        count = self._sample_count(plan.family, kept)
+        self.monitor(Progress(plan.label, 0.0, f"sampling {count} points"))
+        points = sample_evenly(self.problem.domain, count, (self.settings.seed, 1 + plan.tag))
         samples = samples_at(self.problem, points).restricted_to(self.active)
         with deferred():  # CasADi may swallow Ctrl-C while graphs are built
-            objective, theta = self._objective(label, family, samples, theta)
-        keeper = self.checkpoint.keeper(label)
-        watch = Watch(self.monitor, label, keeper)
+            objective, theta = self._objective(plan, samples, kept)
+        keeper = self.checkpoint.keeper(plan.label)
         try:
-            result = solver.minimise(objective, theta, watch)
+            result = plan.solver.minimise(objective, theta, Watch(self.monitor, plan.label, keeper))
         except CheckpointError as error:  # the solver's own part of the state
             raise self.checkpoint.inconsistent(str(error)) from None
         if result.status is Status.INTERRUPTED:
             keeper.flush()
         if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
-            if final:
+            if plan.final:
                 assert self.settings.max_mutual is not None
-                raise missed_bound(label, self.settings.max_mutual, objective, result)
+                raise missed_bound(plan.label, self.settings.max_mutual, objective, result)
         else:
             result.raise_if_failed()
-        stage = Stage(label, family.size, len(samples), result)
-        self.checkpoint.add(stage)
-        return stage
+        if kept is not None:
+            result = replace(result, theta=expanded(result.theta, kept))
+        return Stage(plan.label, plan.family.size, len(samples), result)
 
-    def _objective(self, label: str, family: Family, samples: Samples, theta: Array | None) -> tuple[Objective, Array]:
-        """The loss of a family on samples, and the start."""
+    def _objective(self, plan: Plan, samples: Samples, kept: NDArray[np.bool_] | None) -> tuple[Objective, Array]:
+        """The loss of a family on samples, and the start in the parameters that it leaves free."""
+        family, theta, weights = plan.family, plan.start, self.settings.weights
         if not isinstance(family, LinearFamily):
             if self.settings.max_mutual is not None:
                 raise InvalidValueError(
                     "max_mutual_deg",
-                    f"given with {label}",
+                    f"given with {plan.label}",
                     "a parametrisation linear in its parameters, such as polynomial",
                 )
-            self._require_graph_memory(label, family, len(samples))
+            self._require_graph_memory(plan.label, family, len(samples))
             theta = family.initial(self.settings.seed) if theta is None else theta
-            return GraphObjective(family, samples, self.settings.weights, theta, self._draw), theta
+            return self.folds.added_to(GraphObjective(family, samples, weights, theta, self._draw)), theta
         fresh = theta is None
-        theta = self._spectral_start(family, len(samples)) if theta is None else theta
-        objective = BasisObjective(family, samples, self.settings.weights, theta, self._draw)
+        theta = self._spectral_start(family, len(samples), kept) if theta is None else theta
+        theta = theta if kept is None else theta.reshape(kept.shape)[kept]
+        objective = BasisObjective(family, samples, weights, theta, self._draw, kept)
         if self.settings.max_mutual is None:
-            return objective, theta
-        fitted, all_pairs = len(pairs(family.outputs)), len(pairs(self.problem.r))
+            return self.folds.added_to(objective), theta
+        return self._bounded(objective, theta, fresh)
+
+    def _bounded(self, objective: BasisObjective, theta: Array, fresh: bool) -> tuple[Objective, Array]:
+        """The problem with a bound on the mutual angles, and its start."""
+        assert self.settings.max_mutual is not None
+        fitted, all_pairs = len(pairs(objective.r)), len(pairs(self.problem.r))
         if not fitted:
             raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
         # pairs with an idle joint are exactly orthogonal, so the other pairs may use their share
@@ -167,18 +145,20 @@ class StageRunner:
             theta = GaussNewton().minimise(objective.reweighted(weighted), theta).finished().theta
         return bounded, bounded.in_gauge(theta)
 
-    def _spectral_start(self, family: LinearFamily, count: int) -> Array:
+    def _spectral_start(self, family: LinearFamily, count: int, kept: NDArray[np.bool_] | None) -> Array:
         """A start that does not depend on the seed: eigenvalues are close, so other samples would mix coordinates."""
         points = sample_evenly(self.problem.domain, count, _START_SEED)
-        return spectral_start(family, samples_at(self.problem, points).restricted_to(self.active))
+        return spectral_start(family, samples_at(self.problem, points).restricted_to(self.active), kept)
 
     def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
         return sample_problem(self.problem, count, (self.settings.seed, _FRESH, *seed)).restricted_to(self.active)
 
-    def _sample_count(self, family: Family) -> int:
-        if isinstance(family, LinearFamily):
-            return self._linear_sample_count(family.width, family.outputs)
-        return self.settings.samples or MLP_SAMPLES
+    def _sample_count(self, family: Family, kept: NDArray[np.bool_] | None) -> int:
+        """A sample of a mirror symmetric problem counts twice."""
+        if not isinstance(family, LinearFamily):
+            return self.settings.samples or MLP_SAMPLES
+        count = self._linear_sample_count(family.width, family.outputs)
+        return count if kept is None or self.settings.samples else ceil(count / 2)
 
     def _linear_sample_count(self, terms: int, r: int) -> int:
         """Number of samples for a linear family, so that there are about 140 residuals per coefficient."""
@@ -188,7 +168,7 @@ class StageRunner:
         """Refuse a network whose parameters and solver state exceed the memory."""
         require_memory(f"{label} with {family.size} parameters", 8.0 * (60 * family.size + 100 * count * self.space.n))
 
-    def _require_memory(self, target: GradedParametrisation, r: int) -> None:
+    def require_memory(self, target: GradedParametrisation, r: int) -> None:
         """Refuse a degree that exceeds the memory, before building anything."""
         K = target.term_count(self.space.n)
         N = self._linear_sample_count(K, r)

@@ -3,13 +3,15 @@
 from orthocas.fitting.loss.angles import mutual_cosines, pairs, task_cosines
 from orthocas.fitting.loss.length import log_lengths
 from orthocas.fitting.loss.registry import register, term_of
-from orthocas.fitting.loss.regularity import REGULAR_VOLUME, gradient_volume
+from orthocas.fitting.loss.regularity import FOLD_TERM, LEAST_CONDITIONING, REGULAR_VOLUME, gradient_volume
 from orthocas.fitting.loss.residuals import Loss
 from orthocas.fitting.loss.term import Data, LossTerm, Sizes
 from orthocas.fitting.loss.weights import DEFAULT_WEIGHTS, WeightNumbers, Weights
 
 __all__ = [
     "DEFAULT_WEIGHTS",
+    "FOLD_TERM",
+    "LEAST_CONDITIONING",
     "REGULAR_VOLUME",
     "Data",
     "Loss",

@@ -6,7 +6,9 @@ import casadi as ca
 
 from orthocas.fitting.loss.term import Data, Sizes
 
-REGULAR_VOLUME = 0.9  #: volume of the gradients below which the term acts
+REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
+LEAST_CONDITIONING = 0.2  #: that fits aim at on the whole domain
+_FOLD_VOLUME = 1.6 * LEAST_CONDITIONING  # enough for it: det D <= sqrt(e) times the conditioning
 
 
 def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
@@ -31,14 +33,18 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
 
 @dataclass(frozen=True)
 class RegularityTerm:
-    """max(0.9 - det D, 0)^2, where det D is the `gradient_volume`."""
+    """max(bound - det D, 0)^2, where det D is the `gradient_volume`."""
 
     name: str = "regularity"
+    bound: float = REGULAR_VOLUME
     data: tuple[str, ...] = ("metric_inverse", "null_basis")
     hinge: bool = True
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """One residual, (1, 1)."""
         volume = gradient_volume(coordinate_jacobian, data["null_basis"], data.get("metric_inverse"))
-        hinge: ca.SX = ca.fmax(REGULAR_VOLUME - volume, 0)
+        hinge: ca.SX = ca.fmax(self.bound - volume, 0)
         return hinge
+
+
+FOLD_TERM = RegularityTerm("folds", _FOLD_VOLUME)  #: for the worst points of the domain only

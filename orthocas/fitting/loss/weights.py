@@ -6,22 +6,24 @@ from dataclasses import dataclass, field
 from orthocas.checks import as_float_array, as_number, require_kind
 from orthocas.errors import InvalidValueError, ShapeError
 
-WeightNumbers = Sequence[float]  #: two to four numbers: task, mutual, regularity, length
+WeightNumbers = Sequence[float]  #: two to five numbers: task, mutual, regularity, length, folds
 
 
 @dataclass(frozen=True)
 class Weights:
-    """lambda1 (task) and lambda2 (mutual) of [AS2023] eq. (24); lambda3 (regularity) and lambda4 (length) are ours.
+    """lambda1 (task) and lambda2 (mutual) of [AS2023] eq. (24); the others are ours.
 
     The ratio of the first two selects a point on the Pareto front of task angles and mutual angles. At the paper's
     1000 : 1 the optimum can lose rank. The regularity term prevents the gradients of the coordinates from collapsing
-    anywhere. The length term keeps their lengths even, which helps controllers.
+    anywhere. The length term keeps their lengths even, which helps controllers. The fold term acts at the worst points
+    of the domain, which a search finds between the stages of a fit, and keeps the conditioning above 0.2 there.
 
     Args:
         task: lambda1 > 0.
         mutual: lambda2 >= 0.
         regularity: lambda3 >= 0.
         length: lambda4 >= 0.
+        folds: lambda5 >= 0. With 0 there is no search.
         extra: weights >= 0 of registered terms, by name; see `orthocas.register_loss_term`.
 
     Raises:
@@ -39,10 +41,11 @@ class Weights:
     mutual: float = 30.0
     regularity: float = 150.0
     length: float = 0.0
+    folds: float = 1000.0
     extra: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        for k, name in enumerate(("task", "mutual", "regularity", "length")):
+        for k, name in enumerate(("task", "mutual", "regularity", "length", "folds")):
             object.__setattr__(self, name, _weight(f"lambda{k + 1}", getattr(self, name)))
         require_kind("extra", self.extra, Mapping)
         extra = {name: _weight(f"weight of {name}", value) for name, value in self.extra.items()}
@@ -52,23 +55,23 @@ class Weights:
 
     @classmethod
     def of(cls, weights: "Weights | WeightNumbers") -> "Weights":
-        """Convert two to four numbers in the order of the fields; missing ones are 0. Weights stay as they are.
+        """Convert two to five numbers in the order of the fields; missing ones are 0. Weights stay as they are.
 
         Raises:
             ShapeError, InvalidValueError: if the numbers are invalid, or the task weight is not positive.
         """
         if not isinstance(weights, Weights):
             values = as_float_array("weights", weights)
-            if values.shape not in ((2,), (3,), (4,)):
-                raise ShapeError("weights", values.shape, (4,))
-            weights = cls(*values.tolist(), *[0.0] * (4 - len(values)))
+            if values.shape not in ((2,), (3,), (4,), (5,)):
+                raise ShapeError("weights", values.shape, (5,))
+            weights = cls(*values.tolist(), *[0.0] * (5 - len(values)))
         if weights.task == 0:
             raise InvalidValueError("lambda1", weights.task, "a positive number")
         return weights
 
     @property
     def by_name(self) -> dict[str, float]:
-        """The weights by the names of their terms."""
+        """The weights by the names of their terms, without the fold term, which acts at the worst points only."""
         own = {"task": self.task, "mutual": self.mutual, "regularity": self.regularity, "length": self.length}
         return own | dict(self.extra)
 

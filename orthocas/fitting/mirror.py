@@ -1,0 +1,112 @@
+"""Mirror symmetry: an arm whose task looks the same in a mirror needs half of the coefficients (ours)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.checks import Array
+from orthocas.parametrisations import JointSpace, LinearFamily
+from orthocas.problem import Problem
+from orthocas.samples import samples_at
+
+_TOLERANCE = 1e-6  # robot files give angles with ten decimals; a symmetry broken by less costs nothing
+_MOST_JOINTS = 12  # 4,096 choices of the joints that turn round
+_POINTS = 16
+_SEED = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Mirror:
+    """A reflection S = diag(s) of the joints about the centre of the domain that keeps task directions and metric.
+
+    The projector on the task gradients fulfils Pi(S q) = S Pi(q) S, and A(S q) = S A(q) S, with q from the centre. So
+    coordinates with xi_j(S q) = p_j xi_j(q), p_j = +1 or -1, have the same angles at q and at S q.
+    """
+
+    space: JointSpace
+    signs: Array  #: s, (n,), +1 or -1
+    parities: Array  #: p, (r,): as many +1 and -1 as the null space has on the mirror, where S q = q
+
+    def kept(self, family: LinearFamily) -> NDArray[np.bool_] | None:
+        """The coefficients (r, K) that such coordinates may have; None if a basis function is neither even nor odd."""
+        q = ca.SX.sym("q", self.space.n)
+        basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
+        u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (self.space.n, _POINTS))
+        here, there = (
+            np.array(basis(self.space.centre[:, None] + self.space.half_width[:, None] * side))
+            for side in (u, self.signs[:, None] * u)
+        )
+        size = np.abs(here).max(axis=1)
+        even, odd = (np.abs(there - sign * here).max(axis=1) <= _TOLERANCE * size for sign in (1, -1))
+        allowed: NDArray[np.bool_] = np.where(even, 1, -1) == self.parities[:, None]
+        return allowed if (even | odd).all() else None
+
+
+def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
+    """The first mirror symmetry of a problem in its active joints, or None."""
+    space = JointSpace.of(problem).restricted_to(active)
+    if space.n > _MOST_JOINTS:
+        return None
+    u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (_POINTS, space.n))
+    left = [np.array(signs) for signs in product((1.0, -1.0), repeat=space.n)][1:]
+    for points in (u[:1], u[1:]):
+        left = _symmetric(problem, active, points, left)
+    for signs in left:
+        parities = _parities(problem, active, signs, u)
+        if parities is not None:
+            return Mirror(space, signs, parities)
+    return None
+
+
+def _symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[Array]) -> list[Array]:
+    """The choices of signs for which task directions and metric at S u are the mirror images of those at u."""
+    images = np.concatenate([u, *(signs * u for signs in choices)])
+    tensors = _tensors(problem, active, images)
+    if tensors is None:
+        return []
+    here, *there = tensors.reshape(1 + len(choices), len(u), *tensors.shape[1:])
+    return [
+        signs
+        for signs, image in zip(choices, there, strict=True)
+        if np.abs(image - signs[:, None] * here * signs).max() <= _TOLERANCE
+    ]
+
+
+def _tensors(problem: Problem, active: list[int], u: Array) -> Array | None:
+    """A^-1 and the projector on the task gradients with its second index raised, both of size 1, (N, 2, n, n)."""
+    q = np.repeat(problem.domain.centre[None, :], len(u), axis=0)
+    q[:, active] += problem.domain.half_width[active] * u
+    samples = samples_at(problem, q).restricted_to(active)
+    if len(samples) < len(u):
+        return None
+    basis = samples.task_basis
+    projector = basis.transpose(0, 2, 1) @ basis
+    inverse = np.broadcast_to(np.eye(len(active)), projector.shape)
+    if samples.metric_inverse is not None:
+        inverse = samples.metric_inverse
+    both = np.stack([inverse, projector], axis=1)
+    scaled: Array = both / np.abs(both).max()
+    return scaled
+
+
+def _parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Array | None:
+    """Parities of r coordinates, odd ones first; None if the null space has other parities elsewhere on the mirror.
+
+    The null space of J_x is mapped to itself where S q = q, and trace(S) on it is the number of even coordinates less
+    that of odd ones.
+    """
+    tensors = _tensors(problem, active, np.where(signs > 0, u, 0.0))
+    if tensors is None:
+        return None
+    inverse, projector = tensors[:, 0], tensors[:, 1]
+    along_task = np.einsum("sii,i->s", np.linalg.solve(inverse, projector.transpose(0, 2, 1)), signs)
+    differences = signs.sum() - along_task
+    r = len(active) - problem.m
+    even = np.round((r + differences.mean()) / 2)
+    if np.abs(2 * even - r - differences).max() > 0.01 or not 0 <= even <= r:
+        return None
+    return np.where(np.arange(r) < r - even, -1.0, 1.0)

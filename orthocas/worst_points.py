@@ -1,0 +1,100 @@
+"""The worst points of a chart: a search of the domain for the least conditioning and for folds (ours)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthocas.checks import Array
+from orthocas.coordinates.map import CoordinateMap
+from orthocas.problem import Problem
+from orthocas.samples import samples_at
+
+CANDIDATES = 6000
+_DESCENTS = 300  # of the worst candidates
+_STEPS = 15
+_FIRST_STEP = 0.3  # of the half-widths
+_MOVED = 0.4  # share of the joints that move in a step
+_POWERS = (1.0, 0.5, 0.25)  # |u|^p of uniform u: uniform, near faces, near corners
+
+
+@dataclass(frozen=True, eq=False)
+class WorstPoints:
+    """Points of least conditioning, the worst one first."""
+
+    points: Array  #: q, (k, n)
+    conditioning: Array  #: signed conditioning, (k,), < 0 where the chart folds over
+
+    @property
+    def least(self) -> float:
+        """Least conditioning found."""
+        return float(self.conditioning[0])
+
+    @property
+    def told(self) -> str:
+        """The least conditioning and how it was searched."""
+        found = (
+            f"{self.least:.3f}"
+            if self.least >= 0
+            else f"the chart FOLDS OVER at {np.sum(self.conditioning < 0)} points"
+        )
+        return f"{found} by descent from {len(self.points)} of {CANDIDATES} points, uniform and near faces and corners"
+
+    def below(self, bound: float) -> Array:
+        """Points with less conditioning than that, (l, n)."""
+        return self.points[self.conditioning < bound]
+
+
+def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) -> WorstPoints:
+    """Search the domain: uniform candidates, others near faces and corners, then local descent from the worst.
+
+    Folds of charts lie in corners and in thin wedges, which uniform samples miss. Descent is a random search that keeps
+    what is worse. Points where a gradient vanishes, or a grown coordinate has no value, are left out.
+
+    Args:
+        problem: problem of the coordinates.
+        coordinates: the coordinates.
+        seed: seed of candidates and steps.
+    """
+    rng = np.random.default_rng((seed, CANDIDATES))
+    u = corner_heavy(rng, CANDIDATES, problem.n)
+    found = _signed_conditioning(problem, coordinates, u)
+    orientation = 1.0 if np.nanmedian(found) >= 0 else -1.0
+    order = np.argsort(orientation * found)[:_DESCENTS]  # NaN comes last
+    u, found = u[order], orientation * found[order]
+    step = np.full(len(u), _FIRST_STEP)
+    for _ in range(_STEPS):
+        moves = rng.normal(size=u.shape) * (rng.uniform(size=u.shape) < _MOVED)
+        tried = np.clip(u + step[:, None] * moves, -1, 1)
+        values = orientation * _signed_conditioning(problem, coordinates, tried)
+        worse = values < found
+        u[worse], found[worse] = tried[worse], values[worse]
+        step *= np.where(worse, 1.5, 0.8)
+    order = np.argsort(found)
+    return WorstPoints(_joint_positions(problem, u[order]), found[order])
+
+
+def corner_heavy(rng: np.random.Generator, count: int, n: int) -> Array:
+    """Points u of the cube [-1, 1]^n: a third uniform, a third near faces, a third near corners, (count, n)."""
+    u = rng.uniform(-1.0, 1.0, (count, n))
+    for part, power in zip(np.array_split(u, len(_POWERS)), _POWERS, strict=True):
+        part[:] = np.sign(part) * np.abs(part) ** power
+    return u
+
+
+def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:
+    """Conditioning times the sign of det J at points of the cube, (N,)."""
+    points = _joint_positions(problem, u)
+    samples = samples_at(problem, points)
+    values = samples.signed_conditioning(coordinates.jacobian(samples.points))
+    if len(samples) == len(points):
+        return values
+    found = np.full(len(points), np.nan)
+    kept = {point.tobytes() for point in samples.points}
+    found[[point.tobytes() in kept for point in points]] = values
+    return found
+
+
+def _joint_positions(problem: Problem, u: Array) -> Array:
+    """q of points u of the cube [-1, 1]^n."""
+    q: Array = problem.domain.centre + problem.domain.half_width * u
+    return q

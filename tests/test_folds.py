@@ -1,0 +1,109 @@
+"""Fits without folds: mirror symmetry, the search for the worst points, and the fold term."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.fit import Fit
+from orthocas.fitting.fold_search import FoldSearch
+from orthocas.fitting.loss import LEAST_CONDITIONING, Weights
+from orthocas.fitting.mirror import find_mirror
+from orthocas.samples import sample_problem, samples_at
+from orthocas.worst_points import corner_heavy, worst_points
+
+ACTIVE = list(range(6))
+SIGNS = (-1, 1, -1, 1, -1, 1)  # joints that turn about the arm's plane turn round in the mirror
+
+
+def shifted(problem: oc.Problem, joint: int, angle: float) -> oc.Problem:
+    centre = problem.domain.centre.copy()
+    centre[joint] += angle
+    return replace(problem, domain=oc.Box(centre, problem.domain.half_width))
+
+
+def test_the_mirror_of_the_iiwa_is_found(iiwa: oc.Problem) -> None:
+    mirror = find_mirror(iiwa, ACTIVE)
+    assert mirror is not None
+    assert tuple(mirror.signs) == SIGNS
+    assert tuple(mirror.parities) == (-1, -1, 1)
+
+
+def test_a_turned_base_keeps_the_mirror_and_a_turned_elbow_breaks_it(iiwa: oc.Problem) -> None:
+    assert find_mirror(shifted(iiwa, 0, 0.3), ACTIVE) is not None
+    assert find_mirror(shifted(iiwa, 2, 0.3), ACTIVE) is None
+
+
+def test_a_planar_arm_out_of_line_has_no_mirror(planar_xy: oc.Problem) -> None:
+    assert find_mirror(planar_xy, [0, 1, 2]) is None
+
+
+def test_fitted_coordinates_are_even_or_odd_in_the_mirror(iiwa_fit: Fit) -> None:
+    chart = iiwa_fit.chart
+    u = np.random.default_rng(1).uniform(-0.7, 0.7, (50, 7))
+    here, there = (chart.xi(chart.problem.domain.centre + side) for side in (u, np.array([*SIGNS, 1]) * u))
+    signs = np.sign(np.einsum("sj,sj->j", here, there))
+    np.testing.assert_allclose(there, signs * here, atol=1e-9)
+    assert sorted(signs[:3]) == [-1, -1, 1]
+
+
+def test_no_fold_is_left_where_other_samples_look_for_one(iiwa_fit: Fit) -> None:
+    """200,000 samples near corners and faces with another seed, and a search with another seed."""
+    chart = iiwa_fit.chart
+    assert iiwa_fit.worst is not None
+    u = corner_heavy(np.random.default_rng(77), 200_000, 7)
+    found = []
+    for part in np.array_split(chart.problem.domain.centre + chart.problem.domain.half_width * u, 20):
+        samples = samples_at(chart.problem, part)
+        found.append(samples.signed_conditioning(chart.coordinates.jacobian(samples.points)))
+    values = np.concatenate(found)
+    values *= np.sign(np.median(values))
+    assert values.min() > 0.1
+    assert worst_points(chart.problem, chart.coordinates, seed=5).least == pytest.approx(iiwa_fit.worst.least, abs=0.05)
+
+
+def test_without_the_fold_term_the_same_fit_folds(iiwa: oc.Problem) -> None:
+    fit = oc.fit(iiwa, oc.Polynomial(3), weights=Weights(folds=0))
+    assert fit.worst is None
+    assert worst_points(iiwa, fit.chart.coordinates).least < 0
+
+
+def test_signed_conditioning_is_that_of_evaluate(planar_fit: Fit) -> None:
+    chart = planar_fit.chart
+    report = oc.evaluate(chart, 4000, seed=3)
+    samples = sample_problem(chart.problem, 4000, 3)
+    values = samples.signed_conditioning(chart.coordinates.jacobian(samples.points))
+    assert np.abs(values).min() == pytest.approx(report.conditioning.min, rel=1e-9)
+
+
+def test_fold_term_acts_at_collected_points_with_its_exact_gradient(iiwa: oc.Problem) -> None:
+    """Against central differences; and the value is weight / 2 mean(max(0.32 - det D, 0)^2) more."""
+    unsafe = oc.fit(iiwa, oc.Polynomial(2), weights=Weights(folds=0))
+    folds = FoldSearch(iiwa, ACTIVE, 1000.0)
+    folds.search(unsafe.stages[-1], oc.Polynomial(2), 0, lambda progress: None)
+    assert folds.least < LEAST_CONDITIONING
+    family = unsafe.chart.coordinates.family
+    theta = unsafe.stages[-1].result.theta
+    samples = sample_problem(iiwa, 300, 4).restricted_to(ACTIVE)
+    plain = BasisObjective(family, samples, Weights(), theta, lambda count, seed: samples)
+    both = folds.added_to(plain)
+    assert both.value(theta) > plain.value(theta)
+    direction = np.random.default_rng(0).normal(size=theta.size)
+    slope = both.value_and_gradient(theta)[1] @ direction
+    step = 1e-6
+    central = (both.value(theta + step * direction) - both.value(theta - step * direction)) / (2 * step)
+    assert slope == pytest.approx(central, rel=1e-5)
+    folds.give_up()
+    assert folds.added_to(plain) is plain
+
+
+def test_domains_that_force_folds_are_fitted_without_the_term(planar_xy: oc.Problem) -> None:
+    """The box around the stretched arm holds singular positions of the task: folds stay, and the fit says so."""
+    wide = replace(planar_xy, domain=oc.Box([0.6, 0.0, 0.0], 1.2))
+    fit = oc.fit(wide, oc.Polynomial(3), samples=600)
+    assert fit.worst is not None
+    assert fit.worst.least < 0
+    assert fit.stages[-1].label == "polynomial:3, with folds"
+    assert "FOLDS" in fit.facts()["least conditioning"]
