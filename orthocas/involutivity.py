@@ -174,11 +174,11 @@ def lie_bracket(f: ca.SX, g: ca.SX, q: ca.SX) -> ca.SX:
         >>> oc.lie_bracket(ca.vertcat(1, 0), ca.vertcat(0, q[0]), q)
         SX([0, 1])
     """
-    for name, field in (("f", f), ("g", g)):
-        if not isinstance(field, ca.SX | ca.DM | ca.MX):
-            raise InvalidValueError(name, f"a {type(field).__name__}", "a vector field, an expression in q")
     if not isinstance(q, ca.SX | ca.MX) or not q.is_valid_input():
         raise InvalidValueError("q", f"a {type(q).__name__}", "a column of symbols")
+    for name, field in (("f", f), ("g", g)):
+        if not isinstance(field, ca.DM | type(q)):
+            raise InvalidValueError(name, f"a {type(field).__name__}", f"a vector field, an {type(q).__name__} of q")
     require_shape("q", q.shape, (None, 1))
     require_shape("f", f.shape, q.shape)
     require_shape("g", g.shape, q.shape)

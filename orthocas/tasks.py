@@ -107,12 +107,14 @@ class Task(Shown):
         Source:
             Lambert's azimuthal equal-area map of the sphere of directions.
         """
+        require_kind("axis", axis, str)
         turn = TipTurn(False, axis)
         return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis))
 
     @classmethod
     def position_and_axis(cls, robot: Robot, axis: str = "z", reference: ArrayLike | None = None) -> Self:
         """Position [m] and direction of one axis of the tip, (5,); see `position` and `axis`."""
+        require_kind("axis", axis, str)
         turn = TipTurn(True, axis)
         return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis))
 

@@ -129,7 +129,11 @@ WRONG: dict[str, Callable[[], Any]] = {
     "pushes of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], pushes=[1]),  # type: ignore[list-item]
     "friction of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], friction=1.0),  # type: ignore[arg-type]
     "plant of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], plant=planar()),  # type: ignore[arg-type]
-    "f of lie_bracket": lambda: oc.lie_bracket(planar(), 2, 3),  # type: ignore[arg-type]
+    "f of lie_bracket": lambda: oc.lie_bracket(planar(), 2, ca.SX.sym("q", 3)),  # type: ignore[arg-type]
+    "f of lie_bracket in other symbols": lambda: oc.lie_bracket(ca.SX(3, 1), ca.SX(3, 1), ca.MX.sym("q", 3)),
+    "homes of a robot": lambda: oc.Robot(planar().robot.tree, np.eye(3)),  # type: ignore[arg-type]
+    "axis of Task.axis": lambda: oc.Task.axis(planar().robot, None),  # type: ignore[arg-type]
+    "axis of Task.position_and_axis": lambda: oc.Task.position_and_axis(planar().robot, None),  # type: ignore[arg-type]
     "domain of contains": lambda: oc.contains(planar(), [0, 0, 0]),  # type: ignore[arg-type]
     "robot of default_box": lambda: oc.default_box(planar()),  # type: ignore[arg-type]
     "robot of a metric": lambda: oc.Metric.from_spec(planar(), "inertia"),  # type: ignore[arg-type]
@@ -180,6 +184,7 @@ def test_numbers_too_large_to_work_with_are_refused_at_once() -> None:
         lambda: oc.Torus(10**18),
         lambda: oc.Given.from_function("g", 10**18, lambda q: q),
         lambda: oc.simulate(impedance(), steps(), [0, 0, 0], control_rate=1e18),
+        lambda: oc.simulate(impedance(), steps(), [0, 0, 0], step=np.full(3, np.nan)),  # type: ignore[arg-type]
         lambda: oc.loss(planar(), oc.Linear(), samples=10**18),
         lambda: oc.Box([10**400], 1.0),
     ]

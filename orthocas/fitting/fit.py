@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from orthocas.chart import Chart
-from orthocas.checks import as_path
+from orthocas.checks import as_path, require_kind
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.errors import Interrupted
 from orthocas.fitting.checkpoint import Checkpoint, Stage
@@ -124,6 +124,7 @@ def fit(
         (1,)
     """
     start = time.perf_counter()
+    require_kind("problem", problem, Problem)
     wanted = (
         default_parametrisation(problem, max_mutual_deg is not None) if parametrisation is None else parametrisation
     )

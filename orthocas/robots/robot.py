@@ -47,10 +47,11 @@ class Robot(Shown):
 
     def __init__(self, tree: KinematicTree, homes: Mapping[str, ArrayLike] | None = None) -> None:
         require_kind("tree", tree, KinematicTree)
-        require_kind("homes", homes or {}, Mapping)
+        homes = {} if homes is None else homes
+        require_kind("homes", homes, Mapping)
         self.tree = tree
         #: named postures (n,) of the robot's files: SRDF group states, MJCF keyframes. Chart files do not store them.
-        self.homes = {name: frozen_array(f"home '{name}'", q, (tree.n,)) for name, q in (homes or {}).items()}
+        self.homes = {name: frozen_array(f"home '{name}'", q, (tree.n,)) for name, q in homes.items()}
 
     @classmethod
     def from_model(cls, model: pin.Model, tip: str, locked: Locked = None) -> Self:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched
-from orthocas.checks import Array, as_float_array, as_number, as_point, require_kind
+from orthocas.checks import Array, as_number, as_point, require_kind
 from orthocas.control.controller import Controller, require_controller
 from orthocas.control.reference import Reference
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
@@ -87,7 +87,7 @@ def simulate(
         ("tolerance", tolerance),
         ("control_rate", 1.0 if control_rate is None else control_rate),
     ):
-        if not 0 < as_float_array(name, value) < np.inf:
+        if not 0 < as_number(name, value) < np.inf:
             raise InvalidValueError(name, value, "a finite number > 0")
     _require_fitting(loop, reference, tuple(pushes), friction, noise, control_rate)
     start = _start_state(loop, q_start, dq_start)
@@ -175,7 +175,7 @@ def _require_fitting(
     late = [push.start for push in pushes if push.start >= reference.duration]
     if late:
         raise InvalidValueError("start of a push", late[0], f"a time before the end at {reference.duration:g} s")
-    if control_rate is not None and as_float_array("control_rate", control_rate) * reference.duration < 1:
+    if control_rate is not None and as_number("control_rate", control_rate) * reference.duration < 1:
         raise InvalidValueError("control_rate", control_rate, f"at least one tick in {reference.duration:g} s")
     if control_rate is not None and as_number("control_rate", control_rate) * reference.duration > _MOST_TICKS:
         raise InvalidValueError(

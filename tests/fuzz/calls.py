@@ -181,7 +181,10 @@ def _makers() -> dict[str, Call]:
         ),
         "Chart": (oc.Chart, {"problem": problem, "coordinates": fitted().chart.coordinates, "notes": {"a": 1.0}}),
         "GrownChart": (oc.GrownChart, {"problem": circle().problem, "coordinates": circle().coordinates, "notes": {}}),
-        "Weights": (oc.Weights, {"task": 1.0, "mutual": 1.0, "regularity": 1.0, "length": 1.0, "extra": {}}),
+        "Weights": (
+            oc.Weights,
+            {"task": 1.0, "mutual": 1.0, "regularity": 1.0, "length": 1.0, "folds": 1.0, "extra": {}},
+        ),
         "Task.position": (oc.Task.position, {"robot": robot, "axes": "x"}),
         "Task.polar": (oc.Task.polar, {"robot": robot}),
         "Task.orientation": (oc.Task.orientation, {"robot": robot, "reference": np.eye(3)}),
@@ -195,8 +198,9 @@ def _makers() -> dict[str, Call]:
         ),
         **{
             f"{kind.__name__}": (kind, {"max_iterations": 5, "tolerance": 1e-3})
-            for kind in (solvers.GaussNewton, solvers.LBFGS, solvers.Ipopt)
+            for kind in (solvers.GaussNewton, solvers.LBFGS, solvers.Ipopt, solvers.GradientFlow)
         },
+        "Adam": (solvers.Adam, {"epochs": 2, "steps": 3, "batch": 20, "learning_rate": 1e-3}),
     }
 
 
