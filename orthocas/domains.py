@@ -20,6 +20,7 @@ from orthocas.robots import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
 
 _MOST_JOINTS = 1000
+_MOST_SAMPLES = 10**12
 _WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes, and overflow later
 
 
@@ -141,8 +142,9 @@ class Torus:
 
 def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
     """Draw points uniformly from the domain, (samples, n)."""
-    require_count("samples", samples)
+    require_count("samples", samples, most=_MOST_SAMPLES)
     _require_seed(seed)
+    require_memory(f"{samples} samples", 32.0 * samples * len(domain.centre))
     unit = np.random.default_rng(seed).uniform(-1.0, 1.0, (samples, len(domain.centre)))
     points: Array = domain.centre + domain.half_width * unit
     return points
@@ -158,7 +160,7 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
     Source:
         M. Roberts, docs/references.md [R2018]. The use for training is ours.
     """
-    require_count("samples", samples)
+    require_count("samples", samples, most=_MOST_SAMPLES)
     _require_seed(seed)
     n = len(domain.centre)
     require_memory(f"{samples} samples", 32.0 * samples * n)

@@ -187,6 +187,8 @@ def test_numbers_too_large_to_work_with_are_refused_at_once() -> None:
         lambda: oc.simulate(impedance(), steps(), [0, 0, 0], step=np.full(3, np.nan)),  # type: ignore[arg-type]
         lambda: oc.loss(planar(), oc.Linear(), samples=10**18),
         lambda: oc.Box([10**400], 1.0),
+        lambda: oc.check(planar(), samples=10**9),
+        lambda: impedance().check_damping(samples=10**60),
     ]
     for call in calls:
         with pytest.raises(OrthocasError):

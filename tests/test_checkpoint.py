@@ -167,6 +167,16 @@ def test_states_that_do_not_fit_are_refused_with_file_and_field(
         oc.fit(planar_x, oc.MLP((2,)), **settings, checkpoint=file)
 
 
+def test_a_finished_stage_that_was_interrupted_is_refused(planar_x: oc.Problem, tmp_path: Path) -> None:
+    file = tmp_path / "run"
+    oc.fit(planar_x, oc.Polynomial(2), samples=60, checkpoint=file)
+    header, arrays = checkpoint.read_archive(file, checkpoint.CHECKPOINT)
+    header["stages"][0]["status"] = "interrupted"
+    checkpoint.write_archive(file, checkpoint.CHECKPOINT, header, arrays)
+    with pytest.raises(CheckpointError, match=f"{file} is inconsistent: status of stage 'polynomial:2' is interrupted"):
+        oc.fit(planar_x, oc.Polynomial(2), samples=60, checkpoint=file)
+
+
 def test_stages_of_another_size_are_refused(planar_x: oc.Problem, tmp_path: Path) -> None:
     file = tmp_path / "run"
     oc.fit(planar_x, oc.Polynomial(1), samples=60, checkpoint=file)

@@ -180,10 +180,13 @@ def _stage(data: Mapping[str, Any], theta: Array) -> Stage:
     """
     counts = {name: require_count(name, data[name], least=0) for name in ("iterations", "evaluations", "samples")}
     parameters = require_count("parameters", data["parameters"])
+    status = Status(data["status"])
+    if status is Status.INTERRUPTED:
+        raise InvalidValueError(f"status of stage '{data['label']}'", status.value, "that of a finished stage")
     result = SolveResult(
         frozen_array(f"theta of stage '{data['label']}'", theta, (parameters,)),
         inf if data["value"] is None else float(data["value"]),
-        Status(data["status"]),
+        status,
         counts["iterations"],
         counts["evaluations"],
         float(data["seconds"]),

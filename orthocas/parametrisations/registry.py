@@ -56,7 +56,7 @@ def register(name: str, kind: type[Parametrisation], parse: Callable[[str], Para
     known = _REGISTERED.get(name)
     if known is not None and known.kind is not kind:
         raise InvalidValueError("name", repr(name), f"a name that {known.kind.__name__} does not use")
-    if not is_dataclass(kind):
+    if not isinstance(kind, type) or not is_dataclass(kind):
         raise InvalidValueError("kind", repr(kind), "a dataclass: chart files store its fields")
     _REGISTERED[name] = Registration(kind, parse)
 

@@ -80,7 +80,7 @@ def _bent(rng: Rng, good: np.ndarray) -> Any:
 
 @cache
 def _values() -> tuple[Any, ...]:
-    numbers = (0, 1, 2, -1, 10**6, 10**9, 10**18, 10**400, 1.5, -0.0, 1e-320, 1e9, 1e300, np.nan, np.inf, -np.inf, 1j)
+    numbers = (0, 1, 2, -1, 10**5, 10**9, 10**18, 10**400, 1.5, -0.0, 1e-320, 1e9, 1e300, np.nan, np.inf, -np.inf, 1j)
     numpies = (np.float32(1), np.int8(3), np.array(2.0), np.zeros(0), np.zeros(3), np.ones((3, 3)), np.zeros((2, 0)))
     more = (
         np.full(3, np.nan),
