@@ -29,7 +29,7 @@ from orthocas.fitting.symbolic_loss import loss
 from orthocas.grow import grow
 from orthocas.involutivity import Involutivity, involutivity, lie_bracket
 from orthocas.metrics import Metric
-from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial
+from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
 from orthocas.parametrisations import register as register_parametrisation
 from orthocas.problem import Problem, check
 from orthocas.quality import Report, evaluate
@@ -67,6 +67,7 @@ __all__ = [
     "compare",
     "contains",
     "control",
+    "cyclic_joints",
     "default_box",
     "distil",
     "errors",

@@ -1,5 +1,6 @@
 """Domains: the regions of joint space on which charts are fitted and evaluated, with seeded sampling."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -54,6 +55,8 @@ class Box:
     Args:
         centre: (n,) [rad] or [m].
         half_width: (n,) or one number for all joints, > 0 [rad] or [m].
+        unbounded: indices of joints whose every position lies inside, such as a joint that turns without end. Samples
+            still keep within their half-width.
 
     Example:
         >>> import orthocas as oc
@@ -66,9 +69,10 @@ class Box:
 
     centre: Array
     half_width: Array
+    unbounded: tuple[int, ...] = ()
     name: str = "box"
 
-    def __init__(self, centre: ArrayLike, half_width: ArrayLike) -> None:
+    def __init__(self, centre: ArrayLike, half_width: ArrayLike, unbounded: Iterable[int] = ()) -> None:
         middle = frozen_array("centre", centre, (None,))
         widths = as_float_array("half_width", half_width)
         if widths.ndim > 0 and widths.shape != middle.shape:
@@ -81,6 +85,7 @@ class Box:
             raise InvalidValueError("half_width", bad, f"positive numbers up to {_WIDEST:g}")
         object.__setattr__(self, "centre", middle)
         object.__setattr__(self, "half_width", widths)
+        object.__setattr__(self, "unbounded", _joint_indices("unbounded", unbounded, len(middle)))
 
     @classmethod
     def from_limits(cls, lower: ArrayLike, upper: ArrayLike) -> Self:
@@ -186,8 +191,9 @@ def require_domain(domain: Domain) -> None:
 
 
 def borders(domain: Domain) -> tuple[Array, Array]:
-    """Lowest and highest joint positions, (n,) each. They are infinite for a torus, which has no borders."""
-    half_width = np.inf if isinstance(domain, Torus) else domain.half_width
+    """Lowest and highest joint positions, (n,) each. They are infinite for unbounded joints, and for a torus."""
+    half_width = domain.half_width.copy()
+    half_width[list(domain.unbounded) if isinstance(domain, Box) else slice(None)] = np.inf
     return domain.centre - half_width, domain.centre + half_width
 
 
@@ -242,10 +248,19 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
         name = robot.joint_names[robot.tree.prismatic.index(True)]
         raise DomainError(f"joint '{name}' is prismatic, expected a Box domain instead of a Torus")
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
+    if isinstance(domain, Box):
+        low, high = borders(domain)
     slack = 1e-9 * domain.half_width  # limits in a URDF are decimal, so sums are not exact
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
     if outside.size:
         _raise_outside(robot, int(outside[0]), low, high)
+
+
+def _joint_indices(name: str, values: Any, n: int) -> tuple[int, ...]:
+    """Different indices of joints, sorted."""
+    require_kind(name, values, Iterable)
+    found = sorted({require_count(f"entry of {name}", value, least=0, most=n - 1) for value in values})
+    return tuple(found)
 
 
 def _wanted_half_width(robot: Robot) -> Array:

@@ -19,7 +19,14 @@ from orthocas.fitting.settings import FitSettings
 from orthocas.fitting.stages import StageRunner
 from orthocas.minimising.solver import Solver, Status
 from orthocas.minimising.watch import Monitor, silent
-from orthocas.parametrisations import JointSpace, Parametrisation, Polynomial, warn_unless_savable
+from orthocas.parametrisations import (
+    CyclicParametrisation,
+    JointSpace,
+    Parametrisation,
+    Polynomial,
+    warn_unless_savable,
+)
+from orthocas.parametrisations.cyclic_joints import over_cyclic_joints
 from orthocas.problem import Problem, ProblemCheck, check
 from orthocas.samples import Samples, sample_problem
 from orthocas.showing import Shown, listed
@@ -79,9 +86,11 @@ def fit(
     """Find coordinates xi(q) that are as orthogonal as possible to the task.
 
     The fit minimises the mean of [AS2023] eq. (24) over uniform samples of the domain. Joints that do not affect the
-    task become coordinates themselves. Families linear in their parameters start from a spectral solution of low
-    degree, and the degree rises step by step. Ctrl-C raises `Interrupted`: its `result` is the fit with the best
-    coordinates so far and status INTERRUPTED. So callers that need a finished fit, and loops around them, end as well.
+    task become coordinates themselves. With `Polynomial(degree, cyclic="auto")`, the domain of the chart covers all
+    positions of the cyclic joints; see `orthocas.cyclic_joints`. Families linear in their parameters start from a
+    spectral solution of low degree, and the degree rises step by step. Ctrl-C raises `Interrupted`: its `result` is the
+    fit with the best coordinates so far and status INTERRUPTED. So callers that need a finished fit, and loops around
+    them, end as well.
 
     Args:
         problem: robot, task, metric and domain.
@@ -121,6 +130,8 @@ def fit(
     wanted = Polynomial(degree=4) if parametrisation is None else parametrisation
     settings = FitSettings.checked(problem, wanted, solver, weights, samples, seed, max_mutual_deg)
     warn_unless_savable(settings.parametrisation)
+    if isinstance(settings.parametrisation, CyclicParametrisation):
+        problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))
     found = check(problem, seed=settings.seed)
     first = sample_problem(problem, 200, (settings.seed, _FIRST_SAMPLES))
     if settings.parametrisation.closed_form is not None:
