@@ -53,6 +53,13 @@ class Fit(Shown):
     seconds: float  #: of this run; the seconds of stages include earlier runs of a checkpoint
 
     @property
+    def cyclic_joints(self) -> tuple[str, ...]:
+        """Names of joints at all of whose positions the chart holds, because its coordinates are linear in them."""
+        coordinates = self.chart.coordinates
+        chosen = coordinates.parametrisation if isinstance(coordinates, Coordinates) else None
+        return tuple(chosen.cyclic) if isinstance(chosen, CyclicParametrisation) else ()
+
+    @property
     def status(self) -> Status:
         """How the last stage ended, or CONVERGED if there was nothing to minimise."""
         return self.stages[-1].result.status if self.stages else Status.CONVERGED

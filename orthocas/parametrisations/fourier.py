@@ -59,8 +59,8 @@ class Fourier:
     def term_count(self, n: int) -> int:
         """Sum over j of C(n, j) C(d, j) 2^j, without the constant. Cyclic joints do not count in n, but add a term."""
         linear = min(n, cyclic_choice.count(self.cyclic))
-        n = n - linear
-        return linear + sum(comb(n, j) * comb(self.degree, j) * 2**j for j in range(1, min(n, self.degree) + 1))
+        n, d = n - linear, self.degree
+        return linear + sum(comb(n, j) * comb(d, j) * 2**j for j in range(1, min(n, d) + 1))
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Fourier terms of the joint angles.
