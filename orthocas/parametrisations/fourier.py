@@ -60,7 +60,8 @@ class Fourier:
         """Sum over j of C(n, j) C(d, j) 2^j, without the constant. Cyclic joints do not count in n, but add a term."""
         linear = min(n, cyclic_choice.count(self.cyclic))
         n, d = n - linear, self.degree
-        return linear + sum(comb(n, j) * comb(d, j) * 2**j for j in range(1, min(n, d) + 1))
+        terms: int = sum(comb(n, j) * comb(d, j) * 2**j for j in range(1, min(n, d) + 1))
+        return terms + linear
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Fourier terms of the joint angles.

@@ -25,7 +25,7 @@ from orthocas.samples import Samples, samples_at
 from orthocas.solvers import GaussNewton
 
 _DEGREE = 2  # its conditioning is that of degree 4, its leak about a fifth larger
-_TRAINING, _HEAVY, _JUDGES = 1000, 400, 4000  # numbers of samples: even, near faces and corners, and of a verdict
+_TRAINING, _HEAVY, _JUDGES = 700, 300, 3000  # numbers of samples: even, near faces and corners, and of a verdict
 _SEED = 0
 _TINY = 1e-4
 
@@ -106,7 +106,7 @@ class Prober:
         with deferred():
             start = spectral_start(family, samples[: len(even)])
             objective = BasisObjective(family, samples, DEFAULT_WEIGHTS, start, lambda count, seed: samples)
-        result = GaussNewton().minimise(objective, start)
+        result = GaussNewton().coarser().minimise(objective, start)
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         return result.theta

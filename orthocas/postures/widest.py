@@ -113,13 +113,18 @@ class WidestBox:
         """Widen each joint alone while the bounds are kept, and say what breaks then."""
         broken: dict[int, list[Miss]] = {k: [] for k in self.free}
         for k in self.free:
-            while widths[k] < self.room[k] and not broken[k]:
-                wider = self._widened(widths, k)
-                broken[k] = [name for name, ratio in self.verdict(wider).excess(self.bounds).items() if ratio > 1]
-                widths = widths if broken[k] else wider
+            factor = _WIDER
+            while widths[k] < self.room[k]:
+                wider = self._widened(widths, k, factor)
+                misses = [name for name, ratio in self.verdict(wider).excess(self.bounds).items() if ratio > 1]
+                if misses and factor == _WIDER:
+                    broken[k] = misses
+                    break
+                widths = widths if misses else wider
+                factor = _WIDER if misses else factor**2
         return widths, broken
 
-    def _widened(self, widths: Array, k: int) -> Array:
+    def _widened(self, widths: Array, k: int, factor: float = _WIDER) -> Array:
         wider = widths.copy()
-        wider[k] = min(_WIDER * widths[k], self.room[k])
+        wider[k] = min(factor * widths[k], self.room[k])
         return wider
