@@ -21,7 +21,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.postures.probe import judged_chart
 
-HALF_WIDTHS_DEG = (5, 10, 15, 20, 25, 30, 35, 40, 45, 50, 60)
+HALF_WIDTHS_DEG = (5, 10, 15, 20, 30, 37, 45, 52, 59)  # A4 meets its limit at 59.8 degrees
 DEGREES = (3, 4, 5)
 COLOURS = {2: "#7570b3", 3: "#66a61e", 4: "#d95f02", 5: "#1f5fa8"}
 
@@ -144,7 +144,7 @@ def draw_conditioning(axes: Axes, rows: list[Row]) -> None:
 
 
 def _finish(axes: Axes, label: str) -> None:
-    axes.xaxis.set_major_locator(FixedLocator([5, 10, 20, 30, 45, 60]))
+    axes.xaxis.set_major_locator(FixedLocator([5, 10, 20, 30, 45, 59]))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("half-width of the cube [deg]")

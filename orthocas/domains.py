@@ -1,6 +1,6 @@
 """Domains: the regions of joint space on which charts are fitted and evaluated, with seeded sampling."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -72,7 +72,7 @@ class Box:
     unbounded: tuple[int, ...] = ()
     name: str = "box"
 
-    def __init__(self, centre: ArrayLike, half_width: ArrayLike, unbounded: Iterable[int] = ()) -> None:
+    def __init__(self, centre: ArrayLike, half_width: ArrayLike, unbounded: Sequence[int] = ()) -> None:
         middle = frozen_array("centre", centre, (None,))
         widths = as_float_array("half_width", half_width)
         if widths.ndim > 0 and widths.shape != middle.shape:
@@ -258,7 +258,8 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
 
 def _joint_indices(name: str, values: Any, n: int) -> tuple[int, ...]:
     """Different indices of joints, sorted."""
-    require_kind(name, values, Iterable)
+    if not isinstance(values, list | tuple | range):
+        raise InvalidValueError(name, repr(values)[:80], "a list of joint indices")
     found = sorted({require_count(f"entry of {name}", value, least=0, most=n - 1) for value in values})
     return tuple(found)
 

@@ -203,8 +203,8 @@ def test_joints_that_are_not_cyclic_are_refused() -> None:
         oc.Polynomial(2, ["A1"]).family(_space(known).restricted_to([1, 2]), 1)
     with pytest.raises(InvalidValueError, match="for_problem"):
         oc.Polynomial(2, "auto").family(_space(known), 1)
-    for wrong in ("A1", ["A1", "A1"], [1], 3):
-        with pytest.raises(InvalidValueError, match="different joint names, or 'auto'"):
+    for wrong in ("A1", ["A1", "A1"], [1], 3, np.array(["A1", 0], dtype=object)):
+        with pytest.raises(InvalidValueError, match="a list of different joint names, or 'auto'"):
             oc.Polynomial(2, wrong)
 
 

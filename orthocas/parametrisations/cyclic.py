@@ -1,6 +1,5 @@
 """The choice of cyclic joints in a basis: the basis contains only the linear term of each."""
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Literal
 
 from orthocas.errors import InvalidValueError
@@ -20,12 +19,12 @@ def checked_cyclic(value: Any) -> Cyclic:
     Raises:
         InvalidValueError: if it is neither, or a name appears twice.
     """
-    if value == "auto" and isinstance(value, str):
+    if isinstance(value, str) and value == "auto":
         return "auto"
-    names = tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else None
-    if names is None or not all(isinstance(name, str) for name in names) or len(set(names)) != len(names):
-        raise InvalidValueError("cyclic", repr(value)[:80], "different joint names, or 'auto'")
-    return names
+    known = isinstance(value, list | tuple) and all(isinstance(name, str) for name in value)
+    if not known or len(set(value)) != len(value):
+        raise InvalidValueError("cyclic", repr(value)[:80], "a list of different joint names, or 'auto'")
+    return tuple(value)
 
 
 def suffix(cyclic: Cyclic) -> str:

@@ -44,6 +44,7 @@ def over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
 
     The box reaches from limit to limit. A joint without limits becomes unbounded: every position of it lies inside.
     """
+    require_kind("problem", problem, Problem)
     robot, domain = problem.robot, problem.domain
     if not names or not isinstance(domain, Box):
         return problem
