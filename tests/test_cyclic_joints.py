@@ -13,7 +13,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.casadi_tools.batch import Batched
 from orthocas.codegen.proof import check_c
-from orthocas.control import ControlStatus, PDPlus
+from orthocas.control import ControlStatus, Kinematic, PDPlus
 from orthocas.domains import borders, sample_uniform
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.files.archive import read_archive
@@ -131,6 +131,22 @@ def test_guard_of_controllers_follows_the_unbounded_joint(endless: oc.Chart) -> 
     gains = [np.tile(value, (3, 1)) for value in law.gains.values()]
     status = Batched(law.function)(q, zero, phi, zero, zero, *gains)[1].ravel()
     assert status.tolist() == [ControlStatus.OK, ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN]
+
+
+@pytest.mark.parametrize("law", [lambda chart: PDPlus(chart, 20.0), lambda chart: Kinematic(chart, 3.0)])
+def test_commands_do_not_depend_on_whole_turns_of_the_unbounded_joint(endless: oc.Chart, law: object) -> None:
+    """An angle that a sensor wraps from pi to -pi must not make the springs jump."""
+    built = law(endless)
+    q = np.tile(endless.problem.domain.centre + 0.1, (4, 1))
+    q[:, 0] += 2 * np.pi * np.array([0, 1, -1, 3])
+    wanted = np.tile(endless.phi(endless.problem.domain.centre), (4, 1))
+    gains = [np.tile(value, (4, 1)) for value in built.gains.values()]
+    command, status = Batched(built.function)(q, np.zeros((4, 3)), wanted, *np.zeros((2, 4, 3)), *gains)
+    assert not status.any()
+    assert np.abs(command[0]).max() > 0.1
+    np.testing.assert_allclose(command, command[:1].repeat(4, axis=0), atol=1e-8)
+    xi = endless.xi(q)
+    assert np.abs(xi[1] - xi[0]).max() > 1  # the coordinates themselves do count turns
 
 
 @pytest.mark.slow
