@@ -15,7 +15,7 @@ import numpy as np
 from involutivity import angle_in_metric
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 import orthocas as oc
 from orthocas import problems
@@ -55,14 +55,19 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     rows = [measured(width, degree) for width in ((5, 15, 30) if quick else HALF_WIDTHS_DEG) for degree in degrees]
     for line in table(rows):
         print(line)
+    drawn(rows).savefig(out / "domain_size.png", dpi=150)
+    return numbers(rows)
+
+
+def drawn(rows: list[Row]) -> Figure:
+    """The three panels."""
     figure = Figure(figsize=(12.5, 4.2), layout="constrained")
     angles, mutual, conditioning = figure.subplots(1, 3)
-    draw(angles, rows, "angle", "task: angle off 90° [deg]")
+    draw(angles, rows, "angle", "task angles: deviation from 90° [deg]")
     draw_expected(angles, rows)
-    draw(mutual, rows, "mutual_std", "mutual: angle off 90°, std [deg]")
+    draw(mutual, rows, "mutual_std", "mutual angles: deviation from 90° [deg]")
     draw_conditioning(conditioning, rows)
-    figure.savefig(out / "domain_size.png", dpi=150)
-    return numbers(rows)
+    return figure
 
 
 def measured(half_width_deg: float, degree: int) -> Row:
@@ -119,14 +124,18 @@ def draw(axes: Axes, rows: list[Row], name: str, label: str) -> None:
         axes.plot(widths, values, "o-", color=COLOURS[degree], markersize=4, linewidth=1.3, label=f"degree {degree}")
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.set_ylim(0.1, 13)
+    axes.yaxis.set_major_locator(FixedLocator([0.1, 0.2, 0.5, 1, 2, 5, 10]))
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
     _finish(axes, label)
 
 
 def draw_expected(axes: Axes, rows: list[Row]) -> None:
-    """Draw the expectation from the involutivity defect."""
-    expected = dict(sorted((row.half_width_deg, row.expected) for row in rows))
-    axes.plot(list(expected), list(expected.values()), "k--", linewidth=1.3, label="expected from the defect")
+    """Draw the expectation from the involutivity defect, and proportional growth for comparison."""
+    widths, values = zip(*sorted({(row.half_width_deg, row.expected) for row in rows}), strict=True)
+    axes.plot(widths, values, "k--", linewidth=1.3, label="expected from the defect, without a fit")
+    axes.plot(widths, values[0] * np.array(widths) / widths[0], ":", color="0.5", label="proportional to the size")
     axes.legend(fontsize=8)
 
 
@@ -139,14 +148,13 @@ def draw_conditioning(axes: Axes, rows: list[Row]) -> None:
     axes.set_xscale("log")
     axes.set_ylim(-0.02, 1.02)
     axes.axhline(0, color="0.4", linewidth=0.8)
-    axes.annotate("folds", (0.03, 0.04), xycoords="axes fraction", fontsize=8, color="0.3")
-    _finish(axes, "least conditioning")
+    _finish(axes, "least conditioning (0: the chart folds over)")
 
 
 def _finish(axes: Axes, label: str) -> None:
     axes.xaxis.set_major_locator(FixedLocator([5, 10, 20, 30, 45, 59]))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("half-width of the cube [deg]")
     axes.set_title(label, fontsize=10)
     axes.grid(alpha=0.3)

@@ -115,18 +115,6 @@ def test_joint_limits_end_the_box() -> None:
     assert "to the joint limit" in repr(found)
 
 
-@pytest.mark.slow
-def test_panda_from_its_urdf_without_tuning() -> None:
-    robot = arm("panda")
-    found = oc.suggest_domain(robot, oc.Task.position(robot), parametrisation=oc.Polynomial(2))
-    assert found.home_source == "posture 'default' of the robot's files"
-    assert found.conditioning >= 0.2
-    assert found.leak_deg <= 8
-    assert np.median(found.domain.half_width) > 0.4
-    reasons = {joint.joint: joint.reason for joint in found.joints}
-    assert (reasons["panda_joint1"], reasons["panda_joint7"]) == ("cyclic", "idle")
-
-
 def test_home_comes_from_the_files_or_is_a_bent_posture() -> None:
     panda, xarm, ur10 = arm("panda"), arm("xarm7"), arm("ur10")
     assert "default" in home_posture(panda, oc.Task.position(panda)).source
