@@ -47,6 +47,7 @@ def test_base_rotation_of_a_position_task_is_cyclic(metric: str) -> None:
 @pytest.mark.parametrize(
     ("task", "metric", "wanted"),
     [
+        (lambda robot: oc.Task.custom(robot, "half", lambda q: ca.fmax(q[0], 0)), "euclidean", ()),
         (lambda robot: oc.Task.position(robot, "xy"), "euclidean", ("q1",)),
         (oc.Task.polar, "inertia", ("q1",)),
         (lambda robot: oc.Task.position(robot, "x"), "euclidean", ()),  # one direction of the plane is not the plane
@@ -54,7 +55,7 @@ def test_base_rotation_of_a_position_task_is_cyclic(metric: str) -> None:
         (lambda robot: oc.Task.custom(robot, "wave", lambda q: q[0] + ca.sin(q[1])), "euclidean", ("q1",)),
         (lambda robot: oc.Task.custom(robot, "scaled", lambda q: ca.exp(q[0]) * ca.sin(q[1])), "euclidean", ()),
     ],
-    ids=["xy", "polar", "x", "metric that feels the joint", "shift", "no isometry"],
+    ids=["loses rank", "xy", "polar", "x", "metric that feels the joint", "shift", "no isometry"],
 )
 def test_a_joint_is_cyclic_if_and_only_if_task_and_metric_stay_alike(
     task: object, metric: object, wanted: tuple[str, ...]

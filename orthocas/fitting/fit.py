@@ -73,6 +73,7 @@ class Fit(Shown):
             "loss": listed(stages) or "nothing to minimise",
             "samples": str(self.chart.notes.get("samples", "")),
             "idle joints": listed(self.idle_joints) or "none",
+            **({"cyclic joints": listed(self.cyclic_joints)} if self.cyclic_joints else {}),
             "near singular": f"{self.problem_check.singular_share:.3%} of the domain",
         }
 

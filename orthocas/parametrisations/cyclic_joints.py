@@ -83,7 +83,10 @@ def _is_cyclic(problem: Problem, points: Array, k: int) -> bool:
     J_there, A_there = _task_and_metric(problem, moved.reshape(-1, problem.n))
     if not (np.isfinite(J_there).all() and np.isfinite(A_there).all() and _same(A, A_there)):
         return False
-    return all(_same(*pair) for pair in zip(_invariants(J, A), _invariants(J_there, A_there), strict=True))
+    try:
+        return all(_same(*pair) for pair in zip(_invariants(J, A), _invariants(J_there, A_there), strict=True))
+    except np.linalg.LinAlgError:  # the task loses rank where the joint moves
+        return False
 
 
 def _task_and_metric(problem: Problem, points: Array) -> tuple[Array, Array]:

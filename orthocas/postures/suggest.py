@@ -12,6 +12,7 @@ from orthocas.domains import Box
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.idle_joints import idle_joints
+from orthocas.fitting.settings import require_parametrisation
 from orthocas.metrics import Metric, MetricSpec
 from orthocas.minimising.watch import Monitor, silent
 from orthocas.parametrisations import Parametrisation, Polynomial, cyclic_joints
@@ -84,6 +85,7 @@ def suggest_domain(
     start = time.perf_counter()
     bounds = _checked(robot, task, leak_deg, conditioning, seed)
     wanted = Polynomial(degree=4) if parametrisation is None else parametrisation
+    require_parametrisation(wanted)
     posture = home_posture(robot, task, home)
     room = np.minimum(_room(robot, posture.q), _farthest(robot))
     problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_unit(robot), room)))
@@ -129,16 +131,22 @@ class _Joints:
         return [k for k in self.active if self.names[k] not in self.cyclic]
 
     def described(self, problem: Problem, broken: Mapping[int, list[Miss]]) -> tuple[JointWidth, ...]:
-        """Half-widths of the problem's domain, with what ends them."""
-        widths, room = problem.domain.half_width, _room(problem.robot, problem.domain.centre)
+        """Half-widths of the problem's domain, with what ends them.
+
+        Args:
+            problem: the problem on the suggested domain.
+            broken: the bounds that break if a joint moves further; none for joints that have no room.
+        """
+        robot, domain = problem.robot, problem.domain
+        limited = _room(robot, domain.centre) <= _farthest(robot)
         found = []
         for k, name in enumerate(self.names):
-            reason: Reason = "joint limit" if widths[k] >= room[k] * (1 - 1e-9) else "unlimited"
+            reason: Reason = "joint limit" if limited[k] else "unlimited"
             if broken.get(k):
                 reason = broken[k][0]
             if k not in self.free:
                 reason = "idle" if k in self.idle else "cyclic"
-            found.append(JointWidth(name, float(widths[k]), reason))
+            found.append(JointWidth(name, float(domain.half_width[k]), reason))
         return tuple(found)
 
 
