@@ -61,7 +61,8 @@ def cyclic() -> oc.Chart:
 @cache
 def suggestion() -> Any:
     known = problems.get("planar_3r_xy")
-    return oc.suggest_domain(known.robot, known.task, known.domain.centre, parametrisation=oc.Polynomial(2))
+    parametrisation = oc.Polynomial(2, cyclic="auto")
+    return oc.suggest_domain(known.robot, known.task, known.domain.centre, parametrisation=parametrisation)
 
 
 @cache

@@ -109,7 +109,8 @@ class Prober:
         result = GaussNewton().coarser().minimise(objective, start)
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        return result.theta
+        theta: Array = result.theta
+        return theta
 
 
 def judged_chart(chart: Chart, samples: int, seed: int) -> Verdict:
