@@ -8,6 +8,7 @@ SCRIPTS = (
     "dynamics",
     "command",
     "fits",
+    "suggested_domains",
     "choices",
     "scaling",
     "gradients",

@@ -29,8 +29,9 @@ from orthocas.fitting.symbolic_loss import loss
 from orthocas.grow import grow
 from orthocas.involutivity import Involutivity, involutivity, lie_bracket
 from orthocas.metrics import Metric
-from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial
+from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
 from orthocas.parametrisations import register as register_parametrisation
+from orthocas.postures.suggest import suggest_domain
 from orthocas.problem import Problem, check
 from orthocas.quality import Report, evaluate
 from orthocas.robots import Robot
@@ -67,6 +68,7 @@ __all__ = [
     "compare",
     "contains",
     "control",
+    "cyclic_joints",
     "default_box",
     "distil",
     "errors",
@@ -88,6 +90,7 @@ __all__ = [
     "simulation",
     "singular_points",
     "solvers",
+    "suggest_domain",
 ]
 
 

@@ -1,5 +1,6 @@
 """Domains: the regions of joint space on which charts are fitted and evaluated, with seeded sampling."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -21,6 +22,7 @@ from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
 
 _MOST_JOINTS = 1000
 _MOST_SAMPLES = 10**12
+_POWERS = (1.0, 0.5, 0.25)  # of the distance from the middle: uniform, near faces, near corners
 _WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes, and overflow later
 
 
@@ -55,6 +57,8 @@ class Box:
     Args:
         centre: (n,) [rad] or [m].
         half_width: (n,) or one number for all joints, > 0 [rad] or [m].
+        unbounded: indices of joints whose every position lies inside, such as a joint that turns without end. Samples
+            still keep within their half-width.
 
     Example:
         >>> import orthocas as oc
@@ -67,9 +71,10 @@ class Box:
 
     centre: Array
     half_width: Array
+    unbounded: tuple[int, ...] = ()
     name: str = "box"
 
-    def __init__(self, centre: ArrayLike, half_width: ArrayLike) -> None:
+    def __init__(self, centre: ArrayLike, half_width: ArrayLike, unbounded: Sequence[int] = ()) -> None:
         middle = frozen_array("centre", centre, (None,))
         widths = as_float_array("half_width", half_width)
         if widths.ndim > 0 and widths.shape != middle.shape:
@@ -82,6 +87,7 @@ class Box:
             raise InvalidValueError("half_width", bad, f"positive numbers up to {_WIDEST:g}")
         object.__setattr__(self, "centre", middle)
         object.__setattr__(self, "half_width", widths)
+        object.__setattr__(self, "unbounded", _joint_indices("unbounded", unbounded, len(middle)))
 
     @classmethod
     def from_limits(cls, lower: ArrayLike, upper: ArrayLike) -> Self:
@@ -150,6 +156,20 @@ def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) ->
     return points
 
 
+def sample_heavily(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
+    """Draw points of which a third is uniform, a third near faces and a third near corners, (samples, n).
+
+    Charts fail there first. The distances from the centre are |u|^p half-widths, with uniform u and p = 1, 1/2 and 1/4.
+
+    Source:
+        ours.
+    """
+    powers = np.repeat(_POWERS, [samples - 2 * (samples // 3), samples // 3, samples // 3])
+    unit = (sample_uniform(domain, samples, seed) - domain.centre) / domain.half_width
+    points: Array = domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers[:, None]
+    return points
+
+
 def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
     """Draw points that fill the domain more evenly than random points, (samples, n).
 
@@ -188,8 +208,9 @@ def require_domain(domain: Domain) -> None:
 
 
 def borders(domain: Domain) -> tuple[Array, Array]:
-    """Lowest and highest joint positions, (n,) each. They are infinite for a torus, which has no borders."""
-    half_width = np.inf if isinstance(domain, Torus) else domain.half_width
+    """Lowest and highest joint positions, (n,) each. They are infinite for unbounded joints, and for a torus."""
+    half_width = domain.half_width.copy()
+    half_width[list(domain.unbounded) if isinstance(domain, Box) else slice(None)] = np.inf
     return domain.centre - half_width, domain.centre + half_width
 
 
@@ -244,10 +265,20 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
         name = robot.joint_names[robot.tree.prismatic.index(True)]
         raise DomainError(f"joint '{name}' is prismatic, expected a Box domain instead of a Torus")
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
+    if isinstance(domain, Box):
+        low, high = borders(domain)
     slack = 1e-9 * domain.half_width  # limits in a URDF are decimal, so sums are not exact
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
     if outside.size:
         _raise_outside(robot, int(outside[0]), low, high)
+
+
+def _joint_indices(name: str, values: Any, n: int) -> tuple[int, ...]:
+    """Different indices of joints, sorted."""
+    if not isinstance(values, list | tuple | range):
+        raise InvalidValueError(name, repr(values)[:80], "a list of joint indices")
+    found = sorted({require_count(f"entry of {name}", value, least=0, most=n - 1) for value in values})
+    return tuple(found)
 
 
 def _wanted_half_width(robot: Robot) -> Array:

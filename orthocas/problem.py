@@ -10,7 +10,7 @@ from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskEr
 from orthocas.metrics import Metric, MetricSpec, metric_matrices
 from orthocas.postures.regular_box import regular_box
 from orthocas.robots import Robot
-from orthocas.showing import Shown, number_list
+from orthocas.showing import Shown, listed, number_list
 from orthocas.tasks import Task
 
 NEAR_SINGULAR = 0.01  #: smallest relative singular value of J_x below which a sample counts as singular
@@ -103,10 +103,16 @@ class Problem(Shown):
             "problem": f"{self.name}, n = {self.n} joints, m = {self.m} task, r = {self.r} extra",
             "task": self.task.heading,
             "metric": self.metric.name,
-            "domain": f"{domain.name}, half-width {number_list(domain.half_width)}",
+            "domain": f"{domain.name}, half-width {number_list(domain.half_width)}{self._endless}",
             "centre": number_list(domain.centre),
             "robot": self.robot.heading,
         }
+
+    @property
+    def _endless(self) -> str:
+        """The unbounded joints of the domain, in words."""
+        joints = [self.robot.joint_names[k] for k in getattr(self.domain, "unbounded", ())]
+        return f", unbounded in {listed(joints)}" if joints else ""
 
 
 @dataclass(frozen=True)

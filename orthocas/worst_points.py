@@ -6,6 +6,7 @@ import numpy as np
 
 from orthocas.checks import Array
 from orthocas.coordinates.map import CoordinateMap
+from orthocas.domains import sample_heavily
 from orthocas.problem import Problem
 from orthocas.samples import samples_at
 
@@ -14,7 +15,6 @@ _DESCENTS = 300  # of the worst candidates
 _STEPS = 15
 _FIRST_STEP = 0.3  # of the half-widths
 _MOVED = 0.4  # share of the joints that move in a step
-_POWERS = (1.0, 0.5, 0.25)  # |u|^p of uniform u: uniform, near faces, near corners
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,8 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) ->
         seed: seed of candidates and steps.
     """
     rng = np.random.default_rng((seed, CANDIDATES))
-    u = corner_heavy(rng, CANDIDATES, problem.n)
+    points = sample_heavily(problem.domain, CANDIDATES, (seed, CANDIDATES, 1))
+    u = (points - problem.domain.centre) / problem.domain.half_width
     found = _signed_conditioning(problem, coordinates, u)
     orientation = 1.0 if np.nanmedian(found) >= 0 else -1.0
     order = np.argsort(orientation * found)[:_DESCENTS]  # NaN comes last
@@ -71,14 +72,6 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) ->
         step *= np.where(worse, 1.5, 0.8)
     order = np.argsort(found)
     return WorstPoints(_joint_positions(problem, u[order]), found[order])
-
-
-def corner_heavy(rng: np.random.Generator, count: int, n: int) -> Array:
-    """Points u of the cube [-1, 1]^n: a third uniform, a third near faces, a third near corners, (count, n)."""
-    u = rng.uniform(-1.0, 1.0, (count, n))
-    for part, power in zip(np.array_split(u, len(_POWERS)), _POWERS, strict=True):
-        part[:] = np.sign(part) * np.abs(part) ** power
-    return u
 
 
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:

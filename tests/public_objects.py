@@ -53,6 +53,19 @@ def given() -> oc.Chart:
 
 
 @cache
+def cyclic() -> oc.Chart:
+    known = problems.get("planar_3r_xy")
+    return oc.fit(known, oc.Polynomial(2, cyclic="auto"), samples=300).chart
+
+
+@cache
+def suggestion() -> Any:
+    known = problems.get("planar_3r_xy")
+    parametrisation = oc.Polynomial(2, cyclic="auto")
+    return oc.suggest_domain(known.robot, known.task, known.domain.centre, parametrisation=parametrisation)
+
+
+@cache
 def circle() -> oc.Chart:
     return oc.grow(problems.get("planar_2r"), 1.0, origin=[np.pi / 3, 0.0])
 
@@ -108,6 +121,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "network chart": network,
     "given chart": given,
     "chart with an idle joint": with_idle_joint,
+    "cyclic chart": cyclic,
     "circle chart": circle,
     "disk chart": disk,
     "linear leaf chart": on_planes,
@@ -132,8 +146,12 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "problem": planar,
     "check of a problem": lambda: oc.check(planar(), 100),
     "box": lambda: planar().domain,
+    "unbounded box": lambda: cyclic().problem.domain,
     "torus": lambda: oc.Torus(3),
+    "suggestion of a domain": suggestion,
+    "width of a joint": lambda: suggestion().joints[0],
     "polynomial": lambda: oc.Polynomial(3),
+    "cyclic polynomial": lambda: oc.Polynomial(3, cyclic="auto"),
     "linear": oc.Linear,
     "Fourier": lambda: oc.Fourier(2),
     "network": oc.MLP,

@@ -61,6 +61,14 @@ def test_python_block_of_the_page_on_control_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_python_block_of_the_page_on_domains_runs(tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "domains.md").read_text(), flags=re.DOTALL)
+    printed = python(code, tmp_path).splitlines()
+    assert printed[0].startswith("DomainSuggestion: half-width 3.142")
+    assert printed[-1] == "('q1',) True"
+
+
+@pytest.mark.slow
 @needs_c
 @needs_cmake
 @pytest.mark.usefixtures("checkout")

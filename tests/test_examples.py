@@ -7,6 +7,7 @@ import c_timing
 import casadi as ca
 import compare_parametrisations
 import distillation
+import domain_size
 import fits
 import front
 import gallery
@@ -19,6 +20,7 @@ import paper_network
 import pytest
 import scaling
 import starts
+import suggested_domains
 from PIL import Image
 
 import orthocas as oc
@@ -74,6 +76,26 @@ def test_involutivity_defect_tells_the_angles_of_fits(tmp_path: Path, capsys: py
     assert found["x_M"] < found["xy_M"] / 50
     assert capsys.readouterr().out.count("\n") == 11
     assert (tmp_path / "involutivity.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_angles_grow_with_the_box_as_the_defect_expects_at_any_degree(tmp_path: Path) -> None:
+    found = domain_size.main(tmp_path, quick=True)
+    assert 0.9 < found["smallest_ratio"] <= found["largest_ratio"] < 1.15  # nothing is fitted to the expected angles
+    assert abs(found["exponent"] - found["expected_exponent"]) < 0.15
+    assert found["exponent"] > 1.1  # faster than the size: the defect itself grows
+    assert found["gain_of_degree"] < 1.3
+    assert (tmp_path / "domain_size.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_suggested_domain_of_an_arm_from_its_urdf_has_no_folds() -> None:
+    (line,) = suggested_domains.main(quick=True)
+    *_, widths, _, leak, least = line.strip("| ").split("|")
+    assert widths.count("cyclic") == widths.count("idle") == 1
+    assert float(leak) <= 8
+    assert "none" in least
+    assert float(least.split(",")[1]) >= 0.2
 
 
 @pytest.mark.slow

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 import orthocas as oc
+from orthocas.domains import sample_heavily
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fold_search import FoldSearch
 from orthocas.fitting.loss import LEAST_CONDITIONING, Weights
 from orthocas.fitting.mirror import find_mirror
 from orthocas.samples import sample_problem, samples_at
-from orthocas.worst_points import corner_heavy, worst_points
+from orthocas.worst_points import worst_points
 
 ACTIVE = list(range(6))
 SIGNS = (-1, 1, -1, 1, -1, 1)  # joints that turn about the arm's plane turn round in the mirror
@@ -53,9 +54,8 @@ def test_no_fold_is_left_where_other_samples_look_for_one(iiwa_fit: Fit) -> None
     """200,000 samples near corners and faces with another seed, and a search with another seed."""
     chart = iiwa_fit.chart
     assert iiwa_fit.worst is not None
-    u = corner_heavy(np.random.default_rng(77), 200_000, 7)
     found = []
-    for part in np.array_split(chart.problem.domain.centre + chart.problem.domain.half_width * u, 20):
+    for part in np.array_split(sample_heavily(chart.problem.domain, 200_000, 77), 20):
         samples = samples_at(chart.problem, part)
         found.append(samples.signed_conditioning(chart.coordinates.jacobian(samples.points)))
     values = np.concatenate(found)

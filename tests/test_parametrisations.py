@@ -14,7 +14,8 @@ from orthocas.parametrisations import JointSpace, ProductFamily, component_gradi
 SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))
 SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE.joint_names)
 GIVEN = oc.Given.from_function("by hand", 3, lambda q: ca.vertcat(ca.sin(q[0]) * q[1], q[2] + 2))
-ALL = [oc.Linear(), oc.Polynomial(3), oc.Fourier(2), oc.MLP((5, 4)), GIVEN]
+REDUCED = [oc.Polynomial(3, cyclic=["b"]), oc.Fourier(2, cyclic=("a", "c"))]
+ALL = [oc.Linear(), oc.Polynomial(3), oc.Fourier(2), *REDUCED, oc.MLP((5, 4)), GIVEN]
 
 
 def values(parametrisation: object, space: JointSpace, points: np.ndarray, theta: np.ndarray, r: int = 2) -> np.ndarray:

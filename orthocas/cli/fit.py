@@ -8,6 +8,7 @@ import typer
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, report_rows, whole_number
 from orthocas.cli.problem_argument import (
     CentreText,
+    DomainText,
     HalfWidth,
     HomeName,
     Locks,
@@ -19,6 +20,7 @@ from orthocas.cli.problem_argument import (
     ToolText,
     build_problem,
     parse_numbers,
+    suggested,
 )
 from orthocas.cli.progress import terminal_monitor
 from orthocas.errors import Interrupted, InvalidValueError
@@ -29,7 +31,11 @@ from orthocas.fitting.fit import fit as fit_chart
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, Weights
 from orthocas.minimising.solver import Status
 from orthocas.parametrisations import parse_parametrisation
+from orthocas.postures.probe import Bounds
+from orthocas.postures.suggest import CONDITIONING, LEAK_DEG
+from orthocas.postures.suggestion import DomainSuggestion
 from orthocas.quality import Report, evaluate
+from orthocas.showing import number_list
 from orthocas.solvers import get as get_solver
 
 _NUMBERS = ("task", "mutual", "regularity", "length", "folds")
@@ -47,8 +53,8 @@ def fit(
         str | None,
         typer.Option(
             "--param",
-            help="Parametrisation: polynomial:5, fourier:2, mlp:64x64, linear or sew; default: polynomial:5, "
-            "or polynomial:4 for more than seven joints.",
+            help="Parametrisation: polynomial:5, polynomial:5:cyclic, fourier:2, mlp:64x64, linear or sew; "
+            "default: polynomial:5, or polynomial:4 for more than seven joints.",
         ),
     ] = None,
     solver: Annotated[
@@ -61,6 +67,14 @@ def fit(
     centre: CentreText = None,
     home: HomeName = None,
     half_width: HalfWidth = None,
+    domain: DomainText = None,
+    leak_deg: Annotated[
+        float | None, typer.Option("--leak-deg", parser=number, help="Largest leak for --domain auto [deg]; default 8.")
+    ] = None,
+    conditioning: Annotated[
+        float | None,
+        typer.Option("--conditioning", parser=number, help="Smallest conditioning for --domain auto; default 0.2."),
+    ] = None,
     samples: Annotated[
         int | None,
         typer.Option(
@@ -95,14 +109,19 @@ def fit(
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
     words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width)
-    built = build_problem(problem, words)
-    target = out or Path(f"{built.name}.orthocas")
+    bounds = _bounds(domain, leak_deg, conditioning)
+    built = build_problem(problem, words) if bounds is None else None
+    target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
     require_free(target, CHART, force)
     parametrisation = None if param is None else parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
     loss = parse_weights(weights)
+    suggestion = None
     try:
         with terminal_monitor() as monitor:
+            if bounds is not None:
+                built, suggestion = suggested(problem, words, parametrisation, bounds, seed, monitor)
+            assert built is not None
             result = fit_chart(
                 built,
                 parametrisation,
@@ -119,12 +138,25 @@ def fit(
     result.chart.save(target, force)
     report = evaluate(result.chart, seed=seed + 1)
     if json:
-        print_json(_as_dict(result, report, target))
+        print_json(_as_dict(result, report, target, suggestion))
     else:
-        print_rows(_rows(result, report, target))
+        print_rows({**_rows(result, report, target), **({} if suggestion is None else _domain_rows(suggestion))})
     if result.status is Status.INTERRUPTED:
         note("interrupted: the chart holds the best coordinates found so far")
         raise typer.Exit(130)
+
+
+def _bounds(domain: str | None, leak_deg: float | None, conditioning: float | None) -> Bounds | None:
+    """What --domain auto asks for; None without it."""
+    given = {"--leak-deg": leak_deg, "--conditioning": conditioning}
+    if domain is None:
+        for option, value in given.items():
+            if value is not None:
+                raise InvalidValueError(option, value, "--domain auto with it")
+        return None
+    if domain != "auto":
+        raise InvalidValueError("--domain", repr(domain), "auto, or --centre and --half-width for a box of your own")
+    return Bounds(LEAK_DEG if leak_deg is None else leak_deg, CONDITIONING if conditioning is None else conditioning)
 
 
 def parse_weights(text: str) -> Weights:
@@ -143,6 +175,8 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
         rows["exact"] = f"joints that do not move the task: {', '.join(result.idle_joints)}"
     if result.worst is not None:
         rows["searched"] = f"least conditioning {result.worst.told}"
+    if result.cyclic_joints:
+        rows["cyclic"] = f"holds at all positions of {', '.join(result.cyclic_joints)}"
     if result.problem_check.singular_samples:
         check = result.problem_check
         at = ", ".join(f"{value:.2f}" for value in check.most_singular_point)
@@ -151,15 +185,25 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     return rows
 
 
-def _as_dict(result: Fit, report: Report, target: Path) -> dict[str, Any]:
+def _domain_rows(suggestion: DomainSuggestion) -> dict[str, str]:
+    """What ends the domain in each joint."""
+    rows = {"home": f"{number_list(suggestion.home)} ({suggestion.home_source})"}
+    for joint in suggestion.joints:
+        rows[joint.joint] = f"half-width {joint.half_width:.3g}, {joint.explanation}"
+    return rows
+
+
+def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSuggestion | None) -> dict[str, Any]:
     check = result.problem_check
     return {
+        **({} if suggestion is None else {"suggested_domain": suggestion.as_dict()}),
         "chart": str(target),
         "parametrisation": result.chart.coordinates.label,
         "status": result.status.value,
         "seconds": result.seconds,
         "idle_joints": list(result.idle_joints),
         "least_conditioning": None if result.worst is None else result.worst.least,
+        "cyclic_joints": list(result.cyclic_joints),
         "near_singular_share": check.singular_share,
         "most_singular_point": list(check.most_singular_point),
         "stages": [

@@ -19,6 +19,7 @@ from orthocas.cli.problem_argument import (
 from orthocas.errors import SingularTaskError
 from orthocas.files.json import plain
 from orthocas.involutivity import involutivity
+from orthocas.parametrisations import cyclic_joints
 from orthocas.problem import Problem, check
 from orthocas.robots import Robot
 
@@ -81,6 +82,8 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "domain": problem.domain.name,
         "centre": problem.domain.centre.tolist(),
         "half_width": problem.domain.half_width.tolist(),
+        "unbounded_joints": [problem.robot.joint_names[k] for k in getattr(problem.domain, "unbounded", ())],
+        "cyclic_joints": list(cyclic_joints(problem)),
         "near_singular_share": found.singular_share,
         "most_singular_point": list(found.most_singular_point),
         **_involutivity(problem),

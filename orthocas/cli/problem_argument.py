@@ -11,7 +11,13 @@ from orthocas import problems
 from orthocas.checks import Array
 from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, UnknownNameError
+from orthocas.metrics import Metric
+from orthocas.minimising.watch import Monitor
+from orthocas.parametrisations import Parametrisation
+from orthocas.postures.probe import Bounds
 from orthocas.postures.regular_box import regular_box
+from orthocas.postures.suggest import suggest_domain
+from orthocas.postures.suggestion import DomainSuggestion
 from orthocas.problem import Problem
 from orthocas.robots import Robot
 from orthocas.tasks import Task
@@ -37,6 +43,12 @@ CentreText = Annotated[str | None, typer.Option("--centre", help='Centre of the 
 HomeName = Annotated[
     str | None,
     typer.Option("--home", help="Named posture as centre of the domain, from an MJCF file or the SRDF beside a URDF."),
+]
+DomainText = Annotated[
+    str | None,
+    typer.Option(
+        "--domain", help="auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning."
+    ),
 ]
 HalfWidth = Annotated[
     str | None, typer.Option("--half-width", help='Half-width of the domain, "0.4" or one per joint [rad or m].')
@@ -103,6 +115,43 @@ def build_problem(name: str, options: ProblemOptions) -> Problem:
         domain = default_box(base.robot, base.domain.centre if centre is None else centre, half_width)
     task = base.task if options.task is None else Task.named(base.robot, options.task)
     return Problem(base.robot, task, base.metric if options.metric is None else options.metric, domain, name)
+
+
+def suggested(
+    name: str,
+    options: ProblemOptions,
+    parametrisation: Parametrisation,
+    bounds: Bounds,
+    seed: int,
+    monitor: Monitor,
+) -> tuple[Problem, DomainSuggestion]:
+    """Build the problem of `--domain auto`, and the suggestion that its domain comes from.
+
+    Raises:
+        UnknownNameError: if `name` is neither a named problem nor a robot file.
+        OrthocasError: if anything does not fit together.
+    """
+    if options.half_width is not None:
+        raise InvalidValueError("--half-width", options.half_width, "none with --domain auto, which finds it")
+    base = None if is_robot_file(name) else build_problem(name, options)
+    robot = build_robot(name, options) if base is None else base.robot
+    task = Task.named(robot, options.task or "position") if base is None else base.task
+    metric: Metric | str = (options.metric or "euclidean") if base is None else base.metric
+    home: Array | str | None = _centre(robot, options) if base is None else base.domain.centre
+    if options.home is not None:
+        home = options.home
+    found = suggest_domain(
+        robot,
+        task,
+        home,
+        metric,
+        leak_deg=bounds.leak_deg,
+        conditioning=bounds.conditioning,
+        parametrisation=parametrisation,
+        seed=seed,
+        monitor=monitor,
+    )
+    return Problem(robot, task, metric, found.domain, Path(name).stem if base is None else base.name), found
 
 
 def parse_numbers(option: str, text: str) -> Array:

@@ -108,8 +108,10 @@ def _remark(controller: Controller, gain: str) -> str:
 def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
     if np.isinf(lower).all():
         return " *   all joint positions"
-    rows = zip(names, lower, upper, strict=True)
-    return "\n".join(f" *   {name}: {low:.6g} to {high:.6g}" for name, low, high in rows)
+    ranges = [
+        "all positions" if np.isinf(low) else f"{low:.6g} to {high:.6g}" for low, high in zip(lower, upper, strict=True)
+    ]
+    return "\n".join(f" *   {name}: {range_}" for name, range_ in zip(names, ranges, strict=True))
 
 
 def _numbers(values: Array) -> str:

@@ -15,6 +15,7 @@ from orthocas.control.gains import FEEDBACK, LIMIT, command_limit, non_negative_
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
+from orthocas.control.turns import without_turns
 from orthocas.problem import Problem
 from orthocas.showing import Shown
 
@@ -100,7 +101,8 @@ class Kinematic(Shown):
         inputs = named_inputs(n, self.gains, n)
         q = inputs["q"]
         B, Lambda, volume = block_inertia(n, (n,))(self.chart.function("jacobian")(q), problem.metric.function(q))
-        rate = inputs["reference_velocity"] + inputs["feedback"] * (inputs["reference"] - self.measured(q))
+        error = without_turns(self.chart, inputs["reference"] - self.measured(q))
+        rate = inputs["reference_velocity"] + inputs["feedback"] * error
         scale = median_volume(problem, self.chart.function("jacobian"), problem.metric, (n,))
         velocity = B @ (Lambda @ rate)  # J^-1 = A^-1 J^T (J A^-1 J^T)^-1
         return guarded_graph(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain)

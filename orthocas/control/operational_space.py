@@ -26,6 +26,7 @@ from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.matched_stiffness import matched_stiffness
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
+from orthocas.control.turns import without_turns
 from orthocas.domains import sample_uniform
 from orthocas.problem import Problem
 from orthocas.showing import Shown
@@ -218,7 +219,7 @@ class _OperationalSpace(Shown):
         return B, Lambda, volume, D
 
     def _errors(self, inputs: dict[str, ca.MX], J: ca.MX) -> tuple[ca.MX, ca.MX]:
-        e = self.measured(inputs["q"]) - inputs["reference"]
+        e = without_turns(self.chart, self.measured(inputs["q"]) - inputs["reference"])
         velocity = J @ inputs["dq"]
         return e, velocity - inputs["reference_velocity"] if self.feed_forward else velocity
 

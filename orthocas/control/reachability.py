@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_point, require_kind
 from orthocas.control.reference import Reference
-from orthocas.domains import contains
+from orthocas.domains import borders, contains
 from orthocas.errors import InvalidValueError, InverseError, UnreachableReferenceError
 
 
@@ -41,8 +41,9 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
 
 def _outside(chart: Chart, q: Array) -> str:
     domain = chart.problem.domain
-    i = int(np.argmax(np.abs(q - domain.centre) / domain.half_width))
-    low, high = domain.centre[i] - domain.half_width[i], domain.centre[i] + domain.half_width[i]
+    low, high = borders(domain)
+    i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))
+    low, high = low[i], high[i]
     return f"joint '{chart.problem.robot.joint_names[i]}' at {q[i]:.4g}, expected within [{low:.4g}, {high:.4g}]"
 
 

@@ -3,8 +3,9 @@
 from enum import IntEnum
 
 import casadi as ca
+import numpy as np
 
-from orthocas.domains import Domain, Torus, reach
+from orthocas.domains import Domain, reach
 
 LARGEST = 1e100  #: larger numbers count as not finite, because their squares may overflow
 _SMALLEST_VOLUME = 1e-3  # of the parallelepiped of the gradients, relative to its median over the domain
@@ -53,10 +54,12 @@ def guard(domain: Domain | None, n: int, numbers: int) -> ca.Function:
 
 
 def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
-    """Whether q (n, 1) lies in the domain; always true for the angles of a torus."""
-    if domain is None or isinstance(domain, Torus):
+    """Whether q (n, 1) lies in the domain; always true for joints without borders, such as the angles of a torus."""
+    widths = np.full(q.shape[0], np.inf) if domain is None else reach(domain)
+    bounded = np.flatnonzero(np.isfinite(widths)).tolist()
+    if domain is None or not bounded:
         return ca.SX(1)
-    return ca.logic_all(ca.fabs(q - ca.DM(domain.centre)) <= ca.DM(reach(domain)))
+    return ca.logic_all(ca.fabs(q[bounded] - ca.DM(domain.centre[bounded])) <= ca.DM(widths[bounded]))
 
 
 def _is_finite(value: ca.SX) -> ca.SX:

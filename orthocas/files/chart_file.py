@@ -51,6 +51,7 @@ def write_chart(
             "task": _with_tape(problem.task.recipe, problem.task.function),
             "metric": _with_tape(problem.metric.recipe, problem.metric.function),
             "domain": problem.domain.name,
+            **({"unbounded": list(problem.domain.unbounded)} if isinstance(problem.domain, Box) else {}),
         },
         "coordinates": description,
         "notes": _checked_notes(notes),
@@ -165,7 +166,8 @@ def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTre
 
 def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
     require_known("domain", part(data, "domain", str), ("box", "torus"))
-    box = Box(part(arrays, "domain_centre", np.ndarray), part(arrays, "domain_half_width", np.ndarray))
+    unbounded = part(data, "unbounded", list) if "unbounded" in data else ()  # missing in older files
+    box = Box(part(arrays, "domain_centre", np.ndarray), part(arrays, "domain_half_width", np.ndarray), unbounded)
     domain: Domain = Torus(robot.n) if data["domain"] == "torus" else box
     return Problem(
         robot,

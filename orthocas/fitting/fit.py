@@ -21,7 +21,13 @@ from orthocas.fitting.settings import FitSettings, default_parametrisation
 from orthocas.fitting.stages import StageRunner
 from orthocas.minimising.solver import Solver, Status
 from orthocas.minimising.watch import Monitor, silent
-from orthocas.parametrisations import JointSpace, Parametrisation, warn_unless_savable
+from orthocas.parametrisations import (
+    CyclicParametrisation,
+    JointSpace,
+    Parametrisation,
+    warn_unless_savable,
+)
+from orthocas.parametrisations.cyclic_joints import over_cyclic_joints
 from orthocas.problem import Problem, ProblemCheck, check
 from orthocas.samples import Samples, sample_problem
 from orthocas.showing import Shown, listed
@@ -50,6 +56,13 @@ class Fit(Shown):
     seconds: float  #: of this run; the seconds of stages include earlier runs of a checkpoint
 
     @property
+    def cyclic_joints(self) -> tuple[str, ...]:
+        """Names of joints at all of whose positions the chart holds, because its coordinates are linear in them."""
+        coordinates = self.chart.coordinates
+        chosen = coordinates.parametrisation if isinstance(coordinates, Coordinates) else None
+        return tuple(chosen.cyclic) if isinstance(chosen, CyclicParametrisation) else ()
+
+    @property
     def status(self) -> Status:
         """How the last stage ended, or CONVERGED if there was nothing to minimise."""
         return self.stages[-1].result.status if self.stages else Status.CONVERGED
@@ -64,6 +77,7 @@ class Fit(Shown):
             "samples": str(self.chart.notes.get("samples", "")),
             "idle joints": listed(self.idle_joints) or "none",
             "least conditioning": "not searched" if self.worst is None else self.worst.told,
+            **({"cyclic joints": listed(self.cyclic_joints)} if self.cyclic_joints else {}),
             "near singular": f"{self.problem_check.singular_share:.3%} of the domain",
         }
 
@@ -84,9 +98,11 @@ def fit(
     """Find coordinates xi(q) that are as orthogonal as possible to the task.
 
     The fit minimises the mean of [AS2023] eq. (24) over uniform samples of the domain. Joints that do not affect the
-    task become coordinates themselves. Families linear in their parameters start from a spectral solution of low
-    degree, and the degree rises step by step. Ctrl-C raises `Interrupted`: its `result` is the fit with the best
-    coordinates so far and status INTERRUPTED. So callers that need a finished fit, and loops around them, end as well.
+    task become coordinates themselves. With `Polynomial(degree, cyclic="auto")`, the domain of the chart covers all
+    positions of the cyclic joints; see `orthocas.cyclic_joints`. Families linear in their parameters start from a
+    spectral solution of low degree, and the degree rises step by step. Ctrl-C raises `Interrupted`: its `result` is the
+    fit with the best coordinates so far and status INTERRUPTED. So callers that need a finished fit, and loops around
+    them, end as well.
 
     Args:
         problem: robot, task, metric and domain.
@@ -130,6 +146,8 @@ def fit(
     )
     settings = FitSettings.checked(problem, wanted, solver, weights, samples, seed, max_mutual_deg)
     warn_unless_savable(settings.parametrisation)
+    if isinstance(settings.parametrisation, CyclicParametrisation):
+        problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))
     found = check(problem, seed=settings.seed)
     first = sample_problem(problem, 200, (settings.seed, _FIRST_SAMPLES))
     if settings.parametrisation.closed_form is not None:

@@ -1,8 +1,10 @@
 """Parametrisations xi_theta(q): linear, polynomial, Fourier, MLP, closed forms, and your own."""
 
 from orthocas.parametrisations.basis import BasisFamily
+from orthocas.parametrisations.cyclic_joints import cyclic_joints
 from orthocas.parametrisations.family import (
     ClosedForm,
+    CyclicParametrisation,
     Family,
     GradedFamily,
     GradedParametrisation,
@@ -35,6 +37,7 @@ __all__ = [
     "SEW",
     "BasisFamily",
     "ClosedForm",
+    "CyclicParametrisation",
     "Family",
     "Fourier",
     "Given",
@@ -50,6 +53,7 @@ __all__ = [
     "SelfDerivativeFamily",
     "Term",
     "component_gradients",
+    "cyclic_joints",
     "parametrisation_from_data",
     "parametrisation_names",
     "parametrisation_to_data",

@@ -178,6 +178,16 @@ class GradedParametrisation(Parametrisation, Protocol):
         ...
 
 
+@runtime_checkable
+class CyclicParametrisation(Parametrisation, Protocol):
+    """A parametrisation that can reduce joints to one linear term each, so that charts hold at all their positions."""
+
+    @property
+    def cyclic(self) -> Sequence[str]:
+        """Names of these joints, after `for_problem`."""
+        ...
+
+
 def component_gradients(xi: Expression, q: Expression) -> list[Expression]:
     """dxi_j/dq of every component j by reverse automatic differentiation, r matrices (n, N).
 

@@ -9,8 +9,10 @@ import numpy as np
 
 from orthocas.checks import Array, require_count
 from orthocas.errors import InvalidValueError
+from orthocas.parametrisations import cyclic as cyclic_choice
+from orthocas.parametrisations.cyclic import Cyclic
 from orthocas.parametrisations.family import JointSpace
-from orthocas.parametrisations.product_basis import ProductFamily, product_family, terms_up_to
+from orthocas.parametrisations.product_basis import ProductFamily, product_family, reduced_terms
 
 if TYPE_CHECKING:
     from orthocas.problem import Problem
@@ -22,6 +24,8 @@ class Fourier:
 
     Args:
         degree: total degree, >= 1.
+        cyclic: joints that appear in one linear term each instead of sines and cosines, by name, or "auto" for all
+            cyclic joints of the problem; see `orthocas.cyclic_joints`.
 
     Example:
         >>> import orthocas as oc
@@ -31,28 +35,33 @@ class Fourier:
     """
 
     degree: int
+    cyclic: Cyclic = ()
     linear: ClassVar[bool] = True
     closed_form: ClassVar[None] = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", require_count("degree", self.degree))
+        object.__setattr__(self, "cyclic", cyclic_choice.checked_cyclic(self.cyclic))
 
     @property
     def label(self) -> str:
-        """'fourier:DEGREE'."""
-        return f"fourier:{self.degree}"
+        """'fourier:DEGREE', with the cyclic joints if there are any."""
+        return f"fourier:{self.degree}{cyclic_choice.suffix(self.cyclic)}"
 
     def for_problem(self, problem: "Problem") -> "Fourier":
-        """The object itself: it does not depend on the problem."""
-        return self
+        """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
+        return Fourier(self.degree, cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
 
     def of_degree(self, degree: int) -> "Fourier":
         """The same parametrisation with another degree."""
-        return Fourier(degree)
+        return Fourier(degree, self.cyclic)
 
     def term_count(self, n: int) -> int:
-        """Sum over j of C(n, j) C(d, j) 2^j, without the constant."""
-        return sum(comb(n, j) * comb(self.degree, j) * 2**j for j in range(1, min(n, self.degree) + 1))
+        """Sum over j of C(n, j) C(d, j) 2^j, without the constant. Cyclic joints do not count in n, but add a term."""
+        linear = min(n, cyclic_choice.count(self.cyclic))
+        n, d = n - linear, self.degree
+        terms: int = sum(comb(n, j) * comb(d, j) * 2**j for j in range(1, min(n, d) + 1))
+        return terms + linear
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Fourier terms of the joint angles.
@@ -65,19 +74,24 @@ class Fourier:
             raise InvalidValueError(
                 f"joint '{name}' of a Fourier basis", "prismatic", "a revolute joint; use polynomial instead"
             )
+        linear = cyclic_choice.indices(self.cyclic, space)
 
         def waves(i: int, q: ca.SX) -> list[ca.SX]:
+            if i in linear:
+                return [1 + 0 * q, q - space.centre[i]]
             out = [1 + 0 * q]
             for k in range(1, self.degree + 1):
                 out += [sqrt(2) * ca.cos(k * q), sqrt(2) * ca.sin(k * q)]
             return out
 
         def derivatives(i: int) -> Array:
-            """cos(k q)' = -k sin(k q), sin(k q)' = k cos(k q)."""
+            """cos(k q)' = -k sin(k q), sin(k q)' = k cos(k q); a linear function has the derivative 1."""
+            if i in linear:
+                return np.array([[0.0, 0.0], [1.0, 0.0]])
             D = np.zeros((2 * self.degree + 1,) * 2)
             for k in range(1, self.degree + 1):
                 D[2 * k - 1, 2 * k], D[2 * k, 2 * k - 1] = -k, k
             return D
 
         degrees = [[0] + [k for k in range(1, self.degree + 1) for _ in range(2)]] * space.n
-        return product_family(space, outputs, tuple(terms_up_to(degrees, self.degree)), waves, derivatives)
+        return product_family(space, outputs, reduced_terms(degrees, self.degree, linear), waves, derivatives)

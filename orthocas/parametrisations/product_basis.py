@@ -92,6 +92,12 @@ def _product(term: Term, tables: list[list[Any]], products: dict[Term, Any]) -> 
     return products[term]
 
 
+def reduced_terms(degrees: list[list[int]], total: int, linear: list[int]) -> tuple[Term, ...]:
+    """The terms of `terms_up_to` without those in the joints `linear`, then the term linear in each of these."""
+    kept = [[0] if k in linear else own for k, own in enumerate(degrees)]
+    return (*terms_up_to(kept, total), *(tuple(int(i == k) for i in range(len(degrees))) for k in linear))
+
+
 def terms_up_to(degrees: list[list[int]], total: int) -> Iterator[Term]:
     """All non-constant choices of one function per joint whose degrees add up to at most `total`.
 

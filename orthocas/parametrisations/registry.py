@@ -8,6 +8,7 @@ from typing import Any
 
 from orthocas.checks import require_kind, require_known
 from orthocas.errors import InvalidValueError, NotSavableWarning
+from orthocas.parametrisations.cyclic import Cyclic, parse_suffix
 from orthocas.parametrisations.family import Parametrisation
 from orthocas.parametrisations.fourier import Fourier
 from orthocas.parametrisations.given import Given
@@ -50,7 +51,7 @@ def register(name: str, kind: type[Parametrisation], parse: Callable[[str], Para
         ...     degree: int = 3
         >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
         >>> oc.parametrisations.parse_parametrisation("cubic")
-        Cubic(degree=3)
+        Cubic(degree=3, cyclic=())
     """
     require_kind("name", name, str)
     known = _REGISTERED.get(name)
@@ -120,7 +121,7 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
 
 
 def parse_parametrisation(label: str) -> Parametrisation:
-    """Parse a label: 'polynomial:4', 'fourier:2', 'mlp:64x64', 'linear', 'sew:stereographic', or your own.
+    """Parse a label: 'polynomial:4', 'fourier:2:cyclic', 'mlp:64x64', 'linear', 'sew:stereographic', or your own.
 
     Raises:
         UnknownNameError: if there is no such parametrisation.
@@ -143,6 +144,11 @@ def _whole(text: str) -> int:
         ) from None
 
 
+def _degree_and_cyclic(text: str) -> tuple[int, Cyclic]:
+    degree, _, rest = text.partition(":")
+    return _whole(degree), parse_suffix(rest)
+
+
 def _linear(text: str) -> Linear:
     if text:
         raise InvalidValueError("parametrisation", repr(f"linear:{text}"), "'linear' without a number")
@@ -150,8 +156,8 @@ def _linear(text: str) -> Linear:
 
 
 register("linear", Linear, _linear)
-register("polynomial", Polynomial, lambda text: Polynomial(_whole(text)))
-register("fourier", Fourier, lambda text: Fourier(_whole(text)))
+register("polynomial", Polynomial, lambda text: Polynomial(*_degree_and_cyclic(text)))
+register("fourier", Fourier, lambda text: Fourier(*_degree_and_cyclic(text)))
 register("mlp", MLP, lambda text: MLP(tuple(_whole(width) for width in text.split("x"))))
 register("sew", SEW, lambda text: SEW(text or "stereographic"))
 register("given", Given)

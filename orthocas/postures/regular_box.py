@@ -42,9 +42,14 @@ def regular_box(robot: Robot, task: Task) -> Box:
     if task.m >= robot.n:
         raise NotRedundantError(task.m, robot.n)
     box = default_box(robot)
-    judge = _Judge.of(robot, task, box)
+    judge = Judge.of(robot, task, box)
     if np.quantile(judge.regularity(box.centre[None], _JUDGES), 0.05) >= _REGULAR:
         return box
+    return default_box(robot, bent_posture(judge, robot, box))
+
+
+def bent_posture(judge: "Judge", robot: Robot, box: Box) -> Array:
+    """The posture with the best score, (n,), found from the middle of the default box."""
     room = np.minimum(box.centre - robot.lower, robot.upper - box.centre) - box.half_width
     way = np.where(robot.tree.prismatic, 0.0, np.clip(room, 0.0, _FARTHEST))
     best, value = judge.best(_bent_postures(way))
@@ -53,11 +58,11 @@ def regular_box(robot: Robot, task: Task) -> Box:
         if improved <= value:
             break
         best, value = moved, improved
-    return default_box(robot, box.centre + best)
+    return box.centre + best
 
 
 @dataclass(frozen=True)
-class _Judge:
+class Judge:
     """Scores postures: how regular a task is on the default boxes around them."""
 
     robot: Robot
@@ -67,7 +72,8 @@ class _Judge:
     scale: Array  # scale of the rows of J_x, (m,)
 
     @classmethod
-    def of(cls, robot: Robot, task: Task, box: Box) -> "_Judge":
+    def of(cls, robot: Robot, task: Task, box: Box) -> "Judge":
+        """Scale the rows of J_x by their size on a box."""
         jacobian = Batched(task.centred_jacobian_function)
         points = sample_evenly(box, _JUDGES, 0)
         J = _finite(jacobian(points, np.broadcast_to(box.centre, points.shape))[0].reshape(-1, task.m, robot.n))
@@ -89,10 +95,14 @@ class _Judge:
         stacked = np.concatenate([J, np.broadcast_to(rest, (*points.shape[:2], n - self.m, n))], axis=2)
         return np.asarray(np.linalg.svd(stacked, compute_uv=False)[..., -1])
 
+    def worst(self, centres: Array) -> Array:
+        """Mean of the smallest regularities on the boxes around centres (N, n), (N,)."""
+        values: Array = np.sort(self.regularity(centres, _SAMPLES - 1), axis=1)[:, :_WORST].mean(axis=1)
+        return values
+
     def best(self, offsets: Array) -> tuple[Array, float]:
         """The best of the offsets (N, n) from the middle, and its score."""
-        worst = np.sort(self.regularity(self.middle + offsets, _SAMPLES - 1), axis=1)[:, :_WORST].mean(axis=1)
-        values = worst - _PENALTY * np.abs(offsets).sum(axis=1)
+        values = self.worst(self.middle + offsets) - _PENALTY * np.abs(offsets).sum(axis=1)
         k = int(np.argmax(values))
         return offsets[k], float(values[k])
 

@@ -30,6 +30,9 @@ _WORDS = (
     "mlp:2x2",
     "sew",
     "given",
+    "polynomial:1:cyclic",
+    "polynomial:1:cyclic=q1,q9",
+    "polynomial:1:=",
     "polynomial:",
     "polynomial:-1",
     "mlp:0x9",
@@ -45,6 +48,8 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--stiffness", "--damping-ratio", "--posture-stiffness", "--feedback", "--limit"), _LISTS),
     **dict.fromkeys(("--seed", "--seeds", "--samples", "--held-out", "--jobs"), _COUNTS),
     **dict.fromkeys(("--rate", "--mass-factor", "--max-mutual-deg"), (*NUMBERS, "50", "10")),
+    **dict.fromkeys(("--leak-deg", "--conditioning"), (*NUMBERS, "5", "0.3")),
+    "--domain": ("auto", "box", ""),
     **dict.fromkeys(("--out", "--checkpoint"), ("out", "out/x/y", ".", "", "chart.orthocas", "/dev/null/x", "x" * 300)),
     **dict.fromkeys(("--coupling", "--damping", "--animation"), ("coupled", "square_root", "none", "mp5", "")),
     "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose", "position:xx", "position+axis", ""),
@@ -57,6 +62,7 @@ _VALUES: dict[str, tuple[str, ...]] = {
 }
 _PROBLEM_OPTIONS = ("--tip", "--lock", "--tool")
 _DOMAIN_OPTIONS = ("--task", "--metric", "--centre", "--home", "--half-width")
+_AUTO_OPTIONS = ("--domain", "--leak-deg", "--conditioning")
 _LAW_OPTIONS = (
     "--stiffness",
     "--damping-ratio",
@@ -71,7 +77,10 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     "fit": (
         _PROBLEMS,
         {"--param": "polynomial:1", "--samples": "30", "--out": "new.orthocas"},
-        (*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, "--solver", "--seed", "--weights", "--max-mutual-deg", "--checkpoint"),
+        (
+            *(*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, *_AUTO_OPTIONS),
+            *("--solver", "--seed", "--weights", "--max-mutual-deg", "--checkpoint"),
+        ),
     ),
     "evaluate": (_FILES, {"--samples": "50"}, ("--seed",)),
     "info": ((*_PROBLEMS, *_FILES), {}, _PROBLEM_OPTIONS),

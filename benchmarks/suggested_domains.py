@@ -1,0 +1,75 @@
+"""Suggested domains of real arms from their URDFs, without tuning: time, size, and quality at many samples."""
+
+import argparse
+from importlib.metadata import files
+from pathlib import Path
+
+import numpy as np
+
+import orthocas as oc
+from orthocas import problems
+from orthocas.postures.probe import judged_chart
+
+CASES = (  # robot, task, metric
+    ("iiwa", "position", "euclidean"),
+    ("panda", "position", "euclidean"),
+    ("panda", "pose", "euclidean"),
+    ("xarm7", "position", "euclidean"),
+    ("kinova j2s6", "position", "euclidean"),
+    ("ur10", "position", "euclidean"),
+    ("tiago with its torso", "position", "euclidean"),
+    ("iiwa", "position", "inertia"),
+)
+ROBOTS = {  # of the package example-robot-data: file and tip
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef"),
+    "kinova j2s6": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
+    "tiago with its torso": ("tiago_description/robots/tiago.urdf", "arm_tool_link"),
+}
+HEADER = (
+    "| robot, task, metric | home | half-widths (what ends them) | suggestion, of which fit [s] | leak [deg] "
+    "| folds, least conditioning |\n| --- | --- | --- | --- | --- | --- |"
+)
+MARKS = {"leak": "L", "conditioning": "C", "singularity": "S", "joint limit": "J"}
+
+
+def robot_of(name: str) -> oc.Robot:
+    """The arm of a named problem, or a robot of example-robot-data."""
+    if name in problems.names():
+        return problems.get(name).robot
+    file, tip = ROBOTS[name]
+    path = next(Path(str(f.locate())).resolve() for f in files("example-robot-data") or [] if str(f).endswith(file))
+    return oc.Robot.from_file(path, tip)
+
+
+def row(name: str, task: str, metric: str, degree: int, samples: int) -> str:
+    """One row of the table, with the quality at `samples` points, two thirds of them near faces and corners."""
+    robot = robot_of(name)
+    parametrisation = oc.Polynomial(degree, cyclic="auto")
+    found = oc.suggest_domain(robot, oc.Task.named(robot, task), metric=metric, parametrisation=parametrisation)
+    widths = ", ".join(f"{joint.half_width:.2f} {MARKS.get(joint.reason, joint.reason)}" for joint in found.joints)
+    verdicts = [judged_chart(found.fit.chart, 50_000, seed=100 + k) for k in range(samples // 50_000)]
+    least = min(verdict.conditioning for verdict in verdicts)
+    return (
+        f"| {name}, {task}, {metric} | {np.round(found.home, 2).tolist()}, {found.home_source} | {widths} "
+        f"| {found.seconds:.1f}, {found.fit.seconds:.1f} | {verdicts[0].leak_deg:.2f} "
+        f"| {'folds' if least <= 0 else 'none'}, {least:.3f} |"
+    )
+
+
+def main(quick: bool = False) -> list[str]:
+    """All rows; `quick` takes one arm, quadratic coordinates and few samples."""
+    cases = [("ur10", "position", "euclidean")] if quick else CASES
+    rows = []
+    for case in cases:
+        rows.append(row(*case, 2 if quick else 4, 50_000 if quick else 1_000_000))
+        print(rows[-1], flush=True)
+    return rows
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    print(HEADER)
+    main(parser.parse_args().quick)

@@ -1,0 +1,46 @@
+"""Whole turns of joints that turn without end: they change the coordinates, but not the posture (ours)."""
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.coordinates.fitted import Coordinates
+from orthocas.domains import Box
+from orthocas.parametrisations import CyclicParametrisation
+
+
+def without_turns(chart: Chart, difference: Any) -> Any:
+    """A difference of two phi (n, 1) without the whole turns of unbounded joints; the spring takes the shorter way.
+
+    A turn of joint k changes phi by the constant 2 pi dphi/dq_k, a column of T (n, u), if the coordinates are linear in
+    q_k. The difference becomes e - T round(T^+ e). So sensors may report angles with or without whole turns.
+
+    Args:
+        chart: the chart.
+        difference: phi - phi_d, an expression.
+    """
+    T = _turns(chart)
+    if T.shape[1] == 0:
+        return difference
+    whole = ca.floor(ca.DM(np.linalg.pinv(T)) @ difference + 0.5)
+    return difference - ca.DM(T) @ whole
+
+
+def _turns(chart: Chart) -> Array:
+    """What a turn of each unbounded joint adds to phi, (n, u)."""
+    problem, coordinates = chart.problem, chart.coordinates
+    if not (isinstance(problem.domain, Box) and isinstance(coordinates, Coordinates)):
+        return np.zeros((chart.n, 0))
+    chosen = coordinates.parametrisation
+    cyclic = chosen.cyclic if isinstance(chosen, CyclicParametrisation) else ()
+    joints = [
+        k
+        for k in problem.domain.unbounded
+        if not problem.robot.tree.prismatic[k] and (k in coordinates.idle or problem.robot.joint_names[k] in cyclic)
+    ]
+    T = 2 * np.pi * chart.jacobian(problem.domain.centre)[:, joints]
+    T[: chart.m] = 0.0
+    return np.asarray(T)

@@ -1,0 +1,170 @@
+"""Quick fits on trial boxes: the leak and the conditioning that a chart would have there (ours)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.casadi_tools.interrupts import deferred
+from orthocas.casadi_tools.threads import one_blas_thread
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.coordinates.fitted import Coordinates
+from orthocas.domains import Box, sample_evenly, sample_heavily
+from orthocas.fitting.basis_gradients import BasisGradients
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.loss import DEFAULT_WEIGHTS
+from orthocas.fitting.spectral_start import spectral_start
+from orthocas.minimising.solver import Status
+from orthocas.parametrisations import JointSpace, LinearFamily, Polynomial
+from orthocas.problem import NEAR_SINGULAR, Problem
+from orthocas.samples import Samples, samples_at
+from orthocas.solvers import GaussNewton
+
+_DEGREE = 2  # its conditioning is that of degree 4, its leak about a fifth larger
+_TRAINING, _HEAVY, _JUDGES = 700, 300, 3000  # numbers of samples: even, near faces and corners, and of a verdict
+_SEED = 0
+_TINY = 1e-4
+
+
+Miss = Literal["leak", "conditioning", "singularity"]  #: bounds that a box may miss
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What is asked of coordinates on a box."""
+
+    leak_deg: float  #: largest leak [deg]
+    conditioning: float  #: smallest conditioning
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Quality of coordinates on a box."""
+
+    leak_deg: float  #: root mean square over uniform samples and coordinates [deg]
+    conditioning: float  #: the smallest at any sample; negative if det J changes its sign, because the chart folds over
+    worst_point: Array  #: where, (n,)
+    task_value: float  #: smallest singular value of J_x with rows of unit root mean square length
+
+    def excess(self, bounds: Bounds) -> dict[Miss, float]:
+        """How much each value misses its bound, as a ratio of at most 1 where it keeps it, the largest first.
+
+        "singularity" is the bound `NEAR_SINGULAR` on the task itself, which the conditioning does not see.
+        """
+        ratios: dict[Miss, float] = {
+            "leak": self.leak_deg / bounds.leak_deg,
+            "conditioning": bounds.conditioning / max(self.conditioning, _TINY),
+            "singularity": NEAR_SINGULAR / max(self.task_value, _TINY),
+        }
+        return dict(sorted(ratios.items(), key=lambda pair: -pair[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Prober:
+    """Fits quadratic coordinates of the active joints on trial boxes."""
+
+    problem: Problem  #: robot, task and metric; trial boxes replace its domain
+    active: list[int]  #: joints that are not coordinates themselves
+    cyclic: tuple[str, ...] = ()  #: joints that enter linearly
+
+    @cached_property
+    def outputs(self) -> int:
+        """Number of coordinates to fit."""
+        return len(self.active) - self.problem.m
+
+    def verdict(self, box: Box) -> Verdict:
+        """Fit and judge on a box.
+
+        Raises:
+            KeyboardInterrupt: after Ctrl-C.
+        """
+        if self.outputs == 0:
+            return Verdict(0.0, 1.0, box.centre, 1.0)
+        problem = Problem(self.problem.robot, self.problem.task, self.problem.metric, box)
+        space = JointSpace.of(problem).restricted_to(self.active)
+        family = Polynomial(_DEGREE, self.cyclic).family(space, self.outputs)
+        with one_blas_thread():
+            C = self._fitted(problem, family).reshape(self.outputs, family.width)
+
+            def jacobian(points: Array) -> Array:
+                basis = BasisGradients(family, len(self.active))
+                G = basis.dense(basis.at(points[:, self.active]), len(points))
+                J: Array = (G @ C.T).transpose(0, 2, 1)
+                return J
+
+            return judged(samples_at(problem, sample_heavily(box, _JUDGES, _SEED)), jacobian, self.active)
+
+    def _fitted(self, problem: Problem, family: LinearFamily) -> Array:
+        """Parameters, (size,)."""
+        even = sample_evenly(problem.domain, _TRAINING, _SEED)
+        heavy = sample_heavily(problem.domain, _HEAVY, _SEED + 1)
+        samples = samples_at(problem, np.vstack([even, heavy])).restricted_to(self.active)
+        with deferred():
+            start = spectral_start(family, samples[: len(even)])
+            objective = BasisObjective(family, samples, DEFAULT_WEIGHTS, start, lambda count, seed: samples)
+        result = GaussNewton().coarser().minimise(objective, start)
+        if result.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        theta: Array = result.theta
+        return theta
+
+
+def judged_chart(chart: Chart, samples: int, seed: int) -> Verdict:
+    """Quality of a fitted chart, without its idle joints, on samples of its domain, many near faces and corners."""
+    coordinates = chart.coordinates
+    assert isinstance(coordinates, Coordinates)
+    fitted, active = len(coordinates.offset), coordinates.active
+
+    def jacobian(points: Array) -> Array:
+        J: Array = coordinates.jacobian(points)[:, :fitted, active]
+        return J
+
+    return judged(samples_at(chart.problem, sample_heavily(chart.problem.domain, samples, seed)), jacobian, active)
+
+
+def judged(samples: Samples, jacobian: Callable[[Array], Array], active: list[int]) -> Verdict:
+    """Quality at the result of `sample_heavily`.
+
+    Args:
+        samples: all samples.
+        jacobian: gradients of the fitted coordinates in the active joints, (N, r, n), at points of all joints.
+        active: the active joints.
+    """
+    J, own = jacobian(samples.points), samples.restricted_to(active)
+    uniform = len(samples) - 2 * (len(samples) // 3)
+    leaks, conditioning = leak_and_conditioning(own, J)
+    worst = int(np.argmin(conditioning))
+    leak = float(np.degrees(np.sqrt(np.mean(leaks[:uniform] ** 2))))
+    scale = np.sqrt((samples.task_jacobian**2).sum(axis=2).mean(axis=0))
+    task_values = np.linalg.svd(samples.task_jacobian / scale[:, None], compute_uv=False)[:, -1]
+    return Verdict(leak, float(conditioning[worst]), samples.points[worst], float(task_values.min()))
+
+
+def leak_and_conditioning(samples: Samples, J: Array) -> tuple[Array, Array]:
+    """Leaks (N, r) [rad] and signed conditioning (N,) of coordinates with gradients J (N, r, n).
+
+    The leak of a coordinate is the angle, in the metric, between its gradient and the space orthogonal to the task. The
+    conditioning is the smallest singular value of [A-orthonormal task basis; unit coordinate gradients]. It is negative
+    where det J has the opposite sign of most samples.
+    """
+    lengths = np.sqrt(np.einsum("sjn,sjn->sj", J, samples.raised(J)))
+    unit = J / np.maximum(lengths, 1e-300)[:, :, None]
+    basis = samples.task_basis
+    across = basis @ unit.transpose(0, 2, 1)  # (N, m, r)
+    leaks = np.arcsin(np.minimum(np.sqrt((across**2).sum(axis=1)), 1.0))
+    mutual = samples.raised(unit) @ unit.transpose(0, 2, 1)
+    identity = np.broadcast_to(np.eye(basis.shape[1]), (len(J), basis.shape[1], basis.shape[1]))
+    gram = np.concatenate(
+        [
+            np.concatenate([identity, across], axis=2),
+            np.concatenate([across.transpose(0, 2, 1), mutual], axis=2),
+        ],
+        axis=1,
+    )
+    smallest = np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[:, 0], 0.0))
+    signs = np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1)))
+    usual = 1.0 if signs.sum() >= 0 else -1.0
+    return leaks, smallest * np.where(signs == -usual, -1.0, 1.0)

@@ -1,0 +1,186 @@
+"""Suggested domains: the quality that was asked for is kept, and one joint wider breaks it."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from conftest import ROBOTS, robot_data
+from programs import Run
+from public_objects import suggestion
+
+import orthocas as oc
+from orthocas import problems
+from orthocas.domains import sample_heavily
+from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, UnknownNameError
+from orthocas.minimising.watch import Progress
+from orthocas.postures.home import home_posture
+from orthocas.postures.probe import Prober, leak_and_conditioning
+from orthocas.quality import evaluate
+from orthocas.samples import samples_at
+
+HOME = (0.6, 0.8, 0.8)
+
+
+def planar() -> tuple[oc.Robot, oc.Task]:
+    known = problems.get("planar_3r_xy")
+    return known.robot, known.task
+
+
+def arm(name: str) -> oc.Robot:
+    file, tip = ROBOTS[name]
+    return oc.Robot.from_urdf(robot_data(file), tip)
+
+
+def suggested(**asked: object) -> object:
+    return oc.suggest_domain(*planar(), HOME, **{"parametrisation": oc.Polynomial(2, cyclic="auto"), **asked})
+
+
+def test_leak_and_conditioning_are_those_of_their_definitions() -> None:
+    """Against principal angles and singular values in coordinates where A is the identity."""
+    known = problems.get("planar_3r_xy")
+    problem = oc.Problem(known.robot, known.task, "inertia", known.domain)
+    samples = samples_at(problem, sample_heavily(known.domain, 20, 3))
+    J = np.random.default_rng(1).normal(size=(20, 1, 3))
+    leaks, conditioning = leak_and_conditioning(samples, J)
+    for k, q in enumerate(samples.points):
+        L = np.linalg.cholesky(np.linalg.inv(known.robot.mass_matrix(q)))
+        task = np.linalg.qr((samples.task_jacobian[k] @ L).T)[0].T
+        own = J[k] @ L / np.linalg.norm(J[k] @ L)
+        np.testing.assert_allclose(np.sin(leaks[k, 0]), np.linalg.norm(task @ own.T), atol=1e-9)
+        np.testing.assert_allclose(
+            abs(conditioning[k]), np.linalg.svd(np.vstack([task, own]), compute_uv=False)[-1], atol=1e-7
+        )
+
+
+def test_two_thirds_of_heavy_samples_lie_near_faces_and_corners() -> None:
+    box = oc.Box(np.full(5, 0.3), [0.1, 0.2, 0.3, 0.4, 0.5])
+    distances = np.abs(sample_heavily(box, 9000, 2) - box.centre) / box.half_width
+    assert distances.max() <= 1
+    means = distances.reshape(3, 3000, 5).mean(axis=(1, 2))
+    np.testing.assert_allclose(means, [1 / 2, 2 / 3, 4 / 5], atol=0.01)  # of |u|^p: 1 / (1 + p)
+
+
+def test_a_chart_on_the_suggested_domain_has_the_quality_that_was_asked() -> None:
+    """Measured again with other samples, by other code."""
+    found = suggestion()
+    report = evaluate(found.fit.chart, 50_000, seed=77)
+    assert report.folded_samples == 0
+    assert report.conditioning.min >= 0.2
+    assert found.leak_deg <= 8.0
+    assert 90 - report.task_angle.max < 90
+    assert found.conditioning <= report.conditioning.min + 0.02  # corners are where the conditioning is smallest
+    np.testing.assert_array_equal(found.domain.centre, HOME)
+
+
+def test_every_joint_has_a_reason_and_one_fifth_more_breaks_the_bound() -> None:
+    found = suggestion()
+    assert [joint.reason for joint in found.joints] == ["cyclic", "conditioning", "conditioning"]
+    prober = Prober(found.problem, [0, 1, 2], ("q1",))
+    here = prober.verdict(oc.Box(HOME, found.domain.half_width))
+    assert max(here.excess(dataclasses.replace(found.asked, conditioning=0.25)).values()) <= 1
+    for k in (1, 2):
+        wider = found.domain.half_width.copy()
+        wider[k] *= 1.2
+        assert prober.verdict(oc.Box(HOME, wider)).excess(found.asked)["conditioning"] > 1
+
+
+def test_cyclic_joint_takes_its_whole_range() -> None:
+    found = suggestion()
+    assert found.domain.unbounded == (0,)
+    assert found.fit.cyclic_joints == ("q1",)
+
+
+@pytest.mark.slow
+def test_a_stricter_leak_gives_a_smaller_box_ended_by_the_leak() -> None:
+    strict = suggested(leak_deg=2.0)
+    assert (strict.domain.half_width[1:] < suggestion().domain.half_width[1:]).all()
+    assert [joint.reason for joint in strict.joints] == ["cyclic", "leak", "leak"]
+    assert strict.leak_deg <= 2.0
+
+
+@pytest.mark.slow
+def test_the_same_call_gives_the_same_box() -> None:
+    np.testing.assert_array_equal(suggested().domain.half_width, suggestion().domain.half_width)
+
+
+def test_joint_limits_end_the_box() -> None:
+    robot, _ = planar()
+    limits = {"lower": np.array([-1.0, 0.5, 0.5]), "upper": np.array([2.0, 1.0, 1.05])}
+    limited = oc.Robot(dataclasses.replace(robot.tree, **limits))
+    task = oc.Task.position(limited, "xy")
+    found = oc.suggest_domain(limited, task, HOME, parametrisation=oc.Polynomial(2))
+    np.testing.assert_allclose(found.domain.half_width, [1.4, 0.2, 0.25])
+    assert [joint.reason for joint in found.joints] == ["cyclic", "joint limit", "joint limit"]
+    assert "to the joint limit" in repr(found)
+
+
+def test_home_comes_from_the_files_or_is_a_bent_posture() -> None:
+    panda, xarm, ur10 = arm("panda"), arm("xarm7"), arm("ur10")
+    assert "default" in home_posture(panda, oc.Task.position(panda)).source
+    for robot in (xarm, ur10):  # the postures of the xarm7 lie at limits, and the middle of the ur10 is stretched out
+        home = home_posture(robot, oc.Task.position(robot))
+        assert home.source.startswith("bent posture")
+        J = robot.tip_jacobian(home.q)[:3]
+        assert np.linalg.svd(J, compute_uv=False)[-1] > 0.15
+    np.testing.assert_array_equal(home_posture(xarm, oc.Task.position(xarm), "hold-up").q, xarm.homes["hold-up"])
+
+
+def test_bad_arguments_are_refused() -> None:
+    robot, task = planar()
+    panda = arm("panda")
+    position = oc.Task.position(panda)
+    with pytest.raises(UnknownNameError, match="home 'nowhere'"):
+        oc.suggest_domain(panda, position, "nowhere")
+    with pytest.raises(DomainError, match="home of joint 'panda_joint4' is 0, expected inside its limits"):
+        oc.suggest_domain(panda, position, np.zeros(7))
+    with pytest.raises(DomainError, match="no box around the home keeps the bounds"):
+        oc.suggest_domain(robot, task, [0.5, 0.0, 0.0])  # stretched out
+    with pytest.raises(InvalidValueError, match="leak_deg is 90"):
+        oc.suggest_domain(robot, task, HOME, leak_deg=90)
+    with pytest.raises(InvalidValueError, match="conditioning is 1, expected a number between 0 and 1"):
+        oc.suggest_domain(robot, task, HOME, conditioning=1)
+    with pytest.raises(NotRedundantError):
+        oc.suggest_domain(robot, oc.Task.custom(robot, "all", lambda q: q))
+
+
+def test_progress_is_reported_and_ctrl_c_ends_the_search() -> None:
+    seen: list[Progress] = []
+
+    def stop(progress: Progress) -> None:
+        seen.append(progress)
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        suggested(monitor=stop)
+    assert [progress.stage for progress in seen] == ["suggest a domain"] * 3
+    assert 0 < seen[0].fraction < seen[2].fraction < 1
+
+
+@pytest.mark.slow
+def test_fit_with_automatic_domain(run: Run) -> None:
+    words = ("--metric", "euclidean", "--param", "polynomial:2", "--json")
+    code, out, err = run("fit", "planar_3r_xy", "--domain", "auto", *words)
+    data = json.loads(out)
+    assert (code, err) == (0, "")
+    assert data["conditioning"]["min"] >= 0.2
+    reasons = [joint["reason"] for joint in data["suggested_domain"]["joints"]]
+    assert reasons == ["cyclic", "conditioning", "conditioning"]
+    assert oc.load("planar_3r_xy.orthocas").problem.domain.half_width[0] == np.pi
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--domain", "auto", "--half-width", "0.3"), "--half-width is 0.3, expected none with --domain auto"),
+        (("--domain", "wide"), "--domain is 'wide', expected auto"),
+        (("--leak-deg", "3"), "--leak-deg is 3.0, expected --domain auto with it"),
+        (("--domain", "auto", "--leak-deg", "120"), "leak_deg is 120.0, expected an angle between 0 and 90"),
+        (("--domain", "auto", "--centre", "0,0,0"), "no box around the home keeps the bounds"),
+    ],
+)
+def test_contradictory_options_are_refused(run: Run, words: tuple[str, ...], complaint: str) -> None:
+    code, _, err = run("fit", "planar_3r_xy", *words)
+    assert code == 2
+    assert complaint in err
