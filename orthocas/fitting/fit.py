@@ -178,4 +178,5 @@ def _notes(stages: Sequence[Stage], settings: FitSettings) -> dict[str, str | fl
         "seed": settings.seed,
         "samples": stages[-1].samples if stages else 0,
         "status": stages[-1].result.status.value if stages else Status.CONVERGED.value,
+        "angles": weights.angles,
     }

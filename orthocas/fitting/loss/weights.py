@@ -1,11 +1,12 @@
-"""Weights of the loss: one number for each term."""
+"""Weights of the loss: one number for each term, and the kind of angles that the first two terms measure."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from orthocas.checks import as_float_array, as_number, require_kind
+from orthocas.checks import as_float_array, as_number, require_kind, require_known
 from orthocas.errors import InvalidValueError, ShapeError
 
+ANGLES = ("paper", "metric")  #: kinds of angles in the loss
 WeightNumbers = Sequence[float]  #: two to four numbers: task, mutual, regularity, length
 
 
@@ -23,9 +24,13 @@ class Weights:
         regularity: lambda3 >= 0.
         length: lambda4 >= 0.
         extra: weights >= 0 of registered terms, by name; see `orthocas.register_loss_term`.
+        angles: what the task and mutual terms measure: 'paper', the cosines of [AS2023] eq. (24) with Euclidean norms;
+            'metric', cosines in the metric with an orthonormal basis of the task gradients, which do not depend on the
+            choice of task coordinates. Default: 'paper'.
 
     Raises:
         InvalidValueError: if a weight is negative or not finite, or all weights are zero.
+        UnknownNameError: if there are no such angles.
 
     Example:
         >>> import orthocas as oc
@@ -40,11 +45,13 @@ class Weights:
     regularity: float = 150.0
     length: float = 0.0
     extra: Mapping[str, float] = field(default_factory=dict, hash=False)
+    angles: str = "paper"
 
     def __post_init__(self) -> None:
         for k, name in enumerate(("task", "mutual", "regularity", "length")):
             object.__setattr__(self, name, _weight(f"lambda{k + 1}", getattr(self, name)))
         require_kind("extra", self.extra, Mapping)
+        require_known("angles", self.angles, ANGLES)
         extra = {name: _weight(f"weight of {name}", value) for name, value in self.extra.items()}
         object.__setattr__(self, "extra", extra)
         if not any(self.by_name.values()):
@@ -69,8 +76,9 @@ class Weights:
     @property
     def by_name(self) -> dict[str, float]:
         """The weights by the names of their terms."""
-        own = {"task": self.task, "mutual": self.mutual, "regularity": self.regularity, "length": self.length}
-        return own | dict(self.extra)
+        kind = "metric " if self.angles == "metric" else ""
+        angles = {f"{kind}task": self.task, f"{kind}mutual": self.mutual}
+        return angles | {"regularity": self.regularity, "length": self.length} | dict(self.extra)
 
 
 def _weight(name: str, value: float) -> float:
