@@ -1,5 +1,6 @@
 """`orthocas fit`: from a robot to a chart file."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,6 +33,13 @@ from orthocas.parametrisations import parse_parametrisation
 from orthocas.quality import Report, evaluate
 from orthocas.solvers import get as get_solver
 
+AnglesName = Annotated[
+    str | None,
+    typer.Option(
+        "--angles",
+        help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia.",
+    ),
+]
 WEIGHTS_TEXT = f"{DEFAULT_WEIGHTS.task:g},{DEFAULT_WEIGHTS.mutual:g},{DEFAULT_WEIGHTS.regularity:g}"
 
 
@@ -67,6 +75,7 @@ def fit(
     weights: Annotated[
         str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3 and lambda4.')
     ] = WEIGHTS_TEXT,
+    angles: AnglesName = None,
     max_mutual_deg: Annotated[
         float | None,
         typer.Option(
@@ -94,7 +103,7 @@ def fit(
     require_free(target, CHART, force)
     parametrisation = parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
-    loss = parse_weights(weights)
+    loss = parse_weights(weights, angles)
     try:
         with terminal_monitor() as monitor:
             result = fit_chart(
@@ -121,12 +130,12 @@ def fit(
         raise typer.Exit(130)
 
 
-def parse_weights(text: str) -> Weights:
-    """Read "1000,30", "1000,30,150" or "1000,30,150,0.01"."""
+def parse_weights(text: str, angles: str | None) -> Weights:
+    """Read "1000,30", "1000,30,150" or "1000,30,150,0.01", with the kind of angles."""
     numbers = parse_numbers("--weights", text).tolist()
     if not 2 <= len(numbers) <= 4:
         raise InvalidValueError("--weights", repr(text), "two to four numbers")
-    return Weights.of(numbers)
+    return replace(Weights.of(numbers), angles=angles)
 
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
