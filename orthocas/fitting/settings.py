@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocas.checks import as_number, require_count
+from orthocas.checks import as_number, require_count, require_kind
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.loss import WeightNumbers, Weights
 from orthocas.minimising.solver import Solver
@@ -44,6 +44,7 @@ class FitSettings:
         Raises:
             InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
+        require_kind("problem", problem, Problem)
         require_parametrisation(parametrisation)
         bound = parametrisation.for_problem(problem)
         if max_mutual_deg is not None:

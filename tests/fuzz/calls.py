@@ -181,7 +181,10 @@ def _makers() -> dict[str, Call]:
         ),
         "Chart": (oc.Chart, {"problem": problem, "coordinates": fitted().chart.coordinates, "notes": {"a": 1.0}}),
         "GrownChart": (oc.GrownChart, {"problem": circle().problem, "coordinates": circle().coordinates, "notes": {}}),
-        "Weights": (oc.Weights, {"task": 1.0, "mutual": 1.0, "regularity": 1.0, "length": 1.0, "extra": {}}),
+        "Weights": (
+            oc.Weights,
+            {"task": 1.0, "mutual": 1.0, "regularity": 1.0, "length": 1.0, "extra": {}, "angles": "paper"},
+        ),
         "Task.position": (oc.Task.position, {"robot": robot, "axes": "x"}),
         "Task.polar": (oc.Task.polar, {"robot": robot}),
         "Task.orientation": (oc.Task.orientation, {"robot": robot, "reference": np.eye(3)}),
@@ -225,6 +228,7 @@ def _functions() -> dict[str, Call]:
             {"chart": circle(), "parametrisation": oc.Polynomial(1), "solver": None, "samples": 30, "seed": 0},
         ),
         "evaluate": (oc.evaluate, {"chart": chart, "samples": 50, "seed": 1}),
+        "evaluate points": (oc.evaluate, {"chart": chart, "samples": None, "seed": None, "points": [q, q]}),
         "generate_c": (oc.generate_c, {"chart": chart, "out": "c", "controller": impedance(), "name": "arm"}),
         "grow": (
             oc.grow,
@@ -277,6 +281,8 @@ def _methods() -> dict[str, Call]:
         **{f"robot.{name}": (getattr(robot, name), arguments) for name, arguments in states.items()},
         **{f"chart.{name}": (getattr(chart, name), {"q": q}) for name in evaluations},
         **{f"grown.{name}": (getattr(grown, name), {"q": q[:2]}) for name in evaluations},
+        "chart.quality": (chart.quality, {"q": q}),
+        "grown.quality": (grown.quality, {"q": [q[:2], q[:2]]}),
         "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "tolerance": 1e-9}),
         "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
         "chart.function": (chart.function, {"name": "phi"}),
