@@ -225,7 +225,7 @@ def _idle_coordinates(chart: Chart, judged: Judged) -> dict[int, str]:
     """Coordinates that are functions of one idle joint alone, with the names of these joints."""
     first = samples_at(chart.problem, sample_uniform(chart.problem.domain, _TELLING, 0))
     shares = np.abs(judged.jacobian) / np.linalg.norm(judged.jacobian, axis=2, keepdims=True)
-    found = {}
+    found: dict[int, str] = {}
     for joint in idle_joints(chart.problem, first):
         others = np.delete(shares, joint, axis=2).max(axis=(0, 2))
         found |= {int(j): chart.problem.robot.joint_names[joint] for j in np.flatnonzero(others <= _ALONE)}

@@ -11,8 +11,9 @@ import numpy as np
 
 from orthocas import problems
 from orthocas.fitting.fit import fit
+from orthocas.judging.statistics import AngleStatistics
 from orthocas.parametrisations import Polynomial
-from orthocas.quality import AngleStatistics, Report, evaluate
+from orthocas.quality import Report, evaluate
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.reproduce.style import EXTRA, LABEL, TASK, TICK, new_figure
