@@ -20,6 +20,7 @@ SCRIPTS = (
     "lengths",
     "closed_loop",
     "control_tick",
+    "metric_loss",
     "against_torch",
     "paper_network",
 )

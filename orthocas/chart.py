@@ -19,6 +19,7 @@ from orthocas.coordinates.map import CoordinateMap, InvertibleMap
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.files.chart_file import read_chart, write_chart
 from orthocas.growing import GrownCoordinates
+from orthocas.judging.pointwise import PointQuality, point_quality
 from orthocas.problem import Problem, task_jacobians, task_sizes
 from orthocas.showing import Shown, listed
 
@@ -149,6 +150,30 @@ class Chart(Shown):
         points, single = as_point_set("q", q, self.n)
         J = np.concatenate([task_jacobians(self.problem, points), self.coordinates.jacobian(points)], axis=1)
         return J[0] if single else J
+
+    def quality(self, q: ArrayLike) -> PointQuality:
+        """How good the chart is at one joint position (n,), or at each of a set or a path (N, n).
+
+        Returns:
+            The leak of each coordinate [deg], the conditioning, and the distance to the border of the domain. The leak
+            is the angle in the metric between the gradient of a coordinate and the space orthogonal to the task.
+
+        Raises:
+            ShapeError, InvalidValueError: if q has another number of joints, or is not finite.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
+            >>> quality = chart.quality([0.6, 0.8, 0.8])  # the centre, where linear coordinates are exact
+            >>> bool(quality.leak_deg.max() < 1e-4), float(quality.border_distance.round(3))
+            (True, 0.393)
+        """
+        points, single = as_point_set("q", q, self.n)
+        found = point_quality(self.problem, self.coordinates, points)
+        if single:
+            found = PointQuality(found.leak_deg[0], found.conditioning[0], found.border_distance[0])
+        return found
 
     def inverse(self, phi: ArrayLike, q_start: ArrayLike, tolerance: float = 1e-9) -> Array:
         """Solve phi(q) = phi for q: fitted charts by Newton's method with line search, grown ones along the flow.

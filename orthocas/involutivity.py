@@ -15,7 +15,7 @@ from orthocas.showing import Shown, number_list
 
 _ROUNDING = 1e-7  # a defect below this share of the terms that cancel in it counts as zero
 _STRAIGHT = 1e-12  # [rad]; task gradients that turn by less over the domain count as constant
-_LARGE = 20.0  # [deg]; larger expected angles are beyond the first-order estimate
+_LARGE = 20.0  # [deg]; larger expected leaks are beyond the first-order estimate
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,7 +28,8 @@ class Involutivity(Shown):
     p99: float  #: 99 % quantile
     max: float
     worst_point: tuple[float, ...]  #: the sampled joint position with the largest d [rad] or [m]
-    expected_angle_deg: float  #: estimated RMS deviation of task angles from 90 degrees, for good coordinates
+    expected_leak_deg: float  #: estimated root mean square leak of good coordinates; compare `Report.leak`
+    expected_angle_deg: float  #: the same per component of an A-orthonormal task basis: expected leak / sqrt(m)
     exact: bool  #: whether d = 0 up to rounding at all samples: exact coordinates exist near regular points
     samples: int
     seed: int
@@ -39,10 +40,10 @@ class Involutivity(Shown):
         """The result in one sentence."""
         if self.exact:
             return "exact orthogonal coordinates exist locally: the task gradients span an involutive distribution"
-        angle = f"about {self.expected_angle_deg:.2g}" if self.expected_angle_deg < _LARGE else f"more than {_LARGE:g}"
+        leak = f"about {self.expected_leak_deg:.2g}" if self.expected_leak_deg < _LARGE else f"more than {_LARGE:g}"
         return (
             f"no exact orthogonal coordinates exist: the mean involutivity defect is {self.mean:.3g}, "
-            f"expect task angles {angle} degrees off 90 in the metric on this domain"
+            f"expect coordinates with a leak of {leak} degrees on this domain (rms, in the metric)"
         )
 
     def facts(self) -> dict[str, str]:
@@ -52,7 +53,7 @@ class Involutivity(Shown):
             "verdict": self.verdict,
             "defect": f"mean {self.mean:.3g}, std {self.std:.3g}, 99 % {self.p99:.3g}, max {self.max:.3g}",
             "worst at": number_list(self.worst_point),
-            "expected angle": f"{self.expected_angle_deg:.3g} deg off 90",
+            "expected leak": f"{self.expected_leak_deg:.3g} deg rms, in the metric",
             "samples": f"{self.samples}, seed {self.seed}, {self.singular_samples} left out",
         }
 
@@ -70,10 +71,10 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     of a length in the metric: 1/rad for A = I and revolute joints, 1/(sqrt(kg) m) for A = M. A defect below 1e-7 of the
     terms that cancel in it counts as zero.
 
-    The expected angle is d times the size of the domain along the span, without a fitted constant. To first order in
-    that size it is the root mean square deviation from right angles, in the metric, between the gradients of quadratic
-    coordinates and an A-orthonormal basis of the task gradients. Rich families come within a factor of two
-    (examples/involutivity.py). Exact coordinates exist only locally: none covers a closed self-motion manifold.
+    The expected leak is d times the size of the domain along the span, without a fitted constant. To first order in
+    that size it is the root mean square leak of quadratic coordinates that `evaluate` reports, an angle in the metric.
+    The paper's task angles have Euclidean norms and can be several times smaller. Rich families come within a factor of
+    two (examples/involutivity.py). Exact coordinates exist only locally: none covers a closed self-motion manifold.
 
     Args:
         problem: robot, task, metric and domain.
@@ -85,7 +86,7 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
         MetricError: if A is not symmetric positive definite at a sample.
 
     Source:
-        Theorem: [AS2023] Sec. 3. Defect and expected angle: ours, docs/derivations.md#involutivity.
+        Theorem: [AS2023] Sec. 3. Defect and expected leak: ours, docs/derivations.md#involutivity.
 
     Example:
         >>> import orthocas as oc
@@ -107,6 +108,7 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
         at = np.round(points[np.flatnonzero(~np.isfinite(d))[0]], 4).tolist()
         raise SingularTaskError(f"the second derivative of task '{problem.task.name}' is not finite at q = {at}")
     turns = _squared_turns(T, basis.reshape(-1, problem.n, problem.m), problem.domain.half_width)
+    leak = float(np.degrees(np.sqrt(turns.mean() / problem.r)))
     worst = int(np.argmax(d))
     return Involutivity(
         function=brackets.defect_function(),
@@ -115,7 +117,8 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
         p99=float(np.quantile(d, 0.99)),
         max=float(d[worst]),
         worst_point=tuple(points[worst].tolist()),
-        expected_angle_deg=float(np.degrees(np.sqrt(turns.mean() / (problem.m * problem.r)))),
+        expected_leak_deg=leak,
+        expected_angle_deg=leak / problem.m**0.5,
         exact=bool(np.all((d <= _ROUNDING * size[:, 0]) | (turns <= _STRAIGHT**2))),
         samples=samples,
         seed=seed,

@@ -95,6 +95,11 @@ class Metric:
         """Whether A = I everywhere."""
         return bool(self.recipe["kind"] == "euclidean")
 
+    @property
+    def is_inertia(self) -> bool:
+        """Whether A = M, the mass matrix."""
+        return bool(self.recipe["kind"] == "inertia")
+
 
 def metric_matrices(metric: Metric, points: Array) -> Array:
     """A at points (N, n), as an array (N, n, n). Each matrix is checked to be symmetric positive definite."""

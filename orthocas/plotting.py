@@ -10,22 +10,24 @@ from matplotlib.figure import Figure
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_at_least, require_count, require_kind
 from orthocas.comparing.figures import convergence_figure, front_figure
-from orthocas.quality import AngleStatistics, Report
+from orthocas.judging.statistics import AngleStatistics, LeakStatistics
+from orthocas.quality import Report
 from orthocas.simulation.figure import trajectory_figure
 
 __all__ = ["convergence_figure", "front_figure", "quality_figure", "self_motion_figure", "trajectory_figure"]
 
 _MOST_POSTURES = 1000
-_TASK, _EXTRA = "#1f5fa8", "#d95f02"
+_TASK, _EXTRA, _LEAK = "#1f5fa8", "#d95f02", "#5a9e6f"
 
 
 def quality_figure(report: Report) -> Figure:
-    """Histograms of task and mutual angles [deg], with mean and standard deviation, as [AS2023] Figs. 20 and 27."""
+    """Histograms of task and mutual angles [deg], as in [AS2023] Figs. 20 and 27, and of leaks (ours)."""
     require_kind("report", report, Report)
-    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
-    left, right = figure.subplots(1, 2, sharex=True)
+    figure = Figure(figsize=(12.0, 3.4), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
     _draw_angles(left, report.task_angle, _TASK, r"task angle $\angle(\mathrm{d}\xi_j, \nabla_A h_i)$")
-    _draw_angles(right, report.mutual_angle, _EXTRA, r"mutual angle $\angle(\mathrm{d}\xi_i, \mathrm{d}\xi_j)$")
+    _draw_angles(middle, report.mutual_angle, _EXTRA, r"mutual angle $\angle(\mathrm{d}\xi_i, \mathrm{d}\xi_j)$")
+    _draw_leaks(right, report.leak)
     left.set_ylabel("share of angles per degree")
     figure.suptitle(f"{report.samples:,} held-out samples, conditioning mean {report.conditioning.mean:.2f}")
     return figure
@@ -70,6 +72,15 @@ def _draw_angles(axes: Axes, angles: AngleStatistics, colour: str, label: str) -
     axes.set_xlim(90 - width, 90 + width)
     axes.set_xlabel(f"{label} [deg]")
     axes.set_title(f"mean {angles.mean:.2f}°, std {angles.std:.2f}°", fontsize=10)
+    axes.grid(alpha=0.3)
+
+
+def _draw_leaks(axes: Axes, leak: LeakStatistics) -> None:
+    counts = leak.histogram[:900].reshape(-1, 5).sum(axis=1)
+    axes.stairs(counts / max(counts.sum(), 1) / 0.5, 0.5 * np.arange(len(counts) + 1) - 0.05, fill=True, color=_LEAK)
+    axes.set_xlim(0, max(6.0, 3 * leak.rms))
+    axes.set_xlabel(r"leak, angle in the metric to the space across the task [deg]")
+    axes.set_title(f"rms {leak.rms:.2f}°, largest {leak.max:.1f}°", fontsize=10)
     axes.grid(alpha=0.3)
 
 

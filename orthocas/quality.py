@@ -1,69 +1,67 @@
-"""The quality of a chart: angles and conditioning on held-out samples ([AS2023] Figs. 20 and 27, and ours)."""
+"""The quality of a chart on its domain: angles and conditioning ([AS2023] Figs. 20 and 27), leaks and folds (ours)."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_count, require_kind, require_memory
-from orthocas.domains import sample_uniform
-from orthocas.errors import SingularTaskError
+from orthocas.checks import Array, as_point_set, require_count, require_kind, require_memory
+from orthocas.coordinates.fitted import Coordinates
+from orthocas.domains import Torus, sample_uniform
+from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.files.json import plain
-from orthocas.fitting.loss import pairs
-from orthocas.samples import Samples, samples_at
-from orthocas.showing import Shown
+from orthocas.fitting.idle_joints import idle_joints
+from orthocas.judging.gradients import Judged
+from orthocas.judging.statistics import Angles, AngleStatistics, LeakStatistics
+from orthocas.samples import samples_at
+from orthocas.showing import Shown, listed
+from orthocas.worst_points import WorstPoints, worst_points
 
 DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
-_CHUNK = 5000
-_BIN_EDGES = np.linspace(-0.05, 180.05, 1802)  # 90 degrees lies in the middle of its bin
-
-
-@dataclass(frozen=True, eq=False)
-class AngleStatistics:
-    """Angles between gradients over all samples and pairs, in degrees. 90 is perfect; NaN if there are no pairs."""
-
-    mean: float
-    std: float
-    max: float  #: largest deviation from 90 degrees
-    histogram: Array = field(repr=False)  #: counts in bins of 0.1 degree, centred at 0.0, 0.1, ..., 180.0
-
-    @classmethod
-    def of_cosines(cls, cosines: Array) -> "AngleStatistics":
-        """Statistics of the angles arccos(cosines), in degrees."""
-        angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).ravel()
-        counts = np.histogram(angles, _BIN_EDGES)[0].astype(float)
-        if angles.size == 0:
-            return cls(np.nan, np.nan, np.nan, counts)
-        return cls(float(angles.mean()), float(angles.std()), float(np.abs(angles - 90).max()), counts)
+SAMPLES, SEED = 100_000, 1  #: of an evaluation by default
+_TELLING = 200  # samples that tell idle joints from others
+_ALONE = 1e-10  # share of a gradient that counts as zero
 
 
 @dataclass(frozen=True)
 class Conditioning:
     """Smallest singular value of [A-orthonormal task basis; unit coordinate gradients]: 1 is perfect, 0 degenerate."""
 
-    min: float
+    min: float  #: of samples and of the search for the worst points; 0 if the search finds folds
     p01: float  #: 1 % quantile
     mean: float
+
+    @classmethod
+    def of(cls, values: Array, worst: WorstPoints | None) -> "Conditioning":
+        """Statistics of the values at all samples, (N,), and of the worst points of a search."""
+        least = values.min() if worst is None else max(0.0, min(values.min(), worst.least))
+        return cls(float(least), float(np.quantile(values, 0.01)), float(values.mean()))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Report(Shown):
-    """Quality of a chart on uniform samples of its domain."""
+    """Quality of a chart on uniform samples of its domain, or at given joint positions."""
 
     n: int
     m: int
     r: int
     samples: int
-    seed: int
+    seed: int | None  #: None for given joint positions
     metric: str
-    task_angle: AngleStatistics
-    mutual_angle: AngleStatistics
+    task_angle: AngleStatistics  #: the paper's, with Euclidean norms
+    mutual_angle: AngleStatistics  #: the paper's, with Euclidean norms
+    leak: LeakStatistics  #: in the metric: what couples the inertias of task and coordinates
+    metric_mutual_angle: AngleStatistics  #: between two coordinates, in the metric
     conditioning: Conditioning
-    worst_point: tuple[float, ...]  #: the sampled joint position with the smallest conditioning
+    worst_point: tuple[float, ...]  #: the joint position with the smallest conditioning, of samples and search
+    worst: WorstPoints | None  #: found by a search; None on a torus, at given joint positions, and for grown charts
     singular_samples: int  #: samples left out: a gradient vanishes, or a grown coordinate has no value
     length_ratio: float  #: 99 % over 1 % quantile of the gradient length, for the worst coordinate
     folded_samples: int  #: samples where det J has the opposite sign of most samples: the chart folds over
+    idle_joints: tuple[str, ...]  #: names of joints that are exact coordinates themselves
+    without_idle: Angles | None  #: angles of the other coordinates; None if no joint, or every coordinate, is idle
 
     @property
     def degenerate(self) -> bool:
@@ -72,39 +70,63 @@ class Report(Shown):
 
     def facts(self) -> dict[str, str]:
         """Angles, conditioning, lengths, and the faults of the chart if there are any."""
-        task, mutual, values = self.task_angle, self.mutual_angle, self.conditioning
-        facts = {
+        values = self.conditioning
+        return {
             "problem": f"n = {self.n} joints, m = {self.m} task, r = {self.r} extra, metric {self.metric}",
-            "task angle": f"mean {task.mean:.2f}, std {task.std:.2f}, largest deviation {task.max:.1f} deg",
-            "mutual angle": f"mean {mutual.mean:.2f}, std {mutual.std:.2f}, largest deviation {mutual.max:.1f} deg",
+            **self._angles(),
             "conditioning": f"mean {values.mean:.3f}, 1 % quantile {values.p01:.3f}, min {values.min:.3g}",
+            **({} if self.worst is None else {"searched": f"least conditioning {self.worst.told}"}),
+            **self._faults(),
             "lengths": f"of gradients differ by a factor of {self.length_ratio:.3g} (99 % to 1 % quantile)",
-            "samples": f"{self.samples} held out, seed {self.seed}",
+            "samples": f"{self.samples} given" if self.seed is None else f"{self.samples} held out, seed {self.seed}",
+        }
+
+    def _angles(self) -> dict[str, str]:
+        """The paper's angles and ours, by name."""
+        leak, others = self.leak, self.without_idle
+
+        def paper(angles: AngleStatistics) -> str:
+            spread = f"mean {angles.mean:.2f}, std {angles.std:.2f}, largest deviation {angles.max:.1f} deg"
+            return f"{spread} (the paper's cosines)"
+
+        found = {
+            "task angle": paper(self.task_angle),
+            "mutual angle": paper(self.mutual_angle),
+            "leak": f"rms {leak.rms:.2f}, mean {leak.mean:.2f}, largest {leak.max:.1f} deg (angle in the metric)",
         }
         if self.r == 1:
-            facts["mutual angle"] = "none, r = 1"
-        return facts | self._faults()
+            found["mutual angle"] = "none, r = 1"
+        if others is not None:
+            several = f", mutual std {others.mutual_angle.std:.2f}" if len(others.leak.rms_of_each) > 1 else ""
+            found["without idle"] = (
+                f"task std {others.task_angle.std:.2f}{several}, leak rms {others.leak.rms:.2f} deg: "
+                f"{listed(self.idle_joints)} is exact and flatters the mean"
+            )
+        return found
 
     def _faults(self) -> dict[str, str]:
         faults = {}
         if self.folded_samples:
             at = ", ".join(f"{value:.2f}" for value in self.worst_point)
             share = self.folded_samples / self.samples
-            faults["folded"] = f"{share:.3%} of the domain, where det J changes sign; conditioning worst at q = ({at})"
+            faults["folded"] = (
+                f"{share:.3%} of the {self._where}, where det J changes sign; conditioning worst at q = ({at})"
+            )
         if self.singular_samples:
             share = self.singular_samples / self.samples
-            faults["left out"] = f"{share:.3%} of the domain: singular, or without a value"
+            faults["left out"] = f"{share:.3%} of the {self._where}: singular, or without a value"
         if self.degenerate:
             advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
             faults["DEGENERATE"] = f"coordinates are nearly parallel to each other or to the task: {advice}"
         return faults
 
+    @property
+    def _where(self) -> str:
+        return "given points" if self.seed is None else "domain"
+
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON. NaN becomes None."""
-
-        def angle(s: AngleStatistics) -> dict[str, float]:
-            return {"mean": s.mean, "std": s.std, "max": s.max}
-
+        angles = Angles(self.task_angle, self.mutual_angle, self.leak, self.metric_mutual_angle)
         data = {
             "n": self.n,
             "m": self.m,
@@ -112,10 +134,12 @@ class Report(Shown):
             "samples": self.samples,
             "seed": self.seed,
             "metric": self.metric,
-            "task_angle_deg": angle(self.task_angle),
-            "mutual_angle_deg": angle(self.mutual_angle),
+            **angles.as_dict(),
+            "idle_joints": list(self.idle_joints),
+            "without_idle": None if self.without_idle is None else self.without_idle.as_dict(),
             "conditioning": asdict(self.conditioning),
             "worst_point": list(self.worst_point),
+            "least_conditioning_searched": None if self.worst is None else self.worst.least,
             "singular_samples": self.singular_samples,
             "folded_samples": self.folded_samples,
             "length_ratio": self.length_ratio,
@@ -124,17 +148,28 @@ class Report(Shown):
         return dict(plain(data))
 
 
-def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
+def evaluate(
+    chart: Chart, samples: int | None = None, seed: int | None = None, *, points: ArrayLike | None = None
+) -> Report:
     """Measure the quality of a chart on uniform samples of its domain. Use another seed than that of the fit.
 
-    The angles are those of [AS2023] eq. (24): between each dxi_j and grad_A h_i, over all m r pairs, and between the
-    coordinates, over all r (r - 1) / 2 pairs. The conditioning is computed in coordinates where A is the identity, so
-    it does not depend on the task's own conditioning or units.
+    Uniform samples miss folds, so the least conditioning is searched near faces and corners too, and by descent.
+
+    The task and mutual angles are those of [AS2023] eq. (24): between each dxi_j and grad_A h_i, over all m r pairs,
+    and between the coordinates, over all r (r - 1) / 2 pairs. Their norms are Euclidean, so for A = M they hide how far
+    a coordinate leans into the task. The leak, the angle in the metric, shows it; see `LeakStatistics`. The
+    conditioning is computed in coordinates where A is the identity, so it does not depend on the task's own
+    conditioning or units.
 
     Args:
         chart: the chart.
-        samples: number of samples N.
-        seed: seed of the samples.
+        samples: number of samples N. Default: 100,000.
+        seed: seed of the samples. Default: 1.
+        points: joint positions (N, n) or (n,) [rad] or [m] in place of samples, for example those of a path.
+
+    Raises:
+        SingularTaskError: if a gradient vanishes, or a coordinate has no value, everywhere.
+        InvalidValueError, ShapeError: if an argument is invalid, or both points and samples or a seed are given.
 
     Example:
         >>> import orthocas as oc
@@ -143,64 +178,73 @@ def evaluate(chart: Chart, samples: int = 100_000, seed: int = 1) -> Report:
         >>> report = oc.evaluate(chart, samples=2000)
         >>> 85 < report.task_angle.mean < 95, report.folded_samples
         (True, 0)
+        >>> oc.evaluate(chart, points=[[0.6, 0.8, 0.8], [0.7, 0.8, 0.8]]).samples
+        2
     """
     require_kind("chart", chart, Chart)
-    samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
-    require_memory(f"evaluating {samples} samples", 8.0 * samples * chart.n * (chart.n + 4))
-    points = sample_uniform(chart.problem.domain, samples, seed)
-    parts = [_judge(chart, points[start : start + _CHUNK]) for start in range(0, samples, _CHUNK)]
-    task, mutual, smallest, signs, lengths, kept = (np.concatenate([part[i] for part in parts]) for i in range(6))
-    if len(kept) == 0:
-        raise SingularTaskError(
-            f"a gradient vanishes, or a coordinate has no value, at all {samples} samples of the domain"
-        )
-    worst = int(np.argmin(smallest))
-    short, long = np.quantile(lengths, [0.01, 0.99], axis=0)
+    if points is None:
+        count, drawn = _count(chart, SAMPLES if samples is None else samples), SEED if seed is None else seed
+        drawn = require_count("seed", drawn, least=0)
+        searched = isinstance(chart.coordinates, Coordinates) and not isinstance(chart.problem.domain, Torus)
+        worst = worst_points(chart.problem, chart.coordinates, drawn) if searched else None
+        return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst)
+    if samples is not None or seed is not None:
+        raise InvalidValueError("points", "given with samples or a seed", "points alone")
+    given = as_point_set("points", points, chart.n)[0]
+    _count(chart, len(given))
+    return _report(chart, given, None, None)
+
+
+def _count(chart: Chart, samples: int) -> int:
+    """The number of samples, if there is memory for them."""
+    count = require_count("samples", samples)
+    require_memory(f"evaluating {count} samples", 8.0 * count * chart.n * (2 * chart.n + 4))
+    return count
+
+
+def _report(chart: Chart, points: Array, seed: int | None, worst: WorstPoints | None) -> Report:
+    judged = Judged.at(chart.problem, chart.coordinates, points)
+    if len(judged.points) == 0:
+        where = "given points" if seed is None else "samples of the domain"
+        raise SingularTaskError(f"a gradient vanishes, or a coordinate has no value, at all {len(points)} {where}")
+    angles, idle = Angles.of(judged), _idle_coordinates(chart, judged)
+    others = [j for j in range(chart.r) if j not in idle]
+    short, long = np.quantile(np.linalg.norm(judged.jacobian, axis=2), [0.01, 0.99], axis=0)
     return Report(
         n=chart.n,
         m=chart.m,
         r=chart.r,
-        samples=samples,
+        samples=len(points),
         seed=seed,
         metric=chart.problem.metric.name,
-        task_angle=AngleStatistics.of_cosines(task),
-        mutual_angle=AngleStatistics.of_cosines(mutual),
-        conditioning=Conditioning(float(smallest[worst]), float(np.quantile(smallest, 0.01)), float(smallest.mean())),
-        worst_point=tuple(kept[worst].tolist()),
-        singular_samples=samples - len(kept),
+        task_angle=angles.task_angle,
+        mutual_angle=angles.mutual_angle,
+        leak=angles.leak,
+        metric_mutual_angle=angles.metric_mutual_angle,
+        conditioning=Conditioning.of(judged.conditioning, worst),
+        worst_point=tuple(_worst_point(judged, worst).tolist()),
+        worst=worst,
+        singular_samples=len(points) - len(judged.points),
         length_ratio=float((long / short).max()),
-        folded_samples=int(min((signs > 0).sum(), (signs <= 0).sum())),
+        folded_samples=int(min((judged.signs > 0).sum(), (judged.signs <= 0).sum())),
+        idle_joints=tuple(idle.values()),
+        without_idle=Angles.of(judged.of_coordinates(others)) if idle and others else None,
     )
 
 
-def _judge(chart: Chart, points: Array) -> tuple[Array, ...]:
-    """The quantities of each point that is kept.
-
-    They are task cosines (N, m, r), mutual cosines (N, pairs), smallest singular values (N,), signs of det J (N,),
-    lengths of the coordinate gradients (N, r), and the points (N, n).
-    """
-    samples = samples_at(chart.problem, points)
-    J = chart.coordinates.jacobian(samples.points)
-    lengths = np.linalg.norm(J, axis=2)
-    alive = lengths.min(axis=1) > 0  # also false for NaN, where grown coordinates have no value
-    samples, J, lengths = samples[alive], J[alive], lengths[alive]
-    raised = samples.raised(J)
-    task = samples.unit_task_gradients @ (J / lengths[:, :, None]).transpose(0, 2, 1)
-    first, second = (np.array([pair[k] for pair in pairs(chart.r)], dtype=int) for k in (0, 1))
-    products = np.einsum("spn,spn->sp", raised[:, first], J[:, second])
-    mutual = products / (np.linalg.norm(raised, axis=2)[:, first] * lengths[:, second])
-    signs = np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1)))
-    return task, mutual, _smallest_singular_values(samples, J, raised), signs, lengths, samples.points
+def _worst_point(judged: Judged, worst: WorstPoints | None) -> Array:
+    """The point of least conditioning, (n,)."""
+    k = int(np.argmin(judged.conditioning))
+    point: Array = judged.points[k]
+    return point if worst is None or worst.least > judged.conditioning[k] else worst.points[0]
 
 
-def _smallest_singular_values(samples: Samples, J: Array, raised: Array) -> Array:
-    """Roots of the smallest eigenvalues of the Gram matrix [[I, E v], [v^T E^T, v^T A^-1 v]], (N,)."""
-    unit = 1 / np.sqrt(np.einsum("sjn,sjn->sj", J, raised))[:, :, None]
-    basis = samples.task_basis
-    leaning = basis @ (J * unit).transpose(0, 2, 1)  # (N, m, r)
-    mutual = (raised * unit) @ (J * unit).transpose(0, 2, 1)  # (N, r, r)
-    identity = np.broadcast_to(np.eye(basis.shape[1]), (len(J), basis.shape[1], basis.shape[1]))
-    above = np.concatenate([identity, leaning], axis=2)
-    below = np.concatenate([leaning.transpose(0, 2, 1), mutual], axis=2)
-    gram = np.concatenate([above, below], axis=1)
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[:, 0], 0.0))
+def _idle_coordinates(chart: Chart, judged: Judged) -> dict[int, str]:
+    """Coordinates that are functions of one idle joint alone, with the names of these joints."""
+    first = samples_at(chart.problem, sample_uniform(chart.problem.domain, _TELLING, 0))
+    shares = np.abs(judged.jacobian) / np.linalg.norm(judged.jacobian, axis=2, keepdims=True)
+    found: dict[int, str] = {}
+    for joint in idle_joints(chart.problem, first):
+        others = np.delete(shares, joint, axis=2).max(axis=(0, 2))
+        found |= {int(j): chart.problem.robot.joint_names[joint] for j in np.flatnonzero(others <= _ALONE)}
+    return found

@@ -79,26 +79,6 @@ class Samples:
         """Sign (+1 or -1), at most of the samples, of the volume that J_xi (N, r, n) spans across the task."""
         return 1.0 if np.median(np.linalg.det(coordinate_jacobians @ self.null_basis)) >= 0 else -1.0
 
-    def signed_conditioning(self, J: Array) -> Array:
-        """Conditioning of coordinates with Jacobians J (N, r, n) times the sign of det [J_x; J], (N,).
-
-        It is the smallest singular value of [A-orthonormal task basis; unit coordinate gradients] in coordinates where
-        A is the identity: the root of the smallest eigenvalue of the Gram matrix [[I, E v], [v^T E^T, v^T A^-1 v]]. It
-        is NaN where a gradient vanishes or has no value.
-        """
-        raised, basis = self.raised(J), self.task_basis
-        lengths = np.sqrt(np.einsum("sjn,sjn->sj", J, raised))
-        alive = lengths.min(axis=1) > 0  # also false for NaN
-        unit = 1 / np.where(alive[:, None], lengths, 1.0)[:, :, None]
-        J, raised = np.where(alive[:, None, None], (J * unit, raised * unit), 0.0)
-        leaning = basis @ J.transpose(0, 2, 1)  # (N, m, r)
-        identity = np.broadcast_to(np.eye(basis.shape[1]), (len(J), basis.shape[1], basis.shape[1]))
-        above = np.concatenate([identity, leaning], axis=2)
-        below = np.concatenate([leaning.transpose(0, 2, 1), raised @ J.transpose(0, 2, 1)], axis=2)
-        smallest = np.linalg.eigvalsh(np.concatenate([above, below], axis=1))[:, 0]
-        sign = np.sign(np.linalg.det(np.concatenate([self.task_jacobian, J], axis=1)))
-        return np.where(alive, sign * np.sqrt(np.maximum(smallest, 0.0)), np.nan)
-
     def described(self, names: Iterable[str], orientation: float | None) -> list[Array]:
         """The data of every sample that a loss needs, by name: arrays (N, rows, columns) or (N, rows).
 

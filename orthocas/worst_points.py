@@ -7,8 +7,8 @@ import numpy as np
 from orthocas.checks import Array
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.domains import sample_heavily
+from orthocas.judging.gradients import Judged
 from orthocas.problem import Problem
-from orthocas.samples import samples_at
 
 CANDIDATES = 6000
 _DESCENTS = 300  # of the worst candidates
@@ -76,15 +76,10 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) ->
 
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:
     """Conditioning times the sign of det J at points of the cube, (N,)."""
-    points = _joint_positions(problem, u)
-    samples = samples_at(problem, points)
-    values = samples.signed_conditioning(coordinates.jacobian(samples.points))
-    if len(samples) == len(points):
-        return values
-    found = np.full(len(points), np.nan)
-    kept = {point.tobytes() for point in samples.points}
-    found[[point.tobytes() in kept for point in points]] = values
-    return found
+    judged = Judged.at(problem, coordinates, _joint_positions(problem, u))
+    values = np.full(len(u), np.nan)
+    values[judged.kept] = judged.signs * judged.conditioning
+    return values
 
 
 def _joint_positions(problem: Problem, u: Array) -> Array:

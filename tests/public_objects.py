@@ -160,6 +160,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "solver": solvers.GaussNewton,
     "samples": lambda: sample_problem(planar(), 20, 0),
     "report": lambda: oc.evaluate(fitted().chart, 500),
+    "quality of a point": lambda: fitted().chart.quality(planar().domain.centre),
+    "quality of points": lambda: fitted().chart.quality(points_of(fitted().chart)),
     "involutivity": lambda: oc.involutivity(planar(), 100),
     "singular point": lambda: oc.singular_points(problems.get("planar_2r"))[0],
     "jump": lambda: oc.jumps(circle())[0],

@@ -95,7 +95,7 @@ def test_example_of_the_docs_end_to_end(run: Run, chart: oc.Chart) -> None:
 
 
 @pytest.mark.slow
-def test_rows_name_units_and_the_folder(run: Run) -> None:
+def test_rows_name_units_angles_and_the_folder(run: Run, chart: oc.Chart) -> None:
     code, out, err = run("impedance", "--animation", "none")
     assert (code, err) == (0, "")
     rows = dict(line.split(maxsplit=1) for line in out.splitlines())
@@ -103,6 +103,8 @@ def test_rows_name_units_and_the_folder(run: Run) -> None:
     assert " m, xi1 " in rows["largest"]
     assert "task <- extra" in rows["coupling"]
     assert rows["command"].endswith("N m, q1")
+    leak = oc.evaluate(chart, points=Trajectory.load("out/trajectory.npz").q).leak
+    assert rows["angles"].startswith(f"on path  leak rms {leak.rms:.2f}, largest {leak.max:.1f} deg (in the metric)")
     assert "J dissipated" in rows["energy"]
     assert rows["files"] == "out"
 

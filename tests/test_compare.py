@@ -112,6 +112,7 @@ def test_results_are_those_of_the_saved_charts(grid: tuple[Comparison, Path]) ->
     report = oc.evaluate(chart, 500, cells.HELD_OUT_SEED)
     assert result.task_std_deg == report.task_angle.std
     assert result.mutual_std_deg == report.mutual_angle.std
+    assert result.leak_rms_deg == report.leak.rms
     assert result.conditioning_p01 == report.conditioning.p01
     assert result.parameters == chart.coordinates.theta.size
     assert len(list(folder.iterdir())) == 7

@@ -15,6 +15,7 @@ import growing_queries
 import iiwa_demo
 import involutivity
 import ipopt_front
+import metric_loss
 import numpy as np
 import paper_network
 import pytest
@@ -44,6 +45,14 @@ def test_fit_benchmark_prints_rows() -> None:
 
 def test_scaling_benchmark_prints_rows() -> None:
     assert len(scaling.main(quick=True)) == 2
+
+
+def test_loss_in_the_metric_moves_the_task_less_in_closed_loop() -> None:
+    """One arm, place, seed and goal: the direction, not the size, of what the whole study shows."""
+    ratios = metric_loss.main(quick=True)
+    for what in ("leak, rms [deg]", "coupling index [m]", "PD+ decoupled: task error, rms [mm]"):
+        assert ratios[f"planar_3r_xy: {what}"] < 0.8
+    assert ratios["planar_3r_xy: paper's task angle, std [deg]"] > 1.2
 
 
 def test_compiled_timing_harness_times_calls() -> None:

@@ -61,7 +61,8 @@ def test_degree_continuation_goes_through_every_degree(iiwa_fit: Fit) -> None:
 @pytest.mark.slow
 def test_exact_coordinates_of_an_involutive_task_are_found(planar_x: oc.Problem) -> None:
     coarse, fine = (oc.evaluate(oc.fit(planar_x, oc.Polynomial(d)).chart, 5000) for d in (4, 8))
-    assert fine.task_angle.std <= 0.1 < coarse.task_angle.std
+    assert fine.leak.rms <= 0.1 < coarse.leak.rms
+    assert fine.task_angle.std < 0.3 < coarse.task_angle.std
     assert fine.conditioning.p01 > 0.9
 
 
@@ -74,7 +75,7 @@ def test_length_term_keeps_gradients_even(planar_x: oc.Problem) -> None:
     )
     assert plain.length_ratio > 500
     assert even.length_ratio < 20
-    assert even.task_angle.std < 1.0
+    assert even.leak.rms < 1.0
 
 
 def test_linear_coordinates_are_exact_at_their_base_only(planar_x: oc.Problem) -> None:
@@ -106,7 +107,7 @@ def test_every_sensible_pair_fits_and_beats_linear_coordinates(
 ) -> None:
     linear = oc.evaluate(oc.fit(planar_xy, oc.Linear()).chart, 2000)
     report = oc.evaluate(oc.fit(planar_xy, parametrisation, solver, samples=400).chart, 2000)
-    assert report.task_angle.std <= linear.task_angle.std + 1e-9
+    assert report.leak.rms <= linear.leak.rms + 1e-9  # what the fit minimises for A = M
     assert np.isnan(report.mutual_angle.std)
 
 

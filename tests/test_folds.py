@@ -12,7 +12,8 @@ from orthocas.fitting.fit import Fit
 from orthocas.fitting.fold_search import FoldSearch
 from orthocas.fitting.loss import LEAST_CONDITIONING, Weights
 from orthocas.fitting.mirror import find_mirror
-from orthocas.samples import sample_problem, samples_at
+from orthocas.judging.gradients import Judged
+from orthocas.samples import sample_problem
 from orthocas.worst_points import worst_points
 
 ACTIVE = list(range(6))
@@ -56,8 +57,8 @@ def test_no_fold_is_left_where_other_samples_look_for_one(iiwa_fit: Fit) -> None
     assert iiwa_fit.worst is not None
     found = []
     for part in np.array_split(sample_heavily(chart.problem.domain, 200_000, 77), 20):
-        samples = samples_at(chart.problem, part)
-        found.append(samples.signed_conditioning(chart.coordinates.jacobian(samples.points)))
+        judged = Judged.at(chart.problem, chart.coordinates, part)
+        found.append(judged.signs * judged.conditioning)
     values = np.concatenate(found)
     values *= np.sign(np.median(values))
     assert values.min() > 0.1
@@ -68,14 +69,6 @@ def test_without_the_fold_term_the_same_fit_folds(iiwa: oc.Problem) -> None:
     fit = oc.fit(iiwa, oc.Polynomial(3), weights=Weights(folds=0))
     assert fit.worst is None
     assert worst_points(iiwa, fit.chart.coordinates).least < 0
-
-
-def test_signed_conditioning_is_that_of_evaluate(planar_fit: Fit) -> None:
-    chart = planar_fit.chart
-    report = oc.evaluate(chart, 4000, seed=3)
-    samples = sample_problem(chart.problem, 4000, 3)
-    values = samples.signed_conditioning(chart.coordinates.jacobian(samples.points))
-    assert np.abs(values).min() == pytest.approx(report.conditioning.min, rel=1e-9)
 
 
 def test_fold_term_acts_at_collected_points_with_its_exact_gradient(iiwa: oc.Problem) -> None:

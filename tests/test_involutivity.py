@@ -270,7 +270,8 @@ def test_planar_arm_with_two_components_has_no_exact_coordinates(planar_xy: oc.P
     np.testing.assert_allclose(np.array(found.function(found.worst_point)).item(), found.max, rtol=1e-12)
     assert found.verdict == (
         f"no exact orthogonal coordinates exist: the mean involutivity defect is {found.mean:.3g}, "
-        f"expect task angles about {found.expected_angle_deg:.2g} degrees off 90 in the metric on this domain"
+        f"expect coordinates with a leak of about {found.expected_leak_deg:.2g} degrees on this domain "
+        "(rms, in the metric)"
     )
     data = json.loads(json.dumps(found.as_dict(), allow_nan=False))
     assert data["mean"] == found.mean
@@ -326,6 +327,7 @@ def test_info_shows_defect_and_verdict(run: Run, planar_xy: oc.Problem) -> None:
     data = json.loads(printed("info", "planar_3r_xy", "--json"))
     assert data["involutivity_defect"] == {"mean": found.mean, "max": found.max}
     assert data["expected_angle_deg"] == found.expected_angle_deg
+    assert data["expected_leak_deg"] == found.expected_leak_deg == found.expected_angle_deg * 2**0.5
     assert data["verdict"] == found.verdict
     assert f"involutivity_defect  mean {found.mean:.4g}, max {found.max:.4g}" in printed("info", "planar_3r_xy")
     assert "exact orthogonal coordinates exist" in printed("info", "planar_3r_x")

@@ -11,11 +11,12 @@ from orthocas.fitting.fit import Fit
 from orthocas.plotting import quality_figure, self_motion_figure
 
 
-def test_quality_figure_shows_both_deviations(planar_fit: Fit) -> None:
+def test_quality_figure_shows_both_deviations_and_the_leak(planar_fit: Fit) -> None:
     report = oc.evaluate(planar_fit.chart, 1000)
-    left, right = quality_figure(report).axes
+    left, middle, right = quality_figure(report).axes
     assert f"std {report.task_angle.std:.2f}" in left.get_title()
-    assert f"std {report.mutual_angle.std:.2f}" in right.get_title()
+    assert f"std {report.mutual_angle.std:.2f}" in middle.get_title()
+    assert f"rms {report.leak.rms:.2f}" in right.get_title()
     assert "[deg]" in left.get_xlabel()
 
 

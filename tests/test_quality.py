@@ -11,8 +11,8 @@ from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError, MemoryNeedError, SingularTaskError
 from orthocas.fitting.fit import Fit
+from orthocas.judging.statistics import AngleStatistics
 from orthocas.parametrisations import JointSpace
-from orthocas.quality import AngleStatistics
 
 
 def chart_with_normals(normals: list[list[float]], metric: object = "euclidean") -> Chart:

@@ -13,7 +13,8 @@ from public_objects import CONTROLLERS, OBJECTS, comparison, fitted, impedance, 
 import orthocas as oc
 from orthocas import control, problems
 from orthocas.cli.output import report_rows
-from orthocas.quality import AngleStatistics, Conditioning
+from orthocas.judging.statistics import AngleStatistics
+from orthocas.quality import Conditioning
 from orthocas.showing import Shown, listed, number_list
 from orthocas.showing.facts import as_html, as_text
 

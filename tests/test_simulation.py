@@ -316,7 +316,7 @@ def test_kinematic_feedback_pulls_errors_in(planar_chart: oc.Chart, q0: Array) -
 
 
 def test_unreachable_reference_is_reported_before_the_run(planar_chart: oc.Chart, q0: Array) -> None:
-    away = Reference.steps(planar_chart.labels, planar_chart.phi(q0), [(1.0, {"xi1": 2.0})], 3.0)
+    away = Reference.steps(planar_chart.labels, planar_chart.phi(q0), [(1.0, {"xi1": -2.0})], 3.0)
     seen: list[Progress] = []
     with pytest.raises(UnreachableReferenceError, match="leaves the domain at t = 1"):
         simulate(Impedance(planar_chart, K), away, q0, monitor=seen.append)

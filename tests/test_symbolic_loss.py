@@ -12,7 +12,7 @@ from orthocas.fitting.graph_objective import GraphObjective
 from orthocas.parametrisations import JointSpace, Parametrisation
 from orthocas.samples import samples_at
 
-EVERY_TERM = oc.Weights(length=3.0)
+EVERY_TERM = oc.Weights(length=3.0, angles="paper")
 CASES = [
     ("planar_x", oc.Polynomial(2)),
     ("planar_xy", oc.Fourier(1)),

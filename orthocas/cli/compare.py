@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from orthocas.cli.fit import WEIGHTS_TEXT, parse_weights
+from orthocas.cli.fit import WEIGHTS_TEXT, AnglesName, parse_weights
 from orthocas.cli.output import AsJson, Force, note, print_json, print_table, whole_number
 from orthocas.cli.problem_argument import (
     CentreText,
@@ -65,6 +65,7 @@ def compare(
     weights: Annotated[
         str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3, lambda4 and lambda5.')
     ] = WEIGHTS_TEXT,
+    angles: AnglesName = None,
     jobs: Annotated[
         int | None,
         typer.Option("--jobs", parser=whole_number, help="Number of processes, one thread each; default: all cores."),
@@ -78,7 +79,7 @@ def compare(
     built = build_problem(problem, words)
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers = [get_solver(name) for name in solver] if solver else None
-    loss = parse_weights(weights)
+    loss = parse_weights(weights, angles)
     with output_folder("--out", out) as folder, output_folder("--out", folder / "charts") as charts:
         require_replaceable_files(folder, _FILES, force)
         try:

@@ -1,5 +1,6 @@
 """`orthocas fit`: from a robot to a chart file."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,6 +39,13 @@ from orthocas.quality import Report, evaluate
 from orthocas.showing import number_list
 from orthocas.solvers import get as get_solver
 
+AnglesName = Annotated[
+    str | None,
+    typer.Option(
+        "--angles",
+        help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia.",
+    ),
+]
 _NUMBERS = ("task", "mutual", "regularity", "length", "folds")
 WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _NUMBERS)
 
@@ -87,6 +95,7 @@ def fit(
     weights: Annotated[
         str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3, lambda4 and lambda5.')
     ] = WEIGHTS_TEXT,
+    angles: AnglesName = None,
     max_mutual_deg: Annotated[
         float | None,
         typer.Option(
@@ -115,7 +124,7 @@ def fit(
     require_free(target, CHART, force)
     parametrisation = None if param is None else parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
-    loss = parse_weights(weights)
+    loss = parse_weights(weights, angles)
     suggestion = None
     try:
         with terminal_monitor() as monitor:
@@ -159,12 +168,12 @@ def _bounds(domain: str | None, leak_deg: float | None, conditioning: float | No
     return Bounds(LEAK_DEG if leak_deg is None else leak_deg, CONDITIONING if conditioning is None else conditioning)
 
 
-def parse_weights(text: str) -> Weights:
-    """Read two to five numbers, such as "1000,30" or "1000,30,150,0.01,1000"."""
+def parse_weights(text: str, angles: str | None) -> Weights:
+    """Read two to five numbers, such as "1000,30" or "1000,30,150,0.01,1000", with the kind of angles."""
     numbers = parse_numbers("--weights", text).tolist()
     if not 2 <= len(numbers) <= 5:
         raise InvalidValueError("--weights", repr(text), "two to five numbers")
-    return Weights.of(numbers)
+    return replace(Weights.of(numbers), angles=angles)
 
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
@@ -173,8 +182,6 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
     if result.idle_joints:
         rows["exact"] = f"joints that do not move the task: {', '.join(result.idle_joints)}"
-    if result.worst is not None:
-        rows["searched"] = f"least conditioning {result.worst.told}"
     if result.cyclic_joints:
         rows["cyclic"] = f"holds at all positions of {', '.join(result.cyclic_joints)}"
     if result.problem_check.singular_samples:

@@ -98,6 +98,7 @@ def _involutivity(problem: Problem) -> dict[str, Any]:
         return {"verdict": f"unknown whether exact coordinates exist: {error}"}
     return {
         "involutivity_defect": {"mean": found.mean, "max": found.max},
+        "expected_leak_deg": found.expected_leak_deg,
         "expected_angle_deg": found.expected_angle_deg,
         "verdict": found.verdict,
     }

@@ -8,8 +8,10 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.control import Controller, ControlStatus, Reference
 from orthocas.domains import contains
+from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.files.json import plain
 from orthocas.problem import Problem
+from orthocas.quality import evaluate
 from orthocas.simulation import Outcome, Trajectory, coupling_index
 from orthocas.simulation.figure import units_of
 from orthocas.simulation.steps_file import Plan
@@ -44,6 +46,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
         "duration": float(seen.times[-1]),
         "tracking_error": dict(zip(seen.labels, seen.tracking_error, strict=True)),
         "coupling_index": _coupling(chart, plan.reference, seen) if judged else None,
+        "angles_on_path": _angles(chart, seen),
         "fallback": {
             "share": len(bad) / len(seen.times),
             "since": None if first is None else float(seen.times[first]),
@@ -74,6 +77,12 @@ def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
     }
     if report["coupling_index"]:
         rows["coupling index"] = _worst_couplings(report["coupling_index"], problem.task.labels)
+    if angles := report["angles_on_path"]:
+        task, leak = angles["task_angle_deg"], angles["leak_deg"]
+        rows["angles on path"] = (
+            f"leak rms {leak['rms']:.2f}, largest {leak['max']:.1f} deg (in the metric); "
+            f"task angle mean {task['mean']:.2f}, std {task['std']:.2f} deg (the paper's cosines)"
+        )
     rows["command"] = f"at most {command:.4g} {unit}, {joint}"
     if energy := report["energy"]:
         rows["energy"] = (
@@ -94,6 +103,15 @@ def fallback_text(report: dict[str, Any]) -> str | None:
         f"at t = {fallback['since']:.4g} s {fallback['reason']}: the controller commanded only {what} "
         f"for {fallback['share']:.1%} of the run"
     )
+
+
+def _angles(chart: Chart, seen: Trajectory) -> dict[str, Any] | None:
+    """The paper's angles and the leak along the run; None where no gradient has a value."""
+    try:
+        found = evaluate(chart, points=seen.q[np.isfinite(seen.q).all(axis=1)]).as_dict()
+    except (SingularTaskError, InvalidValueError):
+        return None
+    return {name: found[name] for name in ("task_angle_deg", "mutual_angle_deg", "leak_deg")}
 
 
 def _coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str, dict[str, float]]:

@@ -66,6 +66,7 @@ class CellResult:
     evaluations: int = 0
     task_std_deg: float = float("nan")
     mutual_std_deg: float = float("nan")
+    leak_rms_deg: float = float("nan")  #: in the metric; the two above are the paper's
     conditioning_min: float = float("nan")
     conditioning_p01: float = float("nan")
     conditioning_mean: float = float("nan")
@@ -130,6 +131,7 @@ def _result(cell: Cell, found: Fit, report: Report, history: list[tuple[float, f
         evaluations=sum(result.evaluations for result in results),
         task_std_deg=report.task_angle.std,
         mutual_std_deg=report.mutual_angle.std,
+        leak_rms_deg=report.leak.rms,
         conditioning_min=report.conditioning.min,
         conditioning_p01=report.conditioning.p01,
         conditioning_mean=report.conditioning.mean,

@@ -27,8 +27,8 @@ class BoundedMutual:
 
     def __init__(self, objective: BasisObjective, bound: float) -> None:
         weights, self._gram = objective.weights, objective.gram  # sampled once, and shared by the objectives below
-        self._task = objective.reweighted(Weights(weights.task, mutual=0.0, regularity=weights.regularity))
-        only_mutual = Weights(task=0.0, mutual=2.0, regularity=0.0)  # 2 cancels the factor 1/2 of the loss
+        self._task = objective.reweighted(Weights(weights.task, 0.0, weights.regularity, angles=weights.angles))
+        only_mutual = Weights(0.0, 2.0, 0.0, angles=weights.angles)  # 2 cancels the factor 1/2 of the loss
         self._mutual = objective.reweighted(only_mutual)
         self._r, self._K, self._bound = objective.r, objective.K, bound
 

@@ -97,19 +97,21 @@ def fit(
 ) -> Fit:
     """Find coordinates xi(q) that are as orthogonal as possible to the task.
 
-    The fit minimises the mean of [AS2023] eq. (24) over uniform samples of the domain. Joints that do not affect the
-    task become coordinates themselves. With `Polynomial(degree, cyclic="auto")`, the domain of the chart covers all
-    positions of the cyclic joints; see `orthocas.cyclic_joints`. Families linear in their parameters start from a
-    spectral solution of low degree, and the degree rises step by step. Ctrl-C raises `Interrupted`: its `result` is the
-    fit with the best coordinates so far and status INTERRUPTED. So callers that need a finished fit, and loops around
-    them, end as well.
+    The fit minimises the mean of [AS2023] eq. (24) over uniform samples of the domain, for A = M with angles in the
+    metric. Joints that do not affect the task become coordinates themselves. With `Polynomial(degree, cyclic="auto")`,
+    the domain of the chart covers all positions of the cyclic joints; see `orthocas.cyclic_joints`. Families linear in
+    their parameters start from a spectral solution of low degree, and the degree rises step by step. Between the
+    degrees, a search for the worst points of the domain keeps the chart from folding. Ctrl-C raises `Interrupted`: its
+    `result` is the fit with the best coordinates so far and status INTERRUPTED. So callers that need a finished fit,
+    and loops around them, end as well.
 
     Args:
         problem: robot, task, metric and domain.
         parametrisation: the family of coordinates. Default: polynomials of degree 5; of degree 4 for more than
             seven joints, or with a bound on mutual angles.
         solver: the minimiser. Default: GaussNewton for families linear in their parameters, LBFGS otherwise.
-        weights: weights of the loss, as `Weights` or as two to four numbers (lambda1, lambda2, ...).
+        weights: weights of the loss, as `Weights` or as two to five numbers (lambda1, lambda2, ...). The field `angles`
+            of `Weights` chooses between the paper's cosines and angles in the metric.
         samples: number of samples. Default: grows with the number of parameters.
         seed: seed of the samples and of random starts.
         monitor: called with progress.
@@ -211,4 +213,5 @@ def _notes(stages: Sequence[Stage], settings: FitSettings, worst: WorstPoints | 
         "seed": settings.seed,
         "samples": stages[-1].samples if stages else 0,
         "status": stages[-1].result.status.value if stages else Status.CONVERGED.value,
+        "angles": weights.angles,
     }

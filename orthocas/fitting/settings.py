@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocas.checks import as_number, require_count
+from orthocas.checks import as_number, require_count, require_kind
 from orthocas.domains import Torus
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.loss import WeightNumbers, Weights
@@ -40,11 +40,12 @@ class FitSettings:
         seed: int,
         max_mutual_deg: float | None,
     ) -> "FitSettings":
-        """Check the settings, and fill in the default solver.
+        """Check the settings, and fill in the default solver and the default angles.
 
         Raises:
             InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
+        require_kind("problem", problem, Problem)
         require_parametrisation(parametrisation)
         bound = parametrisation.for_problem(problem)
         if max_mutual_deg is not None:
@@ -55,7 +56,8 @@ class FitSettings:
         if max_mutual_deg is not None and not isinstance(solver, Ipopt):
             raise InvalidValueError("solver", solver.name, "ipopt, the only solver that supports max_mutual_deg")
         count = None if samples is None else require_count("samples", samples, least=2)
-        return cls(bound, solver, Weights.of(weights), count, require_count("seed", seed, least=0), max_mutual_deg)
+        loss = Weights.of(weights).for_metric(problem.metric)
+        return cls(bound, solver, loss, count, require_count("seed", seed, least=0), max_mutual_deg)
 
     @property
     def max_mutual(self) -> float | None:

@@ -34,7 +34,7 @@ def loss(
     Args:
         problem: robot, task, metric and domain.
         parametrisation: the family with parameters theta (size, 1). For bases they are the coefficients row by row.
-        weights: weights of the terms; see `Weights`.
+        weights: weights of the terms, and the kind of angles; see `Weights`.
         samples: number of samples to draw, or joint positions (N, n) [rad] or [m].
         seed: seed of drawn samples, and of the start of a network.
         start: parameters (size,) whose orientation the regularity term keeps. Default: where `fit` starts.
@@ -63,7 +63,8 @@ def loss(
     theta = ca.MX.sym("theta", family.size)
     J = _jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
     identity = drawn.metric_inverse is None
-    of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), Weights.of(weights).by_name)
+    known = Weights.of(weights).for_metric(problem.metric)
+    of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), known.by_name)
     orientation = _orientation(drawn, ca.Function("J", [theta], [J])(theta0).full(), problem.r)
     data = [_columns(part) for part in drawn.described(of_sample.data, orientation)]
     mean = ca.sum2(_mapped(of_sample, len(drawn))(J, *data)) / len(drawn)

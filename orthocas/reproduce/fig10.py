@@ -20,6 +20,7 @@ from orthocas.involutivity import TaskBrackets, lie_bracket
 from orthocas.parametrisations import Polynomial
 from orthocas.problem import Problem
 from orthocas.reproduce.drawing import Drawing
+from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.section import curves_inside, isosurface, section, tilts, unit_gradients
 from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, add_3d, joint_cube, line_legend, new_figure
@@ -48,7 +49,7 @@ def draw(quick: bool) -> Drawing:
     `quick` draws a coarser leaf.
     """
     problem = section(_LOW, _HIGH)
-    chart = fit(problem, Polynomial(degree=_DEGREE)).chart
+    chart = fit(problem, Polynomial(degree=_DEGREE), weights=PAPER_LOSS).chart
     ways = [way(problem, _START, order, _DRAWN) for order in ((0, 1), (1, 0))]
     figure = new_figure(4.6, layout=None)
     axes = add_3d(figure, 0.1, 0.1, 0.8, 0.89)

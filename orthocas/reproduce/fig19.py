@@ -16,6 +16,7 @@ from orthocas.problem import Problem
 from orthocas.quality import evaluate
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.fig10 import GREEN, RED
+from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.section import curves_inside, isosurface, section, tilts, unit_gradients
 from orthocas.reproduce.style import TASK, add_3d, joint_cube, line_legend, new_figure
@@ -37,7 +38,7 @@ def draw(quick: bool) -> Drawing:
     `quick` draws coarser surfaces.
     """
     problem = section(_LOW, _HIGH)
-    chart = fit(problem, Polynomial(degree=_DEGREE)).chart
+    chart = fit(problem, Polynomial(degree=_DEGREE), weights=PAPER_LOSS).chart
     levels = np.quantile(chart.xi(sample_uniform(problem.domain, _SAMPLES, 3))[:, 0], _SHARES)
     curves = curves_inside(problem, _starts(problem), 0.02)
     places = np.concatenate([_crossings(chart, curve, levels) for curve in curves])

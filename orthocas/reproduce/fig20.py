@@ -11,9 +11,11 @@ import numpy as np
 
 from orthocas import problems
 from orthocas.fitting.fit import fit
+from orthocas.judging.statistics import AngleStatistics
 from orthocas.parametrisations import Polynomial
-from orthocas.quality import AngleStatistics, Report, evaluate
+from orthocas.quality import Report, evaluate
 from orthocas.reproduce.drawing import Drawing
+from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.reproduce.style import EXTRA, LABEL, TASK, TICK, new_figure
 
 _PANELS = {
@@ -47,7 +49,7 @@ def draw(quick: bool) -> Drawing:
 
 
 def _judged(name: str, quick: bool) -> Report:
-    found = fit(problems.get(name), Polynomial(4 if quick else 6), samples=1500 if quick else None)
+    found = fit(problems.get(name), Polynomial(4 if quick else 6), weights=PAPER_LOSS, samples=1500 if quick else None)
     return evaluate(found.chart, 10_000 if quick else 100_000)
 
 

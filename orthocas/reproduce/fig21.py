@@ -20,6 +20,7 @@ from orthocas.domains import sample_uniform
 from orthocas.fitting.fit import fit
 from orthocas.parametrisations import Polynomial
 from orthocas.reproduce.drawing import Drawing
+from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, THIRD, TICK, new_figure
 
 _STEP_AT, _DURATION = 0.5, 3.0  # [s]
@@ -135,7 +136,7 @@ def _low_pass_numbers(response: Reference) -> dict[str, float]:
 
 def _loop_numbers() -> dict[str, float]:
     """The torque of the controller compared with the sum in the diagram, at random states and references."""
-    chart = fit(problems.get("planar_3r_x"), Polynomial(4), samples=1500).chart
+    chart = fit(problems.get("planar_3r_x"), Polynomial(4), weights=PAPER_LOSS, samples=1500).chart
     controller = PDPlus(chart, _STIFFNESS)
     q = sample_uniform(chart.problem.domain, _STATES, 0)
     dq, *wanted = np.random.default_rng(1).normal(size=(4, _STATES, chart.n))

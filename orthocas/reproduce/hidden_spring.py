@@ -20,6 +20,7 @@ from orthocas.errors import SolveError
 from orthocas.fitting.fit import fit
 from orthocas.parametrisations import Polynomial
 from orthocas.problem import Problem
+from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.reproduce.self_motion import trace
 from orthocas.reproduce.style import TURN
 
@@ -49,7 +50,7 @@ class HiddenSpring:
     @cached_property
     def chart(self) -> Chart:
         """Fitted coordinates."""
-        return fit(self.problem, Polynomial(_DEGREE)).chart
+        return fit(self.problem, Polynomial(_DEGREE), weights=PAPER_LOSS).chart
 
     @cached_property
     def start(self) -> Array:

@@ -25,12 +25,12 @@ from orthocas.reproduce.planar_flow import grown_chart
 from orthocas.samples import sample_problem, samples_at
 from orthocas.solvers import GaussNewton
 
-_WEIGHTS = Weights.of((1000.0, 0.0))  # one coordinate has no mutual angles
+_WEIGHTS = Weights(1000.0, 0.0, 0.0, angles="paper")  # one coordinate has no mutual angles
 
 
 def freely_fitted(problem: Problem, quick: bool) -> Chart:
     """The chart that `oc.fit` finds without a given start."""
-    return fit(problem, _series(quick), weights=(_WEIGHTS.task, 0.0), samples=_sample_count(quick)).chart
+    return fit(problem, _series(quick), weights=_WEIGHTS, samples=_sample_count(quick)).chart
 
 
 def fitted_from_grown(problem: Problem, quick: bool) -> Chart:

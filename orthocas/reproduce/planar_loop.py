@@ -27,6 +27,7 @@ from orthocas.fitting.fit import fit
 from orthocas.parametrisations import Linear, Polynomial
 from orthocas.problem import Problem
 from orthocas.quality import evaluate
+from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.robots import Robot
 from orthocas.simulation import Coupling, Trajectory, coupling_index, simulate
 from orthocas.tasks import Task
@@ -104,7 +105,7 @@ def _fitted(arm: Arm, axes: Axes, place: Place, quick: bool) -> Chart:
     """Fit a chart once, because several figures share it."""
     degree = 8 if axes == "x" and not quick else 6
     samples = 1500 if quick else 4000
-    chart = fit(arm.problem(axes, arm.box(place)), Polynomial(degree), samples=samples).chart
+    chart = fit(arm.problem(axes, arm.box(place)), Polynomial(degree), weights=PAPER_LOSS, samples=samples).chart
     base = arm.base(place)
     return combined(chart, base, arm.linear(axes, place).jacobian(base)[chart.m :])
 

@@ -184,7 +184,7 @@ def _makers() -> dict[str, Call]:
         "GrownChart": (oc.GrownChart, {"problem": circle().problem, "coordinates": circle().coordinates, "notes": {}}),
         "Weights": (
             oc.Weights,
-            {"task": 1.0, "mutual": 1.0, "regularity": 1.0, "length": 1.0, "folds": 1.0, "extra": {}},
+            {"task": 1.0, "regularity": 1.0, "length": 1.0, "folds": 1.0, "extra": {}, "angles": "paper"},
         ),
         "Task.position": (oc.Task.position, {"robot": robot, "axes": "x"}),
         "Task.polar": (oc.Task.polar, {"robot": robot}),
@@ -244,6 +244,7 @@ def _functions() -> dict[str, Call]:
             {"chart": circle(), "parametrisation": oc.Polynomial(1), "solver": None, "samples": 30, "seed": 0},
         ),
         "evaluate": (oc.evaluate, {"chart": chart, "samples": 50, "seed": 1}),
+        "evaluate points": (oc.evaluate, {"chart": chart, "samples": None, "seed": None, "points": [q, q]}),
         "generate_c": (oc.generate_c, {"chart": chart, "out": "c", "controller": impedance(), "name": "arm"}),
         "grow": (
             oc.grow,
@@ -296,6 +297,8 @@ def _methods() -> dict[str, Call]:
         **{f"robot.{name}": (getattr(robot, name), arguments) for name, arguments in states.items()},
         **{f"chart.{name}": (getattr(chart, name), {"q": q}) for name in evaluations},
         **{f"grown.{name}": (getattr(grown, name), {"q": q[:2]}) for name in evaluations},
+        "chart.quality": (chart.quality, {"q": q}),
+        "grown.quality": (grown.quality, {"q": [q[:2], q[:2]]}),
         "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "tolerance": 1e-9}),
         "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
         "chart.function": (chart.function, {"name": "phi"}),

@@ -2,13 +2,15 @@
 
 from orthocas.fitting.loss.angles import mutual_cosines, pairs, task_cosines
 from orthocas.fitting.loss.length import log_lengths
+from orthocas.fitting.loss.metric_angles import leak_sines, metric_mutual_cosines
 from orthocas.fitting.loss.registry import register, term_of
 from orthocas.fitting.loss.regularity import FOLD_TERM, LEAST_CONDITIONING, REGULAR_VOLUME, gradient_volume
 from orthocas.fitting.loss.residuals import Loss
 from orthocas.fitting.loss.term import Data, LossTerm, Sizes
-from orthocas.fitting.loss.weights import DEFAULT_WEIGHTS, WeightNumbers, Weights
+from orthocas.fitting.loss.weights import ANGLES, DEFAULT_WEIGHTS, WeightNumbers, Weights
 
 __all__ = [
+    "ANGLES",
     "DEFAULT_WEIGHTS",
     "FOLD_TERM",
     "LEAST_CONDITIONING",
@@ -20,7 +22,9 @@ __all__ = [
     "WeightNumbers",
     "Weights",
     "gradient_volume",
+    "leak_sines",
     "log_lengths",
+    "metric_mutual_cosines",
     "mutual_cosines",
     "pairs",
     "register",

@@ -4,6 +4,7 @@ from orthocas.checks import require_known
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.loss.angles import MutualTerm, TaskTerm
 from orthocas.fitting.loss.length import LengthTerm
+from orthocas.fitting.loss.metric_angles import MetricMutualTerm, MetricTaskTerm
 from orthocas.fitting.loss.regularity import FOLD_TERM, RegularityTerm
 from orthocas.fitting.loss.term import LossTerm, require_sample_data
 
@@ -54,5 +55,6 @@ def term_of(name: str) -> LossTerm:
     return _TERMS[name]
 
 
-for _term in (TaskTerm(), MutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM):
+_OURS = (MetricTaskTerm(), MetricMutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM)
+for _term in (TaskTerm(), MutualTerm(), *_OURS):
     register(_term)

@@ -1,11 +1,13 @@
-"""Weights of the loss: one number for each term."""
+"""Weights of the loss: one number for each term, and the kind of angles that the first two terms measure."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from orthocas.checks import as_float_array, as_number, require_kind
+from orthocas.checks import as_float_array, as_number, require_kind, require_known
 from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.metrics import Metric
 
+ANGLES = ("paper", "metric")  #: kinds of angles in the loss
 WeightNumbers = Sequence[float]  #: two to five numbers: task, mutual, regularity, length, folds
 
 
@@ -25,9 +27,14 @@ class Weights:
         length: lambda4 >= 0.
         folds: lambda5 >= 0. With 0 there is no search.
         extra: weights >= 0 of registered terms, by name; see `orthocas.register_loss_term`.
+        angles: what the task and mutual terms measure: 'paper', the cosines of [AS2023] eq. (24) with Euclidean norms;
+            'metric', cosines in the metric with an orthonormal basis of the task gradients, which do not depend on the
+            choice of task coordinates. Default: 'metric' for A = M, where closed loops are better with it, and 'paper'
+            otherwise; see docs/angles.md.
 
     Raises:
         InvalidValueError: if a weight is negative or not finite, or all weights are zero.
+        UnknownNameError: if there are no such angles.
 
     Example:
         >>> import orthocas as oc
@@ -43,11 +50,14 @@ class Weights:
     length: float = 0.0
     folds: float = 1000.0
     extra: Mapping[str, float] = field(default_factory=dict, hash=False)
+    angles: str | None = None
 
     def __post_init__(self) -> None:
         for k, name in enumerate(("task", "mutual", "regularity", "length", "folds")):
             object.__setattr__(self, name, _weight(f"lambda{k + 1}", getattr(self, name)))
         require_kind("extra", self.extra, Mapping)
+        if self.angles is not None:
+            require_known("angles", self.angles, ANGLES)
         extra = {name: _weight(f"weight of {name}", value) for name, value in self.extra.items()}
         object.__setattr__(self, "extra", extra)
         if not any(self.by_name.values()):
@@ -69,11 +79,16 @@ class Weights:
             raise InvalidValueError("lambda1", weights.task, "a positive number")
         return weights
 
+    def for_metric(self, metric: Metric) -> "Weights":
+        """The same weights with the default angles of a metric, unless angles are given."""
+        return replace(self, angles="metric" if metric.is_inertia else "paper") if self.angles is None else self
+
     @property
     def by_name(self) -> dict[str, float]:
-        """The weights by the names of their terms, without the fold term, which acts at the worst points only."""
-        own = {"task": self.task, "mutual": self.mutual, "regularity": self.regularity, "length": self.length}
-        return own | dict(self.extra)
+        """The weights by the names of their terms, without the fold term; without angles, those of the paper."""
+        kind = "metric " if self.angles == "metric" else ""
+        angles = {f"{kind}task": self.task, f"{kind}mutual": self.mutual}
+        return angles | {"regularity": self.regularity, "length": self.length} | dict(self.extra)
 
 
 def _weight(name: str, value: float) -> float:

@@ -1,0 +1,96 @@
+"""Angles, leaks, conditioning and orientation of coordinate gradients at joint positions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.checks import Array
+from orthocas.coordinates.map import CoordinateMap
+from orthocas.fitting.loss import pairs
+from orthocas.problem import Problem, task_jacobians
+from orthocas.samples import samples_at
+
+_CHUNK = 5000
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """The gradients at N joint positions. Positions where a gradient vanishes or has no value are left out."""
+
+    kept: NDArray[np.bool_]  #: which of the given positions are not left out, (given,)
+    points: Array  #: q, (N, n)
+    jacobian: Array  #: J_xi, (N, r, n)
+    task_cosines: Array  #: of [AS2023] eq. (24), Euclidean norms, (N, m, r)
+    mutual_cosines: Array  #: of [AS2023] eq. (24), Euclidean norms, (N, pairs)
+    leak_sines: Array  #: sin(leak_j) = |Pi_x grad_A xi_j|_A / |grad_A xi_j|_A, (N, r)
+    metric_mutual_cosines: Array  #: cosines between coordinate gradients in the metric, (N, pairs)
+    conditioning: Array  #: smallest singular value of [A-orthonormal task basis; unit coordinate gradients], (N,)
+    signs: Array  #: of det J, (N,)
+
+    @classmethod
+    def at(cls, problem: Problem, coordinates: CoordinateMap, points: Array) -> Self:
+        """Judge coordinates at joint positions (N, n)."""
+        starts = range(0, max(len(points), 1), _CHUNK)
+        parts = [_judged(problem, coordinates, points[start : start + _CHUNK]) for start in starts]
+        return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+    def of_coordinates(self, chosen: Sequence[int]) -> Self:
+        """The same without the other coordinates. Conditioning and signs are still those of all."""
+        columns = list(chosen)
+        kept = [k for k, pair in enumerate(pairs(self.jacobian.shape[1])) if set(pair) <= set(columns)]
+        shortened = {
+            "jacobian": self.jacobian[:, columns],
+            "task_cosines": self.task_cosines[:, :, columns],
+            "leak_sines": self.leak_sines[:, columns],
+            "mutual_cosines": self.mutual_cosines[:, kept],
+            "metric_mutual_cosines": self.metric_mutual_cosines[:, kept],
+        }
+        return type(self)(**({part.name: getattr(self, part.name) for part in fields(self)} | shortened))
+
+
+def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> tuple[Array, ...]:
+    """The fields of `Judged` for one chunk."""
+    samples = samples_at(problem, points)
+    kept = np.ones(len(points), dtype=bool)
+    if len(samples) < len(points):
+        kept = np.asarray((task_jacobians(problem, points) != 0).any(axis=2).all(axis=1))
+    J = coordinates.jacobian(samples.points)
+    lengths = np.linalg.norm(J, axis=2)
+    alive = lengths.min(axis=1) > 0  # also false for NaN, where grown coordinates have no value
+    kept[kept] = alive
+    samples, J, lengths = samples[alive], J[alive], lengths[alive]
+    raised = samples.raised(J)
+    first, second = (np.array([pair[k] for pair in pairs(J.shape[1])], dtype=int) for k in (0, 1))
+    products = np.einsum("spn,spn->sp", raised[:, first], J[:, second])
+    metric_lengths = np.sqrt(np.einsum("sjn,sjn->sj", J, raised))
+    along = samples.task_basis @ (J / metric_lengths[:, :, None]).transpose(0, 2, 1)  # (N, m, r)
+    return (
+        kept,
+        samples.points,
+        J,
+        samples.unit_task_gradients @ (J / lengths[:, :, None]).transpose(0, 2, 1),
+        products / (np.linalg.norm(raised, axis=2)[:, first] * lengths[:, second]),
+        np.linalg.norm(along, axis=1),
+        products / (metric_lengths[:, first] * metric_lengths[:, second]),
+        _smallest_singular_values(J / metric_lengths[:, :, None], raised / metric_lengths[:, :, None], along),
+        np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1))),
+    )
+
+
+def _smallest_singular_values(unit: Array, raised: Array, along: Array) -> Array:
+    """Roots of the smallest eigenvalues of the Gram matrix [[I, E v], [v^T E^T, v^T A^-1 v]], (N,).
+
+    Args:
+        unit: gradients v of unit length in the metric, (N, r, n).
+        raised: A^-1 v, (N, r, n).
+        along: E v, components along an A-orthonormal basis E of the task gradients, (N, m, r).
+    """
+    m = along.shape[1]
+    identity = np.broadcast_to(np.eye(m), (len(unit), m, m))
+    above = np.concatenate([identity, along], axis=2)
+    below = np.concatenate([along.transpose(0, 2, 1), raised @ unit.transpose(0, 2, 1)], axis=2)
+    gram = np.concatenate([above, below], axis=1)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[:, 0], 0.0))

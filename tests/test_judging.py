@@ -1,0 +1,178 @@
+"""Leaks against a second computation, figures without idle joints, and the quality of a chart at points."""
+
+import json
+
+import casadi as ca
+import numpy as np
+import pytest
+import scipy.linalg
+from charts import with_metric
+from programs import Run
+
+import orthocas as oc
+from orthocas.domains import sample_uniform
+from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
+from orthocas.fitting.fit import Fit
+
+
+def leaks_by_hand(chart: oc.Chart, q: np.ndarray) -> np.ndarray:
+    """Angle of each coordinate gradient to the task's null space, where the Cholesky factor makes A the identity."""
+    n, m = chart.n, chart.m
+    A = np.eye(n) if chart.problem.metric.is_identity else np.asarray(chart.problem.metric.function(q))
+    white = scipy.linalg.solve_triangular(np.linalg.cholesky(A), chart.jacobian(q).T, lower=True)
+    task, coordinates = white[:, :m], white[:, m:]
+    within = task @ np.linalg.lstsq(task, coordinates, rcond=None)[0]
+    return np.degrees(np.arcsin(np.linalg.norm(within, axis=0) / np.linalg.norm(coordinates, axis=0)))
+
+
+@pytest.fixture(scope="module")
+def charts(iiwa_fit: Fit, planar_fit: Fit, planar_xy: oc.Problem) -> dict[str, oc.Chart]:
+    in_metric = oc.fit(with_metric(iiwa_fit.chart.problem, "inertia"), oc.Polynomial(2), samples=500).chart
+    plane = oc.fit(planar_xy, oc.Polynomial(3), samples=500).chart
+    return {"iiwa": iiwa_fit.chart, "iiwa, A = M": in_metric, "planar_x": planar_fit.chart, "planar_xy": plane}
+
+
+@pytest.mark.parametrize("name", ["iiwa", "iiwa, A = M", "planar_x", "planar_xy"])
+def test_leaks_are_those_of_a_least_squares_projection(charts: dict[str, oc.Chart], name: str) -> None:
+    chart = charts[name]
+    points = sample_uniform(chart.problem.domain, 60, 5)
+    want = np.array([leaks_by_hand(chart, q) for q in points])
+    assert want.max() > 1
+    np.testing.assert_allclose(chart.quality(points).leak_deg, want, atol=1e-5)
+    leak = oc.evaluate(chart, points=points).leak
+    np.testing.assert_allclose(leak.mean, want.mean(), atol=1e-5)
+    np.testing.assert_allclose(leak.rms, np.sqrt((want**2).mean()), atol=1e-5)
+    np.testing.assert_allclose(leak.rms_of_each, np.sqrt((want**2).mean(axis=0)), atol=1e-5)
+    np.testing.assert_allclose(leak.max, want.max(), atol=1e-5)
+    assert leak.histogram.sum() == want.size
+    assert leak.histogram[round(10 * want.max())] >= 1
+
+
+def test_leak_does_not_depend_on_task_coordinates_but_the_papers_angle_does(planar_xy: oc.Problem) -> None:
+    robot, chart = planar_xy.robot, oc.fit(planar_xy, oc.Polynomial(2), samples=300).chart
+    mixed = oc.Task.custom(robot, "mixed", lambda q: ca.DM([[1.0, 0.9], [0.0, 0.1]]) @ robot.tip_position(q)[:2])
+    others = [mixed, oc.Task.polar(robot)]
+    first, *more = (
+        oc.evaluate(oc.Chart(oc.Problem(robot, task, "inertia", planar_xy.domain), chart.coordinates), 500)
+        for task in (planar_xy.task, *others)
+    )
+    for report in more:
+        np.testing.assert_allclose(report.leak.rms_of_each, first.leak.rms_of_each, rtol=1e-9)
+        assert abs(report.task_angle.std - first.task_angle.std) > 0.1
+
+
+def test_for_one_task_component_and_identity_metric_the_leak_is_the_papers_angle(planar_x: oc.Problem) -> None:
+    chart = oc.fit(with_metric(planar_x, "euclidean"), oc.Linear()).chart
+    report = oc.evaluate(chart, 500)
+    np.testing.assert_allclose(report.leak.max, report.task_angle.max, rtol=1e-9)
+    np.testing.assert_allclose(
+        report.leak.rms**2, report.task_angle.std**2 + (report.task_angle.mean - 90) ** 2, rtol=1e-9
+    )
+
+
+def test_the_papers_angle_hides_the_leak_for_the_inertia_metric(charts: dict[str, oc.Chart]) -> None:
+    hidden, shown = (oc.evaluate(charts[name], 5000) for name in ("iiwa, A = M", "planar_x"))
+    assert hidden.leak.rms > 3 * hidden.task_angle.std
+    assert shown.leak.rms < 3 * shown.task_angle.std  # m = 1
+
+
+def test_idle_joints_are_left_out_of_the_second_set_of_figures(iiwa_fit: Fit, planar_fit: Fit) -> None:
+    report = oc.evaluate(iiwa_fit.chart, 2000)
+    others = report.without_idle
+    assert report.idle_joints == ("A7",)
+    assert report.leak.rms_of_each[3] < 1e-5
+    np.testing.assert_allclose(others.leak.rms_of_each, report.leak.rms_of_each[:3])
+    np.testing.assert_allclose(others.leak.rms**2 * 3, report.leak.rms**2 * 4, rtol=1e-9)  # coordinates
+    for all_of, some, pairs, active in (
+        (report.task_angle, others.task_angle, 12, 9),
+        (report.mutual_angle, others.mutual_angle, 6, 3),
+    ):
+        whole, part = (a.std**2 + (a.mean - 90) ** 2 for a in (all_of, some))
+        np.testing.assert_allclose(part * active, whole * pairs, rtol=1e-9)
+    assert "A7" in report.facts()["without idle"]
+    assert json.loads(json.dumps(report.as_dict()))["without_idle"]["leak_deg"]["rms"] == others.leak.rms
+    planar = oc.evaluate(planar_fit.chart, 200)
+    assert planar.idle_joints == ()
+    assert planar.without_idle is None
+
+
+def test_points_take_the_place_of_samples(planar_fit: Fit) -> None:
+    chart = planar_fit.chart
+    drawn = oc.evaluate(chart, 300, seed=5)
+    given = oc.evaluate(chart, points=sample_uniform(chart.problem.domain, 300, 5))
+    want = drawn.as_dict() | {"seed": None}
+    assert given.as_dict() == want
+    assert given.facts()["samples"] == "300 given"
+    assert oc.evaluate(chart, points=chart.problem.domain.centre).samples == 1
+
+
+def test_points_of_another_shape_or_beside_samples_are_refused(planar_fit: Fit) -> None:
+    chart = planar_fit.chart
+    with pytest.raises(ShapeError, match="points has shape"):
+        oc.evaluate(chart, points=np.zeros((4, 2)))
+    with pytest.raises(InvalidValueError, match="points is given with samples or a seed"):
+        oc.evaluate(chart, 100, points=np.zeros((4, 3)))
+    with pytest.raises(InvalidValueError, match="samples is 0"):
+        oc.evaluate(chart, points=np.zeros((0, 3)))
+    with pytest.raises(ShapeError, match="q has shape"):
+        chart.quality([0.0, 1.0])
+    with pytest.raises(InvalidValueError, match="q"):
+        chart.quality([0.0, 1.0, np.nan])
+
+
+def test_quality_of_a_point_is_that_of_the_set(planar_fit: Fit) -> None:
+    chart = planar_fit.chart
+    path = np.linspace(chart.problem.domain.centre, chart.problem.domain.centre + 0.5, 7)
+    along = chart.quality(path)
+    assert along.leak_deg.shape == (7, 2)
+    assert along.conditioning.shape == along.border_distance.shape == (7,)
+    for k, q in enumerate(path):
+        here = chart.quality(q)
+        np.testing.assert_allclose(here.leak_deg, along.leak_deg[k], rtol=1e-12)
+        assert here.conditioning.shape == here.border_distance.shape == ()
+        np.testing.assert_allclose(here.conditioning, along.conditioning[k], rtol=1e-9)
+        np.testing.assert_allclose(oc.evaluate(chart, points=q).conditioning.min, here.conditioning, rtol=1e-9)
+    np.testing.assert_allclose(along.border_distance, np.pi / 8 - np.linspace(0, 0.5, 7), atol=1e-12)
+    assert "at most" in along.facts()["leak"]
+    assert json.loads(json.dumps(along.as_dict()))["conditioning"] == along.conditioning.tolist()
+
+
+def test_quality_is_nan_where_the_task_is_flat_and_a_torus_has_no_border() -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    task = oc.Task.custom(robot, "half flat", lambda q: ca.fmax(q[0], 0) ** 2)
+    chart = oc.fit(oc.Problem(robot, task, domain=oc.Box([0.5, 0.0], 0.4)), oc.Linear()).chart
+    found = chart.quality([[0.5, 0.0], [-0.5, 0.0], [0.6, 0.3]])
+    assert np.isnan(found.conditioning).tolist() == [False, True, False]
+    assert np.isnan(found.leak_deg).any(axis=1).tolist() == [False, True, False]
+    np.testing.assert_allclose(found.border_distance, [0.4, -0.6, 0.1], atol=1e-12)
+    assert found.facts()["left out"].startswith("1,")
+    with pytest.raises(SingularTaskError, match="all 1 given points"):
+        oc.evaluate(chart, points=[-0.5, 0.0])
+    everywhere = oc.Chart(oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Torus(2)), chart.coordinates)
+    assert everywhere.quality([0.3, 9.0]).border_distance == np.inf
+
+
+def test_prediction_of_info_and_report_of_evaluate_agree_on_small_boxes(planar_xy: oc.Problem) -> None:
+    """To first order in the size of the box: what is left shrinks with it, and the paper's angle does not agree."""
+    ratios = []
+    for half_width in (0.3, 0.1, 0.03):
+        problem = oc.Problem(planar_xy.robot, planar_xy.task, "inertia", oc.Box(planar_xy.domain.centre, half_width))
+        report = oc.evaluate(oc.fit(problem, oc.Polynomial(2)).chart, 5000)
+        expected = oc.involutivity(problem).expected_leak_deg
+        ratios.append(report.leak.rms / expected)
+        assert report.task_angle.std < 0.8 * expected
+    assert abs(ratios[0] - 1) > abs(ratios[1] - 1)
+    np.testing.assert_allclose(ratios[1:], 1, atol=0.015)
+
+
+def test_commands_print_the_papers_angle_and_the_leak_by_name(run: Run, planar_fit: Fit) -> None:
+    planar_fit.chart.save("a.orthocas")
+    _, out, _ = run("evaluate", "a.orthocas", "--samples", "500")
+    task, leak = (next(line for line in out.splitlines() if line.startswith(name)) for name in ("task angle", "leak"))
+    assert "the paper's cosines" in task
+    assert "in the metric" in leak
+    report = oc.evaluate(planar_fit.chart, 500)
+    assert f"rms {report.leak.rms:.2f}" in leak
+    data = json.loads(run("evaluate", "a.orthocas", "--samples", "500", "--json")[1])
+    assert data["leak_deg"] == report.leak.as_dict()
+    assert {"task_angle_deg", "mutual_angle_deg", "metric_mutual_angle_deg", "without_idle", "idle_joints"} <= set(data)
