@@ -32,12 +32,8 @@ class WorstPoints:
     @property
     def told(self) -> str:
         """The least conditioning and how it was searched."""
-        found = (
-            f"{self.least:.3f}"
-            if self.least >= 0
-            else f"the chart FOLDS OVER at {np.sum(self.conditioning < 0)} points"
-        )
-        return f"{found} by descent from {len(self.points)} of {CANDIDATES} points, uniform and near faces and corners"
+        found = f"{self.least:.3f}" if self.least >= 0 else "0, the chart FOLDS OVER"
+        return f"{found} ({len(self.points)} descents from {CANDIDATES} points, many in corners)"
 
     def below(self, bound: float) -> Array:
         """Points with less conditioning than that, (l, n)."""

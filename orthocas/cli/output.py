@@ -64,5 +64,5 @@ def report_rows(report: Report) -> dict[str, str]:
     """The rows of a quality report, with advice on command-line options."""
     rows = report.facts()
     if report.length_ratio > _UNEVEN:
-        rows["lengths"] += "; for use in controllers, fit with --weights 1000,30,150,1"
+        rows["lengths"] += "; for use in controllers, fit with --weights 1000,30,150,1,1000"
     return rows
