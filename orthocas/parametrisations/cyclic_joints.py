@@ -48,31 +48,30 @@ def over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
     robot, domain = problem.robot, problem.domain
     if not names or not isinstance(domain, Box):
         return problem
-    low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
-    unbounded = set(domain.unbounded)
+    centre, half_width, unbounded = domain.centre.copy(), domain.half_width.copy(), set(domain.unbounded)
     for k in map(robot.joint_names.index, names):
-        low[k], high[k] = _range(problem, k)
+        low, high = _range(problem, k)
+        half_width[k] = (high - low) / 2
         if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k]):
             unbounded.add(k)
-    box = Box((low + high) / 2, (high - low) / 2, sorted(unbounded))
-    return Problem(robot, problem.task, problem.metric, box, problem.name)
+        else:
+            centre[k] = (low + high) / 2
+    return Problem(robot, problem.task, problem.metric, Box(centre, half_width, sorted(unbounded)), problem.name)
 
 
 def _range(problem: Problem, k: int) -> tuple[float, float]:
     """Limits of joint k. Where it has none: a turn around the domain's centre, or the domain of a prismatic joint."""
     robot, domain = problem.robot, problem.domain
     reach = domain.half_width[k] if robot.tree.prismatic[k] else max(np.pi, domain.half_width[k])
-    low, high = max(robot.lower[k], domain.centre[k] - reach), min(robot.upper[k], domain.centre[k] + reach)
-    return (
-        float(low if np.isinf(robot.lower[k]) else robot.lower[k]),
-        float(high if np.isinf(robot.upper[k]) else robot.upper[k]),
-    )
+    low = domain.centre[k] - reach if np.isinf(robot.lower[k]) else robot.lower[k]
+    high = domain.centre[k] + reach if np.isinf(robot.upper[k]) else robot.upper[k]
+    return float(low), float(high)
 
 
 def _is_cyclic(problem: Problem, points: Array, k: int) -> bool:
     """Whether nothing that matters changes when joint k moves."""
-    low, high = _range(problem, k)
-    if problem.robot.tree.prismatic[k] and np.isinf(problem.robot.lower[k] + problem.robot.upper[k]):
+    robot, (low, high) = problem.robot, _range(problem, k)
+    if robot.tree.prismatic[k] and np.isinf([robot.lower[k], robot.upper[k]]).any():
         low, high = -_LARGEST_SLIDE, _LARGEST_SLIDE
     places = low + (high - low) * np.random.default_rng((_SEED, k)).uniform(size=(_POSITIONS, len(points)))
     moved = np.repeat(points[None], _POSITIONS, axis=0)
