@@ -17,7 +17,7 @@ def expression_of(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function, q
         raise InvalidValueError(what, repr(function), "a function of an SX column q")
     try:
         value = ca.SX(function(q))
-    except (NotImplementedError, RuntimeError, TypeError, ValueError, IndexError) as error:
+    except (NotImplementedError, RuntimeError, TypeError, ValueError, IndexError, ArithmeticError) as error:
         reason = " ".join(str(error).split())[:120]
         raise InvalidValueError(what, f"failing ({reason})", f"a function of an SX column q {q.shape}") from None
     known = {str(symbol) for symbol in ca.vertsplit(q)}
