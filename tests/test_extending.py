@@ -37,7 +37,7 @@ found = oc.compare(problem, [Radial(20), oc.Linear()], executor=ThreadPoolExecut
 print(sum(result.failed for result in found.results), len(found.results))
 """
     (angle,), (lost,), grid = run(tmp_path, BASIS, more)
-    assert angle < 2.5  # linear coordinates: 18 degrees
+    assert angle < 2.5  # leak; linear coordinates: 7.1 degrees
     assert lost < 0.01
     assert grid == [0, 2]
 
@@ -71,7 +71,7 @@ from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.parametrisations import JointSpace
 from orthocas.samples import samples_at
 from orthocas.domains import sample_evenly
-weights = oc.Weights(extra={"quiet": 3000.0})
+weights = oc.Weights(extra={"quiet": 3000.0}, angles="metric")
 points = np.repeat(sample_evenly(problem.domain, 30, 3), 2, axis=0)  # every second one makes the Gauss-Newton matrix
 family = oc.Polynomial(2).family(JointSpace.of(problem), 2)
 theta = family.initial(1)
@@ -83,7 +83,7 @@ exact = ca.Function("exact", [x], [value, g, H])
 value, gradient, hessian = (part.full().squeeze() for part in exact(theta))
 print(abs(fast.value(theta) / value - 1), np.abs(fast.value_and_gradient(theta)[1] - gradient).max())
 print(np.abs(fast.hessian(theta) - hessian).max() / np.abs(hessian).max())
-without = BasisObjective(family, samples_at(problem, points), oc.Weights(), theta, None)
+without = BasisObjective(family, samples_at(problem, points), oc.Weights(angles="metric"), theta, None)
 assert fast.value(theta) > without.value(theta)
 """
     (
@@ -91,7 +91,7 @@ assert fast.value(theta) > without.value(theta)
         (value, gradient),
         (hessian,),
     ) = run(tmp_path, TERM, more.replace("print(fast.value(theta) >", "assert (fast.value(theta) >"))
-    assert quiet[0] < 0.1 * quiet[1]
+    assert quiet[0] < 0.5 * quiet[1] < 0.005  # for A = M joint 3 takes little part anyway
     assert value < 1e-12
     assert gradient < 1e-9
     assert hessian < 1e-12

@@ -9,7 +9,7 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas.errors import MetricError, ShapeError, UnknownNameError
+from orthocas.errors import InvalidValueError, MetricError, ShapeError, UnknownNameError
 from orthocas.metrics import Metric, metric_matrices
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (10, 2))
@@ -97,3 +97,8 @@ def test_joint_that_moves_no_mass_is_named_when_inertia_is_the_metric() -> None:
     oc.check(oc.Problem(rotor, oc.Task.position(rotor), "inertia"))
     carried = massless(ur5, 2)  # carries what has mass
     oc.check(oc.Problem(carried, oc.Task.position(carried), "inertia"))
+
+
+def test_function_that_divides_by_zero_is_refused(planar_x: oc.Problem) -> None:
+    with pytest.raises(InvalidValueError, match="metric is failing"):
+        oc.Metric.custom(planar_x.robot, "broken", lambda q: 1 / 0)
