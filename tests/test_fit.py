@@ -1,5 +1,7 @@
 """Fits: idle joints, continuation, determinism, interrupts, limits."""
 
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -56,6 +58,11 @@ def test_degree_continuation_goes_through_every_degree(iiwa_fit: Fit) -> None:
     assert [stage.label for stage in iiwa_fit.stages[:2]] == ["polynomial:2", "polynomial:3"]
     assert [stage.parameters for stage in iiwa_fit.stages[:2]] == [3 * 27, 3 * 83]
     assert iiwa_fit.stages[1].result.value < iiwa_fit.stages[0].result.value
+
+
+def test_seeds_may_be_larger_than_a_machine_word(planar_x: oc.Problem, tmp_path: Path) -> None:
+    oc.fit(planar_x, oc.Polynomial(1), seed=10**20, samples=30).chart.save(tmp_path / "c")
+    assert oc.load(tmp_path / "c").notes["seed"] == 10**20
 
 
 @pytest.mark.slow

@@ -90,7 +90,7 @@ def _checked_notes(notes: Notes) -> dict[str, str | float]:
     """
     for name, value in notes.items():
         require_text("name of a note", name)
-        if isinstance(value, int | float) and not np.isfinite(value):
+        if isinstance(value, float) and not np.isfinite(value):
             raise InvalidValueError(f"note '{name}'", value, "a finite number")
         if not isinstance(value, str | int | float):
             raise InvalidValueError(f"note '{name}'", repr(value)[:80], "text or a number")

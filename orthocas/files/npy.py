@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 Stored = NDArray[Any]  #: an array in a file, of floats or integers
 
 _MOST_AXES = 32
+_LAST_CHARACTER = 0x10FFFF
+_SURROGATES = 0xD800 >> 11  # halves of characters, which cannot be written
 _START = b"\x93NUMPY\x01\x00"
 _HEADER = re.compile(
     rb"\{'descr': '([<>|][biuf][1248]|[<>]U\d{1,8})', 'fortran_order': (True|False), "
@@ -43,5 +45,13 @@ def from_npy(content: bytes) -> Stored:
     shape = tuple(int(part) for part in found[3].split(b",") if part.strip())
     if len(shape) > _MOST_AXES or prod(shape) * kind.itemsize != len(content) - body:
         raise ValueError(f"{len(content) - body} bytes for the shape {shape[:5]}")
+    if kind.kind == "U":
+        _require_characters(np.frombuffer(content, f"{kind.byteorder}u4", offset=body))
     flat = np.frombuffer(content, kind, prod(shape), body)
     return flat.reshape(shape, order="F" if found[2] == b"True" else "C").copy()
+
+
+def _require_characters(codes: Stored) -> None:
+    """Raise ValueError unless all are characters. Python fails on others only when the text is used."""
+    if ((codes > _LAST_CHARACTER) | (codes >> 11 == _SURROGATES)).any():
+        raise ValueError("text of no characters")

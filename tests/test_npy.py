@@ -1,0 +1,26 @@
+"""Arrays in files: what NumPy writes is read, and nothing that fails later."""
+
+import numpy as np
+import pytest
+
+from orthocas.files.npy import from_npy, to_npy
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_texts_of_both_byte_orders_are_read(order: str) -> None:
+    texts = np.array(["abc", "d\N{GRINNING FACE}", ""]).astype(f"{order}U3")
+    np.testing.assert_array_equal(from_npy(to_npy(texts)), texts)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("code", [0x110000, 0xFFFFFFFF, 0xD800, 0xDFFF])
+def test_texts_of_no_characters_are_refused(code: int, order: str) -> None:
+    """NumPy reads them, and Python fails with a SystemError when they are used."""
+    content = to_npy(np.frombuffer(np.array([65, code], dtype=f"{order}u4").tobytes(), f"{order}U2"))
+    with pytest.raises(ValueError, match="text of no characters"):
+        from_npy(content)
+
+
+def test_texts_next_to_the_surrogates_are_read() -> None:
+    texts = np.array(["\ud7ff", "\ue000", "\U0010ffff"])
+    np.testing.assert_array_equal(from_npy(to_npy(texts)), texts)
