@@ -113,6 +113,8 @@ def metric_matrices(metric: Metric, points: Array) -> Array:
 
 def require_spd(matrices: Array, points: Array) -> None:
     """Raise MetricError, with the worst point, unless all matrices (N, n, n) are symmetric positive definite."""
+    if not len(matrices):
+        return
     size = np.abs(matrices).max(axis=(1, 2))
     if not np.isfinite(size).all():
         at = points[np.flatnonzero(~np.isfinite(size))[0]]

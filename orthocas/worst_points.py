@@ -26,8 +26,8 @@ class WorstPoints:
 
     @property
     def least(self) -> float:
-        """Least conditioning found."""
-        return float(self.conditioning[0])
+        """Least conditioning found; NaN if it has no value anywhere."""
+        return float(self.conditioning[0]) if len(self.conditioning) else float("nan")
 
     @property
     def told(self) -> str:
@@ -55,8 +55,9 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) ->
     points = sample_heavily(problem.domain, CANDIDATES, (seed, CANDIDATES, 1))
     u = (points - problem.domain.centre) / problem.domain.half_width
     found = _signed_conditioning(problem, coordinates, u)
-    orientation = 1.0 if np.nanmedian(found) >= 0 else -1.0
-    order = np.argsort(orientation * found)[:_DESCENTS]  # NaN comes last
+    u, found = u[np.isfinite(found)], found[np.isfinite(found)]
+    orientation = 1.0 if np.sum(found >= 0) >= len(found) / 2 else -1.0
+    order = np.argsort(orientation * found)[:_DESCENTS]
     u, found = u[order], orientation * found[order]
     step = np.full(len(u), _FIRST_STEP)
     for _ in range(_STEPS):

@@ -71,9 +71,19 @@ def test_conditioning_matches_a_direct_computation_in_whitened_coordinates(plana
         units = white[1:] / np.linalg.norm(white[1:], axis=1, keepdims=True)
         smallest.append(np.linalg.svd(np.vstack([task, units]), compute_uv=False)[-1])
     np.testing.assert_allclose(report.conditioning.mean, np.mean(smallest), atol=1e-9)
-    np.testing.assert_allclose(report.conditioning.min, np.min(smallest), atol=1e-7)
+    given = oc.evaluate(chart, points=sample_uniform(chart.problem.domain, 200, 5))  # no search beside these points
+    np.testing.assert_allclose(given.conditioning.min, np.min(smallest), atol=1e-7)
     worst = sample_uniform(chart.problem.domain, 200, 5)[int(np.argmin(smallest))]
-    np.testing.assert_allclose(report.worst_point, worst)
+    np.testing.assert_allclose(given.worst_point, worst)
+
+
+def test_search_finds_less_than_samples_and_says_where(planar_fit: Fit) -> None:
+    chart = planar_fit.chart
+    report = oc.evaluate(chart, samples=200, seed=5)
+    assert report.worst is not None
+    assert report.conditioning.min == report.worst.least < oc.evaluate(chart, samples=200_000, seed=6).conditioning.p01
+    np.testing.assert_array_equal(report.worst_point, report.worst.points[0])
+    assert oc.evaluate(chart, points=[report.worst_point]).conditioning.min == pytest.approx(report.worst.least)
 
 
 def test_folded_samples_are_counted() -> None:

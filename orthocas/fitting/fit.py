@@ -203,15 +203,15 @@ def _notes(stages: Sequence[Stage], settings: FitSettings, worst: WorstPoints | 
     extra = {f"weight of {name}": weight for name, weight in weights.extra.items()}
     return {
         "solver": settings.solver.name if stages else "closed form",
+        "seed": settings.seed,
+        "samples": stages[-1].samples if stages else 0,
+        "status": stages[-1].result.status.value if stages else Status.CONVERGED.value,
+        **searched,
         "lambda1": weights.task,
         "lambda2": weights.mutual,
         "lambda3": weights.regularity,
         "lambda4": weights.length,
         "lambda5": weights.folds,
         **extra,
-        **searched,
-        "seed": settings.seed,
-        "samples": stages[-1].samples if stages else 0,
-        "status": stages[-1].result.status.value if stages else Status.CONVERGED.value,
         "angles": weights.angles,
     }
