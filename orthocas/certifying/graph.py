@@ -51,10 +51,9 @@ class TaylorGraph:
         """The values for models of q_1, ..., q_n."""
         work: dict[int, Any] = {}
         results: dict[int, TaylorModel] = {}
-        ones = np.ones_like(inputs[0].centre)
         for name, into, *of in self.steps:
             if name == "const":
-                work[into] = TaylorModel.constant(float(of[0]) * ones)
+                work[into] = TaylorModel.constant(np.array([float(of[0])]))
             elif name == "input":
                 work[into] = inputs[of[0]]
             elif name == "output":

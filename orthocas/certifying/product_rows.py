@@ -85,7 +85,10 @@ class ProductRows:
     def _rest(self, boxes: list[TaylorModel], half_widths: Array) -> Array:
         """Lagrange's bound of the terms of J_xi above degree 3, (r, n, boxes)."""
         last = self.orders[-1]
-        highest = self._products([box.magnitude() for box in self.functions(boxes)], last.used)
+        if last.used.any():
+            highest = self._products([box.magnitude() for box in self.functions(boxes)], last.used)
+        else:  # constants only
+            highest = np.ones((len(last.used), half_widths.shape[1]))
         bounds = self._spread(last.sizes @ highest * (1 + last.rounding), DEGREE + 2)
         rest: Array = (bounds * _weights(half_widths, DEGREE + 1)).sum(axis=2)
         return rest

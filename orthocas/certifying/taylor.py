@@ -79,6 +79,10 @@ class TaylorModel:
         return TaylorModel(self.variables, scaled, (np.abs(factor) * self.remainder + rounding) * UP + TINY)
 
     def __mul__(self, other: "TaylorModel") -> "TaylorModel":
+        if not self.variables:
+            return other._by_constant(self)
+        if not other.variables:
+            return self._by_constant(other)
         table = product(self.variables, other.variables)
         a, b = self.coefficients, other.coefficients
         out = np.zeros((table.size, *np.broadcast_shapes(a.shape[1:], b.shape[1:])))
@@ -92,6 +96,12 @@ class TaylorModel:
             out[where] += b[j] * a[starts[2] : starts[3]]
         return TaylorModel(table.variables, out, self._left_out(other))
 
+    def _by_constant(self, factor: "TaylorModel") -> "TaylorModel":
+        """The product with a model without variables."""
+        exact = self.times(factor.centre)
+        doubt = factor.remainder * (np.abs(self.coefficients).sum(axis=0) + self.remainder)
+        return _more_uncertain(exact, doubt)
+
     def _left_out(self, other: "TaylorModel") -> Array:
         """The remainder of a product: degrees above 3, the remainders of the factors, and rounding."""
         a, b = self.sizes(), other.sizes()
@@ -103,6 +113,11 @@ class TaylorModel:
 
     def composed(self, series: "Series") -> "TaylorModel":
         """The model of f(self), for the series of f about the centre."""
+        if not self.variables:
+            first = np.abs(series.values[1:]) + series.errors[1:]
+            e = self.remainder
+            doubt = series.errors[0] + series.tail + e * (first[0] + e * (first[1] + e * first[2]))
+            return TaylorModel.constant(series.values[0], doubt * UP)
         away = TaylorModel(self.variables, self.coefficients.copy(), self.remainder)
         away.coefficients[0] = 0
         values = [TaylorModel.constant(series.values[k], series.errors[k]) for k in range(4)]
