@@ -20,12 +20,17 @@ def in_singular_basis(J: TaylorModel) -> tuple[TaylorModel, Array]:
     U and V are taken as they are in floating-point numbers. They are checked to be orthogonal up to 1e-9, so they are
     nonsingular, and the sign of their determinants is that of the computed ones.
     """
+    Ut, V = singular_vectors(J)
+    signs = np.sign(np.linalg.det(Ut) * np.linalg.det(V)) * (_is_orthogonal(Ut) & _is_orthogonal(V))
+    return between(Ut, J, V), signs
+
+
+def singular_vectors(J: TaylorModel) -> tuple[Array, Array]:
+    """U^T and V of the centre of J (m, n, boxes), as (boxes, m, m) and (boxes, n, n); NaN where it is not finite."""
     centres = np.moveaxis(J.centre, -1, 0)
-    finite = np.isfinite(centres).all(axis=(1, 2))
-    U, _, Vt = np.linalg.svd(np.where(finite[:, None, None], centres, np.eye(len(J.centre))))
-    Ut, V = U.transpose(0, 2, 1), Vt.transpose(0, 2, 1)
-    signs = np.sign(np.linalg.det(U) * np.linalg.det(V)) * (_is_orthogonal(U) & _is_orthogonal(V) & finite)
-    return _between(Ut, J, V), signs
+    finite = np.isfinite(centres).all(axis=(1, 2))[:, None, None]
+    U, _, Vt = np.linalg.svd(np.where(finite, centres, 0.0))
+    return np.where(finite, U.transpose(0, 2, 1), np.nan), Vt.transpose(0, 2, 1)
 
 
 def _is_orthogonal(matrices: Array) -> Array:
@@ -34,11 +39,11 @@ def _is_orthogonal(matrices: Array) -> Array:
     return close
 
 
-def _between(left: Array, J: TaylorModel, right: Array) -> TaylorModel:
-    """left J right for matrices (boxes, n, n)."""
-    N, n, _, boxes = J.coefficients.shape
-    inner = np.ascontiguousarray(J.coefficients.transpose(3, 1, 0, 2)).reshape(boxes, n * N, n) @ right
-    outer = (left @ inner.reshape(boxes, n, N * n)).reshape(boxes, n, N, n)
+def between(left: Array, J: TaylorModel, right: Array) -> TaylorModel:
+    """left J right for matrices left (boxes, m, m) and right (boxes, n, n)."""
+    N, m, n, boxes = J.coefficients.shape
+    inner = np.ascontiguousarray(J.coefficients.transpose(3, 1, 0, 2)).reshape(boxes, m * N, n) @ right
+    outer = (left @ inner.reshape(boxes, m, N * n)).reshape(boxes, m, N, n)
     unknown = J.remainder + SUM * np.abs(J.coefficients).sum(axis=0)
     spread = np.abs(left) @ np.moveaxis(unknown, -1, 0) @ np.abs(right)
     coefficients = np.ascontiguousarray(outer.transpose(2, 1, 3, 0))

@@ -46,6 +46,17 @@ def square_root(model: TaylorModel) -> TaylorModel:
         return model.composed(Series(values, _ROUNDINGS * np.abs(values), tail * UP))
 
 
+def reciprocal_square_root(model: TaylorModel) -> TaylorModel:
+    """The model of 1 / sqrt f. Nothing is known where f may be zero or negative."""
+    x, e = model.centre, model.deviation()
+    low = x - e * UP - x * _ROUNDINGS
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        root = 1 / np.sqrt(x)
+        values = np.stack([root, -root / (2 * x), 3 * root / (8 * x * x), -5 * root / (16 * x * x * x)])
+        tail = np.where(low > 0, 35 / 128 * e**4 / (low**4 * np.sqrt(low)), np.inf)
+        return model.composed(Series(values, _ROUNDINGS * np.abs(values), tail * UP))
+
+
 def exponent(model: TaylorModel) -> TaylorModel:
     """The model of e^f."""
     value, error = exponential(model.centre)
