@@ -166,7 +166,7 @@ def _resumed(chart: Chart, bound: float, certificate: Certificate) -> Subdivisio
     require_same(chart, certificate)
     if certificate.bound != bound or certificate.fold:
         raise CertifyError(
-            f"resume is a certificate for bound {certificate.bound:g} that is finished or different, expected bound {bound:g}"
+            f"resume is a certificate for bound {certificate.bound:g}, expected one for {bound:g} without a fold"
         )
     return certificate.regular
 

@@ -9,6 +9,7 @@ import numpy as np
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.certifying.graph import TaylorGraph
 from orthocas.certifying.monomials import Variables
+from orthocas.certifying.network_rows import NetworkRows
 from orthocas.certifying.product_rows import ProductRows
 from orthocas.certifying.rounding import TINY
 from orthocas.certifying.task_rows import task_rows
@@ -17,6 +18,7 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.errors import CertifyError
+from orthocas.parametrisations.mlp import MLPFamily
 from orthocas.parametrisations.product_basis import ProductFamily
 
 MOST_VARIABLES = 20
@@ -35,13 +37,13 @@ class ChartRows:
     m: int
     active: Variables  #: joints that are not coordinates themselves: the columns
     variables: Variables  #: joints that J depends on
-    task: TaylorGraph  #: q -> task rows of the active joints, column by column
+    task: "GraphRows"  #: of the active joints
     coordinates: CoordinateRows | None
 
     def __call__(self, low: Array, high: Array) -> TaylorModel:
         """Models (active, active, boxes) for the boxes between corners (boxes, n)."""
         joints, half_widths = joint_models(low, high, self.variables)
-        rows = [self._task(joints)]
+        rows = [self.task(joints)]
         if self.coordinates is not None:
             active = list(self.active)
             rows.append(self.coordinates([joints[i] for i in active], half_widths[active], self.active))
@@ -53,10 +55,22 @@ class ChartRows:
             np.concatenate([part.remainder for part in rows]),
         )
 
-    def _task(self, joints: list[TaylorModel]) -> TaylorModel:
-        entries = self.task(joints)
-        columns = [stacked(entries[k : k + self.m]) for k in range(0, len(entries), self.m)]
-        flat = stacked(columns)  # (active, m, boxes)
+
+@dataclass(frozen=True, eq=False)
+class GraphRows:
+    """A matrix of so many rows that a graph gives column by column."""
+
+    graph: TaylorGraph
+    rows: int
+
+    def __call__(
+        self, joints: list[TaylorModel], half_widths: Array | None = None, variables: Variables = ()
+    ) -> TaylorModel:
+        """Models (rows, columns, boxes)."""
+        entries = self.graph(joints)
+        boxes = joints[0].remainder.shape
+        entries = [entry.on(boxes) for entry in entries]
+        flat = stacked([stacked(entries[k : k + self.rows]) for k in range(0, len(entries), self.rows)])
         return TaylorModel(flat.variables, flat.coefficients.swapaxes(1, 2), flat.remainder.swapaxes(0, 1))
 
 
@@ -79,7 +93,7 @@ def chart_rows(chart: Chart) -> ChartRows:
     if len(variables) > MOST_VARIABLES:
         raise CertifyError(f"the chart depends on {len(variables)} joints, expected at most {MOST_VARIABLES}")
     graph = TaylorGraph.of(dense_function("task_rows", [q], [J_x]), "the task")
-    return ChartRows(chart.n, chart.m, active, variables, graph, own)
+    return ChartRows(chart.n, chart.m, active, variables, GraphRows(graph, chart.m), own)
 
 
 def joint_models(low: Array, high: Array, variables: Variables) -> tuple[list[TaylorModel], Array]:
@@ -107,7 +121,15 @@ def _coordinate_rows(coordinates: Coordinates, q: ca.SX) -> tuple[CoordinateRows
     if isinstance(family, ProductFamily):
         rows = ProductRows.of(family, coordinates.theta)
         return rows, {active[i] for i in rows.dependences()}
-    raise CertifyError("not yet")
+    if isinstance(family, MLPFamily):
+        return NetworkRows.of(family, coordinates.theta), set(active)
+    own = ca.SX.sym("q", len(active))
+    theta = ca.SX(ca.DM(coordinates.theta))
+    J = ca.densify(ca.horzcat(*family.jacobian(own, theta)).T)
+    if J.numel() and ca.Function("size", [own], [J]).n_instructions() > _MOST_STEPS:
+        raise CertifyError(f"{coordinates.label} coordinates take too many operations, expected at most {_MOST_STEPS}")
+    graph = TaylorGraph.of(dense_function("J_xi", [own], [J]), "the coordinates")
+    return GraphRows(graph, family.outputs), {active[i] for i in _dependences(J, own)}
 
 
 def _dependences(J: ca.SX, q: ca.SX) -> set[int]:

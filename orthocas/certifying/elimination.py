@@ -1,11 +1,12 @@
 """Matrices of Taylor models: a change of basis, elimination, and lower bounds of ranges (ours).
 
-A matrix J(q) is nonsingular on a box if elimination finds no pivot that can vanish there. Before that, J is taken to the
-singular vectors of its centre: pivots come in order of their size, and the smallest, which is what a chart loses
-first, is bounded last, when nothing is divided by it any more.
+A matrix J(q) is nonsingular on a box if elimination finds no pivot that can vanish there. Before that, J is taken to
+the singular vectors of its centre: pivots come in order of their size, and the smallest, which is what a chart loses
+first, comes last, when nothing is divided by it any more.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.certifying.functions import reciprocal
 from orthocas.certifying.monomials import Variables, monomials
@@ -28,15 +29,14 @@ def in_singular_basis(J: TaylorModel) -> tuple[TaylorModel, Array]:
 def singular_vectors(J: TaylorModel) -> tuple[Array, Array]:
     """U^T and V of the centre of J (m, n, boxes), as (boxes, m, m) and (boxes, n, n); NaN where it is not finite."""
     centres = np.moveaxis(J.centre, -1, 0)
-    finite = np.isfinite(centres).all(axis=(1, 2))[:, None, None]
+    finite = np.asarray(np.isfinite(centres).all(axis=(1, 2)))[:, None, None]
     U, _, Vt = np.linalg.svd(np.where(finite, centres, 0.0))
     return np.where(finite, U.transpose(0, 2, 1), np.nan), Vt.transpose(0, 2, 1)
 
 
-def _is_orthogonal(matrices: Array) -> Array:
+def _is_orthogonal(matrices: Array) -> NDArray[np.bool_]:
     difference = matrices.transpose(0, 2, 1) @ matrices - np.eye(matrices.shape[1])
-    close: Array = np.abs(difference).max(axis=(1, 2)) < 1e-9
-    return close
+    return np.asarray(np.abs(difference).max(axis=(1, 2)) < 1e-9)
 
 
 def between(left: Array, J: TaylorModel, right: Array) -> TaylorModel:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.certifying.chart_rows import ChartRows
 from orthocas.certifying.elimination import between, in_singular_basis, lower_bound, pivots
@@ -90,7 +91,7 @@ class InjectivityJudge:
 def injectivity_judge(rows: ChartRows, centre: Array) -> InjectivityJudge:
     """The judge with the inverse of J at a point as its P."""
     J = rows(centre[None], centre[None]).centre[:, :, 0]
-    return InjectivityJudge(rows, np.linalg.pinv(J))
+    return InjectivityJudge(rows, np.asarray(np.linalg.pinv(J), dtype=float))
 
 
 def _all_positive(found: list[TaylorModel]) -> Array:
@@ -118,7 +119,7 @@ def _parts(J: TaylorModel) -> list[TaylorModel]:
     return [_chosen(J, slice(k, k + _AT_ONCE)) for k in range(0, J.remainder.shape[-1], _AT_ONCE)]
 
 
-def _chosen(J: TaylorModel, boxes: object) -> TaylorModel:
+def _chosen(J: TaylorModel, boxes: slice | NDArray[np.bool_]) -> TaylorModel:
     return TaylorModel(J.variables, J.coefficients[..., boxes], J.remainder[..., boxes])
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from orthocas.casadi_tools.batch import dense_function
@@ -26,7 +27,7 @@ from orthocas.parametrisations.product_basis import ProductFamily
 class Derivatives:
     """The derivatives of one order of all coordinates, as sums of a few basis functions."""
 
-    used: Array  #: numbers of the basis functions
+    used: NDArray[np.intp]  #: numbers of the basis functions
     table: Array  #: (multi-indices * r, used)
     sizes: Array  #: bounds of what the entries are sums of, same shape
     rounding: float  #: relative error of entries and of sums with them
@@ -49,7 +50,7 @@ class ProductRows:
         terms = np.array([(0,) * n, *family.terms])
         alone = np.flatnonzero(np.count_nonzero(terms, axis=1) == 1)
         q = ca.SX.sym("q", n)
-        values = ca.vertcat(*(family.basis(q)[int(k) - 1] for k in alone))
+        values = family.basis(q)[[int(k) - 1 for k in alone]]
         numbers = np.zeros((n, terms.max() + 1), dtype=int)
         for place, k in enumerate(alone):
             joint = int(np.flatnonzero(terms[k])[0])
@@ -78,9 +79,9 @@ class ProductRows:
     def dependences(self) -> set[int]:
         """The joints that J_xi depends on."""
         changing = self.orders[1]  # of J_xi
-        sizes = changing.sizes.reshape(-1, self.r, len(changing.used)).any(axis=(1, 2))
         indices = _multi_indices(self.terms.shape[1], 2)
-        return {i for index, there in zip(indices, sizes, strict=True) if there for i in index}
+        sizes = np.asarray(changing.sizes.reshape(len(indices), self.r * len(changing.used)).any(axis=1))
+        return {i for index, there in zip(indices, sizes.tolist(), strict=True) if there for i in index}
 
     def _rest(self, boxes: list[TaylorModel], half_widths: Array) -> Array:
         """Lagrange's bound of the terms of J_xi above degree 3, (r, n, boxes)."""
@@ -107,7 +108,7 @@ class ProductRows:
         high = self._products([np.abs(model.centre) + model.remainder for model in functions], every)
         return values, np.maximum(high - size, 0) + SUM * high + TINY
 
-    def _products(self, functions: list[Array], which: Array) -> Array:
+    def _products(self, functions: list[Array], which: NDArray[np.intp]) -> Array:
         """Products of one-joint functions, (terms, boxes)."""
         table = np.stack(functions)
         out = np.ones((len(which), table.shape[1]))

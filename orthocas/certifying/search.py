@@ -186,7 +186,7 @@ def distances(base: Subdivision, low: Array, high: Array) -> Array:
     """The scale s at which a copy of the whole about its centre first touches each box, (boxes,)."""
     middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
     gaps: Array = np.maximum(np.maximum(low - middle, middle - high), 0) / half
-    return gaps.max(axis=1)
+    return np.asarray(gaps.max(axis=1))
 
 
 def _shares(base: Subdivision, low: Array, high: Array) -> Array:

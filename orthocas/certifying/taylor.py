@@ -60,6 +60,11 @@ class TaylorModel:
         wide[places(self.variables, variables)] = self.coefficients
         return TaylorModel(variables, wide, self.remainder)
 
+    def on(self, shape: tuple[int, ...]) -> "TaylorModel":
+        """The same model for functions and boxes of another shape, to which its own is broadcast."""
+        wide = np.broadcast_to(self.coefficients, (len(self.coefficients), *shape))
+        return TaylorModel(self.variables, wide, np.broadcast_to(self.remainder, shape))
+
     def __neg__(self) -> "TaylorModel":
         return replace(self, coefficients=-self.coefficients)
 
@@ -142,12 +147,9 @@ def stacked(models: list[TaylorModel]) -> TaylorModel:
     """Models of the same shape as one, with a new first axis."""
     variables = tuple(sorted({v for model in models for v in model.variables}))
     shape = np.broadcast_shapes(*(model.remainder.shape for model in models))
-    parts = [model.over(variables) for model in models]
-    return TaylorModel(
-        variables,
-        np.stack([np.broadcast_to(part.coefficients, (len(part.coefficients), *shape)) for part in parts], axis=1),
-        np.stack([np.broadcast_to(part.remainder, shape) for part in parts]),
-    )
+    parts = [model.on(shape).over(variables) for model in models]
+    coefficients = np.stack([part.coefficients for part in parts], axis=1)
+    return TaylorModel(variables, coefficients, np.stack([part.remainder for part in parts]))
 
 
 def _more_uncertain(model: TaylorModel, error: Array) -> TaylorModel:

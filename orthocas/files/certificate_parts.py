@@ -17,7 +17,7 @@ _CORNERS = ("low", "high", "codes")
 
 def certificate_to_data(certificate: Certificate) -> tuple[dict[str, Any], dict[str, Stored]]:
     """A certificate as plain data and arrays."""
-    arrays = {}
+    arrays: dict[str, Stored] = {}
     for name in _TREES:
         tree: Subdivision | None = getattr(certificate, name)
         if tree is not None:
@@ -53,7 +53,7 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         _number(data, "conditioning"),
         injective,
         tuple(tuple(float(value) for value in point) for point in fold),
-        require_count("boxes of a certificate", data.get("boxes"), least=0),
+        require_count("boxes of a certificate", int(_number(data, "boxes")), least=0),
         _number(data, "seconds"),
     )
 
