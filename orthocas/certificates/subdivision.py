@@ -55,6 +55,11 @@ class Subdivision:
         return int((self.codes == PROVED).sum())
 
     @property
+    def open_count(self) -> int:
+        """Number of parts where nothing is proved."""
+        return int((self.codes == OPEN).sum())
+
+    @property
     def complete(self) -> bool:
         """Whether all parts are proved."""
         return not (self.codes == OPEN).any()

@@ -19,9 +19,9 @@ from orthocas.files.chart_file import fingerprint
 from orthocas.minimising.watch import Monitor, Progress, silent
 
 _SAMPLES = 20_000  # points where folds are looked for before the proof
-_INJECTIVE = Limits(boxes=4000, smallest=2.0**-6, first_failure=True)
+_INJECTIVE_BOXES = 1000  # for each scale of the domain that is tried
+_SCALES = tuple(0.9**k for k in range(25, -1, -1))
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
-_TRIES = 4  # to prove a box slightly smaller than what the search left over
 
 
 def certify(
@@ -83,7 +83,7 @@ def certify(
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
             judge_too = injectivity_judge(judge.rows, chart.problem.domain.centre)
-            injective = _one_to_one(judge_too, base, replace(_INJECTIVE, seconds=left), executor, monitor)
+            injective = _one_to_one(judge_too, base, left, executor, monitor)
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
     return so_far()
@@ -185,27 +185,28 @@ def _suspects(chart: Chart) -> Array:
 
 
 def _one_to_one(
-    judge: InjectivityJudge, base: Subdivision, limits: Limits, executor: Executor | None, monitor: Monitor
+    judge: InjectivityJudge, base: Subdivision, seconds: float, executor: Executor | None, monitor: Monitor
 ) -> Subdivision | None:
-    """The largest box around the centre that the judge accepts, with its parts, or None if none was found."""
-    search = Search(judge, base, limits, nearest_first(base), executor)
-    search.run(_shown(monitor, "one-to-one"))
-    scale = proved_scale(search.subdivision())
-    for _ in range(_TRIES):
-        if scale < limits.smallest:
-            break
-        part = _scaled(base, scale)
-        again = Search(judge, part, replace(limits, first_failure=False), largest_first(part), executor)
-        again.run(_shown(monitor, "one-to-one"))
-        if again.finished:
-            return again.subdivision()
-        scale *= 0.9
-    return None
+    """The largest of some boxes around the centre that the judge accepts, with its parts; None if it accepts none."""
+    end = time.monotonic() + seconds
+    best = None
+    low, high = 0, len(_SCALES)  # the scales before `low` are proved, those from `high` on are not
+    while low < high:
+        middle = (low + high) // 2
+        part = _scaled(base, _SCALES[middle])
+        limits = Limits(max(end - time.monotonic(), 0.0), _INJECTIVE_BOXES)
+        search = Search(judge, part, limits, largest_first(part), executor)
+        search.run(_shown(monitor, "one-to-one"))
+        if search.finished:
+            best, low = search.subdivision(), middle + 1
+        else:
+            high = middle
+    return best
 
 
 def _scaled(base: Subdivision, scale: float) -> Subdivision:
     middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
-    return base if scale == 1 else Subdivision.whole(middle - scale * half, middle + scale * half)
+    return Subdivision.whole(*((base.low, base.high) if scale == 1 else (middle - scale * half, middle + scale * half)))
 
 
 def proved_scale(parts: Subdivision) -> float:

@@ -62,6 +62,7 @@ class GraphRows:
 
     graph: TaylorGraph
     rows: int
+    allowance: float = 0.0  #: added to the remainders
 
     def __call__(
         self, joints: list[TaylorModel], half_widths: Array | None = None, variables: Variables = ()
@@ -71,7 +72,8 @@ class GraphRows:
         boxes = joints[0].remainder.shape
         entries = [entry.on(boxes) for entry in entries]
         flat = stacked([stacked(entries[k : k + self.rows]) for k in range(0, len(entries), self.rows)])
-        return TaylorModel(flat.variables, flat.coefficients.swapaxes(1, 2), flat.remainder.swapaxes(0, 1))
+        remainder = flat.remainder.swapaxes(0, 1) + self.allowance
+        return TaylorModel(flat.variables, flat.coefficients.swapaxes(1, 2), remainder)
 
 
 def chart_rows(chart: Chart) -> ChartRows:
@@ -87,13 +89,14 @@ def chart_rows(chart: Chart) -> ChartRows:
         raise CertifyError("a coordinate is scaled by 0, so it is constant, expected coordinates that vary")
     active = tuple(coordinates.active)
     q = ca.SX.sym("q", chart.n)
-    J_x = ca.densify(task_rows(chart.problem.task)(q)[:, list(active)])
+    rows, allowance = task_rows(chart.problem.task, chart.problem.domain)
+    J_x = ca.densify(rows(q)[:, list(active)])
     own, depends = _coordinate_rows(coordinates, q)
     variables = tuple(sorted({*_dependences(J_x, q), *depends}))
     if len(variables) > MOST_VARIABLES:
         raise CertifyError(f"the chart depends on {len(variables)} joints, expected at most {MOST_VARIABLES}")
     graph = TaylorGraph.of(dense_function("task_rows", [q], [J_x]), "the task")
-    return ChartRows(chart.n, chart.m, active, variables, GraphRows(graph, chart.m), own)
+    return ChartRows(chart.n, chart.m, active, variables, GraphRows(graph, chart.m, allowance), own)
 
 
 def joint_models(low: Array, high: Array, variables: Variables) -> tuple[list[TaylorModel], Array]:

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 
+import numpy as np
+
 from orthocas.certificates.certificate import Certificate
 from orthocas.certificates.subdivision import PROVED, Subdivision
 from orthocas.certifying.certify import require_same
@@ -49,7 +51,7 @@ def check_certificate(
     rows = chart_rows(chart)
     mapped: Mapped = map if executor is None else executor.map
     regular = _judged(RegularityJudge(rows, certificate.bound), certificate.regular, mapped, monitor)
-    signs = {int(sign) for verdicts in regular for sign in verdicts.sign[verdicts.sign != 0]}
+    signs = {int(sign) for verdicts in regular for sign in np.unique(verdicts.sign) if sign}
     least = min((float(verdicts.conditioning.min()) for verdicts in regular), default=0.0)
     holds = all(verdicts.proved.all() for verdicts in regular) and len(signs) < 2 and least >= certificate.conditioning
     if certificate.injective is None or not holds:

@@ -22,6 +22,8 @@ _ERROR = 32 * UNIT  # reduction 3 u, Horner's rule below 8 u, the rest of the se
 
 def sine_and_cosine(x: Array) -> tuple[Enclosed, Enclosed]:
     """Sine and cosine of numbers up to 1e6 in size."""
+    known = np.abs(x) <= _WIDEST_ANGLE
+    x = np.where(known, x, 0.0)
     turns = np.rint(x * (2 / np.pi))
     r = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]  # |r| < 0.79
     square = r * r
@@ -30,16 +32,18 @@ def sine_and_cosine(x: Array) -> tuple[Enclosed, Enclosed]:
     quarter = turns % 4
     sine = np.choose(quarter.astype(int), [s, c, -s, -c])
     cosine = np.choose(quarter.astype(int), [c, -s, -c, s])
-    error = np.where(np.abs(x) <= _WIDEST_ANGLE, _ERROR, np.inf)
+    error = np.where(known, _ERROR, np.inf)
     return (sine, error), (cosine, error)
 
 
 def exponential(x: Array) -> Enclosed:
     """e^x of numbers up to 700 in size."""
+    known = np.abs(x) <= _WIDEST_EXPONENT
+    x = np.where(known, x, 0.0)
     whole = np.rint(x * (1 / np.log(2.0)))
     r = (x - whole * _LN2[0]) - whole * _LN2[1]  # |r| < 0.35
     value = np.ldexp(_horner(r, [1 / factorial(k) for k in range(16)]), whole.astype(int))
-    return value, np.where(np.abs(x) <= _WIDEST_EXPONENT, _ERROR * value, np.inf)
+    return value, np.where(known, _ERROR * value, np.inf)
 
 
 def hyperbolic_tangent(x: Array) -> Enclosed:

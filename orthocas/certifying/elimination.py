@@ -22,7 +22,7 @@ def in_singular_basis(J: TaylorModel) -> tuple[TaylorModel, Array]:
     nonsingular, and the sign of their determinants is that of the computed ones.
     """
     Ut, V = singular_vectors(J)
-    signs = np.sign(np.linalg.det(Ut) * np.linalg.det(V)) * (_is_orthogonal(Ut) & _is_orthogonal(V))
+    signs = np.nan_to_num(np.sign(np.linalg.det(Ut) * np.linalg.det(V))) * (_is_orthogonal(Ut) & _is_orthogonal(V))
     return between(Ut, J, V), signs
 
 

@@ -21,7 +21,8 @@ class Verdicts:
     """What was found on each box."""
 
     proved: Array  #: (boxes,) bool
-    sign: Array  #: (boxes,) of det J at the middle of the box: +1, -1, or 0 where it is not certain
+    regular: Array  #: (boxes,) bool: det J has the sign below on the whole box
+    sign: Array  #: (boxes,) of det J at the middle of the box: +1, -1, or 0 where it is unclear
     conditioning: Array  #: (boxes,) lower bounds; 0 where none is known
     widest: Array  #: (boxes,) the joint to halve
 
@@ -54,7 +55,7 @@ class RegularityJudge:
         if self.bound > 0 and regular.any():
             conditioning[regular] = conditioning_bound(_chosen(J, regular), self.rows.m)
         proved = regular & (conditioning >= self.bound)
-        return proved, signs * _certain(turned), conditioning, _influences(turned)
+        return proved, regular, signs, conditioning, _influences(turned)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +86,7 @@ class InjectivityJudge:
         turned = between(vectors.transpose(0, 2, 1), symmetric, vectors)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             proved = _all_positive(pivots(turned))
-        return proved, np.zeros(boxes), np.zeros(boxes), _influences(turned)
+        return proved, proved, np.zeros(boxes), np.zeros(boxes), _influences(turned)
 
 
 def injectivity_judge(rows: ChartRows, centre: Array) -> InjectivityJudge:
@@ -98,13 +99,6 @@ def _all_positive(found: list[TaylorModel]) -> Array:
     """Whether all pivots have one sign on the box and the pivots of the middle are positive."""
     positive: Array = np.all([lower_bound(pivot) > 0 for pivot in found], axis=0)
     return positive
-
-
-def _certain(turned: TaylorModel) -> Array:
-    """Whether the middle of a box has a matrix so far from singular that rounding cannot change the sign of det."""
-    values = np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))]))
-    certain: Array = values.min(axis=0) > 1e-9 * values.max(axis=0)
-    return certain
 
 
 def _influences(turned: TaylorModel) -> Array:
@@ -124,5 +118,5 @@ def _chosen(J: TaylorModel, boxes: slice | NDArray[np.bool_]) -> TaylorModel:
 
 
 def _joined(parts: list[tuple[Array, ...]], variables: Variables) -> Verdicts:
-    proved, sign, conditioning, influences = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return Verdicts(proved, sign, conditioning, np.array(variables)[np.argmax(influences, axis=1)])
+    proved, regular, sign, conditioning, influences = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return Verdicts(proved, regular, sign, conditioning, np.array(variables)[np.argmax(influences, axis=1)])

@@ -12,7 +12,8 @@ from orthocas.certificates.subdivision import MOST_BOXES, OPEN, PROVED, Subdivis
 from orthocas.certifying.judges import Judge, Verdicts
 from orthocas.checks import Array
 
-BATCH = 256  #: boxes of one task
+BATCH = 512  #: most boxes of one task
+_SMALL = 32  # boxes; smaller tasks take longer for each
 _IN_FLIGHT = 8  # tasks of an executor at a time, so that its workers never wait
 Priority = Callable[[Array, Array], Array]  #: corners (boxes, n) -> numbers, smallest first
 Look = Callable[["Search"], None]  #: called after each batch
@@ -84,8 +85,11 @@ class Search:
         return (self.folded and self.limits.folds) or (behind and self.limits.first_failure)
 
     def visit(self, points: Array) -> None:
-        """Note the signs of det J at points (k, n)."""
-        self._note_signs(points, self.judge(points, points).sign)
+        """Note the signs of det J at points (k, n), where they are proved."""
+        found = self.judge(points, points)
+        for point, regular, sign in zip(points, found.regular, found.sign.tolist(), strict=True):
+            if regular and sign:
+                self.signs.setdefault(int(sign), point)
 
     def subdivision(self) -> Subdivision:
         """The tree so far."""
@@ -119,7 +123,12 @@ class Search:
             self._apply(pending.pop(future), verdicts)
 
     def _take(self) -> list[tuple[float, int, Array, Array]]:
-        return [heapq.heappop(self._waiting) for _ in range(min(BATCH, len(self._waiting)))]
+        return [heapq.heappop(self._waiting) for _ in range(self._batch_size())]
+
+    def _batch_size(self) -> int:
+        """As many boxes as there are, but enough tasks for all workers of an executor."""
+        waiting = len(self._waiting)
+        return min(BATCH, waiting if self.executor is None else max(waiting // _IN_FLIGHT, min(_SMALL, waiting)))
 
     def _return(self, batch: list[tuple[float, int, Array, Array]]) -> None:
         for box in batch:
@@ -129,7 +138,7 @@ class Search:
         """Close the boxes that are proved, and halve the others."""
         low, high = _corners(batch)
         self.judged += len(batch)
-        self._note_signs((low + high) / 2, verdicts.sign)
+        self._look_for_folds((low + high) / 2, verdicts.sign)
         proved = verdicts.proved
         if proved.any():
             self.conditioning = min(self.conditioning, float(verdicts.conditioning[proved].min()))
@@ -156,11 +165,12 @@ class Search:
             self._codes.append(OPEN)
             self._children.append(0)
 
-    def _note_signs(self, points: Array, signs: Array) -> None:
-        for sign in (-1, 1):
+    def _look_for_folds(self, points: Array, signs: Array) -> None:
+        """Visit a point for each sign that is new: signs at the middle of boxes without a proof are hints."""
+        for sign in {-1, 1} - set(self.signs):
             there = np.flatnonzero(signs == sign)
             if there.size:
-                self.signs.setdefault(sign, points[there[0]])
+                self.visit(points[there[:1]])
 
     def _preorder(self, root: int) -> list[int]:
         codes, waiting = [], [root]

@@ -1,26 +1,42 @@
 """The rows of the task Jacobian, in a form with bounds as sharp as possible.
 
 Rotating all rows of the Jacobian of a position does not change a determinant. In the axes of a body in the middle of
-the chain, each entry depends on fewer joints than in the axes of the world, so boxes can be larger (ours).
+the chain, each entry depends on fewer joints than in the axes of the world, so boxes can be larger (ours). The stored
+rotations of a robot are rotations up to rounding only. Each of the at most n factors then changes an entry by at most
+their deviation times the length of the chain, and an allowance covers all changes.
 """
 
 import casadi as ca
+import numpy as np
 
 from orthocas.casadi_tools.batch import dense_function
+from orthocas.certifying.rounding import UNIT
+from orthocas.domains import Domain
 from orthocas.robots.kinematics import Pose
 from orthocas.robots.spatial import constant, turn
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks import Task
 
 
-def task_rows(task: Task) -> ca.Function:
-    """q (n, 1) -> J_x (m, n), or C(q) J_x with det C = 1."""
-    if task.recipe["kind"] != "position:xyz":
-        return task.jacobian_function
+def task_rows(task: Task, domain: Domain) -> tuple[ca.Function, float]:
+    """q (n, 1) -> J_x (m, n), or C(q) J_x with det C = 1 up to an error of the entries, and that error."""
+    if task.recipe["kind"] != "position:xyz" or task.robot.tree.tip_parent < 0:
+        return task.jacobian_function, 0.0
     q = ca.SX.sym("q", task.robot.n)
     chain = _chain(task.robot.tree)
     choices = [position_jacobian(task.robot.tree, q, body) for body in chain]
-    return dense_function("task_rows", [q], [min(choices, key=lambda J: ca.jacobian(ca.vec(J), q).nnz())])
+    best = min(choices, key=lambda J: int(ca.jacobian(ca.vec(J), q).nnz()))
+    return dense_function("task_rows", [q], [best]), _allowance(task.robot.tree, domain)
+
+
+def _allowance(tree: KinematicTree, domain: Domain) -> float:
+    """A bound of what stored rotations change in an entry: 16 n deviations times the length of the chain."""
+    squares = tree.rotations.transpose(0, 2, 1) @ tree.rotations - np.eye(3)
+    deviation = 3 * float(np.abs(squares).max()) + 32 * UNIT
+    furthest = np.abs(domain.centre) + domain.half_width
+    slides = float(furthest[np.array(tree.prismatic)].sum())
+    length = float(np.abs(tree.translations).sum() + np.abs(tree.tip_translation).sum()) + slides + 1.0
+    return 16 * tree.n * deviation * length
 
 
 def position_jacobian(tree: KinematicTree, q: ca.SX, body: int) -> ca.SX:
@@ -41,7 +57,7 @@ def _chain(tree: KinematicTree) -> list[int]:
     while i >= 0:
         bodies.append(i)
         i = tree.parents[i]
-    return bodies[::-1] or [0]
+    return bodies[::-1]
 
 
 def _poses_in(tree: KinematicTree, q: ca.SX, body: int) -> dict[int, Pose]:

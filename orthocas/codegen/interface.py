@@ -45,6 +45,7 @@ def template_values(
         "task_labels": ", ".join(labels[: chart.m]),
         "extra_labels": ", ".join(labels[chart.m :]),
         "domain_lines": _domain_lines(joints, lower, upper),
+        "certificate": _certificate(chart),
         "domain_lower": _numbers(lower),
         "domain_upper": _numbers(upper),
         "domain_centre": _numbers(domain.centre),
@@ -103,6 +104,12 @@ def _control_values(controller: Controller) -> dict[str, str]:
 def _remark(controller: Controller, gain: str) -> str:
     units = controller.gain_units.get(gain)
     return "" if units is None else f" /* {_words([units])[0]} */"
+
+
+def _certificate(chart: Chart) -> str:
+    """What is proved of the chart in exact arithmetic; the code itself is compared with it on samples."""
+    known = chart.certificate
+    return "none" if known is None else f"{known.heading} ({known.method}, chart {known.fingerprint[:16]})"
 
 
 def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
