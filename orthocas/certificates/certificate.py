@@ -26,7 +26,9 @@ class Certificate(Shown):
     regular: Subdivision  #: the domain and its parts
     conditioning: float  #: proven lower bound of the conditioning on the proved share; 0 if none was asked for
     injective: Subdivision | None = None  #: a box on which phi is one-to-one, and its parts
-    fold: tuple[tuple[float, ...], ...] = ()  #: two joint positions where det J has opposite signs, if found
+    fold: tuple[
+        tuple[float, ...], ...
+    ] = ()  #: two joint positions where det J has opposite signs, if found; the second one lies in the fold
     boxes: int = 0  #: judged to find the proof
     seconds: float = field(default=0.0)
 
@@ -76,7 +78,7 @@ class Certificate(Shown):
 
     def _verdict(self) -> str:
         if self.fold:
-            a, b = (", ".join(f"{value:.3f}" for value in point) for point in self.fold)
-            return f"refuted: the chart folds, det J has opposite signs at q = ({a}) and ({b})"
+            at = ", ".join(f"{value:.3f}" for value in self.fold[-1])
+            return f"refuted, the chart folds at q = ({at})"
         where = "everywhere on the domain" if self.proved else f"on {100 * self.share:.4f} % of the domain"
         return f"no fold {where}, conditioning >= {self.bound:g}" if self.bound else f"no fold {where}"

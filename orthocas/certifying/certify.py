@@ -19,7 +19,7 @@ from orthocas.files.chart_file import fingerprint
 from orthocas.minimising.watch import Monitor, Progress, silent
 
 _SAMPLES = 20_000  # points where folds are looked for before the proof
-_INJECTIVE_BOXES = 1000  # for each scale of the domain that is tried
+_INJECTIVE_BOXES = 500  # for each scale of the domain that is tried
 _SCALES = tuple(0.9**k for k in range(25, -1, -1))
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
