@@ -26,9 +26,7 @@ class Certificate(Shown):
     regular: Subdivision  #: the domain and its parts
     conditioning: float  #: proven lower bound of the conditioning on the proved share; 0 if none was asked for
     injective: Subdivision | None = None  #: a box on which phi is one-to-one, and its parts
-    fold: tuple[
-        tuple[float, ...], ...
-    ] = ()  #: two joint positions where det J has opposite signs, if found; the second one lies in the fold
+    fold: tuple[tuple[float, ...], ...] = ()  #: two joint positions where det J differs in sign, the second in the fold
     boxes: int = 0  #: judged to find the proof
     seconds: float = field(default=0.0)
 
