@@ -38,23 +38,27 @@ def reciprocal(model: TaylorModel) -> TaylorModel:
 def square_root(model: TaylorModel) -> TaylorModel:
     """The model of sqrt f. Nothing is known where f may be zero or negative."""
     x, e = model.centre, model.deviation()
-    low = x - e * UP - x * _ROUNDINGS
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         root = np.sqrt(x)
         values = np.stack([root, 1 / (2 * root), -1 / (8 * x * root), 1 / (16 * x * x * root)])
-        tail = np.where(low > 0, 5 / 128 * e**4 / (low**3 * np.sqrt(low)), np.inf)
+        tail = root * _decreasing(5 / 128, e / x)
         return model.composed(Series(values, _ROUNDINGS * np.abs(values), tail * UP))
 
 
 def reciprocal_square_root(model: TaylorModel) -> TaylorModel:
     """The model of 1 / sqrt f. Nothing is known where f may be zero or negative."""
     x, e = model.centre, model.deviation()
-    low = x - e * UP - x * _ROUNDINGS
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         root = 1 / np.sqrt(x)
         values = np.stack([root, -root / (2 * x), 3 * root / (8 * x * x), -5 * root / (16 * x * x * x)])
-        tail = np.where(low > 0, 35 / 128 * e**4 / (low**4 * np.sqrt(low)), np.inf)
+        tail = root * _decreasing(35 / 128, e / x)
         return model.composed(Series(values, _ROUNDINGS * np.abs(values), tail * UP))
+
+
+def _decreasing(first: float, ratio: Array) -> Array:
+    """The rest of a power series from degree 4 on, if its coefficients decrease from `first` on in size."""
+    rest: Array = np.where((ratio >= 0) & (ratio < 1 - 1e-9), first * ratio**4 / (1 - ratio * UP), np.inf)
+    return rest
 
 
 def exponent(model: TaylorModel) -> TaylorModel:
