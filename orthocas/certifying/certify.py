@@ -12,7 +12,7 @@ from orthocas.certifying.chart_rows import chart_rows
 from orthocas.certifying.judges import InjectivityJudge, RegularityJudge, injectivity_judge
 from orthocas.certifying.search import Limits, Look, Search, distances, largest_first, nearest_first
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_kind
+from orthocas.checks import Array, as_number, require_at_least, require_kind
 from orthocas.domains import Box, Domain, reach
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.files.chart_file import fingerprint
@@ -67,9 +67,10 @@ def certify(
         (True, 1.0)
     """
     start = time.monotonic()
-    judge = RegularityJudge(chart_rows(chart), checked_bound(chart, bound))
+    limits = Limits(seconds=checked_options(chart, time_limit, executor))
+    bound = checked_bound(chart, bound)
+    judge = RegularityJudge(chart_rows(chart), bound)
     base = whole_domain(chart.problem.domain) if resume is None else _resumed(chart, bound, resume)
-    limits = Limits(seconds=np.inf if time_limit is None else time_limit)
     search = Search(judge, base, limits, largest_first(base), executor)
     injective: Subdivision | None = None
 
@@ -77,8 +78,7 @@ def certify(
         return _certificate(chart, bound, search, injective, time.monotonic() - start, resume)
 
     try:
-        if resume is None:
-            search.visit(_suspects(chart))
+        search.visit(_suspects(chart))
         search.run(_shown(monitor, "regular"))
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
@@ -118,9 +118,9 @@ def certified_box(
         >>> bool((oc.certified_box(chart).half_width == chart.problem.domain.half_width).all())
         True
     """
+    limits = replace(_LARGEST_BOX, seconds=checked_options(chart, time_limit, executor))
     judge = RegularityJudge(chart_rows(chart), checked_bound(chart, bound))
     base = whole_domain(chart.problem.domain)
-    limits = replace(_LARGEST_BOX, seconds=np.inf if time_limit is None else time_limit)
     search = Search(judge, base, limits, nearest_first(base), executor)
     search.run(_shown(monitor, "largest box"))
     scale = proved_scale(search.subdivision())
@@ -130,16 +130,28 @@ def certified_box(
     return Box(domain.centre, domain.half_width * (scale if scale == 1 else scale * (1 - 1e-9)))
 
 
+def checked_options(chart: Chart, time_limit: float | None, executor: Executor | None) -> float:
+    """Seconds of a time limit, inf for none. Chart and executor are checked as well."""
+    require_kind("chart", chart, Chart)
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise InvalidValueError("executor", f"a {type(executor).__name__}", "an executor with a method submit, or None")
+    if time_limit is None:
+        return float("inf")
+    require_at_least("time_limit", time_limit, 0)
+    return as_number("time_limit", time_limit)
+
+
 def checked_bound(chart: Chart, bound: float) -> float:
     """A bound of the conditioning, checked."""
-    if not isinstance(bound, int | float) or not 0 <= bound < 1:
+    bound = as_number("bound", bound)
+    if not 0 <= bound < 1:
         raise InvalidValueError("bound", bound, "a number from 0 to below 1")
     if bound > 0 and not chart.problem.metric.is_identity:
         metric = chart.problem.metric.name
         raise CertifyError(
             f"bound is {bound:g} with metric {metric}, expected 0: conditioning is proved for the Euclidean metric"
         )
-    return float(bound)
+    return bound
 
 
 def whole_domain(domain: Domain) -> Subdivision:

@@ -7,7 +7,7 @@ import numpy as np
 
 from orthocas.certificates.certificate import Certificate
 from orthocas.certificates.subdivision import PROVED, Subdivision
-from orthocas.certifying.certify import require_same
+from orthocas.certifying.certify import checked_options, require_same
 from orthocas.certifying.chart_rows import chart_rows
 from orthocas.certifying.judges import Judge, RegularityJudge, Verdicts, injectivity_judge
 from orthocas.chart import Chart
@@ -44,6 +44,7 @@ def check_certificate(
         >>> oc.check_certificate(chart, oc.certify(chart))
         True
     """
+    checked_options(chart, None, executor)
     certificate = chart.certificate if certificate is None else certificate
     if certificate is None:
         raise CertifyError("the chart has no certificate, expected one made by `certify`")
