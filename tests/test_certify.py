@@ -232,19 +232,22 @@ def test_regular_charts_are_certified_and_checked(build: Callable[[], oc.Chart])
     assert oc.check_certificate(known, certificate)
 
 
-def test_a_million_points_near_the_worst_corners_do_not_refute_a_proof() -> None:
-    known = chart(0.4)
-    certificate = certified(0.4)
+@pytest.mark.parametrize(("build", "rounds"), [(lambda: fitted().chart, 10), (lambda: chart(0.4), 1)])
+def test_a_million_points_near_the_worst_corners_do_not_refute_a_proof(
+    build: Callable[[], oc.Chart], rounds: int
+) -> None:
+    known = build()
+    certificate = certified(0.4) if known is chart(0.4) else oc.certify(known)
     assert certificate.proved
     rng = np.random.default_rng(RNG)
     low, high = certificate.regular.leaves(PROVED)
-    corners = np.where(rng.integers(0, 2, (20_000, 7)), *(a[rng.integers(0, len(a), 20_000)] for a in (low, high)))
+    ends = (parts[rng.integers(0, len(low), 5000)] for parts in (low, high))
+    corners = np.where(rng.integers(0, 2, (5000, known.n)), *ends)
     sign = np.sign(np.linalg.det(known.jacobian(known.problem.domain.centre)))
-    volumes = np.linalg.det(known.jacobian(corners)) * sign
-    worst = corners[np.argsort(volumes)[:1000]]
+    worst = corners[np.argsort(np.linalg.det(known.jacobian(corners)) * sign)[:1000]]
     domain = known.problem.domain
-    for _ in range(10):
-        near = np.repeat(worst, 100, axis=0) + rng.normal(size=(100_000, 7)) * 0.01
+    for _ in range(rounds):
+        near = np.repeat(worst, 100, axis=0) + rng.normal(size=(100_000, known.n)) * 0.01
         near = np.clip(near, domain.centre - domain.half_width, domain.centre + domain.half_width)
         assert (np.linalg.det(known.jacobian(near)) * sign > 0).all()
 
@@ -462,3 +465,19 @@ def test_a_damaged_certificate_is_a_damaged_file(tmp_path: Path, monkeypatch: py
     known.save(tmp_path / "a.chart")
     with pytest.raises(ChartFileError, match="codes"):
         oc.load(tmp_path / "a.chart")
+
+
+def test_dask_shares_the_work() -> None:
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None) as client,
+        client.get_executor() as executor,
+    ):
+        assert oc.certify(chart(), executor=executor).regular.codes.tolist() == certified().regular.codes.tolist()
+
+
+def test_the_command_names_a_missing_scheduler(tmp_path: Path) -> None:
+    chart().save(tmp_path / "a.chart")
+    done = command("certify", tmp_path / "a.chart", "--scheduler", "tcp://127.0.0.1:1")
+    assert done.exit_code != 0
+    assert isinstance(done.exception, CertifyError)
