@@ -6,6 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.certifying.chart_rows import ChartRows
 from orthocas.certifying.elimination import between, in_singular_basis, lower_bound, pivots
 from orthocas.certifying.monomials import Variables
@@ -44,8 +45,9 @@ class RegularityJudge:
 
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
-        J = self.rows(low, high)
-        return _joined([self._few(part) for part in _parts(J)], self.rows.variables)
+        with one_blas_thread():  # small products, and the same rounding everywhere
+            J = self.rows(low, high)
+            return _joined([self._few(part) for part in _parts(J)], self.rows.variables)
 
     def _few(self, J: TaylorModel) -> tuple[Array, ...]:
         turned, signs = in_singular_basis(J)
@@ -71,8 +73,9 @@ class InjectivityJudge:
 
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
-        J = self.rows(low, high)
-        return _joined([self._few(part) for part in _parts(J)], self.rows.variables)
+        with one_blas_thread():  # small products, and the same rounding everywhere
+            J = self.rows(low, high)
+            return _joined([self._few(part) for part in _parts(J)], self.rows.variables)
 
     def _few(self, J: TaylorModel) -> tuple[Array, ...]:
         boxes = J.remainder.shape[-1]
