@@ -13,8 +13,9 @@ from orthocas.certifying.judges import Judge, Verdicts
 from orthocas.checks import Array
 
 BATCH = 512  #: most boxes of one task
-_SMALL = 32  # boxes; smaller tasks take longer for each
-_IN_FLIGHT = 8  # tasks of an executor at a time, so that its workers never wait
+_SMALL = 128  # boxes; smaller tasks take longer for each
+_TASKS = 8  # that the waiting boxes are cut into if they are few
+_IN_FLIGHT = 64  # most tasks of an executor at a time
 Priority = Callable[[Array, Array], Array]  #: corners (boxes, n) -> numbers, smallest first
 Look = Callable[["Search"], None]  #: called after each batch
 
@@ -128,7 +129,7 @@ class Search:
     def _batch_size(self) -> int:
         """As many boxes as there are, but enough tasks for all workers of an executor."""
         waiting = len(self._waiting)
-        return min(BATCH, waiting if self.executor is None else max(waiting // _IN_FLIGHT, min(_SMALL, waiting)))
+        return min(BATCH, waiting if self.executor is None else max(waiting // _TASKS, min(_SMALL, waiting)))
 
     def _return(self, batch: list[tuple[float, int, Array, Array]]) -> None:
         for box in batch:
