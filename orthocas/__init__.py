@@ -16,6 +16,8 @@ if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
 from orthocas import control, errors, parametrisations, problems, simulation, solvers
+from orthocas.certificates import Certificate
+from orthocas.certifying import certified_box, certify, check_certificate
 from orthocas.chart import Chart, GrownChart, load
 from orthocas.codegen import generate_c
 from orthocas.comparing.compare import compare
@@ -48,6 +50,7 @@ __all__ = [
     "MLP",
     "SEW",
     "Box",
+    "Certificate",
     "Chart",
     "Comparison",
     "Fit",
@@ -64,7 +67,10 @@ __all__ = [
     "Task",
     "Torus",
     "Weights",
+    "certified_box",
+    "certify",
     "check",
+    "check_certificate",
     "compare",
     "contains",
     "control",

@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
+from orthocas.certificates.certificate import Certificate
 from orthocas.checks import Array, as_path, as_point_set, require_at_least, require_kind, require_known, require_shape
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.inverse import NewtonInverse, error_scale, require_solved
 from orthocas.coordinates.map import CoordinateMap, InvertibleMap
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.files.chart_file import read_chart, write_chart
+from orthocas.files.chart_file import fingerprint, read_chart, write_chart
 from orthocas.growing import GrownCoordinates
 from orthocas.judging.pointwise import PointQuality, point_quality
 from orthocas.problem import Problem, task_jacobians, task_sizes
@@ -51,6 +52,7 @@ class Chart(Shown):
     problem: Problem
     coordinates: CoordinateMap
     notes: Mapping[str, str | float] = field(default_factory=dict)  #: how it was made: solver, weights, seed, ...
+    certificate: Certificate | None = None  #: a proof that it does not fold, see `orthocas.certify`
 
     def __post_init__(self) -> None:
         require_kind("problem", self.problem, Problem)
@@ -59,6 +61,8 @@ class Chart(Shown):
             raise InvalidValueError("coordinates", f"a {type(self.coordinates).__name__}", "those of a chart")
         require_kind("notes", self.notes, Mapping)
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
+        if self.certificate is not None:
+            self.certificate.require_for(fingerprint(self.problem, self.coordinates))
 
     def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
         """Pickle and copy the fields, with the notes as a plain dict: a read-only mapping supports neither."""
@@ -93,6 +97,7 @@ class Chart(Shown):
             "parameters": str(self.coordinates.size),
             **{name: problem[name] for name in ("task", "metric", "domain")},
             **({"made by": made} if made else {}),
+            **({"certificate": self.certificate.heading} if self.certificate else {}),
         }
 
     @property
@@ -232,7 +237,7 @@ class Chart(Shown):
             ChartFileError: if the folder is missing or cannot be written, if there is a file that is no chart, or a
                 symbolic link.
         """
-        write_chart(as_path("path", path), self.problem, self.coordinates, self.notes, force)
+        write_chart(as_path("path", path), self.problem, self.coordinates, self.notes, self.certificate, force)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -190,3 +190,7 @@ class NotInvolutiveError(GrowError):
 
 class NoExpressionError(OrthocasError, TypeError):
     """A chart has no closed-form CasADi expression."""
+
+
+class CertifyError(OrthocasError, ValueError):
+    """A chart cannot be certified, or a stored certificate does not belong to it."""

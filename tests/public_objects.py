@@ -1,7 +1,7 @@
 """One of every public object, small and quick to build, and the numbers that tell whether two of them are equal."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from functools import cache, singledispatch
 from pathlib import Path
@@ -114,7 +114,13 @@ def generated_c() -> Any:
         return oc.generate_c(fitted().chart, Path(folder) / "c")
 
 
+@cache
+def certificate() -> oc.Certificate:
+    return oc.certify(fitted().chart)
+
+
 CHARTS: dict[str, Callable[[], oc.Chart]] = {
+    "certified chart": lambda: replace(fitted().chart, certificate=certificate()),
     "polynomial chart": lambda: fitted().chart,
     "linear chart": lambda: oc.fit(planar(), oc.Linear()).chart,
     "Fourier chart": lambda: oc.fit(planar(), oc.Fourier(1), samples=300).chart,
@@ -137,6 +143,7 @@ CONTROLLERS: dict[str, Callable[[], Controller]] = {
 OBJECTS: dict[str, Callable[[], Any]] = {
     **CHARTS,
     **CONTROLLERS,
+    "certificate": certificate,
     "fit": fitted,
     "robot": lambda: planar().robot,
     "task": lambda: planar().task,

@@ -4,6 +4,7 @@ import numpy as np
 import typer
 
 from orthocas.casadi_tools.interrupts import ended_in_order
+from orthocas.cli.certify import certify
 from orthocas.cli.codegen import codegen
 from orthocas.cli.compare import compare
 from orthocas.cli.entry import INTERRUPTED
@@ -24,6 +25,7 @@ app = typer.Typer(
 )
 app.command()(fit)
 app.command()(evaluate)
+app.command()(certify)
 app.command()(info)
 app.command()(compare)
 app.command()(reproduce)

@@ -5,6 +5,7 @@ from typing import Any
 
 from orthocas import problems
 from orthocas.chart import Chart
+from orthocas.cli.certify import as_dict
 from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.cli.problem_argument import (
     Locks,
@@ -41,6 +42,7 @@ def info(
             "parametrisation": chart.coordinates.label,
             "parameters": chart.coordinates.size,
             "notes": dict(chart.notes),
+            **({"certificate": as_dict(chart.certificate)} if chart.certificate else {}),
         }
     if json:
         print_json(data)

@@ -24,7 +24,7 @@ def template_values(
     chart: Chart, controller: Controller | None, name: str, kernels: Kernels, stack_bytes: int
 ) -> dict[str, str]:
     """The values of all placeholders in the templates."""
-    problem, n = chart.problem, chart.n
+    problem = chart.problem
     domain = problem.domain
     lower, upper = borders(domain)
     somewhere = np.round(domain.centre + 0.5 * domain.half_width, 3)
@@ -36,15 +36,13 @@ def template_values(
         "title": _title(chart, controller),
         "version": VERSION,
         "casadi_version": ca.CasadiMeta.version(),
-        "n": str(n),
-        "m": str(chart.m),
-        "r": str(chart.r),
-        "nn": str(n * n),
+        **_sizes(chart),
         "joint_list": ", ".join(joints),
         "joint_lines": "\n".join(f" *   {i} {joint}{slides[i]}" for i, joint in enumerate(joints)),
         "task_labels": ", ".join(labels[: chart.m]),
         "extra_labels": ", ".join(labels[chart.m :]),
         "domain_lines": _domain_lines(joints, lower, upper),
+        "certificate": _certificate(chart),
         "domain_lower": _numbers(lower),
         "domain_upper": _numbers(upper),
         "domain_centre": _numbers(domain.centre),
@@ -64,6 +62,11 @@ def template_values(
     for template in ("control.h", "control.c", "control.md"):
         values[template.replace(".", "_")] = "" if controller is None else filled(template, values)
     return values
+
+
+def _sizes(chart: Chart) -> dict[str, str]:
+    sizes = {"n": chart.n, "m": chart.m, "r": chart.r, "nn": chart.n**2}
+    return {name: str(size) for name, size in sizes.items()}
 
 
 def _words(names: Iterable[str]) -> list[str]:
@@ -103,6 +106,12 @@ def _control_values(controller: Controller) -> dict[str, str]:
 def _remark(controller: Controller, gain: str) -> str:
     units = controller.gain_units.get(gain)
     return "" if units is None else f" /* {_words([units])[0]} */"
+
+
+def _certificate(chart: Chart) -> str:
+    """What is proved of the chart in exact arithmetic; the code itself is compared with it on samples."""
+    known = chart.certificate
+    return "none" if known is None else f"{known.heading} ({known.method}, chart {known.fingerprint[:16]})"
 
 
 def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:

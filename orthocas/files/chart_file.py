@@ -1,5 +1,7 @@
 """The content of a chart file: robot model, task, metric, domain, and the fitted or grown coordinates."""
 
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -9,14 +11,16 @@ import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.tape import from_tape, require_tape, to_tape
+from orthocas.certificates import Certificate
 from orthocas.checks import require_count, require_known, require_text
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.domains import Box, Domain, Torus, sample_uniform
 from orthocas.errors import ChartFileError, InvalidValueError, OrthocasError
 from orthocas.files.archive import Kind, read_archive, write_archive
+from orthocas.files.certificate_parts import certificate_from_data, certificate_to_data
 from orthocas.files.json import part
-from orthocas.files.npy import Stored
+from orthocas.files.npy import Stored, to_npy
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
 from orthocas.parametrisations import JointSpace, parametrisation_from_data, parametrisation_to_data
@@ -31,13 +35,36 @@ _LEAF = "leaf_"  # prefix of the names of arrays that belong to a base leaf
 
 
 def write_chart(
-    path: str | Path, problem: Problem, coordinates: CoordinateMap, notes: Notes, force: bool = False
+    path: str | Path,
+    problem: Problem,
+    coordinates: CoordinateMap,
+    notes: Notes,
+    certificate: Certificate | None = None,
+    force: bool = False,
 ) -> None:
     """Write a chart. `orthocas.files.archive` describes the container.
 
     Raises:
         ChartFileError: if the file cannot be written, or would replace something other than a chart without `force`.
     """
+    header, arrays = _content(problem, coordinates)
+    if certificate is not None:
+        header["certificate"], proof = certificate_to_data(certificate)
+        arrays |= proof
+    write_archive(path, CHART, {**header, "notes": _checked_notes(notes)}, arrays, force)
+
+
+def fingerprint(problem: Problem, coordinates: CoordinateMap) -> str:
+    """A digest of all that defines the chart: robot, task, metric, domain and coordinates, but no notes."""
+    header, arrays = _content(problem, coordinates)
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        digest.update(name.encode() + hashlib.sha256(to_npy(arrays[name])).digest())
+    return digest.hexdigest()
+
+
+def _content(problem: Problem, coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
+    """Header and arrays of a chart, without notes."""
     tree = problem.robot.tree
     numbers = {f.name: getattr(tree, f.name) for f in fields(tree)}
     arrays = {f"robot_{name}": value for name, value in numbers.items() if isinstance(value, np.ndarray)}
@@ -54,12 +81,11 @@ def write_chart(
             **({"unbounded": list(problem.domain.unbounded)} if isinstance(problem.domain, Box) else {}),
         },
         "coordinates": description,
-        "notes": _checked_notes(notes),
     }
-    write_archive(path, CHART, header, arrays, force)
+    return header, arrays
 
 
-def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:
+def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certificate | None]:
     """Read a chart back.
 
     Raises:
@@ -73,13 +99,25 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes]:
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
         _require_finite(problem, coordinates)
-        return problem, coordinates, _checked_notes(part(header, "notes", dict))
+        certificate = _certificate(problem, coordinates, header, arrays)
+        return problem, coordinates, _checked_notes(part(header, "notes", dict)), certificate
     except ChartFileError:
         raise
     except OrthocasError as error:
         raise ChartFileError(f"{path} is inconsistent: {error}") from None
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
         raise ChartFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
+
+
+def _certificate(
+    problem: Problem, coordinates: CoordinateMap, header: Mapping[str, Any], arrays: Mapping[str, Stored]
+) -> Certificate | None:
+    """The certificate of the file, if it has one, and only if it belongs to the chart."""
+    if "certificate" not in header:
+        return None
+    certificate = certificate_from_data(part(header, "certificate", dict), arrays, problem.n)
+    certificate.require_for(fingerprint(problem, coordinates))
+    return certificate
 
 
 def _checked_notes(notes: Notes) -> dict[str, str | float]:

@@ -1,0 +1,82 @@
+"""Certificates: what was proved of a chart, with all that is needed to check it again."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from orthocas.certificates.subdivision import OPEN, Subdivision
+from orthocas.checks import Array, require_kind, require_text
+from orthocas.errors import CertifyError, InvalidValueError
+from orthocas.showing import Shown, number_list
+
+METHOD = "taylor-3/1"  #: of this version; certificates of other methods cannot be checked
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Certificate(Shown):
+    """A proof about the chart with this fingerprint; see `orthocas.certify`.
+
+    The parts of `regular` that are proved cover a share of the domain on which det J has one sign and, if `bound` is
+    above 0, the conditioning is at least `bound`. On the box `injective`, two different q never share phi.
+    """
+
+    fingerprint: str  #: of all that defines J
+    method: str
+    bound: float  #: of the conditioning; 0: det J != 0 only
+    regular: Subdivision  #: the domain and its parts
+    conditioning: float  #: proven lower bound of the conditioning on the proved share; 0 if none was asked for
+    injective: Subdivision | None = None  #: a box on which phi is one-to-one, and its parts
+    fold: tuple[tuple[float, ...], ...] = ()  #: two joint positions where det J differs in sign, the second in the fold
+    boxes: int = 0  #: judged to find the proof
+    seconds: float = field(default=0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("fingerprint", "method"):
+            require_text(name, getattr(self, name))
+        require_kind("regular", self.regular, Subdivision)
+        if not 0 <= self.bound < 1 or not 0 <= self.conditioning <= 1:
+            raise InvalidValueError("bound and conditioning", (self.bound, self.conditioning), "numbers from 0 to 1")
+
+    def require_for(self, fingerprint: str) -> None:
+        """Raise CertifyError if the certificate is not one of the chart with this fingerprint."""
+        if self.fingerprint != fingerprint:
+            raise CertifyError("the certificate is void: it was made for another chart, or the chart has changed")
+
+    @property
+    def proved(self) -> bool:
+        """Whether the proof covers the whole domain."""
+        return self.regular.complete and not self.fold
+
+    @property
+    def share(self) -> float:
+        """Share of the domain's volume that is proved."""
+        return 0.0 if self.fold else self.regular.share
+
+    @property
+    def unproved(self) -> tuple[Array, Array]:
+        """Corners (boxes, n) of the parts where nothing is proved."""
+        return self.regular.leaves(OPEN)
+
+    def facts(self) -> dict[str, str]:
+        """What is proved, of how many boxes, and what is not."""
+        facts = {"certificate": self._verdict()}
+        if self.conditioning > 0:
+            facts["conditioning"] = f"at least {self.conditioning:.3g} there"
+        if self.injective is not None:
+            half = (self.injective.high - self.injective.low) / 2
+            facts["one-to-one"] = f"on the box of half-width {number_list(half)} around the centre"
+        low, high = self.unproved
+        if len(low) and not self.fold:
+            largest = int(np.argmax((high - low).prod(axis=1)))
+            at = number_list((low[largest] + high[largest]) / 2)
+            facts["not proved"] = f"{len(low)} boxes, the largest at q = ({at})"
+        facts["boxes"] = f"{self.regular.proved_count} proved, {self.boxes} judged, {self.seconds:.3g} s"
+        facts["method"] = f"{self.method}, chart {self.fingerprint[:12]}"
+        return facts
+
+    def _verdict(self) -> str:
+        if self.fold:
+            at = ", ".join(f"{value:.3f}" for value in self.fold[-1])
+            return f"refuted, the chart folds at q = ({at})"
+        where = "everywhere on the domain" if self.proved else f"on {100 * self.share:.4f} % of the domain"
+        return f"no fold {where}, conditioning >= {self.bound:g}" if self.bound else f"no fold {where}"

@@ -1,0 +1,13 @@
+"""Proofs that charts do not fold, by rigorous arithmetic on boxes.
+
+- `certify` has the user's functions, `check` checks a certificate again; `orthocas.certificates` has the result.
+- `search` halves boxes, and `judges` decide on each.
+- `chart_rows` gives J on boxes as Taylor models, from `task_rows` and `product_rows`.
+- `elimination` and `volume` bound determinants and the conditioning.
+- `taylor`, `monomials`, `functions`, `elementary` and `graph` are the arithmetic; `rounding` says what it assumes.
+"""
+
+from orthocas.certifying.certify import certified_box, certify
+from orthocas.certifying.check import check_certificate
+
+__all__ = ["certified_box", "certify", "check_certificate"]

@@ -1,0 +1,263 @@
+"""Certify charts: prove with rigorous arithmetic that they do not fold, and where they are one-to-one (ours)."""
+
+import time
+from concurrent.futures import Executor
+from dataclasses import replace
+
+import numpy as np
+
+from orthocas.certificates.certificate import METHOD, Certificate
+from orthocas.certificates.subdivision import OPEN, Subdivision
+from orthocas.certifying.chart_rows import chart_rows
+from orthocas.certifying.judges import InjectivityJudge, RegularityJudge, injectivity_judge
+from orthocas.certifying.search import Limits, Look, Search, distances, largest_first, nearest_first
+from orthocas.chart import Chart
+from orthocas.checks import Array, as_number, require_at_least, require_kind
+from orthocas.domains import Box, Domain, reach
+from orthocas.errors import CertifyError, Interrupted, InvalidValueError
+from orthocas.files.chart_file import fingerprint
+from orthocas.minimising.watch import Monitor, Progress, silent
+
+_SAMPLES = 20_000  # points where folds are looked for before the proof
+_INJECTIVE_BOXES = 500  # for each scale of the domain that is tried
+_SCALES = tuple(0.9**k for k in range(25, -1, -1))
+_LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
+
+
+def certify(
+    chart: Chart,
+    bound: float = 0.0,
+    *,
+    time_limit: float | None = None,
+    executor: Executor | None = None,
+    monitor: Monitor = silent,
+    resume: Certificate | None = None,
+) -> Certificate:
+    """Prove that a chart does not fold: det J has one sign on its domain, and the conditioning is above a bound.
+
+    The domain is halved again and again, until J is proved nonsingular on each part: by Taylor models of degree 3 with
+    remainders that include all rounding, taken to the singular vectors of their centre, and elimination. The robot's
+    numbers and those of the chart are taken as they are in the file. Samples are no part of the proof; they only find
+    folds early. Also proved is the largest box, a scaled copy of the domain, on which phi is one-to-one by a
+    sufficient condition: the symmetric part of J(centre)^-1 J(q) is positive definite.
+
+    Args:
+        chart: a fitted chart.
+        bound: bound of the conditioning as in `evaluate`, from 0 (det J != 0 only) to below 1; Euclidean metric only.
+            The condition used is sufficient, and misses 15 to 35 % of the true conditioning.
+        time_limit: seconds after which the certificate holds the share proved so far.
+        executor: shares the work, for example `concurrent.futures.ProcessPoolExecutor`, or
+            `distributed.Client(...).get_executor()` of Dask. Default: this process.
+        monitor: called with progress.
+        resume: an unfinished certificate of the same chart and bound, to go on from.
+
+    Returns:
+        What is proved and what is not. `certificate.proved` tells whether it is everything.
+
+    Raises:
+        CertifyError: if the chart is grown, uses operations without proven bounds, or `resume` belongs to another one.
+        Interrupted: after Ctrl-C; `result` is the certificate so far.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> certificate = oc.certify(chart)
+        >>> certificate.proved, certificate.share
+        (True, 1.0)
+    """
+    start = time.monotonic()
+    limits = Limits(seconds=checked_options(chart, time_limit, executor))
+    bound = checked_bound(chart, bound)
+    judge = RegularityJudge(chart_rows(chart), bound)
+    base = whole_domain(chart.problem.domain) if resume is None else _resumed(chart, bound, resume)
+    search = Search(judge, base, limits, largest_first(base), executor)
+    injective: Subdivision | None = None
+
+    def so_far() -> Certificate:
+        return _certificate(chart, bound, search, injective, time.monotonic() - start, resume)
+
+    try:
+        search.visit(_suspects(chart))
+        search.run(_shown(monitor, "regular"))
+        left = limits.seconds - (time.monotonic() - start)
+        if search.finished and left > 0:
+            judge_too = injectivity_judge(judge.rows, chart.problem.domain.centre)
+            injective = _one_to_one(judge_too, base, left, executor, monitor)
+    except KeyboardInterrupt:
+        raise Interrupted(so_far()) from None
+    return so_far()
+
+
+def certified_box(
+    chart: Chart,
+    bound: float = 0.0,
+    *,
+    time_limit: float | None = None,
+    executor: Executor | None = None,
+    monitor: Monitor = silent,
+) -> Box:
+    """The largest box around the domain's centre, with its proportions, on which the chart is proved not to fold.
+
+    Largest up to what the bounds resolve: parts are halved down to 1/64 of the domain's widths.
+
+    Args:
+        chart: a fitted chart; it may fold elsewhere.
+        bound: bound of the conditioning, see `certify`.
+        time_limit: seconds after which the box proved so far is returned.
+        executor: shares the work, see `certify`.
+        monitor: called with progress.
+
+    Raises:
+        CertifyError: as `certify`, and if nothing is proved around the centre.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> bool((oc.certified_box(chart).half_width == chart.problem.domain.half_width).all())
+        True
+    """
+    limits = replace(_LARGEST_BOX, seconds=checked_options(chart, time_limit, executor))
+    judge = RegularityJudge(chart_rows(chart), checked_bound(chart, bound))
+    base = whole_domain(chart.problem.domain)
+    search = Search(judge, base, limits, nearest_first(base), executor)
+    search.run(_shown(monitor, "largest box"))
+    scale = proved_scale(search.subdivision())
+    if scale == 0:
+        raise CertifyError("nothing is proved around the centre of the domain, expected a chart that is regular there")
+    domain = chart.problem.domain
+    return Box(domain.centre, domain.half_width * (scale if scale == 1 else scale * (1 - 1e-9)))
+
+
+def checked_options(chart: Chart, time_limit: float | None, executor: Executor | None) -> float:
+    """Seconds of a time limit, inf for none. Chart and executor are checked as well."""
+    require_kind("chart", chart, Chart)
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise InvalidValueError("executor", f"a {type(executor).__name__}", "an executor with a method submit, or None")
+    if time_limit is None:
+        return float("inf")
+    require_at_least("time_limit", time_limit, 0)
+    return as_number("time_limit", time_limit)
+
+
+def checked_bound(chart: Chart, bound: float) -> float:
+    """A bound of the conditioning, checked."""
+    bound = as_number("bound", bound)
+    if not 0 <= bound < 1:
+        raise InvalidValueError("bound", bound, "a number from 0 to below 1")
+    if bound > 0 and not chart.problem.metric.is_identity:
+        metric = chart.problem.metric.name
+        raise CertifyError(
+            f"bound is {bound:g} with metric {metric}, expected 0: conditioning is proved for the Euclidean metric"
+        )
+    return bound
+
+
+def whole_domain(domain: Domain) -> Subdivision:
+    """The domain, with the slack of its borders, as a box in one part."""
+    half = domain.half_width if domain.name == "torus" else reach(domain)
+    low, high = domain.centre - half, domain.centre + half
+    return Subdivision.whole(np.nextafter(low, -np.inf), np.nextafter(high, np.inf))
+
+
+def require_same(chart: Chart, certificate: Certificate) -> None:
+    """Raise CertifyError unless a certificate is one of this chart and of this version's method."""
+    require_kind("certificate", certificate, Certificate)
+    if certificate.method != METHOD:
+        raise CertifyError(f"the certificate is of method {certificate.method}, expected {METHOD}")
+    certificate.require_for(fingerprint(chart.problem, chart.coordinates))
+    domain = whole_domain(chart.problem.domain)
+    if not (
+        np.array_equal(domain.low, certificate.regular.low) and np.array_equal(domain.high, certificate.regular.high)
+    ):
+        raise CertifyError("the certificate is void: it covers another domain")
+
+
+def _resumed(chart: Chart, bound: float, certificate: Certificate) -> Subdivision:
+    require_same(chart, certificate)
+    if certificate.bound != bound or certificate.fold:
+        raise CertifyError(
+            f"resume is a certificate for bound {certificate.bound:g}, expected one for {bound:g} without a fold"
+        )
+    return certificate.regular
+
+
+def _suspects(chart: Chart) -> Array:
+    """The centre, and the sample with the least sign(det J(centre)) det J: uniform, near faces, and near corners."""
+    domain = chart.problem.domain
+    rng = np.random.default_rng(0)
+    unit = rng.uniform(-1, 1, (_SAMPLES, chart.n))
+    powers = rng.choice([1.0, 0.5, 0.25], (_SAMPLES, 1))
+    points = np.vstack([domain.centre, domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers])
+    J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
+    volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
+    worst = int(np.argmin(volumes * np.sign(volumes[0])))
+    return points[[0, worst]]
+
+
+def _one_to_one(
+    judge: InjectivityJudge, base: Subdivision, seconds: float, executor: Executor | None, monitor: Monitor
+) -> Subdivision | None:
+    """The largest of some boxes around the centre that the judge accepts, with its parts; None if it accepts none."""
+    end = time.monotonic() + seconds
+    best = None
+    low, high = 0, len(_SCALES)  # the scales before `low` are proved, those from `high` on are not
+    while low < high:
+        middle = (low + high) // 2
+        part = _scaled(base, _SCALES[middle])
+        limits = Limits(max(end - time.monotonic(), 0.0), _INJECTIVE_BOXES)
+        search = Search(judge, part, limits, largest_first(part), executor)
+        search.run(_shown(monitor, "one-to-one"))
+        if search.finished:
+            best, low = search.subdivision(), middle + 1
+        else:
+            high = middle
+    return best
+
+
+def _scaled(base: Subdivision, scale: float) -> Subdivision:
+    middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
+    return Subdivision.whole(*((base.low, base.high) if scale == 1 else (middle - scale * half, middle + scale * half)))
+
+
+def proved_scale(parts: Subdivision) -> float:
+    """The scale of the largest copy of a box about its centre that no open part reaches into."""
+    low, high = parts.leaves(OPEN)
+    return float(distances(parts, low, high).min()) if len(low) else 1.0
+
+
+def _certificate(
+    chart: Chart,
+    bound: float,
+    search: Search,
+    injective: Subdivision | None,
+    seconds: float,
+    resume: Certificate | None,
+) -> Certificate:
+    fold = tuple(tuple(point.tolist()) for point in search.signs.values()) if search.folded else ()
+    before = (0, 0.0) if resume is None else (resume.boxes, resume.seconds)
+    known = (
+        search.conditioning
+        if resume is None or not resume.conditioning
+        else min(search.conditioning, resume.conditioning)
+    )
+    return Certificate(
+        fingerprint(chart.problem, chart.coordinates),
+        METHOD,
+        bound,
+        search.subdivision(),
+        known * (1 - 1e-9) if bound > 0 and np.isfinite(known) else 0.0,
+        injective,
+        fold,
+        before[0] + search.judged,
+        before[1] + seconds,
+    )
+
+
+def _shown(monitor: Monitor, stage: str) -> Look:
+    def show(search: Search) -> None:
+        detail = f"{search.judged} boxes, {100 * search.proved_volume:.2f} % proved"
+        monitor(Progress(stage, min(search.proved_volume, 1.0), detail))
+
+    return show

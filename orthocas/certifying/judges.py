@@ -1,0 +1,125 @@
+"""Tests of boxes: what can be proved on each of them, and which joint to halve where it is not enough."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.casadi_tools.threads import one_blas_thread
+from orthocas.certifying.chart_rows import ChartRows
+from orthocas.certifying.elimination import between, in_singular_basis, lower_bound, pivots
+from orthocas.certifying.monomials import Variables
+from orthocas.certifying.taylor import TaylorModel
+from orthocas.certifying.volume import conditioning_bound
+from orthocas.checks import Array
+
+_AT_ONCE = 64  # boxes whose models fit into the cache of a processor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdicts:
+    """What was found on each box."""
+
+    proved: Array  #: (boxes,) bool
+    regular: Array  #: (boxes,) bool: det J has the sign below on the whole box
+    sign: Array  #: (boxes,) of det J at the middle of the box: +1, -1, or 0 where it is unclear
+    conditioning: Array  #: (boxes,) lower bounds; 0 where none is known
+    widest: Array  #: (boxes,) the joint to halve
+
+
+class Judge(Protocol):
+    """A test of boxes. Judges can be pickled, so that processes and machines can share the work."""
+
+    def __call__(self, low: Array, high: Array) -> Verdicts:
+        """Judge boxes between corners (boxes, n)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class RegularityJudge:
+    """Proves det J != 0, and, for a bound above 0, conditioning >= bound."""
+
+    rows: ChartRows
+    bound: float
+
+    def __call__(self, low: Array, high: Array) -> Verdicts:
+        """Judge boxes between corners (boxes, n)."""
+        with one_blas_thread():  # small products, and the same rounding everywhere
+            J = self.rows(low, high)
+            return _joined([self._few(part) for part in _parts(J)], self.rows.variables)
+
+    def _few(self, J: TaylorModel) -> tuple[Array, ...]:
+        turned, signs = in_singular_basis(J)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            regular = _all_positive(pivots(turned)) & (signs != 0)
+        conditioning = np.zeros(len(signs))
+        if self.bound > 0 and regular.any():
+            conditioning[regular] = conditioning_bound(_chosen(J, regular), self.rows.m)
+        proved = regular & (conditioning >= self.bound)
+        return proved, regular, signs, conditioning, _influences(turned)
+
+
+@dataclass(frozen=True, eq=False)
+class InjectivityJudge:
+    """Proves that the symmetric part of P J is positive definite, for one P on all boxes.
+
+    On a convex set this makes phi one-to-one: (q - p)^T P (phi(q) - phi(p)) is the integral of (q - p)^T P J (q - p)
+    over the segment, which is positive.
+    """
+
+    rows: ChartRows
+    inverse: Array  #: P, (active, active)
+
+    def __call__(self, low: Array, high: Array) -> Verdicts:
+        """Judge boxes between corners (boxes, n)."""
+        with one_blas_thread():  # small products, and the same rounding everywhere
+            J = self.rows(low, high)
+            return _joined([self._few(part) for part in _parts(J)], self.rows.variables)
+
+    def _few(self, J: TaylorModel) -> tuple[Array, ...]:
+        boxes = J.remainder.shape[-1]
+        unit = np.broadcast_to(np.eye(len(self.inverse)), (boxes, *self.inverse.shape))
+        product = between(np.broadcast_to(self.inverse, unit.shape), J, unit)
+        transposed = TaylorModel(
+            product.variables, product.coefficients.swapaxes(1, 2), product.remainder.swapaxes(0, 1)
+        )
+        symmetric = product + transposed
+        vectors = np.linalg.eigh(np.nan_to_num(np.moveaxis(symmetric.centre, -1, 0)))[1][:, :, ::-1]
+        turned = between(vectors.transpose(0, 2, 1), symmetric, vectors)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            proved = _all_positive(pivots(turned))
+        return proved, proved, np.zeros(boxes), np.zeros(boxes), _influences(turned)
+
+
+def injectivity_judge(rows: ChartRows, centre: Array) -> InjectivityJudge:
+    """The judge with the inverse of J at a point as its P."""
+    J = rows(centre[None], centre[None]).centre[:, :, 0]
+    return InjectivityJudge(rows, np.asarray(np.linalg.pinv(J), dtype=float))
+
+
+def _all_positive(found: list[TaylorModel]) -> Array:
+    """Whether all pivots have one sign on the box and the pivots of the middle are positive."""
+    positive: Array = np.all([lower_bound(pivot) > 0 for pivot in found], axis=0)
+    return positive
+
+
+def _influences(turned: TaylorModel) -> Array:
+    """How much each variable changes the matrix, relative to its singular values, (boxes, variables)."""
+    middle = np.sqrt(np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))])) + 1e-300)
+    linear = np.abs(turned.coefficients[1 : 1 + len(turned.variables)])
+    influences: Array = (linear / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T
+    return np.nan_to_num(influences)
+
+
+def _parts(J: TaylorModel) -> list[TaylorModel]:
+    return [_chosen(J, slice(k, k + _AT_ONCE)) for k in range(0, J.remainder.shape[-1], _AT_ONCE)]
+
+
+def _chosen(J: TaylorModel, boxes: slice | NDArray[np.bool_]) -> TaylorModel:
+    return TaylorModel(J.variables, J.coefficients[..., boxes], J.remainder[..., boxes])
+
+
+def _joined(parts: list[tuple[Array, ...]], variables: Variables) -> Verdicts:
+    proved, regular, sign, conditioning, influences = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return Verdicts(proved, regular, sign, conditioning, np.array(variables)[np.argmax(influences, axis=1)])

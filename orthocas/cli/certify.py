@@ -1,0 +1,151 @@
+"""`orthocas certify`: prove that a chart does not fold, or check the proof in its file."""
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from orthocas import certifying
+from orthocas.certificates import Certificate
+from orthocas.certifying.scheduler import scheduler_executor
+from orthocas.chart import Chart
+from orthocas.checks import require_count
+from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
+from orthocas.cli.progress import terminal_monitor
+from orthocas.comparing.cells import single_threaded
+from orthocas.comparing.workers import end_with_parent
+from orthocas.errors import Interrupted
+from orthocas.files.archive import require_free
+from orthocas.files.chart_file import CHART
+
+_REFUTED = 1  # exit code
+
+
+def certify(
+    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    bound: Annotated[
+        float | None,
+        typer.Option("--bound", parser=number, help="Also prove that the conditioning is at least this; default: 0."),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", parser=number, help="Time limit; what is proved by then is kept.")
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Check the certificate in the file, without a search.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Chart file to write, with the certificate; default: CHART itself.")
+    ] = None,
+    workers: Annotated[int, typer.Option("--workers", parser=whole_number, help="Number of processes.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", help="Address of a Dask scheduler, for example tcp://host:8786.")
+    ] = None,
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Prove that a chart does not fold anywhere on its domain, and keep the proof in its file.
+
+    A certificate without a fold that does not cover the domain is resumed. The exit code is 1 if not all is proved.
+    """
+    require_count("--workers", workers)
+    target = out or chart
+    require_free(target, CHART, force)
+    known = Chart.load(chart)
+    with _executor(workers, scheduler) as executor, terminal_monitor() as monitor:
+        start = time.monotonic()
+        if check:
+            holds = certifying.check_certificate(known, executor=executor, monitor=monitor)
+            _report_check(known.certificate, holds, time.monotonic() - start, json)
+            raise typer.Exit(0 if holds else _REFUTED)
+        resume = _unfinished(known, bound)
+        try:
+            found = certifying.certify(
+                known,
+                resume.bound if bound is None and resume else bound or 0.0,
+                time_limit=seconds,
+                executor=executor,
+                monitor=monitor,
+                resume=resume,
+            )
+            interrupted = False
+        except Interrupted as stop:
+            found, interrupted = stop.result, True
+    replace(known, certificate=found).save(target, force)
+    _report(found, target, json)
+    if interrupted:
+        note("interrupted: the file holds what is proved so far; the same command goes on from it")
+        raise typer.Exit(130)
+    raise typer.Exit(0 if found.proved else _REFUTED)
+
+
+def as_dict(certificate: Certificate) -> dict[str, Any]:
+    """Plain data for JSON."""
+    one = certificate.injective
+    return {
+        "proved": certificate.proved,
+        "share": certificate.share,
+        "bound": certificate.bound,
+        "conditioning": certificate.conditioning,
+        "boxes": certificate.boxes,
+        "parts": certificate.regular.proved_count,
+        "unproved": certificate.regular.open_count,
+        "seconds": certificate.seconds,
+        "one_to_one_half_width": None if one is None else ((one.high - one.low) / 2).tolist(),
+        "fold": [list(point) for point in certificate.fold],
+        "method": certificate.method,
+        "fingerprint": certificate.fingerprint,
+    }
+
+
+@contextmanager
+def _executor(workers: int, scheduler: str | None) -> Iterator[Executor | None]:
+    """What shares the work: processes, a Dask scheduler, or nothing."""
+    if scheduler is not None:
+        with scheduler_executor(scheduler) as executor:
+            yield executor
+    elif workers > 1:
+        with (
+            single_threaded(),
+            ProcessPoolExecutor(workers, get_context("spawn"), _begin, (os.getpid(),)) as executor,
+        ):
+            yield executor
+    else:
+        yield None
+
+
+def _begin(parent: int) -> None:
+    """Begin a worker process: Ctrl-C is for its parent, and it ends with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent(parent)
+
+
+def _unfinished(chart: Chart, bound: float | None) -> Certificate | None:
+    """The certificate in the file if there is more to prove and it is about the same bound."""
+    known = chart.certificate
+    if known is None or known.proved or known.fold or (bound is not None and bound != known.bound):
+        return None
+    return known
+
+
+def _report(certificate: Certificate, target: Path, json: bool) -> None:
+    if json:
+        print_json({"chart": str(target), **as_dict(certificate)})
+    else:
+        print_rows({**certificate.facts(), "chart": str(target)})
+
+
+def _report_check(certificate: Certificate | None, holds: bool, seconds: float, json: bool) -> None:
+    assert certificate is not None
+    if json:
+        print_json({"holds": holds, **as_dict(certificate), "seconds": seconds})
+    else:
+        verdict = "holds" if holds else "does NOT hold"
+        print_rows({"check": f"the certificate {verdict}, {seconds:.3g} s", **certificate.facts()})
