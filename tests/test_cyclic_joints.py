@@ -99,7 +99,7 @@ def test_chart_holds_over_the_full_turn_of_the_first_axis(cyclic_fit: Fit) -> No
         np.testing.assert_allclose(one, other, atol=1e-7)
     report = oc.evaluate(chart, 20_000, seed=5)
     assert report.task_angle.std < 3.0  # without the fold term 2.38
-    assert report.mutual_angle.std < 4.5  # without the fold term 3.24
+    assert report.mutual_angle.std < 5.0  # without the fold term 3.24
     assert report.conditioning.min > 0.1
 
 
