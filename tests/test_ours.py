@@ -148,3 +148,19 @@ def test_the_list_is_plain(tmp_path: Path) -> None:
     found = json.loads((tmp_path / LIST).read_text())
     assert found["format"] == "orthocas-list"
     assert [len(entry) for entry in found["files"]["numbers.csv"]] == [64]
+
+
+@pytest.mark.parametrize(("begun", "named"), [(["a.png"], "a.png"), ([], "")])
+def test_a_full_disk_names_the_file(tmp_path: Path, begun: list[str], named: str) -> None:
+    """Libraries that draw and save raise errors without a file name."""
+
+    def write() -> None:
+        with published(tmp_path / "out", listed=True) as place:
+            for name in begun:
+                (place / name).write_text("half")
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    (tmp_path / "out").mkdir()
+    with pytest.raises(ArchiveError, match=rf"cannot write {tmp_path / 'out' / named}: No space left on device"):
+        write()
+    assert not list((tmp_path / "out").iterdir())

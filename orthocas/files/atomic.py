@@ -1,14 +1,17 @@
 """Files that appear whole or not at all, and replace nothing that orthocas did not write."""
 
+import errno
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.files.drafts import draft_folder, sweep
 from orthocas.files.ours import LIST, is_listed, list_text, require_replaceable
+
+_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
 
 @contextmanager
@@ -24,9 +27,10 @@ def published(folder: Path, listed: bool = False, force: bool = False) -> Iterat
         force: replace others too.
 
     Raises:
-        ArchiveError: if files are listed and a file in the way is not; or if it is a symbolic link.
+        ArchiveError: if files are listed and a file in the way is not, or the disk is full; or if a file in the way is a
+            symbolic link.
     """
-    with draft_folder(folder) as drafts:
+    with draft_folder(folder) as drafts, _full_disk_named(folder, drafts) if listed else nullcontext():
         yield drafts
         files = sorted(drafts.iterdir())
         for file in files:
@@ -40,6 +44,23 @@ def published(folder: Path, listed: bool = False, force: bool = False) -> Iterat
                 os.fsync(stream.fileno())
         for file in files:
             os.replace(file, folder / file.name)
+
+
+@contextmanager
+def _full_disk_named(folder: Path, drafts: Path) -> Iterator[None]:
+    """Say which file did not fit: libraries that draw and save leave its name out.
+
+    Raises:
+        ArchiveError: if the disk, or what the user may write, is full.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        begun = sorted(drafts.iterdir(), key=lambda file: file.stat().st_mtime_ns)
+        target = folder / begun[-1].name if begun else folder
+        raise ArchiveError(f"cannot write {target}: {error.strerror}") from None
 
 
 def require_replaceable_files(folder: Path, names: Iterable[str], force: bool) -> None:
