@@ -8,6 +8,7 @@ SCRIPTS = (
     "dynamics",
     "command",
     "fits",
+    "folds",
     "suggested_domains",
     "choices",
     "scaling",

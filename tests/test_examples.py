@@ -9,6 +9,7 @@ import compare_parametrisations
 import distillation
 import domain_size
 import fits
+import folds
 import front
 import gallery
 import growing_queries
@@ -42,6 +43,13 @@ def test_fit_benchmark_prints_rows() -> None:
     rows = fits.main(quick=True)
     assert len(rows) == 2
     assert rows[0].startswith("| iiwa | polynomial:2 |")
+
+
+def test_fold_benchmark_finds_none() -> None:
+    (line,) = folds.main(quick=True)
+    *_, searched, uniform, heavy, count = (float(word) for word in line.strip("| ").split("|"))
+    assert count == 0
+    assert searched <= min(uniform, heavy)
 
 
 def test_scaling_benchmark_prints_rows() -> None:
