@@ -27,8 +27,8 @@ def published(folder: Path, listed: bool = False, force: bool = False) -> Iterat
         force: replace others too.
 
     Raises:
-        ArchiveError: if files are listed and one in the way is not, or the disk is full; or if a symbolic link is in the
-            way.
+        ArchiveError: if files are listed and one in the way is not, or the disk is full; or if a symbolic link is in
+            the way.
     """
     with draft_folder(folder) as drafts, _full_disk_named(folder, drafts) if listed else nullcontext():
         yield drafts
