@@ -16,12 +16,13 @@ from orthocas.fitting.fit import fit
 from orthocas.parametrisations import Polynomial
 from orthocas.quality import evaluate
 from orthocas.reproduce.drawing import Drawing
+from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.reproduce.style import LABEL, TICK, new_figure
 from orthocas.simulation import Trajectory, coupling_index, simulate
 
 JOURNEY = (  # coordinate and target of each step, relative to the value at the start, [m] or [1]
-    *(("xi1", -0.5), ("x", 0.12), ("xi3", -0.6), ("y", -0.3), ("xi4", 0.6), ("z", -0.15), ("xi2", 0.4)),
-    *(("y", 0.25), ("xi1", 0.2), ("x", -0.2), ("xi3", 0.3), ("xi4", -0.45), ("z", 0.15), ("xi2", -0.25)),
+    *(("xi1", -0.5), ("x", 0.12), ("xi3", -0.5), ("y", -0.25), ("xi4", 0.6), ("z", -0.15), ("xi2", 0.4)),
+    *(("y", 0.3), ("xi1", 0.2), ("x", -0.2), ("xi3", 0.3), ("xi4", -0.45), ("z", 0.15), ("xi2", -0.25)),
     *(("y", -0.25), ("xi3", -0.5), ("x", 0.06), ("xi1", -0.45), ("z", -0.25), ("xi2", 0.6)),
     *(("y", 0.0), ("xi4", 0.0), ("xi3", 0.0), ("x", 0.0), ("xi1", 0.0), ("z", 0.0), ("xi2", 0.0)),
 )
@@ -32,7 +33,7 @@ _COLOURS = ("#1f5fa8", "#d95f02", "#1b9e77", "#e7298a", "#7570b3", "#a6761d", "#
 
 def draw(quick: bool) -> Drawing:
     """Draw task, coordinates and joints over time; the numbers tell how exactly the arm returns."""
-    chart = fit(problems.get("iiwa"), Polynomial(4)).chart
+    chart = fit(problems.get("iiwa"), Polynomial(4), weights=PAPER_LOSS).chart
     reference = journey(chart)
     run = simulate(Kinematic(chart), reference, chart.problem.domain.centre, tolerance=_TOLERANCE)
     figure = new_figure(6.2)
