@@ -120,7 +120,7 @@ def build_problem(name: str, options: ProblemOptions) -> Problem:
 def suggested(
     name: str,
     options: ProblemOptions,
-    parametrisation: Parametrisation,
+    parametrisation: Parametrisation | None,
     bounds: Bounds,
     seed: int,
     monitor: Monitor,

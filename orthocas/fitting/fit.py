@@ -213,5 +213,5 @@ def _notes(stages: Sequence[Stage], settings: FitSettings, worst: WorstPoints | 
         "lambda4": weights.length,
         "lambda5": weights.folds,
         **extra,
-        "angles": weights.angles,
+        "angles": weights.angles or "paper",
     }
