@@ -126,8 +126,8 @@ class BasisObjective:
 
         list(in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)]))
         free = self.kept.ravel()
-        curvature: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
-        return curvature
+        block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
+        return block
 
     def reweighted(self, weights: Weights) -> Self:
         """The same loss on the same samples with other weights. It cannot add terms that need other sample data."""
