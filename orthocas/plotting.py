@@ -79,7 +79,7 @@ def _draw_leaks(axes: Axes, leak: LeakStatistics) -> None:
     counts = leak.histogram[:900].reshape(-1, 5).sum(axis=1)
     axes.stairs(counts / max(counts.sum(), 1) / 0.5, 0.5 * np.arange(len(counts) + 1) - 0.05, fill=True, color=_LEAK)
     axes.set_xlim(0, max(6.0, 3 * leak.rms))
-    axes.set_xlabel(r"leak, angle in the metric to the space across the task [deg]")
+    axes.set_xlabel(r"leak, in the metric [deg]")
     axes.set_title(f"rms {leak.rms:.2f}°, largest {leak.max:.1f}°", fontsize=10)
     axes.grid(alpha=0.3)
 
