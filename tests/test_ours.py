@@ -4,9 +4,11 @@ import errno
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -164,3 +166,27 @@ def test_a_full_disk_names_the_file(tmp_path: Path, begun: list[str], named: str
     with pytest.raises(ArchiveError, match=rf"cannot write {tmp_path / 'out' / named}: No space left on device"):
         write()
     assert not list((tmp_path / "out").iterdir())
+
+
+def test_ctrl_c_while_drafts_are_made_or_removed_leaves_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The signal comes right after the folder is made, and in the middle of its removal."""
+    make, remove = tempfile.mkdtemp, shutil.rmtree
+
+    def interrupted_make(**settings: object) -> str:
+        folder = make(**settings)  # type: ignore[call-overload]
+        os.kill(os.getpid(), signal.SIGINT)
+        return str(folder)
+
+    def interrupted_remove(folder: str, ignore_errors: bool) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        remove(folder, ignore_errors=ignore_errors)
+
+    for name, place, replacement in (
+        ("mkdtemp", drafts.tempfile, interrupted_make),
+        ("rmtree", drafts.shutil, interrupted_remove),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(place, name, replacement)
+            with pytest.raises(KeyboardInterrupt), draft_folder(tmp_path) as folder:
+                (folder / "half").write_text("a")
+        assert not list(tmp_path.iterdir())

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from orthocas.casadi_tools.interrupts import deferred
+
 _HOST = re.sub(r"[^A-Za-z0-9]", "", socket.gethostname())[:32] or "host"  # a process id means nothing elsewhere
 _NAME = re.compile(r"\.?orthocas-(?P<host>[A-Za-z0-9]+)-(?P<process>\d+)-\w+")
 
@@ -22,8 +24,15 @@ def draft_folder(parent: Path | None = None) -> Iterator[Path]:
     place = Path(tempfile.gettempdir()) if parent is None else parent
     sweep(place)
     prefix = f"{'' if parent is None else '.'}orthocas-{_HOST}-{os.getpid()}-"
-    with tempfile.TemporaryDirectory(dir=place, prefix=prefix) as name:
-        yield Path(name)
+    folder: str | None = None
+    try:
+        with deferred():  # Ctrl-C between the folder and its name would leave it
+            folder = tempfile.mkdtemp(dir=place, prefix=prefix)
+        yield Path(folder)
+    finally:
+        if folder is not None:
+            with deferred():  # and here half of it
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 def sweep(folder: Path) -> None:
