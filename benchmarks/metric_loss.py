@@ -137,7 +137,7 @@ def measured(arm: str, degree: int, regularity: float, quick: bool) -> Iterator[
         for seed in range(1 if quick else 2):
             targets = goals(problem, 1 if quick else 2, 100 * place + seed)
             for angles in ANGLES:
-                weights = oc.Weights(regularity=regularity, angles=angles)
+                weights = oc.Weights(regularity=regularity, folds=0.0, angles=angles)
                 chart = oc.fit(problem, oc.Polynomial(degree), weights=weights, seed=seed).chart
                 for what, value in of_chart(chart, targets, tuple(LAWS)[: 1 if quick else None]):
                     yield Measured(arm, place, seed, angles, what, value)

@@ -7,6 +7,7 @@ grid, 10 s). The example writes a front and a convergence picture, a CSV and a J
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import orthocas as oc
 from orthocas import problems, solvers
@@ -18,6 +19,7 @@ from orthocas.minimising.watch import Monitor, silent
 
 Parametrisations = Sequence[oc.parametrisations.Parametrisation | oc.SEW]
 
+WEIGHTS = oc.Weights(folds=0.0, angles="paper")  # angles alone, so that families differ in nothing else
 ADAM = solvers.Adam(epochs=60, learning_rate=5e-3)
 FOR_BASES: tuple[Solver, ...] = (solvers.GaussNewton(), solvers.LBFGS(), solvers.Ipopt(), ADAM)
 FOR_NETWORKS: tuple[Solver, ...] = (solvers.LBFGS(), ADAM)
@@ -50,9 +52,10 @@ def compared(name: str, charts: Path, quick: bool, monitor: Monitor) -> Comparis
     """Compare bases with every solver, and networks with the solvers that can fit them."""
     problem = build(name)
     if quick:
-        return oc.compare(problem, BASES[name][:2], samples=200, held_out=2_000, monitor=monitor)
-    bases = oc.compare(problem, BASES[name], FOR_BASES, charts=charts, control_ticks=True, monitor=monitor)
-    networks = oc.compare(problem, NETWORKS[name], FOR_NETWORKS, charts=charts, control_ticks=True, monitor=monitor)
+        return oc.compare(problem, BASES[name][:2], weights=WEIGHTS, samples=200, held_out=2_000, monitor=monitor)
+    settings: dict[str, Any] = {"charts": charts, "control_ticks": True, "monitor": monitor}
+    bases = oc.compare(problem, BASES[name], FOR_BASES, weights=WEIGHTS, **settings)
+    networks = oc.compare(problem, NETWORKS[name], FOR_NETWORKS, weights=WEIGHTS, **settings)
     return Comparison(bases.results + networks.results)
 
 
