@@ -44,7 +44,7 @@ def test_python_block_of_exact_coordinates_runs(checkout: Path) -> None:
 @pytest.mark.usefixtures("checkout")
 def test_shell_quickstart_runs(run: Run) -> None:
     commands = [shlex.split(line) for line in blocks("sh")[1].splitlines()]
-    assert len(commands) == 10
+    assert len(commands) == 11
     for words in commands:
         assert words[0] == "orthocas"
         code, _, err = run(*words[1:])
