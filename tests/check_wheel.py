@@ -13,7 +13,7 @@ USE = """
 import orthocas as oc
 from orthocas import problems, solvers
 problem = problems.get("iiwa")
-fit = oc.fit(problem, oc.Polynomial(2), solvers.GaussNewton())
+fit = oc.fit(problem, oc.Polynomial(3), solvers.GaussNewton())
 report = oc.evaluate(fit.chart, samples=2000)
 assert report.task_angle.std < 3.5, report.task_angle
 print(oc.__file__)
