@@ -17,10 +17,9 @@ from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.graph_objective import GraphObjective
 from orthocas.fitting.loss import Weights
 from orthocas.parametrisations import JointSpace, Parametrisation
-from orthocas.samples import Samples, sample_problem, samples_at
+from orthocas.samples import Samples, sample_problem
 
 IN_METRIC = Weights(1000.0, 30.0, 0.0, angles="metric")
-EVERY_TERM = Weights(length=3.0, angles="metric")
 
 
 def loss_by_hand(samples: Samples, J_xi: np.ndarray, weights: Weights) -> float:
@@ -47,32 +46,6 @@ def test_both_objectives_equal_the_formula_written_out(request: pytest.FixtureRe
     want = loss_by_hand(samples, linear.coordinate_jacobians(theta), IN_METRIC)
     np.testing.assert_allclose(linear.value(theta), want, rtol=1e-12)
     np.testing.assert_allclose(graph.value(theta), want, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("name", "parametrisation"),
-    [
-        ("planar_x", oc.Polynomial(2)),
-        ("iiwa", oc.Polynomial(1)),
-        ("planar_xy", oc.Fourier(1)),
-        ("planar_x", oc.MLP((8,))),
-    ],
-    ids=lambda case: getattr(case, "label", case),
-)
-def test_fast_objectives_have_value_and_gradient_of_the_symbolic_loss(
-    request: pytest.FixtureRequest, name: str, parametrisation: Parametrisation
-) -> None:
-    problem = request.getfixturevalue(name)
-    points = sample_evenly(problem.domain, 40, 1)
-    family = parametrisation.family(JointSpace.of(problem), problem.r)
-    theta = family.initial(3)
-    fast = BasisObjective if parametrisation.linear else GraphObjective
-    value, gradient = fast(family, samples_at(problem, points), EVERY_TERM, theta, None).value_and_gradient(theta)
-    L = oc.loss(problem, parametrisation, weights=EVERY_TERM, samples=points, start=theta)
-    x = ca.MX.sym("x", family.size)
-    slope = ca.Function("slope", [x], [ca.gradient(L(x), x)])
-    np.testing.assert_allclose(float(L(theta)), value, rtol=1e-12)
-    np.testing.assert_allclose(slope(theta).full().ravel(), gradient, atol=1e-11 * np.abs(gradient).max())
 
 
 def mixed(problem: oc.Problem) -> oc.Problem:

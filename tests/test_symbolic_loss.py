@@ -1,5 +1,7 @@
 """The loss as one CasADi function, as oracle of the fast objectives: value, gradient and Hessian to rounding."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -22,17 +24,19 @@ CASES = [
 ]
 
 
+@pytest.mark.parametrize("angles", ["paper", "metric"])
 @pytest.mark.parametrize(("name", "parametrisation"), CASES, ids=lambda case: getattr(case, "label", case))
 def test_fast_objectives_have_its_value_and_gradient(
-    request: pytest.FixtureRequest, name: str, parametrisation: Parametrisation
+    request: pytest.FixtureRequest, name: str, parametrisation: Parametrisation, angles: str
 ) -> None:
+    weights = replace(EVERY_TERM, angles=angles)
     problem = request.getfixturevalue(name)
     points = sample_evenly(problem.domain, 40, 1)
     family = parametrisation.family(JointSpace.of(problem), problem.r)
     theta = family.initial(3)
     fast = BasisObjective if parametrisation.linear else GraphObjective
-    value, gradient = fast(family, samples_at(problem, points), EVERY_TERM, theta, None).value_and_gradient(theta)
-    L = oc.loss(problem, parametrisation, weights=EVERY_TERM, samples=points, start=theta)
+    value, gradient = fast(family, samples_at(problem, points), weights, theta, None).value_and_gradient(theta)
+    L = oc.loss(problem, parametrisation, weights=weights, samples=points, start=theta)
     x = ca.MX.sym("x", family.size)
     slope = ca.Function("slope", [x], [ca.gradient(L(x), x)])
     np.testing.assert_allclose(float(L(theta)), value, rtol=1e-12)

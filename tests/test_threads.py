@@ -57,6 +57,7 @@ def calls_of_chart(chart: oc.Chart) -> list[Call]:
     fitted_calls: list[Call] = [
         lambda k: np.asarray(chart.function("phi")(q[k % 6])),
         lambda k: np.asarray(chart.function("jacobian")(q[k % 6])),
+        lambda k: np.append(chart.quality(q[k % 6]).leak_deg, chart.quality(q[k % 6]).conditioning),
     ]
     return [
         lambda k: chart.phi(q[k % 6]),

@@ -1,7 +1,6 @@
 """`orthocas certify`: prove that a chart does not fold, or check the proof in its file."""
 
 import os
-import signal
 import time
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -21,7 +20,7 @@ from orthocas.checks import require_count
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
 from orthocas.cli.progress import terminal_monitor
 from orthocas.comparing.cells import single_threaded
-from orthocas.comparing.workers import end_with_parent
+from orthocas.comparing.workers import begin_worker
 from orthocas.errors import Interrupted
 from orthocas.files.archive import require_free
 from orthocas.files.chart_file import CHART
@@ -114,17 +113,11 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor | None]:
     elif workers > 1:
         with (
             single_threaded(),
-            ProcessPoolExecutor(workers, get_context("spawn"), _begin, (os.getpid(),)) as executor,
+            ProcessPoolExecutor(workers, get_context("spawn"), begin_worker, (os.getpid(),)) as executor,
         ):
             yield executor
     else:
         yield None
-
-
-def _begin(parent: int) -> None:
-    """Begin a worker process: Ctrl-C is for its parent, and it ends with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent(parent)
 
 
 def _unfinished(chart: Chart, bound: float | None) -> Certificate | None:

@@ -14,7 +14,7 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 
 from orthocas.casadi_tools.batch import THREADS
-from orthocas.comparing.workers import end_with_parent
+from orthocas.comparing.workers import begin_worker
 from orthocas.files.drafts import draft_folder
 from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.loss import Weights
@@ -241,8 +241,7 @@ def _run_stored(file: Path) -> CellResult:
 
 def _begin(stop: Event, parent: int) -> None:
     """Initialise a worker process: it ignores Ctrl-C, the parent tells it when to stop, and it ends with the parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent(parent)
+    begin_worker(parent)
     _stops.append(stop)
 
 

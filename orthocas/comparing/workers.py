@@ -27,6 +27,12 @@ def end_with_parent(parent: int) -> None:
     threading.Thread(target=_wait_for_parent, daemon=True).start()
 
 
+def begin_worker(parent: int) -> None:
+    """Initialise a worker process: Ctrl-C is for its parent, and it ends with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent(parent)
+
+
 def _wait_for_parent() -> None:
     process = parent_process()
     if process is not None:

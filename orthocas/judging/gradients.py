@@ -11,7 +11,7 @@ from orthocas.checks import Array
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.fitting.loss import pairs
 from orthocas.problem import Problem, task_jacobians
-from orthocas.samples import samples_at
+from orthocas.samples import Samples, samples_at
 
 _CHUNK = 5000
 
@@ -65,19 +65,37 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> tupl
     raised = samples.raised(J)
     first, second = (np.array([pair[k] for pair in pairs(J.shape[1])], dtype=int) for k in (0, 1))
     products = np.einsum("spn,spn->sp", raised[:, first], J[:, second])
-    metric_lengths = np.sqrt(np.einsum("sjn,sjn->sj", J, raised))
-    along = samples.task_basis @ (J / metric_lengths[:, :, None]).transpose(0, 2, 1)  # (N, m, r)
+    metric_lengths = _metric_lengths(J, raised)
+    leak_sines, conditioning, signs = in_the_metric(samples, J)
     return (
         kept,
         samples.points,
         J,
         samples.unit_task_gradients @ (J / lengths[:, :, None]).transpose(0, 2, 1),
         products / (np.linalg.norm(raised, axis=2)[:, first] * lengths[:, second]),
-        np.linalg.norm(along, axis=1),
+        leak_sines,
         products / (metric_lengths[:, first] * metric_lengths[:, second]),
-        _smallest_singular_values(J / metric_lengths[:, :, None], raised / metric_lengths[:, :, None], along),
+        conditioning,
+        signs,
+    )
+
+
+def in_the_metric(samples: Samples, J: Array) -> tuple[Array, Array, Array]:
+    """Sines of the leaks (N, r), conditioning (N,) and signs of det J (N,), for gradients J (N, r, n) without zeros."""
+    raised = samples.raised(J)
+    lengths = _metric_lengths(J, raised)[:, :, None]
+    along = samples.task_basis @ (J / lengths).transpose(0, 2, 1)  # (N, m, r)
+    return (
+        np.linalg.norm(along, axis=1),
+        _smallest_singular_values(J / lengths, raised / lengths, along),
         np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1))),
     )
+
+
+def _metric_lengths(J: Array, raised: Array) -> Array:
+    """|v|_A^-1 of the gradients v, (N, r)."""
+    lengths: Array = np.sqrt(np.einsum("sjn,sjn->sj", J, raised))
+    return lengths
 
 
 def _smallest_singular_values(unit: Array, raised: Array, along: Array) -> Array:

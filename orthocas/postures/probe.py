@@ -17,6 +17,7 @@ from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.loss import DEFAULT_WEIGHTS
 from orthocas.fitting.spectral_start import spectral_start
+from orthocas.judging.gradients import in_the_metric
 from orthocas.minimising.solver import Status
 from orthocas.parametrisations import JointSpace, LinearFamily, Polynomial
 from orthocas.problem import NEAR_SINGULAR, Problem
@@ -150,21 +151,6 @@ def leak_and_conditioning(samples: Samples, J: Array) -> tuple[Array, Array]:
     conditioning is the smallest singular value of [A-orthonormal task basis; unit coordinate gradients]. It is negative
     where det J has the opposite sign of most samples.
     """
-    lengths = np.sqrt(np.einsum("sjn,sjn->sj", J, samples.raised(J)))
-    unit = J / np.maximum(lengths, 1e-300)[:, :, None]
-    basis = samples.task_basis
-    across = basis @ unit.transpose(0, 2, 1)  # (N, m, r)
-    leaks = np.arcsin(np.minimum(np.sqrt((across**2).sum(axis=1)), 1.0))
-    mutual = samples.raised(unit) @ unit.transpose(0, 2, 1)
-    identity = np.broadcast_to(np.eye(basis.shape[1]), (len(J), basis.shape[1], basis.shape[1]))
-    gram = np.concatenate(
-        [
-            np.concatenate([identity, across], axis=2),
-            np.concatenate([across.transpose(0, 2, 1), mutual], axis=2),
-        ],
-        axis=1,
-    )
-    smallest = np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[:, 0], 0.0))
-    signs = np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1)))
+    sines, conditioning, signs = in_the_metric(samples, J)
     usual = 1.0 if signs.sum() >= 0 else -1.0
-    return leaks, smallest * np.where(signs == -usual, -1.0, 1.0)
+    return np.arcsin(np.minimum(sines, 1.0)), conditioning * np.where(signs == -usual, -1.0, 1.0)

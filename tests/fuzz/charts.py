@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -48,6 +49,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
         ),
     ),
     "real robot": _iiwa,
+    "certified": lambda: replace(public_objects.fitted().chart, certificate=public_objects.certificate()),
 }
 
 

@@ -46,6 +46,8 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--lock",), ("j1=0", "j1", "=", "j1=nan", "j1=x", "nowhere=1", "l1=0=1", "j1=1e300")),
     **dict.fromkeys(("--tool", "--centre", "--half-width", "--weights", "--friction", "--noise"), _LISTS),
     **dict.fromkeys(("--stiffness", "--damping-ratio", "--posture-stiffness", "--feedback", "--limit"), _LISTS),
+    **dict.fromkeys(("--bound", "--seconds"), (*NUMBERS, "0.1")),
+    "--workers": ("0", "-1", "1", "1.5", ""),
     **dict.fromkeys(("--seed", "--seeds", "--samples", "--held-out", "--jobs"), _COUNTS),
     **dict.fromkeys(("--rate", "--mass-factor", "--max-mutual-deg"), (*NUMBERS, "50", "10")),
     **dict.fromkeys(("--leak-deg", "--conditioning"), (*NUMBERS, "5", "0.3")),
@@ -82,6 +84,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
             *("--solver", "--seed", "--weights", "--max-mutual-deg", "--checkpoint"),
         ),
     ),
+    "certify": (_FILES, {"--seconds": "0.5", "--out": "new.orthocas"}, ("--bound", "--workers")),
     "evaluate": (_FILES, {"--samples": "50"}, ("--seed",)),
     "info": ((*_PROBLEMS, *_FILES), {}, _PROBLEM_OPTIONS),
     "compare": (
