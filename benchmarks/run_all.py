@@ -9,6 +9,7 @@ SCRIPTS = (
     "command",
     "fits",
     "folds",
+    "certificates",
     "suggested_domains",
     "choices",
     "scaling",
