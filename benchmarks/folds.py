@@ -11,7 +11,7 @@ from orthocas.domains import sample_heavily, sample_uniform
 from orthocas.judging.gradients import Judged
 
 HEADER = (
-    "| problem | degree | fit [s] | task std [deg] | mutual std [deg] | least conditioning: search of the fit | uniform "
+    "| problem | degree | fit [s] | task std [deg] | mutual std [deg] | least conditioning: the fit's search | uniform "
     "| near faces and corners | folds |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
 )
 DEGREES = (4, 5, 6)  # of the 7-DoF arm, with 10 million samples each
