@@ -14,10 +14,10 @@ def test_texts_of_both_byte_orders_are_read(order: str) -> None:
 
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("code", [0x110000, 0xFFFFFFFF, 0xD800, 0xDFFF])
-def test_texts_of_no_characters_are_refused(code: int, order: str) -> None:
+def test_texts_with_invalid_characters_are_refused(code: int, order: str) -> None:
     """NumPy reads them, and Python fails with a SystemError when they are used."""
     content = to_npy(np.frombuffer(np.array([65, code], dtype=f"{order}u4").tobytes(), f"{order}U2"))
-    with pytest.raises(ValueError, match="text of no characters"):
+    with pytest.raises(ValueError, match="text with invalid characters"):
         from_npy(content)
 
 

@@ -25,7 +25,7 @@ from orthocas.errors import Interrupted
 from orthocas.files.archive import require_free
 from orthocas.files.chart_file import CHART
 
-_REFUTED = 1  # exit code
+_NOT_PROVED = 1  # exit code
 
 
 def certify(
@@ -63,7 +63,7 @@ def certify(
         if check:
             holds = certifying.check_certificate(known, executor=executor, monitor=monitor)
             _report_check(known.certificate, holds, time.monotonic() - start, json)
-            raise typer.Exit(0 if holds else _REFUTED)
+            raise typer.Exit(0 if holds else _NOT_PROVED)
         resume = _unfinished(known, bound)
         try:
             found = certifying.certify(
@@ -82,7 +82,7 @@ def certify(
     if interrupted:
         note("interrupted: the file holds what is proved so far; the same command goes on from it")
         raise typer.Exit(130)
-    raise typer.Exit(0 if found.proved else _REFUTED)
+    raise typer.Exit(0 if found.proved else _NOT_PROVED)
 
 
 def as_dict(certificate: Certificate) -> dict[str, Any]:

@@ -54,4 +54,4 @@ def from_npy(content: bytes) -> Stored:
 def _require_characters(codes: Stored) -> None:
     """Raise ValueError unless all are characters. Python fails on others only when the text is used."""
     if ((codes > _LAST_CHARACTER) | (codes >> 11 == _SURROGATES)).any():
-        raise ValueError("text of no characters")
+        raise ValueError("text with invalid characters")

@@ -29,7 +29,8 @@ def loss(
     """L(theta), the mean loss (25) of [AS2023] on given samples, for `ca.nlpsol`, `ca.gradient` and `ca.hessian`.
 
     The function is a graph of plain operations without callbacks, so it can be differentiated any number of times.
-    `fit` evaluates the same numbers faster. All r coordinates depend on all joints: idle joints are not split off.
+    `fit` evaluates the same numbers faster. All r coordinates depend on all joints: idle joints are not split off,
+    and no mirror symmetry is used. The fold term is left out, because it acts at points that only a fit searches.
 
     Args:
         problem: robot, task, metric and domain.
