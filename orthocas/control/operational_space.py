@@ -12,7 +12,14 @@ from orthocas.casadi_tools.batch import Batched
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind, require_known
-from orthocas.control.controller import Command, guarded_graph, law_facts, named_function, named_inputs
+from orthocas.control.controller import (
+    Command,
+    fallback_function,
+    guarded_graph,
+    law_facts,
+    named_function,
+    named_inputs,
+)
 from orthocas.control.damping import DAMPING_DESIGNS, DampingDesign, damping_matrix
 from orthocas.control.gains import (
     DAMPING_RATIO,
@@ -165,6 +172,12 @@ class _OperationalSpace(Shown):
         force, volume = self._force(inputs, J)
         torque, relative = J.T @ force + gravity, volume / self._median_volume
         return guarded_graph(self.name, inputs, torque, gravity, relative, self.problem.domain)
+
+    @cached_property
+    def fallback(self) -> ca.Function:
+        """q, gains -> gravity torque."""
+        inputs = named_inputs(self.chart.n, self.gains, 0)
+        return fallback_function(inputs, self.problem.robot.gravity(inputs["q"]))
 
     @cached_property
     def energy(self) -> ca.Function:

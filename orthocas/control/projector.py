@@ -12,7 +12,14 @@ from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.chart import Chart
 from orthocas.checks import Array, frozen_array, require_kind
-from orthocas.control.controller import Command, guarded_graph, law_facts, named_function, named_inputs
+from orthocas.control.controller import (
+    Command,
+    fallback_function,
+    guarded_graph,
+    law_facts,
+    named_function,
+    named_inputs,
+)
 from orthocas.control.damping import damping_matrix
 from orthocas.control.gains import (
     DAMPING_RATIO,
@@ -136,6 +143,12 @@ class Projector(Shown):
         return guarded_graph(self.name, inputs, torque, gravity, volume / scale, None)
 
     @cached_property
+    def fallback(self) -> ca.Function:
+        """q, gains -> gravity torque."""
+        inputs = self._inputs()
+        return fallback_function(inputs, self.problem.robot.gravity(inputs["q"]))
+
+    @cached_property
     def energy(self) -> ca.Function:
         """V, the kinetic energy plus all springs, also their projected-out part [J], and power of both dampers [W]."""
         problem, m = self.problem, self.problem.m
@@ -255,7 +268,13 @@ class KinematicProjector(Shown):
         rate = inputs["reference_velocity"] + inputs["feedback"] * (inputs["reference"] - self.measured(q))
         velocity = rate[m:] + B @ (Lambda @ (rate[:m] - J @ rate[m:]))
         scale = median_volume(problem, problem.task.jacobian_function, problem.metric, (m,))
-        return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale, None)
+        return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale, None, True)
+
+    @cached_property
+    def fallback(self) -> ca.Function:
+        """q, gains -> zero velocity."""
+        n = self.problem.n
+        return fallback_function(named_inputs(n, self.gains, 0), ca.MX(n, 1))
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if a posture of the reference leaves the joint limits."""
