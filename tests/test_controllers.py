@@ -348,8 +348,8 @@ class TestGuard:
     def test_limit_of_velocities_keeps_their_direction(self, planar_chart: oc.Chart, limit: Any) -> None:
         problem, wanted = planar_chart.problem, np.array([0.5, -0.3, 0.2])
         q = problem.domain.centre
-        for law, k in ((Kinematic, 3), (KinematicProjector, 5)):
-            of = planar_chart if law is Kinematic else problem
+        for law, of in ((Kinematic, planar_chart), (KinematicProjector, problem)):
+            k = len(law(of).labels)
             rate = np.resize(wanted, k)
             free, _ = torque(law(of), q, np.zeros(3), np.zeros(k), rate, np.zeros(k))
             cut, status = torque(law(of, limit=limit), q, np.zeros(3), np.zeros(k), rate, np.zeros(k))
