@@ -27,7 +27,7 @@ class Kinematic(Shown):
     Args:
         chart: a chart with a closed expression (not a grown one).
         feedback: diagonal of Lambda, >= 0, (n,) or one number [1/s]; the paper uses 0.
-        limit: largest speed of each joint, (n,) or one number [rad/s] or [m/s]; default no limit.
+        limit: largest speed of each joint, (n,) or one number [rad/s] or [m/s]; default those of the robot.
 
     Raises:
         ShapeError, InvalidValueError: for settings of the wrong shape or value.
@@ -54,7 +54,7 @@ class Kinematic(Shown):
         chart.function("xi")  # raises for grown charts
         object.__setattr__(self, "chart", chart)
         object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))
-        object.__setattr__(self, "limit", command_limit("limit", limit, chart.n))
+        object.__setattr__(self, "limit", command_limit("limit", limit, chart.problem.robot.velocity_limits))
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:

@@ -63,7 +63,7 @@ class _OperationalSpace(Shown):
         coupling: `coupled` uses the full M_phi = (J M^-1 J^T)^-1; `decoupled` adds one controller for the task and one
             for the extra coordinates, each with its own inertia, and relies on condition (5).
         damping: `square_root` is the paper's design (29); `double_diagonal` is always positive semi-definite.
-        limit: largest torque of each joint, (n,) or one number [N m] or [N]; default no limit.
+        limit: largest torque of each joint, (n,) or one number [N m] or [N]; default the effort limits of the robot.
 
     Raises:
         ShapeError, InvalidValueError, UnknownNameError: for settings of the wrong shape, value or name.
@@ -104,7 +104,7 @@ class _OperationalSpace(Shown):
             "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, n),
             "coupling": coupling,
             "damping": damping,
-            "limit": command_limit("limit", limit, n),
+            "limit": command_limit("limit", limit, chart.problem.robot.effort_limits),
         }.items():
             object.__setattr__(self, name, value)
 

@@ -51,7 +51,7 @@ class Projector(Shown):
         stiffness: diagonal of K_x, > 0, (m,) or one number.
         posture_stiffness: diagonal of K_q, > 0, (n,) or one number [N m/rad].
         damping_ratio: of all springs, >= 0, (m + n,) or one number.
-        limit: largest torque of each joint, (n,) or one number; default no limit.
+        limit: largest torque of each joint, (n,) or one number; default the effort limits of the robot.
 
     Source:
         [AS2023] eqs. (2), (3).
@@ -85,7 +85,7 @@ class Projector(Shown):
         object.__setattr__(self, "problem", problem)
         object.__setattr__(self, "stiffness", frozen_array("stiffness", np.concatenate([task, posture]), (m + n,)))
         object.__setattr__(self, "damping_ratio", non_negative_gains("damping_ratio", damping_ratio, m + n))
-        object.__setattr__(self, "limit", command_limit("limit", limit, n))
+        object.__setattr__(self, "limit", command_limit("limit", limit, problem.robot.effort_limits))
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
@@ -189,7 +189,7 @@ class KinematicProjector(Shown):
         problem: robot, task and metric A.
         feedback: diagonal of Lambda_x, >= 0, (m,) or one number [1/s].
         posture_feedback: diagonal of Lambda_q, >= 0, (n,) or one number [1/s].
-        limit: largest speed of each joint, (n,) or one number; default no limit.
+        limit: largest speed of each joint, (n,) or one number; default the velocity limits of the robot.
 
     Source:
         [AS2023] eq. (1).
@@ -220,7 +220,7 @@ class KinematicProjector(Shown):
         posture = non_negative_gains("posture_feedback", posture_feedback, problem.n)
         object.__setattr__(self, "problem", problem)
         object.__setattr__(self, "feedback", np.concatenate([task, posture]))
-        object.__setattr__(self, "limit", command_limit("limit", limit, problem.n))
+        object.__setattr__(self, "limit", command_limit("limit", limit, problem.robot.velocity_limits))
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
