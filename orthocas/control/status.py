@@ -24,9 +24,19 @@ class ControlStatus(IntEnum):
     SINGULAR = 2
     NOT_FINITE = 3
     SATURATED = 4
+    NEAR_BORDER = 5  #: this and the following ones come from the supervised law in C
+    CAUGHT = 6
+    RETURNING = 7
+    BAD_INPUT = 8
+    TOO_FAST = 9  #: why the catcher took over: a joint was faster than its limit
+    LATE = 10  #: why the catcher took over: a tick came too late
 
 
-FROM_THE_LAW = (ControlStatus.OK, ControlStatus.SATURATED)  #: statuses of commands that are not the fallback
+FROM_THE_LAW = (
+    ControlStatus.OK,
+    ControlStatus.SATURATED,
+    ControlStatus.NEAR_BORDER,
+)  #: statuses of commands that are not the fallback
 
 
 def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> ca.Function:
