@@ -32,7 +32,8 @@ class ControlStatus(IntEnum):
     LATE = 10  #: why the catcher took over: a tick came too late
 
 
-FROM_THE_LAW = (
+#: statuses of commands that are not the fallback
+FROM_THE_LAW = (ControlStatus.OK, ControlStatus.SATURATED, ControlStatus.NEAR_BORDER)
     ControlStatus.OK,
     ControlStatus.SATURATED,
     ControlStatus.NEAR_BORDER,
