@@ -34,10 +34,6 @@ class ControlStatus(IntEnum):
 
 #: statuses of commands that are not the fallback
 FROM_THE_LAW = (ControlStatus.OK, ControlStatus.SATURATED, ControlStatus.NEAR_BORDER)
-    ControlStatus.OK,
-    ControlStatus.SATURATED,
-    ControlStatus.NEAR_BORDER,
-)  #: statuses of commands that are not the fallback
 
 
 def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> ca.Function:
