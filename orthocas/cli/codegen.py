@@ -20,7 +20,7 @@ from orthocas.cli.controller_argument import (
     build_controller,
     require_options,
 )
-from orthocas.cli.output import AsJson, Force, print_json, print_rows
+from orthocas.cli.output import AsJson, Force, note, print_json, print_rows
 from orthocas.codegen import GeneratedC, Proof, check_c, generate_c
 from orthocas.errors import InvalidValueError
 
@@ -56,12 +56,15 @@ def codegen(
         loaded.function("xi")  # raises for grown charts
         law = None if controller == _NONE else build_controller(controller, loaded, options, limit)
         generated = generate_c(loaded, out, law, name, force)
+        remarks = [] if law is None else law.remarks()
     proof = check_c(generated, loaded, law) if check else None
     report = _report(generated, proof)
     if json:
         print_json(report)
     else:
         print_rows(_rows(report))
+    for remark in remarks:
+        note(remark)
 
 
 def _report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:

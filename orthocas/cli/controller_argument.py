@@ -17,9 +17,7 @@ _CHOICES = ("coupling", "damping")  # options that are words
 
 Stiffness = Annotated[
     str | None,
-    typer.Option(
-        "--stiffness", help='"100", or "100,50,..." per quantity; default: 2 Hz springs at the median inertia.'
-    ),
+    typer.Option("--stiffness", help='"100", or "100,50,..." per quantity; default: modes around 4 Hz.'),
 ]
 DampingRatio = Annotated[
     str | None, typer.Option("--damping-ratio", help='"0.7", or "0.7,1,..." per quantity; default: 0.7.')
@@ -28,11 +26,13 @@ CouplingName = Annotated[
     str | None, typer.Option("--coupling", help="coupled (default) or decoupled; for impedance and pd_plus.")
 ]
 DampingName = Annotated[
-    str | None, typer.Option("--damping", help="square_root (default) or double_diagonal; for impedance and pd_plus.")
+    str | None, typer.Option("--damping", help="double_diagonal (default) or square_root; for impedance and pd_plus.")
 ]
 PostureStiffness = Annotated[
     str | None,
-    typer.Option("--posture-stiffness", help="Stiffness of the joint springs; for projector. Default: 2 Hz springs."),
+    typer.Option(
+        "--posture-stiffness", help="Stiffness of the joint springs; for projector. Default: modes around 4 Hz."
+    ),
 ]
 Feedback = Annotated[
     str | None,

@@ -89,7 +89,7 @@ class Projector(Shown):
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """Build the law on the problem of a chart; by default with springs of 2 Hz at the median inertia."""
+        """Build the law on the problem of a chart; by default with modes around 4 Hz."""
         stiffness, posture = settings.pop("stiffness", None), settings.pop("posture_stiffness", None)
         return cls(
             chart.problem,
