@@ -19,6 +19,7 @@ from scipy.linalg import eigvalsh
 import orthocas as oc
 from orthocas.cli import simulate as command
 from orthocas.cli.controller_argument import ControllerOptions, build_controller
+from orthocas.control import ControlStatus
 from orthocas.domains import sample_uniform
 from orthocas.files.atomic import published
 from orthocas.files.ours import LIST
@@ -335,9 +336,11 @@ def test_a_fallback_is_said_with_time_and_reason(run: Run) -> None:
     assert "coupling" not in out  # coordinates mean nothing outside the domain
     report = json.loads(Path("out/report.json").read_text())
     fallback, trajectory = report["fallback"], Trajectory.load("out/trajectory.npz")
-    first = int(np.argmax(trajectory.status != 0))
+    first = int(np.argmax(trajectory.fell_back))
     assert fallback["since"] == trajectory.times[first] > 0
-    assert fallback["share"] == np.mean(trajectory.status != 0)
+    assert fallback["share"] == np.mean(trajectory.fell_back)
+    assert report["saturated_share"] == np.mean(trajectory.status == ControlStatus.SATURATED) > 0
+    assert "limit " in out
     assert (
         f"at t = {fallback['since']:.4g} s the arm left the domain: the controller commanded only the gravity torque"
         in err

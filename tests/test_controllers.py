@@ -24,6 +24,7 @@ from orthocas.control import (
     matched_stiffness,
 )
 from orthocas.control.controller import Controller
+from orthocas.control.status import FROM_THE_LAW
 from orthocas.domains import sample_uniform
 from orthocas.errors import (
     InvalidValueError,
@@ -276,7 +277,7 @@ class TestGuard:
             assert status == ControlStatus.OUTSIDE_DOMAIN
             np.testing.assert_allclose(command, gravity if law.command == "torque" else 0.0, atol=1e-12)
         for law in laws[3:]:
-            assert self.run(law, q, 1.0)[1] == ControlStatus.OK  # projectors have no domain
+            assert self.run(law, q, 1.0)[1] in FROM_THE_LAW  # projectors have no domain
 
     def test_singular_task_is_told(self, laws: list[Controller]) -> None:
         for law in laws[3:]:
@@ -336,10 +337,33 @@ class TestGuard:
 
     def test_limit_cuts_the_command(self, planar_chart: oc.Chart) -> None:
         q, far = planar_chart.problem.domain.centre, np.full(3, 10.0)
-        free = torque(Impedance(planar_chart, 50.0), q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))[0]
-        cut = torque(Impedance(planar_chart, 50.0, limit=[5, 6, 7]), q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))[0]
+        free, ok = torque(Impedance(planar_chart, 50.0), q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))
+        law = Impedance(planar_chart, 50.0, limit=[5, 6, 7])
+        cut, status = torque(law, q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))
         np.testing.assert_allclose(cut, np.clip(free, [-5, -6, -7], [5, 6, 7]))
         assert np.abs(free).max() > 7
+        assert (ok, status) == (ControlStatus.OK, ControlStatus.SATURATED)
+
+    @pytest.mark.parametrize("limit", [0.3, [0.2, 1.0, 0.4]])
+    def test_limit_of_velocities_keeps_their_direction(self, planar_chart: oc.Chart, limit: Any) -> None:
+        problem, wanted = planar_chart.problem, np.array([0.5, -0.3, 0.2])
+        q = problem.domain.centre
+        for law, of in ((Kinematic, planar_chart), (KinematicProjector, problem)):
+            k = len(law(of).labels)
+            rate = np.resize(wanted, k)
+            free, _ = torque(law(of), q, np.zeros(3), np.zeros(k), rate, np.zeros(k))
+            cut, status = torque(law(of, limit=limit), q, np.zeros(3), np.zeros(k), rate, np.zeros(k))
+            share = (np.broadcast_to(limit, 3) / np.abs(free)).min()
+            assert share < 1
+            np.testing.assert_allclose(cut, share * free, rtol=1e-12)
+            assert status == ControlStatus.SATURATED
+
+    def test_fallback_is_gravity_or_rest(self, laws: list[Controller]) -> None:
+        for law in laws:
+            q = law.problem.domain.centre
+            command = law.fallback(q, *law.gains.values()).full().ravel()
+            want = law.problem.robot.gravity(q) if law.command == "torque" else 0 * q
+            np.testing.assert_allclose(command, want, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,10 @@ Feedback = Annotated[
     typer.Option("--feedback", help="Feedback gain [1/s]; for kinematic and kinematic_projector. Default: 0."),
 ]
 Limit = Annotated[
-    str | None, typer.Option("--limit", help='Largest torque or speed, "50" or "50,40,..." per joint; default: none.')
+    str | None,
+    typer.Option(
+        "--limit", help='Largest torque or speed, "50" or "50,40,..." per joint; default: the limits of the robot.'
+    ),
 ]
 
 

@@ -9,6 +9,7 @@ from orthocas.control.projector import KinematicProjector, Projector
 from orthocas.control.reachability import joint_path
 from orthocas.control.reference import Reference
 from orthocas.control.registry import law_names, law_of, register
+from orthocas.control.safety import Safety
 from orthocas.control.status import ControlStatus
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "PDPlus",
     "Projector",
     "Reference",
+    "Safety",
     "joint_path",
     "law_names",
     "law_of",

@@ -12,7 +12,14 @@ from orthocas.casadi_tools.batch import Batched
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_point_set, require_kind, require_known
-from orthocas.control.controller import Command, guarded_graph, law_facts, named_function, named_inputs
+from orthocas.control.controller import (
+    Command,
+    fallback_function,
+    guarded_graph,
+    law_facts,
+    named_function,
+    named_inputs,
+)
 from orthocas.control.damping import DAMPING_DESIGNS, DampingDesign, damping_matrix
 from orthocas.control.gains import (
     DAMPING_RATIO,
@@ -59,7 +66,7 @@ class _OperationalSpace(Shown):
             for the extra coordinates, each with its own inertia, and relies on condition (5).
         damping: `double_diagonal` is always positive semi-definite; `square_root` is the paper's design (29), which is
             indefinite in parts of many domains if the stiffnesses are far apart.
-        limit: largest torque of each joint, (n,) or one number [N m] or [N]; default no limit.
+        limit: largest torque of each joint, (n,) or one number [N m] or [N]; default the effort limits of the robot.
 
     Raises:
         ShapeError, InvalidValueError, UnknownNameError: for settings of the wrong shape, value or name.
@@ -100,7 +107,7 @@ class _OperationalSpace(Shown):
             "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, n),
             "coupling": coupling,
             "damping": damping,
-            "limit": command_limit("limit", limit, n),
+            "limit": command_limit("limit", limit, chart.problem.robot.effort_limits),
         }.items():
             object.__setattr__(self, name, value)
 
@@ -168,6 +175,12 @@ class _OperationalSpace(Shown):
         force, volume = self._force(inputs, J)
         torque, relative = J.T @ force + gravity, volume / self._median_volume
         return guarded_graph(self.name, inputs, torque, gravity, relative, self.problem.domain)
+
+    @cached_property
+    def fallback(self) -> ca.Function:
+        """q, gains -> gravity torque."""
+        inputs = named_inputs(self.chart.n, self.gains, 0)
+        return fallback_function(inputs, self.problem.robot.gravity(inputs["q"]))
 
     @cached_property
     def energy(self) -> ca.Function:

@@ -181,7 +181,7 @@ class Robot(Shown):
         return self.tree.velocity_limits
 
     def facts(self) -> dict[str, str]:
-        """Joints, limits, tip and mass."""
+        """Joints, limits, tip and mass. Limits of effort and velocity are left out if the file has none."""
         tree = self.tree
         sliding = [name for name, slides in zip(tree.joint_names, tree.prismatic, strict=True) if slides]
         return {
@@ -190,6 +190,8 @@ class Robot(Shown):
             **({"prismatic": listed(sliding)} if sliding else {}),
             "lower": number_list(self.lower),
             "upper": number_list(self.upper),
+            **({"effort": number_list(self.effort_limits)} if np.isfinite(self.effort_limits).any() else {}),
+            **({"velocity": number_list(self.velocity_limits)} if np.isfinite(self.velocity_limits).any() else {}),
         }
 
     def mass_matrix(self, q: Any) -> Any:
