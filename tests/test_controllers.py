@@ -86,7 +86,8 @@ def torque(controller: Controller, *state: Array, **gains: Any) -> tuple[Array, 
 
 
 def called(controller: Controller, s: State) -> Array:
-    command, status = torque(controller, s.q, s.dq, s.phi_d, s.dphi_d, s.ddphi_d)
+    unlimited = np.full(controller.problem.n, np.inf)
+    command, status = torque(controller, s.q, s.dq, s.phi_d, s.dphi_d, s.ddphi_d, limit=unlimited)
     assert status == ControlStatus.OK
     return command
 

@@ -13,8 +13,12 @@ from orthocas.cli.controller_argument import (
     CouplingName,
     DampingName,
     DampingRatio,
+    DampingStiffness,
     Feedback,
+    GravityName,
+    InputNames,
     Limit,
+    ModelName,
     PostureStiffness,
     Stiffness,
     build_controller,
@@ -39,6 +43,10 @@ def codegen(
     posture_stiffness: PostureStiffness = None,
     feedback: Feedback = None,
     limit: Limit = None,
+    damping_stiffness: DampingStiffness = None,
+    model: ModelName = None,
+    gravity: GravityName = None,
+    inputs: InputNames = None,
     check: Annotated[
         bool, typer.Option("--check", help="Compile the C and compare it with Python on 1000 states.")
     ] = False,
@@ -46,7 +54,14 @@ def codegen(
     json: AsJson = False,
 ) -> None:
     """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
-    options = ControllerOptions(stiffness, damping_ratio, coupling, posture_stiffness, feedback, damping=damping)
+    options = ControllerOptions(
+        *(stiffness, damping_ratio, coupling, posture_stiffness, feedback),
+        damping=damping,
+        damping_stiffness=damping_stiffness,
+        model=model,
+        gravity=gravity,
+        inputs=inputs,
+    )
     if controller != _NONE:
         require_options(controller, options)
     elif options != ControllerOptions() or limit is not None:

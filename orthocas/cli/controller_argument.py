@@ -13,7 +13,7 @@ from orthocas.errors import InvalidValueError
 
 CONTROLLERS = law_names()
 _OF_THE_PLANT = ("mass_factor", "friction")  # options for laws that command torques
-_CHOICES = ("coupling", "damping")  # options that are words
+_CHOICES = ("coupling", "damping", "model", "gravity", "inputs")  # options that are words
 
 Stiffness = Annotated[
     str | None,
@@ -27,6 +27,21 @@ CouplingName = Annotated[
 ]
 DampingName = Annotated[
     str | None, typer.Option("--damping", help="double_diagonal (default) or square_root; for impedance and pd_plus.")
+]
+DampingStiffness = Annotated[
+    str | None,
+    typer.Option(
+        "--damping-stiffness", help="Design the damping for this stiffness, so that --stiffness may be 0 in places."
+    ),
+]
+ModelName = Annotated[
+    str | None, typer.Option("--model", help="own (default), or given: mass matrix and torques become inputs.")
+]
+GravityName = Annotated[
+    str | None, typer.Option("--gravity", help="law (default) compensates gravity; robot: the robot does so itself.")
+]
+InputNames = Annotated[
+    str | None, typer.Option("--inputs", help="Additional inputs: payload, wrench, extra_torque, with commas between.")
 ]
 PostureStiffness = Annotated[
     str | None,
@@ -58,6 +73,10 @@ class ControllerOptions:
     mass_factor: float | None = None
     friction: str | None = None
     damping: str | None = None
+    damping_stiffness: str | None = None
+    model: str | None = None
+    gravity: str | None = None
+    inputs: str | None = None
 
 
 def require_options(name: str, options: ControllerOptions) -> None:

@@ -9,6 +9,7 @@ from orthocas.checks import Array, require_kind
 from orthocas.control.gains import positive_gains
 from orthocas.domains import sample_uniform
 from orthocas.problem import Problem
+from orthocas.robots.robot import Robot
 
 SPRING_FREQUENCY = 8 * np.pi  #: [rad/s], 4 Hz: holds arms whose masses are 20 % off within 20 mm (docs/control.md)
 _SAMPLES, _SEED = 256, 0
@@ -32,7 +33,7 @@ def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY) -> Arra
     require_kind("chart", chart, Chart)
     chart.function("xi")  # raises for grown charts
     points = _points(chart.problem)
-    return _matched(mobility(chart, points), frequency)
+    return _matched(mobility(chart, points, chart.problem.robot), frequency)
 
 
 def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUENCY) -> Array:
@@ -41,9 +42,9 @@ def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUE
     return _matched(np.linalg.inv(problem.robot.mass_matrix(_points(problem))), frequency)
 
 
-def mobility(chart: Chart, points: ArrayLike) -> Array:
-    """M_phi^-1 = J M^-1 J^T at points (N, n), (N, n, n)."""
-    J, M = chart.jacobian(points), chart.problem.robot.mass_matrix(points)
+def mobility(chart: Chart, points: ArrayLike, robot: Robot) -> Array:
+    """M_phi^-1 = J M^-1 J^T of a robot at points (N, n), (N, n, n)."""
+    J, M = chart.jacobian(points), robot.mass_matrix(points)
     return np.asarray(J @ np.linalg.solve(M, J.transpose(0, 2, 1)))
 
 
