@@ -58,4 +58,8 @@ def test_too_much_time_is_a_finding_and_compiled_code_ends_too() -> None:
     assert set(found) == {0, 1, 2}
     assert found[0] in ("takes more than 0.3 s", "takes 0.3 s")
     assert re.fullmatch(r"takes 0\.\d s", found[1])
-    assert found[2] == f"its process died with exit code {-signal.SIGXCPU}"
+    by_the_kernel = f"its process died with exit code {-signal.SIGXCPU}"
+    assert found[2] in (
+        by_the_kernel,
+        "hangs where Python cannot interrupt it",
+    )  # a busy machine counts whole seconds late
