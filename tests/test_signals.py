@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from unittest.mock import patch
 
@@ -14,7 +15,7 @@ from matplotlib.figure import Figure
 from programs import Run
 
 import orthocas as oc
-from orthocas.casadi_tools.interrupts import deferred, ended_in_order
+from orthocas.casadi_tools.interrupts import deferred, ended_in_order, remembered
 from orthocas.cli import entry
 from orthocas.comparing.cells import run_cells
 from orthocas.errors import Interrupted
@@ -72,6 +73,57 @@ def test_reproduce_does_not_draw_an_interrupted_fit(run: Run, planar_x: oc.Probl
         code, out, err = run("reproduce", "all", "--out", "figures")
     assert (code, out, err) == (130, "", "orthocas: interrupted\n")
     assert {path.stem for path in Path("figures").glob("fig*")} == {"fig06"}
+
+
+def swallowed(quick: bool) -> Drawing:
+    """As `except: pass` in a library would."""
+    with suppress(BaseException):
+        signal.raise_signal(signal.SIGINT)
+    return Drawing({"": Figure(figsize=(0.2, 0.2))}, {"one": 1.0})
+
+
+def turned_into_an_error(quick: bool) -> Drawing:
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise RuntimeError("a callback failed") from None
+    raise AssertionError
+
+
+def swallowed_in_compiled_code(quick: bool) -> Drawing:
+    with suppress(BaseException), deferred():
+        signal.raise_signal(signal.SIGINT)
+    return swallowed(quick)
+
+
+@pytest.mark.parametrize("draw", [swallowed, turned_into_an_error, swallowed_in_compiled_code])
+def test_ctrl_c_that_a_library_swallows_is_not_lost(run: Run, draw: Callable[[bool], Drawing]) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with patch.dict(registry.FIGURES, {"fig06": Recipe("first", draw)}, clear=True):
+        code, _, err = run("reproduce", "fig06", "--out", "figures")
+    assert (code, err) == (130, "orthocas: interrupted\n")
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_is_forgotten_with_the_block() -> None:
+    with remembered() as pressed:
+        assert not pressed()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert pressed()
+        with remembered() as again:
+            assert not again()
+
+
+def test_ctrl_c_while_python_ends_needs_no_handler() -> None:
+    before = signal.signal(signal.SIGINT, entry._leave)
+    try:
+        with patch.object(sys, "argv", ["orthocas", "--help"]), pytest.raises(SystemExit) as end:
+            entry.main()
+        assert end.value.code == 0
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
