@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 import pytest
 from matplotlib.figure import Figure
-from programs import Run
+from programs import Run, python
 
 import orthocas as oc
 from orthocas.casadi_tools.interrupts import deferred, ended_in_order, remembered
@@ -210,6 +210,39 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     with patch("tempfile.tempdir", str(tmp_path / "tmp")):
         assert list(run_cells([])) == []
     assert not list((tmp_path / "tmp").glob("orthocas-*"))  # ... but the next comparison does
+
+
+_SLOW_IMPORTS = """
+import time
+import orthocas as oc
+if __name__ == "__mp_main__":  # in a worker, before anything of ours has begun
+    open("began", "w").close()
+    time.sleep(60)
+elif __name__ == "__main__":
+    oc.compare(oc.problems.get("planar_3r_x"), [oc.Linear()], jobs=1, samples=50, held_out=50)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_workers_that_still_import_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "grid.py").write_text(_SLOW_IMPORTS)
+    (tmp_path / "tmp").mkdir()
+    environment = os.environ | {"TMPDIR": str(tmp_path / "tmp")}
+    process = subprocess.Popen(
+        [sys.executable, "grid.py"], cwd=tmp_path, env=environment, start_new_session=True, stderr=subprocess.DEVNULL
+    )
+    wait_until((tmp_path / "began").exists, 60)
+    process.kill()
+    process.wait()
+    wait_until(lambda: not session_of(process.pid), 5)
+
+
+def test_only_workers_end_with_the_process_that_a_variable_names(tmp_path: Path) -> None:
+    """A program that happens to start while workers do inherits the variable; it lives on, and passes nothing on."""
+    code = "import orthocas, os; print('ORTHOCAS_PARENT' in os.environ)"
+    with patch.dict(os.environ, {"ORTHOCAS_PARENT": "1"}):
+        assert python(code).strip() == "False"
 
 
 def wait_until(condition: Callable[[], bool], seconds: float) -> None:
