@@ -75,6 +75,14 @@ def fit(
     centre: CentreText = None,
     home: HomeName = None,
     half_width: HalfWidth = None,
+    least_singular_value: Annotated[
+        float | None,
+        typer.Option(
+            "--least-singular-value",
+            parser=number,
+            help="Leave positions out of the domain where the task's relative singular value is smaller, such as 0.1.",
+        ),
+    ] = None,
     domain: DomainText = None,
     leak_deg: Annotated[
         float | None, typer.Option("--leak-deg", parser=number, help="Largest leak for --domain auto [deg]; default 8.")
@@ -117,7 +125,7 @@ def fit(
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
-    words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width)
+    words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width, least_singular_value)
     bounds = _bounds(domain, leak_deg, conditioning)
     built = build_problem(problem, words) if bounds is None else None
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")

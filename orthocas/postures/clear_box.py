@@ -10,13 +10,14 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_number, as_point_set, frozen_array, require_kind
-from orthocas.domains import Box, Domain, sample_uniform
+from orthocas.domains import Box, Domain, sample_evenly, sample_uniform
 from orthocas.errors import DomainError, InvalidValueError, SingularTaskError
 from orthocas.postures.row_scale import row_scale
 from orthocas.showing import number_list
 from orthocas.tasks import Task
 
 _SAMPLES, _SEED = 256, 0  # of the box, for the scale of the rows
+_SHARE_SAMPLES = 20_000
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -103,6 +104,11 @@ class ClearBox(Box):
         return values[0] if single else values
 
     @cached_property
+    def share(self) -> float:
+        """Share of the box that is clear, from 20,000 samples."""
+        return float(self.is_clear(sample_evenly(_borders(self), _SHARE_SAMPLES, _SEED)).mean())
+
+    @cached_property
     def pivots(self) -> ca.Function:
         """q (n, 1) -> the pivots (m, 1) of D^-1 J_x J_x^T D^-1 - bound^2 I; all are > 0 just where q is clear."""
         q = ca.SX.sym("q", len(self.centre))
@@ -135,10 +141,15 @@ def clear_domain(domain: Domain, task: Task, least_singular_value: float | None)
     return domain
 
 
+def _borders(box: Box) -> Box:
+    """The whole box, also of a ClearBox."""
+    return Box(box.centre, box.half_width)
+
+
 def _row_sizes(box: Box, task: Task) -> Array:
     """The scale of the rows of J_x at samples of a box, without those where it is not finite, (m,)."""
-    borders = Box(box.centre, box.half_width)  # of a ClearBox, too
-    J = task.batched_jacobian(sample_uniform(borders, _SAMPLES, _SEED))[0].reshape(_SAMPLES, task.m, len(box.centre))
+    points = sample_uniform(_borders(box), _SAMPLES, _SEED)
+    J = task.batched_jacobian(points)[0].reshape(_SAMPLES, task.m, len(box.centre))
     known = np.isfinite(J).all(axis=(1, 2))
     if not known.any():
         raise SingularTaskError(f"the Jacobian of task '{task.name}' is not finite at any of {_SAMPLES} samples")
