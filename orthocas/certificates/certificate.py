@@ -67,9 +67,7 @@ class Certificate(Shown):
             half = (self.injective.high - self.injective.low) / 2
             facts["one-to-one"] = f"on the box of half-width {number_list(half)} around the centre"
         if self.least_singular_value > 0:
-            facts["left out"] = (
-                f"parts where the task's relative singular value is at most {self.least_singular_value:g}"
-            )
+            facts["left out"] = f"where the task's relative singular value is at most {self.least_singular_value:g}"
         low, high = self.unproved
         if len(low) and not self.fold:
             largest = int(np.argmax((high - low).prod(axis=1)))

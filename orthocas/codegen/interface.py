@@ -60,10 +60,7 @@ def template_values(
             values[f"{kernel}_{word}"] = str(max(1, size))
     if controller is not None:
         values |= _control_values(controller)
-    clear = isinstance(domain, ClearBox)
-    values |= {"is_clear": "is_clear(q)" if clear else "1", "clear_c": ""}
-    if clear:
-        values["clear_c"] = filled("clear.c", values)
+    values |= _clear_values(domain, values)
     for template in ("control.h", "control.c", "control.md"):
         values[template.replace(".", "_")] = "" if controller is None else filled(template, values)
     return values
@@ -133,6 +130,13 @@ def _clear_line(domain: Domain) -> str:
     if not isinstance(domain, ClearBox):
         return ""
     return f"\n *   and the {domain.heading},\n *   or else the status is OUTSIDE_DOMAIN"
+
+
+def _clear_values(domain: Domain, values: Mapping[str, str]) -> dict[str, str]:
+    """The test of a ClearBox, and its call; for other domains there is none."""
+    if not isinstance(domain, ClearBox):
+        return {"is_clear": "1", "clear_c": ""}
+    return {"is_clear": "is_clear(q)", "clear_c": filled("clear.c", values)}
 
 
 def _somewhere(domain: Domain) -> Array:

@@ -24,7 +24,7 @@ from orthocas.files.npy import Stored, to_npy
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
 from orthocas.parametrisations import JointSpace, parametrisation_from_data, parametrisation_to_data
-from orthocas.postures.clear_box import ClearBox
+from orthocas.postures.clear_box import CLEAR_BOX, ClearBox
 from orthocas.problem import Problem
 from orthocas.robots import KinematicTree, Robot
 from orthocas.tasks import Task
@@ -207,23 +207,23 @@ def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTre
 
 
 def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
-    task = _task(robot, part(data, "task", dict))
-    metric, domain = _metric(robot, part(data, "metric", dict)), _domain(task, data, arrays)
+    domain = _domain(robot.n, data, arrays)
+    task, metric = _task(robot, part(data, "task", dict)), _metric(robot, part(data, "metric", dict))
+    if data["domain"] == CLEAR_BOX and isinstance(domain, Box):
+        require_within_limits(robot, domain)  # before the task is evaluated there
+        scale = part(arrays, "domain_row_scale", np.ndarray)
+        domain = ClearBox(domain, task, part(data, "least_singular_value", float), scale)
     return Problem(robot, task, metric, domain, part(data, "name", str))
 
 
-def _domain(task: Task, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Domain:
+def _domain(n: int, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Domain:
+    """The box or torus of a file; for a ClearBox its box."""
     kind = part(data, "domain", str)
-    require_known("domain", kind, ("box", "torus", "clear box"))
-    unbounded = part(data, "unbounded", list) if "unbounded" in data else ()  # missing in older files
-    box = Box(part(arrays, "domain_centre", np.ndarray), part(arrays, "domain_half_width", np.ndarray), unbounded)
+    require_known("domain", kind, ("box", "torus", CLEAR_BOX))
     if kind == "torus":
-        return Torus(task.robot.n)
-    if kind == "box":
-        return box
-    require_within_limits(task.robot, box)  # before the task is evaluated there
-    bound = part(data, "least_singular_value", float)
-    return ClearBox(box, task, bound, part(arrays, "domain_row_scale", np.ndarray))
+        return Torus(n)
+    unbounded = part(data, "unbounded", list) if "unbounded" in data else ()  # missing in older files
+    return Box(part(arrays, "domain_centre", np.ndarray), part(arrays, "domain_half_width", np.ndarray), unbounded)
 
 
 def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:

@@ -16,6 +16,7 @@ from orthocas.postures.row_scale import row_scale
 from orthocas.showing import number_list
 from orthocas.tasks import Task
 
+CLEAR_BOX = "clear box"  #: name of the kind
 _SAMPLES, _SEED = 256, 0  # of the box, for the scale of the rows
 _SHARE_SAMPLES = 20_000
 
@@ -62,7 +63,7 @@ class ClearBox(Box):
         for name, value in (("least_singular_value", bound), ("scale", sizes.min())):
             if not 0 < value < np.inf:
                 raise InvalidValueError(name, value, "positive and finite")
-        for field, value in (("name", "clear box"), ("task", task), ("least_singular_value", bound), ("scale", sizes)):
+        for field, value in (("name", CLEAR_BOX), ("task", task), ("least_singular_value", bound), ("scale", sizes)):
             object.__setattr__(self, field, value)
         if not self.is_clear(self.centre[None])[0]:
             raise DomainError(f"the centre of the domain {self.told(self.centre)}")
