@@ -199,11 +199,10 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
     return _inside(domain, samples, draw)
 
 
-def contains(domain: Domain, q: ArrayLike) -> Array:
-    """Whether points (n,) or (N, n) lie in the domain. Finite angles always lie on a torus."""
+def contains(domain: Domain, q: ArrayLike) -> Any:
+    """Whether points (n,) or (N, n) lie in the domain: a bool, or (N,). Finite angles always lie on a torus."""
     require_domain(domain)
-    inside: Array = domain.contains(q)
-    return inside
+    return domain.contains(q)
 
 
 def require_domain(domain: Domain) -> None:

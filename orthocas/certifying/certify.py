@@ -199,7 +199,8 @@ def _suspects(chart: Chart) -> Array:
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
     worst = int(np.argmin(volumes * np.sign(volumes[0])))
-    return points[[0, worst]]
+    suspects: Array = points[[0, worst]]
+    return suspects
 
 
 def _one_to_one(

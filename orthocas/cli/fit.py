@@ -1,6 +1,6 @@
 """`orthocas fit`: from a robot to a chart file."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -192,10 +192,15 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
         rows["exact"] = f"joints that do not move the task: {', '.join(result.idle_joints)}"
     if result.cyclic_joints:
         rows["cyclic"] = f"holds at all positions of {', '.join(result.cyclic_joints)}"
-    if result.problem_check.singular_samples:
-        check = result.problem_check
+    check, offer = result.problem_check, result.clear_part
+    if check.singular_samples:
         at = ", ".join(f"{value:.2f}" for value in check.most_singular_point)
         rows["singular"] = f"{check.singular_share:.2%} of the domain is near-singular, worst at q = ({at})"
+        if offer is None:
+            rows["singular"] += "; --domain auto, or another --centre or --home, stays clear"
+    if offer is not None:
+        bound, share = offer.least_singular_value, offer.share
+        rows["clear part"] = f"--least-singular-value {bound:g} leaves out singular positions and keeps {share:.1%}"
     rows["chart"] = str(target)
     return rows
 
@@ -221,6 +226,7 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
         "cyclic_joints": list(result.cyclic_joints),
         "near_singular_share": check.singular_share,
         "most_singular_point": list(check.most_singular_point),
+        "clear_part": None if result.clear_part is None else asdict(result.clear_part),
         "stages": [
             {
                 "parametrisation": stage.label,

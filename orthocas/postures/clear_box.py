@@ -5,7 +5,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.cached import cached_property
@@ -21,7 +21,7 @@ _SAMPLES, _SEED = 256, 0  # of the box, for the scale of the rows
 _SHARE_SAMPLES = 20_000
 
 
-@dataclass(frozen=True, eq=False, init=False)
+@dataclass(frozen=True, eq=False, init=False, kw_only=True)
 class ClearBox(Box):
     """All q of a box at which the relative singular value of a task is above a bound (ours).
 
@@ -90,10 +90,9 @@ class ClearBox(Box):
         inside[inside] = self.is_clear(points[inside])
         return inside[0] if single else inside
 
-    def is_clear(self, points: Array) -> Array:
+    def is_clear(self, points: Array) -> NDArray[np.bool_]:
         """Whether s(q) > bound at points (N, n), also outside the box, (N,)."""
-        clear: Array = (self._batched_pivots(points)[0] > 0).all(axis=1)
-        return clear
+        return np.asarray((self._batched_pivots(points)[0] > 0).all(axis=1))
 
     def singular_values(self, q: ArrayLike) -> Any:
         """s(q) at points (n,) or (N, n): a number, or (N,); NaN where the task has no finite Jacobian."""
