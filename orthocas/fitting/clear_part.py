@@ -47,7 +47,7 @@ def clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints | None)
         wanted = float(np.quantile(values, _MOST_FOLDS)) if len(folded) else 0.0
         if not wanted <= _LARGEST:
             return None
-        bound = round(_STEP * (1 + np.floor(wanted / _STEP)), 2)
+        bound = round(_STEP * (1 + wanted // _STEP), 2)
         return ClearPart(bound, ClearBox(domain, problem.task, bound, measured.scale).share)
     except DomainError:  # the centre is not clear
         return None
