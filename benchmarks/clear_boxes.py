@@ -10,8 +10,8 @@ import orthocas as oc
 from orthocas.postures.regular_box import regular_box
 
 HEADER = (
-    "| robot, half-width [rad] | least singular value | share of the box | fit [s] | task / mutual std [deg] | leak [deg] "
-    "| least conditioning | folds |\n| --- | --- | --- | --- | --- | --- | --- | --- |"
+    "| robot, half-width [rad] | least singular value | share of the box | fit [s] | task / mutual std [deg] "
+    "| leak [deg] | least conditioning | folds |\n| --- | --- | --- | --- | --- | --- | --- | --- |"
 )
 CASES = (  # around the default posture, with the default degree
     ("iiwa", 0.785, (None, 0.1, 0.2)),
