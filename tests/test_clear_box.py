@@ -99,6 +99,11 @@ def test_samples_lie_inside_and_follow_the_seed(problem: oc.Problem, draw: objec
     assert draw is sample_heavily or np.array_equal(points[: len(kept)], kept)
 
 
+def test_a_single_sample_is_drawn(problem: oc.Problem) -> None:
+    for domain in (WIDE, problem.domain):
+        assert [draw(domain, 1, 0).shape for draw in (sample_uniform, sample_heavily, sample_evenly)] == [(1, 3)] * 3
+
+
 def test_a_domain_of_which_nothing_is_left_is_refused_soon(problem: oc.Problem) -> None:
     best = problem.domain.singular_values(sample_uniform(WIDE, 20_000, 0)).max()  # type: ignore[attr-defined]
     with pytest.raises(DomainError, match=r"the centre of the domain has a relative singular value of 0\.\d+"):
