@@ -9,6 +9,7 @@ SCRIPTS = (
     "command",
     "fits",
     "folds",
+    "clear_boxes",
     "certificates",
     "suggested_domains",
     "choices",

@@ -18,6 +18,7 @@ from orthocas.checks import Array
 from orthocas.comparing.report import Comparison
 from orthocas.control import Controller, Reference
 from orthocas.domains import sample_uniform
+from orthocas.fitting.clear_part import ClearPart
 from orthocas.fitting.fit import Fit
 from orthocas.metrics import Metric, metric_matrices
 from orthocas.samples import sample_problem
@@ -67,6 +68,13 @@ def given() -> oc.Chart:
 def cyclic() -> oc.Chart:
     known = problems.get("planar_3r_xy")
     return oc.fit(known, oc.Polynomial(2, cyclic="auto"), samples=300).chart
+
+
+@cache
+def clear() -> oc.Chart:
+    known = problems.get("planar_3r_xy")
+    problem = oc.Problem(known.robot, known.task, domain=known.domain, least_singular_value=0.1)
+    return oc.fit(problem, oc.Polynomial(2), samples=300).chart
 
 
 @cache
@@ -139,6 +147,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "given chart": given,
     "chart with an idle joint": with_idle_joint,
     "cyclic chart": cyclic,
+    "chart of a clear box": clear,
     "circle chart": circle,
     "disk chart": disk,
     "linear leaf chart": on_planes,
@@ -165,6 +174,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "check of a problem": lambda: oc.check(planar(), 100),
     "box": lambda: planar().domain,
     "unbounded box": lambda: cyclic().problem.domain,
+    "clear box": lambda: clear().problem.domain,
+    "clear part of a domain": lambda: ClearPart(0.1, 0.95),
     "torus": lambda: oc.Torus(3),
     "suggestion of a domain": suggestion,
     "width of a joint": lambda: suggestion().joints[0],
