@@ -14,7 +14,8 @@ from orthocas.simulation.mujoco_scene import MuJoCo, Payload, Wall
 
 TIP = "tip"  #: name of the body at the tip frame; it carries the payload
 HAND = "hand"  #: name of the geom at the tip that touches the wall
-_STOP_TIME = 0.004  # [s] time constant of the stops, critically damped; MuJoCo's 0.02 is too soft for light wrists
+_STOP_TIME = 0.004  # [s] time constant of the stops, critically damped; MuJoCo's is 0.02 ...
+_STOP_IMPEDANCE = (0.99, 0.999)  # ... and 0.9 to 0.95, which lets a motor press a light wrist 0.1 rad beyond its stop
 _FAR = 1e9  # [rad] or [m]: MuJoCo's ranges have two ends
 
 
@@ -105,6 +106,7 @@ def _add_joint(
     joint.limited = mj.mjtLimited.mjLIMITED_TRUE if limited else mj.mjtLimited.mjLIMITED_FALSE
     if limited:
         joint.range, joint.solref_limit = np.clip(ends, -_FAR, _FAR), (_STOP_TIME, 1.0)
+        joint.solimp_limit[:2] = _STOP_IMPEDANCE
 
 
 def _add_motor(mj: ModuleType, spec: Any, i: int, limit: float) -> None:
