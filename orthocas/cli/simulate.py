@@ -17,6 +17,7 @@ from orthocas.cli.controller_argument import (
     CouplingName,
     DampingName,
     DampingRatio,
+    DampingStiffness,
     Feedback,
     Limit,
     PostureStiffness,
@@ -61,6 +62,7 @@ def simulate(
     posture_stiffness: PostureStiffness = None,
     feedback: Feedback = None,
     limit: Limit = None,
+    damping_stiffness: DampingStiffness = None,
     rate: Annotated[
         float | None, typer.Option("--rate", parser=number, help="Control rate [Hz]; default: continuous control.")
     ] = None,
@@ -91,7 +93,8 @@ def simulate(
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
     options = ControllerOptions(
-        stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction, damping
+        *(stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction),
+        *(damping, damping_stiffness),
     )
     require_options(controller, options)
     if animation != "none":

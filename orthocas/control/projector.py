@@ -12,7 +12,14 @@ from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.chart import Chart
 from orthocas.checks import Array, frozen_array, require_kind
-from orthocas.control.controller import Command, guarded_graph, law_facts, named_function, named_inputs
+from orthocas.control.controller import (
+    Command,
+    fallback_function,
+    guarded_graph,
+    law_facts,
+    named_function,
+    named_inputs,
+)
 from orthocas.control.damping import damping_matrix
 from orthocas.control.gains import (
     DAMPING_RATIO,
@@ -44,7 +51,7 @@ class Projector(Shown):
         stiffness: diagonal of K_x, > 0, (m,) or one number.
         posture_stiffness: diagonal of K_q, > 0, (n,) or one number [N m/rad].
         damping_ratio: of all springs, >= 0, (m + n,) or one number.
-        limit: largest torque of each joint, (n,) or one number; default no limit.
+        limit: largest torque of each joint, (n,) or one number; default the effort limits of the robot.
 
     Source:
         [AS2023] eqs. (2), (3).
@@ -78,11 +85,11 @@ class Projector(Shown):
         object.__setattr__(self, "problem", problem)
         object.__setattr__(self, "stiffness", frozen_array("stiffness", np.concatenate([task, posture]), (m + n,)))
         object.__setattr__(self, "damping_ratio", non_negative_gains("damping_ratio", damping_ratio, m + n))
-        object.__setattr__(self, "limit", command_limit("limit", limit, n))
+        object.__setattr__(self, "limit", command_limit("limit", limit, problem.robot.effort_limits))
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """Build the law on the problem of a chart; by default with springs of 2 Hz at the median inertia."""
+        """Build the law on the problem of a chart; by default with modes around 4 Hz."""
         stiffness, posture = settings.pop("stiffness", None), settings.pop("posture_stiffness", None)
         return cls(
             chart.problem,
@@ -136,6 +143,12 @@ class Projector(Shown):
         return guarded_graph(self.name, inputs, torque, gravity, volume / scale, None)
 
     @cached_property
+    def fallback(self) -> ca.Function:
+        """q, gains -> gravity torque."""
+        inputs = self._inputs()
+        return fallback_function(inputs, self.problem.robot.gravity(inputs["q"]))
+
+    @cached_property
     def energy(self) -> ca.Function:
         """V, the kinetic energy plus all springs, also their projected-out part [J], and power of both dampers [W]."""
         problem, m = self.problem, self.problem.m
@@ -176,7 +189,7 @@ class KinematicProjector(Shown):
         problem: robot, task and metric A.
         feedback: diagonal of Lambda_x, >= 0, (m,) or one number [1/s].
         posture_feedback: diagonal of Lambda_q, >= 0, (n,) or one number [1/s].
-        limit: largest speed of each joint, (n,) or one number; default no limit.
+        limit: largest speed of each joint, (n,) or one number; default the velocity limits of the robot.
 
     Source:
         [AS2023] eq. (1).
@@ -207,7 +220,7 @@ class KinematicProjector(Shown):
         posture = non_negative_gains("posture_feedback", posture_feedback, problem.n)
         object.__setattr__(self, "problem", problem)
         object.__setattr__(self, "feedback", np.concatenate([task, posture]))
-        object.__setattr__(self, "limit", command_limit("limit", limit, problem.n))
+        object.__setattr__(self, "limit", command_limit("limit", limit, problem.robot.velocity_limits))
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
@@ -255,7 +268,13 @@ class KinematicProjector(Shown):
         rate = inputs["reference_velocity"] + inputs["feedback"] * (inputs["reference"] - self.measured(q))
         velocity = rate[m:] + B @ (Lambda @ (rate[:m] - J @ rate[m:]))
         scale = median_volume(problem, problem.task.jacobian_function, problem.metric, (m,))
-        return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale, None)
+        return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale, None, True)
+
+    @cached_property
+    def fallback(self) -> ca.Function:
+        """q, gains -> zero velocity."""
+        n = self.problem.n
+        return fallback_function(named_inputs(n, self.gains, 0), ca.MX(n, 1))
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if a posture of the reference leaves the joint limits."""

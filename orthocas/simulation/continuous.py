@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.simulation.closed_loop import ClosedLoop, Piece, cvodes_options, run_compiled
@@ -24,7 +25,8 @@ def integrate(loop: ClosedLoop, reference: Reference, start: Array, step: float,
     Raises:
         SimulationError: if CVODES gives up.
     """
-    run = _integrator(loop, reference, tolerance)
+    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+        run = _integrator(loop, reference, tolerance)
     state = start
     for begin, end in _pieces(reference, loop.loads.pushes, step * _OUTPUTS):
         middle = np.array([(begin + end) / 2])

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.simulation.closed_loop import ClosedLoop, Piece, cvodes_options, run_compiled
@@ -33,7 +34,8 @@ def run_ticks(
         noise.sample(ticks, loop.n)[:, : loop.plant_rate.size1_in(0)],
         loop.loads.mean(times, 1 / rate),
     )
-    run = _tick(loop, 1 / rate, len(reference.labels), tolerance).mapaccum(_TICKS)
+    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+        run = _tick(loop, 1 / rate, len(reference.labels), tolerance).mapaccum(_TICKS)
     state = start
     for first in range(0, ticks, _TICKS):
         count = min(_TICKS, ticks - first)
