@@ -59,6 +59,7 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--param": _WORDS,
     "--solver": _SOLVERS,
     "--controller": _LAWS,
+    "--plant": ("mujoco", "cvodes", "MuJoCo", ""),
     "--steps": _FILES,
     "--name": ("arm", "int", "1arm", "a b", "math", "é", "x" * 200, "main"),
 }
@@ -74,7 +75,7 @@ _LAW_OPTIONS = (
     "--feedback",
     "--limit",
 )
-_RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--seed")
+_RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--seed", "--plant")
 _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = {
     "fit": (
         _PROBLEMS,
