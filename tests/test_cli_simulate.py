@@ -178,6 +178,24 @@ def test_points_and_pushes(run: Run) -> None:
     assert "forces do not affect a velocity controller" in err
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("blank")
+def test_mujoco_is_another_plant(run: Run) -> None:
+    """The same run, up to the tolerance of CVODES, which adds up over 600 ticks; a push at a link reaches both."""
+    pytest.importorskip("mujoco", reason="the extra orthocas[sim] is not installed")
+    push = {"start": 0.1, "duration": 0.1, "force": [20, 0, 0], "link": "q2", "point": [0.5, 0, 0]}
+    points = {"points": [{"time": 0.5, "move": {"x": 0.02}}], "pushes": [push]}
+    Path("pushed.json").write_text(json.dumps(points))
+    words = ("--rate", "1000", "--mass-factor", "1.1", "--friction", "0.5,0")
+    cvodes, ours = (
+        report_of(run, "pd_plus", *words, *more, steps="pushed.json") for more in ((), ("--plant", "mujoco"))
+    )
+    assert ours["tracking_error"]["x"] == pytest.approx(cvodes["tracking_error"]["x"], abs=1e-6)
+    Path("pushed.json").write_text(json.dumps(points | {"pushes": []}))
+    still = report_of(run, "pd_plus", *words, steps="pushed.json")["tracking_error"]["x"]
+    assert ours["tracking_error"]["x"] > still + 1e-4
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -203,6 +221,9 @@ def test_points_and_pushes(run: Run) -> None:
         (("kinematic", "--noise", "1,1", "--rate", "100"), "kinematic measures no velocity"),
         (("pd_plus", "--seed", "1"), "--seed is 1, expected no seed without --noise"),
         (("pd_plus", "--friction", "-1,0"), "viscous[0] is -1.0"),
+        (("pd_plus", "--plant", "bullet"), "unknown plant 'bullet', known: cvodes, mujoco"),
+        (("pd_plus", "--plant", "mujoco"), "--plant is mujoco, expected --rate as well, because MuJoCo"),
+        (("kinematic", "--plant", "mujoco", "--rate", "100"), "expected no MuJoCo with a velocity controller"),
         (("pd_plus", "--mass-factor", "0"), "factor is 0.0, expected numbers > 0"),
         (("pd_plus", "--animation", "webp"), "unknown animation format 'webp', known: gif, mp4"),
         (("pd_plus", "--out", "no/out"), "folder no does not exist"),

@@ -238,7 +238,9 @@ def test_runaways_raise_an_error_and_write_nothing(plant: MuJoCoPlant, capfd: py
 def test_wrong_arguments_are_named(plant: MuJoCoPlant) -> None:
     with pytest.raises(InvalidValueError, match="torque is .*nan.*, expected numbers up to 1e\\+10"):
         plant.step([np.nan] * 7, 1e-3)
-    with pytest.raises(InvalidValueError, match="link is 7, expected the index of a joint, from 0 to 6"):
+    with pytest.raises(
+        InvalidValueError, match="link is 7, expected the name of a joint, or the index of one from 0 to 6"
+    ):
         plant.push([1.0, 0, 0], link=7)
     with pytest.raises(UnknownNameError, match="unknown link, named by the joint that moves it, 'elbow'"):
         plant.push([1.0, 0, 0], link="elbow")

@@ -18,6 +18,7 @@ from orthocas.control import Controller, Safety
 from orthocas.control.controller import require_controller
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.files.atomic import output_folder, published, require_writable
+from orthocas.postures.clear_box import ClearBox
 
 _LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/test_c_safety.py)
 _TAKEN = (  # names of C headers and libraries
@@ -106,6 +107,9 @@ def _functions(chart: Chart, controller: Controller | None) -> list[ca.Function]
         ca.Function("chart", [q], [chart.function("phi")(q), chart.function("jacobian")(q).T]),
         scalar_code(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)])),
     ]
+    domain = chart.problem.domain
+    if isinstance(domain, ClearBox):
+        found.append(scalar_code(ca.Function("pivots", [q], [domain.pivots(q)])))
     if controller is not None:
         graph = controller.graph
         inputs = graph.mx_in()
@@ -129,7 +133,8 @@ def _stack_bytes(kernels: Kernels, n: int) -> int:
     """Sum of the work arrays, those of the inverse map, and an allowance for local variables and math.h."""
     inverse = kernels.array_bytes("chart") + 8 * n * (n + 6)
     locals_ = round(_LOCALS * max(1.0, n / 7) ** 2)  # compilers keep matrices in local variables
-    return max(inverse, *map(kernels.array_bytes, kernels.work)) + locals_
+    clear = kernels.array_bytes("pivots") if "pivots" in kernels.work else 0  # called by the others
+    return max(inverse, *map(kernels.array_bytes, kernels.work)) + clear + locals_
 
 
 def _require_matching(chart: Chart, controller: Controller | None, name: str) -> None:

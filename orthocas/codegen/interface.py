@@ -14,7 +14,8 @@ from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.numbers import numbers
 from orthocas.codegen.supervision import supervision_values
 from orthocas.control import Controller, Safety
-from orthocas.domains import borders, reach
+from orthocas.domains import Domain, borders, contains, reach
+from orthocas.postures.clear_box import ClearBox
 from orthocas.version import VERSION
 
 _MAX_EVALUATIONS = 100  # largest number of chart evaluations in one call of the inverse map
@@ -34,7 +35,7 @@ def template_values(
     problem = chart.problem
     domain = problem.domain
     lower, upper = borders(domain)
-    somewhere = np.round(domain.centre + 0.5 * domain.half_width, 3)
+    somewhere = _somewhere(domain)
     joints, labels = _words(problem.robot.joint_names), _words(chart.labels)
     slides = [" (prismatic)" if sliding else "" for sliding in problem.robot.tree.prismatic]
     values = {
@@ -48,7 +49,7 @@ def template_values(
         "joint_lines": "\n".join(f" *   {i} {joint}{slides[i]}" for i, joint in enumerate(joints)),
         "task_labels": ", ".join(labels[: chart.m]),
         "extra_labels": ", ".join(labels[chart.m :]),
-        "domain_lines": _domain_lines(joints, lower, upper),
+        "domain_lines": _domain_lines(joints, lower, upper) + _clear_line(domain),
         "certificate": _certificate(chart),
         "domain_lower": numbers(lower),
         "domain_upper": numbers(upper),
@@ -67,6 +68,7 @@ def template_values(
     if controller is not None and safety is not None:
         values |= _control_values(controller) | supervision_values(controller, safety)
         values["compose"] = filled(f"compose_{controller.command}.c", values)
+    values |= _clear_values(domain, values)
     for template in ("control.h", "control.c", "control.md", "supervisor.h", "supervisor.c"):
         values[template.replace(".", "_")] = "" if controller is None else filled(template, values)
     return values
@@ -137,6 +139,26 @@ def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
         "all positions" if np.isinf(low) else f"{low:.6g} to {high:.6g}" for low, high in zip(lower, upper, strict=True)
     ]
     return "\n".join(f" *   {name}: {range_}" for name, range_ in zip(names, ranges, strict=True))
+
+
+def _clear_line(domain: Domain) -> str:
+    """The condition of a ClearBox."""
+    if not isinstance(domain, ClearBox):
+        return ""
+    return f"\n *   and the {domain.heading},\n *   or else the status is OUTSIDE_DOMAIN"
+
+
+def _clear_values(domain: Domain, values: Mapping[str, str]) -> dict[str, str]:
+    """The test of a ClearBox, and its call; for other domains there is none."""
+    if not isinstance(domain, ClearBox):
+        return {"is_clear": "1", "clear_c": ""}
+    return {"is_clear": "is_clear(q)", "clear_c": filled("clear.c", values)}
+
+
+def _somewhere(domain: Domain) -> Array:
+    """A joint position of the domain between its centre and a corner, (n,)."""
+    shares = [0.5**k for k in range(1, 20) if contains(domain, domain.centre + 0.5**k * domain.half_width)]
+    return np.round(domain.centre + (shares[0] if shares else 0.0) * domain.half_width, 3)
 
 
 def filled(template: str, values: Mapping[str, str]) -> str:

@@ -62,7 +62,7 @@ _MEANING: Mapping[str, str] = {
     "fade_out": "time in which the law gives way to the catcher [s]",
     "return_speed": "of the fastest joint on the way back",
     "error_limit": "largest error that the law gets to see",
-    "offset_time": "time constant from where the arm is to what the reference asks [s]",
+    "offset_rate": "speed at which the reference goes from where the arm is to what is asked",
     "integral_rate": "integral action: growth of the shift of the reference per error [1/s]; 0: none",
     "integral_limit": "largest shift of the reference",
     "hold_ticks": "ticks without a good measurement for which the last command is held",

@@ -3,10 +3,11 @@
 from dataclasses import dataclass, fields
 from typing import Self
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.casadi_tools.batch import Batched
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.checks import Array, as_number, frozen_array, require_count
 from orthocas.control.controller import Controller, require_controller
 from orthocas.domains import sample_uniform
@@ -15,7 +16,8 @@ from orthocas.errors import InvalidValueError
 _SAMPLES, _SEED = 256, 0
 _RATE = {"torque": 1000.0, "velocity": 20.0}  # [N m/s] as on many arms, 1 N m in a millisecond; [rad/s^2]
 _SPEED = 4 * np.pi  # [rad/s] or [m/s], of joints without a limit
-_CATCHER = 25.0  # [1/s] natural frequency and damping rate of the catcher
+_CATCHER = 12.0  # [1/s] natural frequency and damping rate of the catcher
+_RETURN = 0.3  # [rad/s] or [m/s], on the way back
 _STOPS = 30.0  # [rad/s] natural frequency at the joint limits
 _ZONE = 0.05  # [rad] or [m], at most this share of the range of a joint
 
@@ -38,7 +40,7 @@ class Safety:
     fade_out: float  #: time in which the law gives way to the catcher [s]
     return_speed: float  #: of the fastest joint on the way back [rad/s]
     error_limit: Array  #: largest error that the law gets to see (k,)
-    offset_time: float  #: time constant with which the reference goes from where the arm is to what is asked [s]
+    offset_rate: Array  #: speed at which the reference goes from where the arm is to what is asked (k,) [1/s]
     integral_rate: Array  #: integral action: growth of the shift of the reference per error (k,) [1/s]
     integral_limit: Array  #: largest shift (k,)
     hold_ticks: int  #: ticks without a good measurement for which the last command is held
@@ -87,15 +89,15 @@ class Safety:
         settings = {
             "command_rate": np.full(n, _RATE[controller.command]),
             "speed_limit": np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, _SPEED),
-            "rest_speed": np.full(n, 0.3),
+            "rest_speed": np.full(n, 0.5),
             "near_margin": 0.06,
             "catch_margin": 0.01,
             "return_margin": 0.1,
             "fade_in": 0.2,
             "fade_out": 0.03,
-            "return_speed": 0.3,
+            "return_speed": _RETURN,
             "error_limit": 0.15 * span,
-            "offset_time": 1.0,
+            "offset_rate": _RETURN / _joint_motion(controller, points),
             "integral_rate": 0 * span,
             "integral_limit": 0.05 * span,
             "hold_ticks": 10,
@@ -114,6 +116,15 @@ class Safety:
             raise InvalidValueError("setting", repr(unknown[0]), f"one of {', '.join(settings)}")
         spread = {name: _spread(name, value, settings[name]) for name, value in changes.items()}
         return cls(**{**settings, **spread})  # type: ignore[arg-type]
+
+
+def _joint_motion(controller: Controller, points: Array) -> Array:
+    """How far the fastest joint moves per unit of each controlled quantity, at 90 % of the points (k,)."""
+    q = ca.MX.sym("q", controller.problem.n)
+    rows = Batched(dense_function("J", [q], [ca.jacobian(controller.measured(q), q)]))(points)[0]
+    J = rows.reshape(len(points), q.shape[0], -1).transpose(0, 2, 1)
+    largest = np.abs(np.linalg.pinv(J[np.isfinite(J).all(axis=(1, 2))])).max(axis=1)
+    return np.asarray(np.quantile(largest, 0.9, axis=0))
 
 
 def _spread(name: str, value: ArrayLike, default: object) -> object:

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.domains import Domain, reach
+from orthocas.postures.clear_box import ClearBox
 
 LARGEST = 1e100  #: larger numbers count as not finite, because their squares may overflow
 _SMALLEST_VOLUME = 1e-3  # of the parallelepiped of the gradients, relative to its median over the domain
@@ -83,7 +84,13 @@ def _cut(command: ca.SX, limit: ca.SX, keep_direction: bool) -> ca.SX:
 
 
 def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
-    """Whether q (n, 1) lies in the domain; always true for joints without borders, such as the angles of a torus."""
+    """Whether q (n, 1) lies in the domain: between its borders and, in a ClearBox, clear of singular positions."""
+    clear = ca.logic_all(domain.pivots(q) > 0) if isinstance(domain, ClearBox) else ca.SX(1)
+    return ca.logic_and(_is_between_borders(domain, q), clear)
+
+
+def _is_between_borders(domain: Domain | None, q: ca.SX) -> ca.SX:
+    """Whether q (n, 1) lies in the box; always true for joints without borders, such as the angles of a torus."""
     widths = np.full(q.shape[0], np.inf) if domain is None else reach(domain)
     bounded = np.flatnonzero(np.isfinite(widths)).tolist()
     if domain is None or not bounded:

@@ -2,7 +2,7 @@
 
 from orthocas.simulation.breakdown import Breakdown, task_acceleration_breakdown
 from orthocas.simulation.coupling import Coupling, coupling_index
-from orthocas.simulation.disturbances import Friction, Noise, Push
+from orthocas.simulation.disturbances import Friction, Noise, Push, Stops
 from orthocas.simulation.mujoco_plant import MuJoCoPlant
 from orthocas.simulation.mujoco_scene import MuJoCo, Payload, Wall
 from orthocas.simulation.run import simulate
@@ -18,6 +18,7 @@ __all__ = [
     "Outcome",
     "Payload",
     "Push",
+    "Stops",
     "Trajectory",
     "Wall",
     "coupling_index",

@@ -168,10 +168,10 @@ class MuJoCoPlant(Shown):
             ShapeError, InvalidValueError, UnknownNameError: for other forces and places.
         """
         force = frozen_array("force", force, (3,))
-        carrier, at = place_of(self.robot.tree, link, frozen_array("point", point, (3,)))
-        if carrier < 0:
+        body, at = place_of(self.robot.tree, link, frozen_array("point", point, (3,)))
+        if body < 0:
             return  # what carries the tip does not move
-        handle = self._handles[carrier]
+        handle = self._handles[body]
         applied = self.data.xfrc_applied[handle]
         if not applied.any():
             self.model.body_ipos[handle] = at  # the handle has no mass: its centre may be anywhere

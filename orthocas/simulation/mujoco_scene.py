@@ -10,6 +10,7 @@ from orthocas.errors import InvalidValueError
 from orthocas.robots import Robot
 from orthocas.robots.tree_checks import require_body
 
+MUJOCO = "mujoco"  #: name of this plant
 TIMESTEP = 1e-3  #: longest step of the physics [s]
 
 
