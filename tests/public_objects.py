@@ -138,6 +138,10 @@ def certificate() -> oc.Certificate:
     return oc.certify(fitted().chart)
 
 
+def run_time_model() -> control.RunTimeModel:
+    return control.RunTimeModel(payload=1.0, wrench=np.zeros(6), extra_torque=0.1)
+
+
 CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "certified chart": lambda: replace(fitted().chart, certificate=certificate()),
     "polynomial chart": lambda: fitted().chart,
@@ -155,6 +159,8 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
 CONTROLLERS: dict[str, Callable[[], Controller]] = {
     "impedance": impedance,
     "PD+": lambda: control.PDPlus(fitted().chart, 60.0, coupling="decoupled", damping="double_diagonal"),
+    "PD+ with inputs": lambda: control.PDPlus(fitted().chart, 60.0, damping_stiffness=50.0, model=run_time_model()),
+    "PD+ of a given model": lambda: control.PDPlus(fitted().chart, 60.0, model=control.RunTimeModel("given", "robot")),
     "PD+ of a network": lambda: control.PDPlus(network(), 60.0),
     "kinematic": lambda: control.Kinematic(fitted().chart, 1.0),
     "projector": lambda: control.Projector(planar(), 80.0, 10.0),
@@ -167,6 +173,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "fit": fitted,
     "robot": lambda: planar().robot,
     "task": lambda: planar().task,
+    "run-time model": run_time_model,
+    "modes": lambda: impedance().modes(),
     "custom task": lambda: with_idle_joint().problem.task,
     "inertia metric": lambda: planar().metric,
     "custom metric": lambda: Metric.from_spec(planar().robot, lambda q: ca.diag(2 + ca.cos(q))),

@@ -349,6 +349,21 @@ def _control() -> dict[str, Call]:
     changes = [(0.1, {"x": 0.5})]
     return {
         "Impedance": (control.Impedance, {**gains, "limit": None}),
+        "Impedance with a free coordinate": (
+            control.Impedance,
+            {
+                "chart": chart,
+                "stiffness": [0.0, 50.0, 50.0],
+                "damping_stiffness": 50.0,
+                "model": control.RunTimeModel(payload=1.0),
+            },
+        ),
+        "RunTimeModel": (
+            control.RunTimeModel,
+            {"source": "own", "gravity": "law", "payload": [1.0, 0, 0, 0.1], "wrench": [0.0] * 6, "extra_torque": 0.1},
+        ),
+        "with_payload": (problem.robot.with_payload, {"payload": [1.0, 0, 0, 0, 1, 0, 0, 1, 0, 1]}),
+        "modes": (law.modes, {"q": centre}),
         "PDPlus": (control.PDPlus, {**gains, "limit": [1.0, 2.0, 3.0]}),
         "Kinematic": (control.Kinematic, {"chart": chart, "feedback": 1.0, "limit": None}),
         "Projector": (

@@ -46,6 +46,10 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--lock",), ("j1=0", "j1", "=", "j1=nan", "j1=x", "nowhere=1", "l1=0=1", "j1=1e300")),
     **dict.fromkeys(("--tool", "--centre", "--half-width", "--weights", "--friction", "--noise"), _LISTS),
     **dict.fromkeys(("--stiffness", "--damping-ratio", "--posture-stiffness", "--feedback", "--limit"), _LISTS),
+    "--damping-stiffness": _LISTS,
+    "--model": ("own", "given", "", "x"),
+    "--gravity": ("law", "robot", "", "9.81"),
+    "--inputs": ("payload", "payload,wrench,extra_torque", "payload,payload", ",", "", "mass"),
     **dict.fromkeys(("--bound", "--seconds"), (*NUMBERS, "0.1")),
     "--workers": ("0", "-1", "1", "1.5", ""),
     **dict.fromkeys(("--seed", "--seeds", "--samples", "--held-out", "--jobs"), _COUNTS),
@@ -74,6 +78,7 @@ _LAW_OPTIONS = (
     "--posture-stiffness",
     "--feedback",
     "--limit",
+    "--damping-stiffness",
 )
 _RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--seed", "--plant")
 _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = {
@@ -99,7 +104,11 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},
         (*_LAW_OPTIONS, *_RUN_OPTIONS),
     ),
-    "codegen": (_FILES, {"--controller": "pd_plus", "--out": "out"}, (*_LAW_OPTIONS, "--name")),
+    "codegen": (
+        _FILES,
+        {"--controller": "pd_plus", "--out": "out"},
+        (*_LAW_OPTIONS, "--name", "--model", "--gravity", "--inputs"),
+    ),
 }
 
 
