@@ -16,6 +16,7 @@ from orthocas.cli.controller_argument import (
     Feedback,
     Limit,
     PostureStiffness,
+    SecondName,
     Stiffness,
     build_controller,
     require_options,
@@ -37,6 +38,7 @@ def codegen(
     coupling: CouplingName = None,
     damping: DampingName = None,
     posture_stiffness: PostureStiffness = None,
+    second: SecondName = None,
     feedback: Feedback = None,
     limit: Limit = None,
     check: Annotated[
@@ -46,7 +48,9 @@ def codegen(
     json: AsJson = False,
 ) -> None:
     """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
-    options = ControllerOptions(stiffness, damping_ratio, coupling, posture_stiffness, feedback, damping=damping)
+    options = ControllerOptions(
+        stiffness, damping_ratio, coupling, posture_stiffness, feedback, damping=damping, second=second
+    )
     if controller != _NONE:
         require_options(controller, options)
     elif options != ControllerOptions() or limit is not None:

@@ -13,7 +13,7 @@ from orthocas.errors import InvalidValueError
 
 CONTROLLERS = law_names()
 _OF_THE_PLANT = ("mass_factor", "friction")  # options for laws that command torques
-_CHOICES = ("coupling", "damping")  # options that are words
+_CHOICES = ("coupling", "damping", "second")  # options that are words
 
 Stiffness = Annotated[
     str | None,
@@ -32,7 +32,13 @@ DampingName = Annotated[
 ]
 PostureStiffness = Annotated[
     str | None,
-    typer.Option("--posture-stiffness", help="Stiffness of the joint springs; for projector. Default: 2 Hz springs."),
+    typer.Option(
+        "--posture-stiffness", help="Stiffness of the springs in the second task; for projector. Default: 2 Hz springs."
+    ),
+]
+SecondName = Annotated[
+    str | None,
+    typer.Option("--second", help="joints (default) or xi, what the projector moves; for projector laws."),
 ]
 Feedback = Annotated[
     str | None,
@@ -55,6 +61,7 @@ class ControllerOptions:
     mass_factor: float | None = None
     friction: str | None = None
     damping: str | None = None
+    second: str | None = None
 
 
 def require_options(name: str, options: ControllerOptions) -> None:

@@ -19,6 +19,7 @@ from orthocas.cli.controller_argument import (
     Feedback,
     Limit,
     PostureStiffness,
+    SecondName,
     Stiffness,
     build_controller,
     require_options,
@@ -55,6 +56,7 @@ def simulate(
     coupling: CouplingName = None,
     damping: DampingName = None,
     posture_stiffness: PostureStiffness = None,
+    second: SecondName = None,
     feedback: Feedback = None,
     limit: Limit = None,
     rate: Annotated[
@@ -84,7 +86,7 @@ def simulate(
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
     options = ControllerOptions(
-        stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction, damping
+        stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction, damping, second
     )
     require_options(controller, options)
     if animation != "none":
