@@ -12,7 +12,6 @@ from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array, frozen_array, require_kind
 from orthocas.control.controller import Command, guarded_graph, law_facts, named_function, named_inputs
-from orthocas.control.damping import damping_matrix
 from orthocas.control.gains import (
     DAMPING_RATIO,
     LIMIT,
@@ -27,6 +26,7 @@ from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.matched_stiffness import matched_posture_stiffness, matched_stiffness
 from orthocas.control.reference import Reference
 from orthocas.control.second_task import SecondTask, named_second, second_task
+from orthocas.control.two_task_forces import errors_and_damping, two_task_forces
 from orthocas.problem import Problem
 from orthocas.showing import Shown
 from orthocas.tasks import Task
@@ -52,12 +52,16 @@ class Projector(Shown):
             Default: the joints, x_2 = q. The law has the domain of the chart, and otherwise none.
         second_force: f_2, (k_2,) or one number. If it is given, the law has it as an input of that name, with this
             value as the default, as [AS2023] eq. (3b) has it; with a `posture_stiffness` of 0 it acts alone.
+        feed_forward: whether to follow moving references, as operational space control does: the forces in x and in x_2
+            also get the desired acceleration, what Coriolis terms and dJ/dt take away, and D times the desired
+            velocity. With A = M, the task then obeys M_x dd_e + D_x d_e + K_x e = 0, e = x - x_d, exactly, whatever the
+            second task does.
 
     Raises:
         ShapeError, InvalidValueError, SingularTaskError, NoExpressionError: for arguments that do not fit.
 
     Source:
-        [AS2023] eqs. (2), (3); projected coordinates: Sec. 10.
+        [AS2023] eqs. (2), (3); projected coordinates: Sec. 10; feed-forward: [Kha1987].
 
     Example:
         >>> import orthocas as oc
@@ -73,6 +77,7 @@ class Projector(Shown):
     limit: Array
     second: Task | Chart | None
     second_force: Array | None
+    feed_forward: bool
 
     name: ClassVar[str] = "projector"
     command: ClassVar[Command] = "torque"
@@ -93,8 +98,10 @@ class Projector(Shown):
         limit: ArrayLike | None = None,
         second: Task | Chart | None = None,
         second_force: ArrayLike | None = None,
+        feed_forward: bool = False,
     ) -> None:
         require_kind("problem", problem, Problem)
+        require_kind("feed_forward", feed_forward, bool)
         k = len(second_task(problem, second).labels)
         k_2 = k - problem.m
         task = positive_gains("stiffness", stiffness, problem.m)
@@ -107,6 +114,7 @@ class Projector(Shown):
             "limit": command_limit("limit", limit, problem.n),
             "second": second,
             "second_force": None if second_force is None else finite_gains("second_force", second_force, k_2),
+            "feed_forward": feed_forward,
         }.items():
             object.__setattr__(self, name, value)
 
@@ -143,7 +151,8 @@ class Projector(Shown):
     def formula(self) -> str:
         """The law in one line, for generated C."""
         springs = "posture springs" if self.second is None else f"springs in {self._second.name}"
-        return f"Task impedance plus {springs} in the null space of the task, plus g(q)."
+        law = "Task impedance with feed-forward" if self.feed_forward else "Task impedance"
+        return f"{law} plus {springs} in the null space of the task, plus g(q)."
 
     @property
     def chart(self) -> Chart | None:
@@ -153,7 +162,7 @@ class Projector(Shown):
     @property
     def settings(self) -> Mapping[str, str]:
         """The second task."""
-        return {"second": self._second.name}
+        return {"second": self._second.name, "feed_forward": "yes" if self.feed_forward else "no"}
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -181,14 +190,11 @@ class Projector(Shown):
         """The same function as a graph with shared subexpressions; C is generated from it."""
         problem, m = self.problem, self.problem.m
         inputs = self._inputs()
-        q, K = inputs["q"], inputs["stiffness"]
-        J, J_2 = problem.task.jacobian_function(q), self._second.jacobian(q)
-        A, gravity = problem.metric.function(q), problem.robot.gravity(q)
-        e, D_x, D_2 = self._errors_and_damping(inputs)
-        f_x = -K[:m] * e[:m] - D_x @ (J @ inputs["dq"])
-        f_2 = -K[m:] * e[m:] - D_2 @ (J_2 @ inputs["dq"]) + inputs.get("second_force", 0)
+        q = inputs["q"]
+        J, A, gravity = problem.task.jacobian_function(q), problem.metric.function(q), problem.robot.gravity(q)
+        f_x, f_2 = two_task_forces(problem, self._second, inputs, self.feed_forward)
         B, Lambda, volume = block_inertia(problem.n, (m,))(J, A)
-        second = J_2.T @ f_2
+        second = self._second.jacobian(q).T @ f_2
         torque = J.T @ f_x + second - J.T @ (Lambda @ (B.T @ second)) + gravity
         scale = median_volume(problem, problem.task.jacobian_function, problem.metric, (m,))
         relative = volume / scale * self._second.weighted(q, A)[2]
@@ -204,7 +210,7 @@ class Projector(Shown):
         problem, m = self.problem, self.problem.m
         inputs = self._inputs()
         q, dq = inputs["q"], inputs["dq"]
-        e, D_x, D_2 = self._errors_and_damping(inputs)
+        e, D_x, D_2 = errors_and_damping(problem, self._second, inputs)
         J, J_2 = problem.task.jacobian_function(q), self._second.jacobian(q)
         B, Lambda, _ = block_inertia(problem.n, (m,))(J, problem.metric.function(q))
         through = dq - B @ (Lambda @ (J @ dq))  # P dq
@@ -226,18 +232,3 @@ class Projector(Shown):
 
     def _inputs(self) -> dict[str, ca.MX]:
         return named_inputs(self.problem.n, self.gains, len(self.labels))
-
-    def _errors_and_damping(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
-        """e = [x - x_d; x_2 - x_2d], D_x with the inertia M_x, and D_2 with M_2."""
-        problem, m = self.problem, self.problem.m
-        q, K, Z = inputs["q"], inputs["stiffness"], inputs["damping_ratio"]
-        M = problem.robot.mass_matrix(q)
-        M_x = block_inertia(problem.n, (m,))(problem.task.jacobian_function(q), M)[1]
-        M_2 = self._second.weighted(q, M)[1]
-        D_x, D_2 = _damping(m)(M_x, K[:m], Z[:m]), _damping(M_2.shape[0])(M_2, K[m:], Z[m:])
-        return self._second.shortest(self.measured(q) - inputs["reference"]), D_x, D_2
-
-
-def _damping(size: int) -> ca.Function:
-    inertia, K, Z = ca.MX.sym("M", size, size), ca.MX.sym("K", size), ca.MX.sym("Z", size)
-    return ca.Function("damping", [inertia, K, Z], [ca.densify(damping_matrix("square_root", inertia, K, Z))])

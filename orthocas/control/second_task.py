@@ -55,6 +55,10 @@ class SecondTask(Protocol):
         """J_2^#A (n, k_2), (J_2 A^-1 J_2^T)^-1 (k_2, k_2), and det(J_2 A^-1 J_2^T) over its median on the domain."""
         ...
 
+    def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
+        """dJ_2/dt dq, (k_2, 1)."""
+        ...
+
     def shortest(self, difference: ca.MX) -> ca.MX:
         """A difference of two [x; x_2], without whole turns of joints that turn without end."""
         ...
@@ -119,6 +123,9 @@ class _Joints:
     def weighted(self, q: ca.MX, A: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
         return ca.MX.eye(self.problem.n), A, ca.MX(1)
 
+    def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
+        return ca.MX.zeros(self.problem.n)
+
     def shortest(self, difference: ca.MX) -> ca.MX:
         return difference
 
@@ -180,6 +187,9 @@ class _OwnTask:
     def weighted(self, q: ca.MX, A: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
         return _weighted(self.problem, self.problem.metric, self.task.jacobian_function, q, A)
 
+    def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
+        return self.task.second_derivative_function(q, dq, dq)
+
     def shortest(self, difference: ca.MX) -> ca.MX:
         return difference
 
@@ -218,6 +228,9 @@ class _ExtraCoordinates:
 
     def weighted(self, q: ca.MX, A: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
         return _weighted(self.chart.problem, self.problem.metric, self.chart.coordinates.functions["jacobian"], q, A)
+
+    def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
+        return self.chart.coordinates.functions["second_derivative"](q, dq, dq)
 
     def shortest(self, difference: ca.MX) -> ca.MX:
         shorter: ca.MX = without_turns(self.chart, difference)
