@@ -54,6 +54,7 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--domain": ("auto", "box", ""),
     **dict.fromkeys(("--out", "--checkpoint"), ("out", "out/x/y", ".", "", "chart.orthocas", "/dev/null/x", "x" * 300)),
     **dict.fromkeys(("--coupling", "--damping", "--animation"), ("coupled", "square_root", "none", "mp5", "")),
+    "--second": ("joints", "xi", "x2", ""),
     "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose", "position:xx", "position+axis", ""),
     "--metric": ("euclidean", "inertia", "identity"),
     "--param": _WORDS,
@@ -71,6 +72,7 @@ _LAW_OPTIONS = (
     "--coupling",
     "--damping",
     "--posture-stiffness",
+    "--second",
     "--feedback",
     "--limit",
 )
