@@ -35,6 +35,7 @@ SIZES = (0.3, 0.8)  # of the part of the domain, relative to its half-widths
 BOXES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 STEP = 0.3  # length of a motion, the largest joint angle over the half-width of the domain
 WEIGHTS = oc.Weights(1000.0, 30.0, 150.0, 0.1, 1000.0, angles="metric")  # the angle that counts for A = M
+DAMPING_RATIOS = (0.7, 0.1)  # for the energy of runs
 DURATION = 3.0  # of a run [s]
 CYCLES, PERIOD, POINTS = 50, 4.0, 16
 FEEDBACK = 1.0  # of velocity laws [1/s]
@@ -69,15 +70,16 @@ class Arm:
     problem: oc.Problem
     charts: dict[str, oc.Chart]
 
-    def laws(self, feed_forward: bool) -> Iterator[tuple[str, Controller]]:
+    def laws(self, feed_forward: bool, damping: float = 0.7) -> Iterator[tuple[str, Controller]]:
         """Second task and whether it acts directly or behind the projector, with the law."""
         task, xi = self.case.stiffness
         stiffness = [task] * self.problem.m + [xi] * self.problem.r
         direct = PDPlus if feed_forward else Impedance
         for name, chart in self.charts.items():
-            yield f"{name} direct", direct(chart, stiffness, coupling="decoupled")
-            yield f"{name} projected", Projector(self.problem, task, xi, second=chart, feed_forward=feed_forward)
-        yield "joints projected", Projector(self.problem, task, xi, feed_forward=feed_forward)
+            yield f"{name} direct", direct(chart, stiffness, damping, "decoupled")
+            law = Projector(self.problem, task, xi, damping, second=chart, feed_forward=feed_forward)
+            yield f"{name} projected", law
+        yield "joints projected", Projector(self.problem, task, xi, damping, feed_forward=feed_forward)
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
@@ -97,7 +99,8 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
         found |= removed_shares(arm, 300 if quick else 2000)
         for size, radius in zip(SIZES, case.radii, strict=True):
             found |= couplings(arm, size, 2 if quick else 8)
-            found |= energies(arm, size, 3 if quick else case.runs)
+            for damping in DAMPING_RATIOS:
+                found |= energies(arm, size, damping, 3 if quick else case.runs)
             found |= drifts(arm, size, radius, 3 if quick else CYCLES)
         print_table(case, found)
     found |= hidden(quick)
@@ -193,10 +196,10 @@ def error(law: Controller, run: Trajectory, along_task: bool) -> dict[str, float
     return {"xi <- x": float(np.abs(e).max()), "xi <- x in the metric": float(np.sqrt(square.max()))}
 
 
-def energies(arm: Arm, size: float, runs: int) -> dict[str, float]:
+def energies(arm: Arm, size: float, damping: float, runs: int) -> dict[str, float]:
     """Rises of V and V at the end, over V(0), from random postures to the task of a second and the rest of a third."""
     found = {}
-    for name, law in arm.laws(feed_forward=False):
+    for name, law in arm.laws(False, damping):
         rises, rests = [], []
         for start, task, rest in targets(arm, size, runs):
             first, second = (law.measured(q).full().ravel() for q in (task, rest))
@@ -206,7 +209,7 @@ def energies(arm: Arm, size: float, runs: int) -> dict[str, float]:
             if not run.status.any():
                 rises.append(run.storage_rise / run.storage[0])
                 rests.append(run.storage[-1] / run.storage[0])
-        key = f"{arm.case.name} {size} {name}"
+        key = f"{arm.case.name} {size} {name}, damping {damping:g}"
         found[f"{key}: runs with a rise"] = float(np.count_nonzero(np.array(rises) > RISE))
         found |= {f"{key}: runs": float(len(rises)), f"{key}: largest rise": max(rises)}
         found[f"{key}: V left"] = float(np.mean(rests))
@@ -276,20 +279,36 @@ def hidden(quick: bool) -> dict[str, float]:
 
 def print_table(case: Case, found: dict[str, float]) -> None:
     """Print the numbers of one arm: x <- xi without and with feed-forward, xi <- x with it."""
-    print(f"\n{case.name}, degree {case.degree}, circles of {case.radii} m\n")
-    titles = ("part, second task", "removed", "x <- xi", "PD+", "xi <- x, PD+", "metric", "V rises", "V left", "drift")
+    print(f"\n{case.name}, circles of {case.radii} m\n")
+    titles = (
+        "part, second task",
+        "removed",
+        "x <- xi",
+        "PD+",
+        "xi <- x, PD+",
+        "metric",
+        "V rises",
+        "... 0.1",
+        "V left",
+        "drift",
+    )
     print(f"| {' | '.join(titles)} |")
     print("| --- " * len(titles) + "|")
     for size in SIZES:
         for name in ("linear direct", "linear projected", "fitted direct", "fitted projected", "joints projected"):
             row = {
-                key.partition(name)[2].strip(" :"): value for key, value in found.items() if f" {size} {name}" in key
+                key.partition(name)[2].strip(" :,"): value for key, value in found.items() if f" {size} {name}" in key
             }
             share = found[f"{case.name} {size} {name.split()[0]}: removed"] if "projected" in name else 0.0
             cells = [f"{share:.1%}", *(f"{1e3 * row[f'{way}: x <- xi']:.2g} mm" for way in ("impedance", "PD+"))]
             cells += [f"{1e3 * row[f'PD+: xi <- x{more}']:.2g}" for more in ("", " in the metric")]
-            cells += [f"{row['runs with a rise']:.0f} of {row['runs']:.0f}, {row['largest rise']:.1g}"]
-            cells += [f"{row['V left']:.1%}", f"{row['drift, feedback 0']:.2g}, {row['drift, feedback 1']:.2g} rad"]
+            for way in (f"damping {damping:g}" for damping in DAMPING_RATIOS):
+                counts = f"{row[f'{way}: runs with a rise']:.0f} of {row[f'{way}: runs']:.0f}"
+                cells += [f"{counts}, {row[f'{way}: largest rise']:.1g}"]
+            cells += [
+                f"{row['damping 0.7: V left']:.1%}",
+                f"{row['drift, feedback 0']:.2g}, {row['drift, feedback 1']:.2g} rad",
+            ]
             print(f"| {size} {name} | {' | '.join(cells)} |", flush=True)
 
 
