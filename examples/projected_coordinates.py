@@ -135,7 +135,7 @@ def removed_shares(arm: Arm, samples: int) -> dict[str, float]:
 
 def couplings(arm: Arm, size: float, moves: int) -> dict[str, float]:
     """Mean over random motions of the largest error of what should rest, and the number of runs that left."""
-    found = {}
+    found: dict[str, float] = {}
     for feed_forward in (False, True):
         for name, law in arm.laws(feed_forward):
             key = f"{arm.case.name} {size} {name} {'PD+' if feed_forward else 'impedance'}"
@@ -197,7 +197,10 @@ def error(law: Controller, run: Trajectory, along_task: bool) -> dict[str, float
 
 
 def energies(arm: Arm, size: float, damping: float, runs: int) -> dict[str, float]:
-    """Rises of V and V at the end, over V(0), from random postures to the task of a second and the rest of a third."""
+    """Rises of V and V at the end, over V(0), from random postures to the task of a second and the rest of a third.
+
+    Runs that leave the domain do not count.
+    """
     found = {}
     for name, law in arm.laws(False, damping):
         rises, rests = [], []
@@ -211,14 +214,15 @@ def energies(arm: Arm, size: float, damping: float, runs: int) -> dict[str, floa
                 rests.append(run.storage[-1] / run.storage[0])
         key = f"{arm.case.name} {size} {name}, damping {damping:g}"
         found[f"{key}: runs with a rise"] = float(np.count_nonzero(np.array(rises) > RISE))
-        found |= {f"{key}: runs": float(len(rises)), f"{key}: largest rise": max(rises)}
-        found[f"{key}: V left"] = float(np.mean(rests))
+        found |= {f"{key}: runs": float(len(rises)), f"{key}: largest rise": max(rises, default=np.nan)}
+        found[f"{key}: V left"] = float(np.mean(rests)) if rests else np.nan
     return found
 
 
 def targets(arm: Arm, size: float, runs: int) -> list[np.ndarray]:
     """Random start, posture of the task's target, and posture of the other target, which both charts can combine."""
-    rng, box, m, chosen = np.random.default_rng(1), arm.problem.domain, arm.problem.m, []
+    rng, box, m = np.random.default_rng(1), arm.problem.domain, arm.problem.m
+    chosen: list[np.ndarray] = []
     while len(chosen) < runs:
         three = box.centre + size / 4 * box.half_width * rng.uniform(-1, 1, (3, len(box.centre)))
         for chart in arm.charts.values():
