@@ -76,10 +76,10 @@ class Arm:
         stiffness = [task] * self.problem.m + [xi] * self.problem.r
         direct = PDPlus if feed_forward else Impedance
         for name, chart in self.charts.items():
-            yield f"{name} direct", direct(chart, stiffness, damping, "decoupled")
-            law = Projector(self.problem, task, xi, damping, second=chart, feed_forward=feed_forward)
+            yield f"{name} direct", direct(chart, stiffness, damping, "decoupled", limit=np.inf)
+            law = Projector(self.problem, task, xi, damping, np.inf, chart, feed_forward=feed_forward)
             yield f"{name} projected", law
-        yield "joints projected", Projector(self.problem, task, xi, damping, feed_forward=feed_forward)
+        yield "joints projected", Projector(self.problem, task, xi, damping, np.inf, feed_forward=feed_forward)
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
@@ -242,9 +242,11 @@ def drifts(arm: Arm, size: float, radius: float, cycles: int) -> dict[str, float
     """Distance of the joints from their start after the last circle of the task, velocity laws [rad]."""
     found = {}
     for feedback in (0.0, FEEDBACK):
-        laws: dict[str, Controller] = {f"{name} direct": Kinematic(c, feedback) for name, c in arm.charts.items()}
+        laws: dict[str, Controller] = {
+            f"{name} direct": Kinematic(c, feedback, np.inf) for name, c in arm.charts.items()
+        }
         for name, second in (*arm.charts.items(), ("joints", None)):
-            laws[f"{name} projected"] = KinematicProjector(arm.problem, feedback, feedback, second=second)
+            laws[f"{name} projected"] = KinematicProjector(arm.problem, feedback, feedback, np.inf, second)
         for name, law in laws.items():
             found[f"{arm.case.name} {size} {name}: drift, feedback {feedback:g}"] = drift(law, radius, cycles)
     return found

@@ -6,9 +6,13 @@ from typing import TYPE_CHECKING
 
 from orthocas.cli.entry import is_command_line as _is_command_line
 from orthocas.cli.entry import leave_on_ctrl_c as _leave_on_ctrl_c
+from orthocas.comparing.workers import end_early_with_parent as _end_early_with_parent
+from orthocas.comparing.workers import knows_parent as _knows_parent
 
 if _is_command_line():
     _leave_on_ctrl_c()  # the imports below take a second
+if _knows_parent():
+    _end_early_with_parent()
 
 # In a checkout, problems/ and solvers/ lie beside this folder, not inside it. Looking one level up keeps
 # `orthocas.problems` importable there, whether or not an installed copy exists; a wheel does not run this line.
@@ -33,6 +37,7 @@ from orthocas.involutivity import Involutivity, involutivity, lie_bracket
 from orthocas.metrics import Metric
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
 from orthocas.parametrisations import register as register_parametrisation
+from orthocas.postures.clear_box import ClearBox
 from orthocas.postures.suggest import suggest_domain
 from orthocas.problem import Problem, check
 from orthocas.quality import Report, evaluate
@@ -52,6 +57,7 @@ __all__ = [
     "Box",
     "Certificate",
     "Chart",
+    "ClearBox",
     "Comparison",
     "Fit",
     "Fourier",

@@ -21,7 +21,18 @@ from orthocas.domains import sample_uniform
 from orthocas.fitting.fit import Fit
 from orthocas.metrics import Metric, metric_matrices
 from orthocas.samples import sample_problem
-from orthocas.simulation import Friction, Noise, Push, Trajectory, coupling_index, simulate
+from orthocas.simulation import (
+    Friction,
+    MuJoCo,
+    Noise,
+    Payload,
+    Push,
+    Stops,
+    Trajectory,
+    Wall,
+    coupling_index,
+    simulate,
+)
 
 
 @cache
@@ -190,7 +201,12 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "trajectory": trajectory,
     "coupling": lambda: coupling_index(fitted().chart, steps(), trajectory()),
     "push": lambda: Push(0.5, 1.0, [1.0, 0.0, 0.0]),
+    "push at a link": lambda: Push(0.5, 1.0, [1.0, 0.0, 0.0], link="q2", point=[0.5, 0.0, 0.0]),
     "friction": lambda: Friction([1.0, 2.0, 3.0]),
+    "stops": lambda: Stops([1e4, 2e4, 3e4]),
+    "payload": lambda: Payload(1.0, [0.0, 0.0, 0.1], np.diag([0.1, 0.2, 0.25])),
+    "wall": lambda: Wall([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]),
+    "MuJoCo": lambda: MuJoCo(planar().robot, payload=Payload(1.0), wall=Wall([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0])),
     "noise": lambda: Noise(1e-3),
     "comparison": comparison,
     "generated C": generated_c,

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas.errors import ChartFileError, InvalidValueError, NotSavableWarning, OrthocasError
+from orthocas.errors import ChartFileError, InvalidValueError, NotSavableWarning, OrthocasError, TrajectoryFileError
 from orthocas.files import archive, npy
 from orthocas.fitting.fit import Fit
+from orthocas.simulation import Trajectory
 
 
 @pytest.fixture
@@ -334,6 +335,19 @@ def test_bad_output_places_are_refused(planar_fit: Fit, tmp_path: Path) -> None:
         planar_fit.chart.save(tmp_path)
     with pytest.raises(ChartFileError, match="cannot write /proc/chart"):  # a folder where even root cannot write
         planar_fit.chart.save("/proc/chart")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="POSIX")
+def test_devices_and_pipes_are_not_read(tmp_path: Path) -> None:
+    """Some of them never end, and some never begin."""
+    os.mkfifo(tmp_path / "pipe")
+    for path in (Path("/dev/full"), Path("/dev/zero"), tmp_path / "pipe"):
+        with pytest.raises(ChartFileError, match=f"cannot read chart file {path}: it is a device or a pipe"):
+            oc.load(path)
+        with pytest.raises(TrajectoryFileError, match="it is a device or a pipe"):
+            Trajectory.load(path)
+        with pytest.raises(ChartFileError, match="it is not a writable file"):
+            oc.fit(oc.problems.get("planar_3r_x"), oc.Linear()).chart.save(path)
 
 
 def resealed(path: Path, header: dict[str, object] | None = None, **arrays: object) -> Path:

@@ -134,7 +134,7 @@ def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: Generated, t
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("gains->stiffness", "gains->damping_ratio", "in control"),
+        ("gains->stiffness", "gains->damping_ratio", "control"),
         ("return inside(q)", "return 7 +", "failed"),
         ("return inside(q) ?", "return inside(q) + 1 ?", "the status of chart"),
         ("if (!(fabs(x[i]) <= LARGEST)) return 0;", "(void)x;", "the status of chart is . at"),
@@ -142,7 +142,7 @@ def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: Generated, t
         ("memcpy(q, now, sizeof now);", "", "inverse"),
         ("(error >= 0.0 && error <= SOLVED)", "(error < 1e300)", "in inverse"),
         ("arg[7] = gains->limit;", "arg[7] = arm_default_gains.limit;", "control"),
-        ("arg[5] = gains->stiffness;", "arg[5] = arm_default_gains.stiffness;", "in control"),
+        ("arg[5] = gains->stiffness;", "arg[5] = arm_default_gains.stiffness;", "control"),
         ("res[1] = bias;", "res[1] = gravity;", "in (bias|gravity)"),
     ],
 )

@@ -19,7 +19,7 @@ import pytest
 import orthocas as oc
 from orthocas import solvers
 from orthocas.casadi_tools import batch
-from orthocas.comparing import cells
+from orthocas.comparing import cells, workers
 from orthocas.comparing.cells import Cell, CellResult, run_cell, run_cells
 from orthocas.comparing.figures import convergence_figure, front_figure
 from orthocas.comparing.report import Comparison
@@ -227,12 +227,12 @@ def test_process_that_dies_fails_alone(planar_x: oc.Problem) -> None:
 
 def test_processes_use_one_thread_each_and_leave_the_environment_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    with cells.single_threaded():
+    with workers.starting_workers():
         assert os.environ["OMP_NUM_THREADS"] == "1"
         assert batch._threads() == 1
     assert os.environ["OMP_NUM_THREADS"] == "7"
     monkeypatch.delenv("OMP_NUM_THREADS")
-    with cells.single_threaded():
+    with workers.starting_workers():
         pass
     assert "OMP_NUM_THREADS" not in os.environ
 

@@ -153,6 +153,14 @@ def test_quality_is_nan_where_the_task_is_flat_and_a_torus_has_no_border() -> No
     assert everywhere.quality([0.3, 9.0]).border_distance == np.inf
 
 
+def test_quality_is_nan_where_gradients_overflow(planar_fit: Fit) -> None:
+    for far in (1e120, 1e300):
+        quality = planar_fit.chart.quality([0.3, far, 0.5])
+        assert np.isnan(quality.conditioning)
+        assert np.isnan(quality.leak_deg).all()
+        assert quality.border_distance < -0.9 * far
+
+
 def test_prediction_of_info_and_report_of_evaluate_agree_on_small_boxes(planar_xy: oc.Problem) -> None:
     """To first order in the size of the box: what is left shrinks with it, and the paper's angle does not agree."""
     ratios = []

@@ -6,15 +6,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from unittest.mock import patch
 
 import pytest
 from matplotlib.figure import Figure
-from programs import Run
+from programs import Run, python
 
 import orthocas as oc
-from orthocas.casadi_tools.interrupts import deferred, ended_in_order
+from orthocas.casadi_tools.interrupts import deferred, ended_in_order, remembered
 from orthocas.cli import entry
 from orthocas.comparing.cells import run_cells
 from orthocas.errors import Interrupted
@@ -72,6 +73,57 @@ def test_reproduce_does_not_draw_an_interrupted_fit(run: Run, planar_x: oc.Probl
         code, out, err = run("reproduce", "all", "--out", "figures")
     assert (code, out, err) == (130, "", "orthocas: interrupted\n")
     assert {path.stem for path in Path("figures").glob("fig*")} == {"fig06"}
+
+
+def swallowed(quick: bool) -> Drawing:
+    """As `except: pass` in a library would."""
+    with suppress(BaseException):
+        signal.raise_signal(signal.SIGINT)
+    return Drawing({"": Figure(figsize=(0.2, 0.2))}, {"one": 1.0})
+
+
+def turned_into_an_error(quick: bool) -> Drawing:
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise RuntimeError("a callback failed") from None
+    raise AssertionError
+
+
+def swallowed_in_compiled_code(quick: bool) -> Drawing:
+    with suppress(BaseException), deferred():
+        signal.raise_signal(signal.SIGINT)
+    return swallowed(quick)
+
+
+@pytest.mark.parametrize("draw", [swallowed, turned_into_an_error, swallowed_in_compiled_code])
+def test_ctrl_c_that_a_library_swallows_is_not_lost(run: Run, draw: Callable[[bool], Drawing]) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with patch.dict(registry.FIGURES, {"fig06": Recipe("first", draw)}, clear=True):
+        code, _, err = run("reproduce", "fig06", "--out", "figures")
+    assert (code, err) == (130, "orthocas: interrupted\n")
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_is_forgotten_with_the_block() -> None:
+    with remembered() as pressed:
+        assert not pressed()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert pressed()
+        with remembered() as again:
+            assert not again()
+
+
+def test_ctrl_c_while_python_ends_needs_no_handler() -> None:
+    before = signal.signal(signal.SIGINT, entry._leave)
+    try:
+        with patch.object(sys, "argv", ["orthocas", "--help"]), pytest.raises(SystemExit) as end:
+            entry.main()
+        assert end.value.code == 0
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
@@ -158,6 +210,39 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     with patch("tempfile.tempdir", str(tmp_path / "tmp")):
         assert list(run_cells([])) == []
     assert not list((tmp_path / "tmp").glob("orthocas-*"))  # ... but the next comparison does
+
+
+_SLOW_IMPORTS = """
+import time
+import orthocas as oc
+if __name__ == "__mp_main__":  # in a worker, before anything of ours has begun
+    open("began", "w").close()
+    time.sleep(60)
+elif __name__ == "__main__":
+    oc.compare(oc.problems.get("planar_3r_x"), [oc.Linear()], jobs=1, samples=50, held_out=50)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_workers_that_still_import_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "grid.py").write_text(_SLOW_IMPORTS)
+    (tmp_path / "tmp").mkdir()
+    environment = os.environ | {"TMPDIR": str(tmp_path / "tmp")}
+    process = subprocess.Popen(
+        [sys.executable, "grid.py"], cwd=tmp_path, env=environment, start_new_session=True, stderr=subprocess.DEVNULL
+    )
+    wait_until((tmp_path / "began").exists, 60)
+    process.kill()
+    process.wait()
+    wait_until(lambda: not session_of(process.pid), 5)
+
+
+def test_only_workers_end_with_the_process_that_a_variable_names(tmp_path: Path) -> None:
+    """A program that happens to start while workers do inherits the variable; it lives on, and passes nothing on."""
+    code = "import orthocas, os; print('ORTHOCAS_PARENT' in os.environ)"
+    with patch.dict(os.environ, {"ORTHOCAS_PARENT": "1"}):
+        assert python(code).strip() == "False"
 
 
 def wait_until(condition: Callable[[], bool], seconds: float) -> None:

@@ -3,11 +3,14 @@
 An exception cannot pass through CasADi's compiled code: it comes out as another exception, or is lost. So while that
 code runs, a signal is only recorded. When the code returns, or earlier where `check` is called, Ctrl-C becomes
 KeyboardInterrupt, and the signals of `ended_in_order` become SystemExit.
+
+Some of CasADi's Python swallows exceptions of all kinds (`except: pass` in `vertcat` and others). A command line that
+`remembers` Ctrl-C ends as interrupted all the same.
 """
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
@@ -26,6 +29,7 @@ class _Note:
 
 
 _notes: list[_Note] = []
+_memories: list[_Note] = []  # of `remembered`
 
 
 @contextmanager
@@ -77,6 +81,27 @@ def ended_in_order() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+@contextmanager
+def remembered() -> Iterator[Callable[[], bool]]:
+    """A function that tells whether Ctrl-C has come during the block, even if its exception got lost.
+
+    Where something other than Python's own handler is in charge, it tells what compiled code held back only.
+    """
+    memory, before = _Note(), signal.getsignal(signal.SIGINT)
+    _memories.append(memory)
+    if before is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
+    try:
+        yield lambda: memory.number is not None
+    finally:
+        _memories.remove(memory)
+        signal.signal(signal.SIGINT, before)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    _raise(number)
+
+
 def _end(number: int, frame: FrameType | None) -> NoReturn:
     for each in _ENDING:
         signal.signal(each, signal.SIG_IGN)  # the end is not to be disturbed
@@ -91,5 +116,7 @@ def _held(number: int, handler: object) -> bool:
 
 def _raise(number: int) -> NoReturn:
     if number == signal.SIGINT:
+        for memory in _memories:
+            memory.number = number
         raise KeyboardInterrupt
     raise SystemExit(128 + number)

@@ -3,10 +3,9 @@
 import os
 import time
 from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,8 +18,7 @@ from orthocas.chart import Chart
 from orthocas.checks import require_count
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
 from orthocas.cli.progress import terminal_monitor
-from orthocas.comparing.cells import single_threaded
-from orthocas.comparing.workers import begin_worker
+from orthocas.comparing.workers import begin_worker, starting_workers, worker_pool
 from orthocas.errors import Interrupted
 from orthocas.files.archive import require_free
 from orthocas.files.chart_file import CHART
@@ -111,10 +109,10 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor | None]:
         with scheduler_executor(scheduler) as executor:
             yield executor
     elif workers > 1:
-        with (
-            single_threaded(),
-            ProcessPoolExecutor(workers, get_context("spawn"), begin_worker, (os.getpid(),)) as executor,
-        ):
+        with worker_pool(workers, begin_worker, os.getpid()) as executor:
+            with starting_workers():
+                for _ in range(workers):  # each call starts a process
+                    executor.submit(os.getpid)
             yield executor
     else:
         yield None

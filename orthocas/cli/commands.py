@@ -3,7 +3,7 @@
 import numpy as np
 import typer
 
-from orthocas.casadi_tools.interrupts import ended_in_order
+from orthocas.casadi_tools.interrupts import ended_in_order, remembered
 from orthocas.cli.certify import certify
 from orthocas.cli.codegen import codegen
 from orthocas.cli.compare import compare
@@ -41,18 +41,27 @@ def _complain(text: str) -> None:
 
 def run() -> int:
     """Run the command line; bad input gives one line on standard error and exit code 2, a signal its own code."""
-    with ended_in_order():
+    with ended_in_order(), remembered() as pressed:
         try:
-            code = app(standalone_mode=False)
-        except (OrthocasError, typer.TyperException) as error:
-            _complain(error.format_message() if isinstance(error, typer.TyperException) else str(error))
-            code = 2
-        except (OSError, MemoryError, np.linalg.LinAlgError) as error:  # from libraries: also one line, no traceback
-            _complain(f"{type(error).__name__}: {error}")
-            code = 2
+            code = app(standalone_mode=False) or 0
         except KeyboardInterrupt:
             code = INTERRUPTED
-        return interrupted() if code == INTERRUPTED else code or 0
+        except Exception as error:
+            if not pressed():  # otherwise it is what a library made of Ctrl-C
+                _complain(_message(error))
+            code = 2
+        return interrupted() if pressed() or code == INTERRUPTED else code
+
+
+def _message(error: Exception) -> str:
+    """What to say of an error; raises those that are defects."""
+    if isinstance(error, typer.TyperException):
+        return error.format_message()
+    if isinstance(error, OrthocasError):
+        return str(error)
+    if isinstance(error, OSError | MemoryError | np.linalg.LinAlgError):  # from libraries: also one line, no traceback
+        return f"{type(error).__name__}: {error}"
+    raise error
 
 
 def interrupted() -> int:

@@ -42,7 +42,7 @@ def main() -> None:
         code = commands.interrupted()
     finally:
         if watched:
-            signal.signal(signal.SIGINT, _leave)  # while Python ends
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # while Python ends, and runs no handlers any more
     sys.exit(code)
 
 

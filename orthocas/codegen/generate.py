@@ -2,20 +2,23 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import casadi as ca
+import numpy as np
 
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.chart import Chart
-from orthocas.checks import as_path, require_kind
+from orthocas.checks import as_path, require_kind, require_shape
 from orthocas.codegen.interface import filled, template_values
 from orthocas.codegen.kernels import Kernels, generate_kernels
-from orthocas.control import Controller
+from orthocas.codegen.supervision import supervision_kernels
+from orthocas.control import Controller, Safety
 from orthocas.control.controller import require_controller
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.files.atomic import output_folder, published, require_writable
+from orthocas.postures.clear_box import ClearBox
 
 _LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/test_c_safety.py)
 _TAKEN = (  # names of C headers and libraries
@@ -43,6 +46,7 @@ def generate_c(
     controller: Controller | None = None,
     name: str | None = None,
     force: bool = False,
+    safety: Safety | None = None,
 ) -> GeneratedC:
     """Write C99 for a chart, the robot's dynamics, the inverse map, and a controller.
 
@@ -56,6 +60,7 @@ def generate_c(
         controller: a controller of this chart, or of its problem (projectors); default none.
         name: a C identifier; default from the names of problem and controller.
         force: also replace files of the same names that were not generated.
+        safety: settings of the supervised law; default `Safety.of(controller)`.
 
     Raises:
         NoExpressionError: if the chart is grown; `orthocas.distil` turns it into a chart with a closed expression.
@@ -77,11 +82,12 @@ def generate_c(
     require_kind("chart", chart, Chart)
     if controller is not None:
         require_controller(controller)
+        safety = _matching_safety(controller, safety)
     name = _name(chart, controller) if name is None else name
     _require_matching(chart, controller, name)
     kernels = generate_kernels(_functions(chart, controller), f"{name}_kernel")
     stack_bytes = _stack_bytes(kernels, chart.n)
-    values = template_values(chart, controller, name, kernels, stack_bytes)
+    values = template_values(chart, controller, safety, name, kernels, stack_bytes)
     names = {"robot.h": f"{name}.h", "robot.c": f"{name}.c", "pkgconfig.pc": f"{name}.pc.in"}
     contents = {names.get(template, template): filled(template, values) for template in _TEMPLATES}
     folder = as_path("out", out)
@@ -101,18 +107,34 @@ def _functions(chart: Chart, controller: Controller | None) -> list[ca.Function]
         ca.Function("chart", [q], [chart.function("phi")(q), chart.function("jacobian")(q).T]),
         scalar_code(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)])),
     ]
+    domain = chart.problem.domain
+    if isinstance(domain, ClearBox):
+        found.append(scalar_code(ca.Function("pivots", [q], [domain.pivots(q)])))
     if controller is not None:
         graph = controller.graph
         inputs = graph.mx_in()
-        found.append(ca.Function("control", inputs, graph.call(inputs)))
+        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller)]
     return found
+
+
+def _matching_safety(controller: Controller, safety: Safety | None) -> Safety:
+    """The settings, checked against the sizes of the law; default those of `Safety.of`."""
+    wanted = Safety.of(controller)
+    if safety is None:
+        return wanted
+    require_kind("safety", safety, Safety)
+    for field in fields(Safety):
+        name = field.name
+        require_shape(name, np.shape(getattr(safety, name)), np.shape(getattr(wanted, name)))
+    return safety
 
 
 def _stack_bytes(kernels: Kernels, n: int) -> int:
     """Sum of the work arrays, those of the inverse map, and an allowance for local variables and math.h."""
     inverse = kernels.array_bytes("chart") + 8 * n * (n + 6)
     locals_ = round(_LOCALS * max(1.0, n / 7) ** 2)  # compilers keep matrices in local variables
-    return max(inverse, *map(kernels.array_bytes, kernels.work)) + locals_
+    clear = kernels.array_bytes("pivots") if "pivots" in kernels.work else 0  # called by the others
+    return max(inverse, *map(kernels.array_bytes, kernels.work)) + clear + locals_
 
 
 def _require_matching(chart: Chart, controller: Controller | None, name: str) -> None:

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -85,6 +86,14 @@ class CompiledLibrary:
     def default_gains(self, count: int) -> Array:
         """The gains that the library was generated with, (count,)."""
         return self._table("default_gains", count)
+
+    def function(self, name: str) -> Any:
+        """A function of the library, by its name without the prefix."""
+        return getattr(self._c, f"{self.name}_{name}")
+
+    def address(self, name: str) -> Any:
+        """Pointer to a constant of the library, by its name without the prefix."""
+        return ctypes.addressof(ctypes.c_char.in_dll(self._c, f"{self.name}_{name}"))
 
     def _table(self, name: str, count: int) -> Array:
         return np.array((ctypes.c_double * count).in_dll(self._c, f"{self.name}_{name}"))

@@ -3,19 +3,16 @@
 import math
 import os
 import pickle
-import signal
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from concurrent.futures import BrokenExecutor, Executor, Future, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
 from orthocas.casadi_tools.batch import THREADS
-from orthocas.comparing.workers import begin_worker
-from orthocas.files.drafts import draft_folder
+from orthocas.comparing.workers import begin_worker, shared_event, starting_workers, worker_pool
+from orthocas.files.drafts import draft_folder, write_temporary
 from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.loss import Weights
 from orthocas.minimising.solver import Solver, Status
@@ -199,38 +196,32 @@ def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResu
                 yield failure(cell, f"{type(error).__name__}: {error}")
                 continue
             files[cell] = folder / f"{k}.pickle"
-            files[cell].write_bytes(content)
+            write_temporary(files[cell], content)
         yield from _in_pools(files, jobs)
 
 
 def _in_pools(files: Mapping[Cell, Path], jobs: int | None) -> Iterator[CellResult]:
     """Run cells stored in files: in one pool, then one by one the cells that a dying process left."""
     left: list[Cell] = []
-    context = get_context("spawn")  # new interpreters: forked ones inherit the locks of threads that no longer run
-    stop = context.Event()
-
-    def pool_of(size: int) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(size, mp_context=context, initializer=_begin, initargs=(stop, os.getpid()))
-
-    with single_threaded():
-        with pool_of(jobs or THREADS) as pool:
-            try:
-                with _signals_blocked():  # in the processes that this starts, too
-                    futures = {pool.submit(_run_stored, file): cell for cell, file in files.items()}
-                for future in as_completed(futures):
-                    if isinstance(future.exception(), BrokenExecutor):
-                        left.append(futures[future])
-                    else:
-                        yield _outcome(future, futures[future])
-            except BaseException:  # Ctrl-C, or the caller stops: running fits end at their next step
-                stop.set()
-                pool.shutdown(cancel_futures=True)
-                raise
-        for cell in left:
-            with pool_of(1) as pool:
-                with _signals_blocked():
-                    future = pool.submit(_run_stored, files[cell])
-                yield _outcome(future, cell)
+    stop, parent = shared_event(), os.getpid()
+    with worker_pool(jobs or THREADS, _begin, stop, parent) as pool:
+        try:
+            with starting_workers():
+                futures = {pool.submit(_run_stored, file): cell for cell, file in files.items()}
+            for future in as_completed(futures):
+                if isinstance(future.exception(), BrokenExecutor):
+                    left.append(futures[future])
+                else:
+                    yield _outcome(future, futures[future])
+        except BaseException:  # Ctrl-C, or the caller stops: running fits end at their next step
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+    for cell in left:
+        with worker_pool(1, _begin, stop, parent) as pool:
+            with starting_workers():
+                future = pool.submit(_run_stored, files[cell])
+            yield _outcome(future, cell)
 
 
 def _run_stored(file: Path) -> CellResult:
@@ -245,32 +236,5 @@ def _begin(stop: Event, parent: int) -> None:
     _stops.append(stop)
 
 
-@contextmanager
-def _signals_blocked() -> Iterator[None]:
-    """Ctrl-C waits until the end of the block; in processes that start meanwhile, for ever, imports included."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def _cancelled() -> bool:
     return any(stop.is_set() for stop in _stops)
-
-
-@contextmanager
-def single_threaded() -> Iterator[None]:
-    """Processes started in this block use one thread each. They do not compete for cores, and times are comparable."""
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["OMP_NUM_THREADS"]
-        else:
-            os.environ["OMP_NUM_THREADS"] = before

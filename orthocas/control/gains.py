@@ -34,10 +34,10 @@ def finite_gains(name: str, value: ArrayLike, length: int) -> Array:
     return _spread(name, value, length)
 
 
-def command_limit(name: str, value: ArrayLike | None, length: int) -> Array:
-    """Numbers > 0, (length,); infinite if `value` is None."""
-    value = np.inf if value is None else value
-    limit = np.array(np.broadcast_to(_one_or(name, value, length), (length,)))
+def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:
+    """Numbers > 0, (n,), possibly infinite; the limits of the robot if `value` is None."""
+    length = len(default)
+    limit = np.array(np.broadcast_to(_one_or(name, default if value is None else value, length), (length,)))
     _require(name, limit, limit > 0, "positive numbers")
     limit.setflags(write=False)
     return limit

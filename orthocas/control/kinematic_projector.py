@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind
-from orthocas.control.controller import Command, guarded_graph, law_facts, named_inputs
+from orthocas.control.controller import Command, fallback_function, guarded_graph, law_facts, named_inputs
 from orthocas.control.gains import FEEDBACK, LIMIT, command_limit, non_negative_gains
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reference import Reference
@@ -32,7 +32,7 @@ class KinematicProjector(Shown):
         problem: robot, task and metric A.
         feedback: diagonal of Lambda_x, >= 0, (m,) or one number [1/s].
         posture_feedback: diagonal of Lambda_2, >= 0, (k_2,) or one number [1/s].
-        limit: largest speed of each joint, (n,) or one number; default no limit.
+        limit: largest speed of each joint, (n,) or one number; default the velocity limits of the robot.
         second: x_2. A `Task` of the same robot, or a `Chart` of the same task for its xi. Default: the joints, x_2 = q,
             with J_2^#A = I. The law has the domain of the chart, and otherwise none.
 
@@ -69,7 +69,7 @@ class KinematicProjector(Shown):
         posture = non_negative_gains("posture_feedback", posture_feedback, k_2)
         object.__setattr__(self, "problem", problem)
         object.__setattr__(self, "feedback", np.concatenate([task, posture]))
-        object.__setattr__(self, "limit", command_limit("limit", limit, problem.n))
+        object.__setattr__(self, "limit", command_limit("limit", limit, problem.robot.velocity_limits))
         object.__setattr__(self, "second", second)
 
     @classmethod
@@ -137,7 +137,13 @@ class KinematicProjector(Shown):
         velocity = second + B @ (Lambda @ (rate[:m] - J @ second))
         scale = median_volume(problem, problem.task.jacobian_function, problem.metric, (m,))
         domain = None if self.chart is None else self.chart.problem.domain
-        return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale * relative, domain)
+        return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale * relative, domain, True)
+
+    @cached_property
+    def fallback(self) -> ca.Function:
+        """q, gains -> zero velocity."""
+        n = self.problem.n
+        return fallback_function(named_inputs(n, self.gains, 0), ca.MX(n, 1))
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if the reference leaves the joint limits (joints) or the domain (xi).

@@ -11,7 +11,14 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array, frozen_array, require_kind
-from orthocas.control.controller import Command, guarded_graph, law_facts, named_function, named_inputs
+from orthocas.control.controller import (
+    Command,
+    fallback_function,
+    guarded_graph,
+    law_facts,
+    named_function,
+    named_inputs,
+)
 from orthocas.control.gains import (
     DAMPING_RATIO,
     LIMIT,
@@ -47,7 +54,7 @@ class Projector(Shown):
         posture_stiffness: diagonal of K_2, > 0, or >= 0 with a `second_force`, (k_2,) or one number; [N m/rad] for
             joints.
         damping_ratio: of all springs, >= 0, (m + k_2,) or one number.
-        limit: largest torque of each joint, (n,) or one number; default no limit.
+        limit: largest torque of each joint, (n,) or one number; default the effort limits of the robot.
         second: x_2. A `Task` of the same robot, or a `Chart` of the same task for its xi ("projected coordinates").
             Default: the joints, x_2 = q. The law has the domain of the chart, and otherwise none.
         second_force: f_2, (k_2,) or one number. If it is given, the law has it as an input of that name, with this
@@ -111,7 +118,7 @@ class Projector(Shown):
             "problem": problem,
             "stiffness": frozen_array("stiffness", np.concatenate([task, posture]), (k,)),
             "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, k),
-            "limit": command_limit("limit", limit, problem.n),
+            "limit": command_limit("limit", limit, problem.robot.effort_limits),
             "second": second,
             "second_force": None if second_force is None else finite_gains("second_force", second_force, k_2),
             "feed_forward": feed_forward,
@@ -120,7 +127,7 @@ class Projector(Shown):
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """Build the law on the problem of a chart; by default with springs of 2 Hz at the median inertia.
+        """Build the law on the problem of a chart; by default with modes around 4 Hz.
 
         The setting `second` is "joints" (default) or "xi", the coordinates of the chart.
         """
@@ -200,6 +207,12 @@ class Projector(Shown):
         relative = volume / scale * self._second.weighted(q, A)[2]
         domain = None if self.chart is None else self.chart.problem.domain
         return guarded_graph(self.name, inputs, torque, gravity, relative, domain)
+
+    @cached_property
+    def fallback(self) -> ca.Function:
+        """q, gains -> gravity torque."""
+        inputs = self._inputs()
+        return fallback_function(inputs, self.problem.robot.gravity(inputs["q"]))
 
     @cached_property
     def energy(self) -> ca.Function:

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from orthocas.casadi_tools.interrupts import deferred
+from orthocas.errors import ArchiveError
 
 _HOST = re.sub(r"[^A-Za-z0-9]", "", socket.gethostname())[:32] or "host"  # a process id means nothing elsewhere
 _NAME = re.compile(r"\.?orthocas-(?P<host>[A-Za-z0-9]+)-(?P<process>\d+)-\w+")
@@ -33,6 +34,18 @@ def draft_folder(parent: Path | None = None) -> Iterator[Path]:
         if folder is not None:
             with deferred():  # and here half of it
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def write_temporary(file: Path, content: bytes) -> None:
+    """Write a file in a draft folder.
+
+    Raises:
+        ArchiveError: if it cannot be written, for example because the disk for temporary files is full.
+    """
+    try:
+        file.write_bytes(content)
+    except OSError as error:
+        raise ArchiveError(f"cannot write the temporary file {file}: {error.strerror}") from None
 
 
 def sweep(folder: Path) -> None:

@@ -1,7 +1,9 @@
 """Zip files from anywhere: only the entries asked for are unpacked, and never much more than the file holds."""
 
+import errno
 import lzma
 import os
+import stat
 import struct
 import zipfile
 import zlib
@@ -74,6 +76,8 @@ def unpacking(source: Path, what: str, error: type[ArchiveError]) -> Iterator[Un
         ArchiveError: the one given, if the file is missing, cannot be read, is no zip file, or has an entry twice.
     """
     try:
+        if not source.is_dir() and not stat.S_ISREG(source.stat().st_mode):  # some never end, some never begin
+            raise OSError(errno.EINVAL, "it is a device or a pipe")
         stream = source.open("rb")
     except FileNotFoundError:
         raise error(f"{what} file {source} does not exist") from None

@@ -14,6 +14,7 @@ from orthocas.problem import Problem, task_jacobians
 from orthocas.samples import Samples, samples_at
 
 _CHUNK = 5000
+_LONGEST = 1e100  # squares of longer gradients overflow: they have no value
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> tupl
         kept = np.asarray((task_jacobians(problem, points) != 0).any(axis=2).all(axis=1))
     J = coordinates.jacobian(samples.points)
     lengths = np.linalg.norm(J, axis=2)
-    alive = lengths.min(axis=1) > 0  # also false for NaN, where grown coordinates have no value
+    alive = (lengths.min(axis=1) > 0) & (lengths.max(axis=1) < _LONGEST)  # false for NaN, as grown coordinates have it
     kept[kept] = alive
     samples, J, lengths = samples[alive], J[alive], lengths[alive]
     raised = samples.raised(J)

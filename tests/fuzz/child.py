@@ -1,18 +1,25 @@
-"""Judging mutants in a child process with limits, so that a crash is a finding and not the end."""
+"""Judging mutants in a child process with limits, so that a crash is a finding and not the end.
+
+Time is processor time: above `SECONDS` the mutant is a finding, above twice that the kernel ends the child, compiled
+code or not. Memory is the resident peak beyond what the child held before the mutant: above `MEMORY` it is a finding,
+and allocations beyond twice that fail, which is a finding too, whatever the code makes of the error.
+"""
 
 import multiprocessing
 import resource
 import signal
+import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 from types import FrameType
 
 from orthocas.errors import OrthocasError
 
 SECONDS = 10.0  #: of processor time for one mutant; other work on the machine does not count
-MEMORY = 2**30  #: bytes that a child may take beyond what it has after its imports
+MEMORY = 2**30  #: bytes of resident memory that a mutant may take at its peak
 _LONGEST = 2000  # characters of an error
 
 Judge = Callable[[int], str | None]  #: makes the mutant of a seed and says what is wrong with its treatment
@@ -39,10 +46,24 @@ def verdict(call: Callable[[], object]) -> str | None:
         text = str(error)
         if "\n" in text or len(text) > _LONGEST or not text.isprintable():
             return f"message of {len(text)} characters: {text[:200]!r}"
+        if any(map(_failed_allocation, _chain(error))):
+            return f"takes more than {2 * MEMORY / 2**30:g} GiB: {text[:200]}"
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         return f"{type(error).__name__}: {str(error)[:200]} ({where.filename}:{where.lineno})"
     return None
+
+
+def _failed_allocation(error: BaseException) -> bool:
+    """Whether memory was refused; what we refuse ourselves, before anything is built, is an OrthocasError."""
+    return "bad_alloc" in str(error) or (isinstance(error, MemoryError) and not isinstance(error, OrthocasError))
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and those that it was raised for, also `from None`."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def run(campaign: str, judge: Judge, seeds: Iterable[int], seconds: float = SECONDS) -> list[Finding]:
@@ -83,26 +104,47 @@ def _in_one_child(campaign: str, judge: Judge, seeds: list[int], seconds: float)
 
 def _work(judge: Judge, seeds: list[int], seconds: float, answers: Connection) -> None:
     """In the child: one answer for every seed."""
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    _limit_memory(used + MEMORY)
     signal.signal(signal.SIGPROF, _time_is_up)
     for seed in seeds:
-        signal.setitimer(signal.ITIMER_PROF, seconds)
-        try:
-            answer = judge(seed)
-        except _TimeIsUp:
-            answer = f"takes more than {seconds:g} s"
-        except BaseException as error:
-            answer = f"the judge failed: {type(error).__name__}: {str(error)[:200]}"
-        finally:
-            signal.setitimer(signal.ITIMER_PROF, 0)
-        answers.send(answer)
+        answers.send(_measured(judge, seed, seconds))
 
 
-def _limit_memory(most: int) -> None:
-    """Bound the data segment: private memory, not what libraries map."""
+def _measured(judge: Judge, seed: int, seconds: float) -> str | None:
+    """What the judge says of a mutant, or that it takes too much time or memory."""
+    _limit(seconds)
+    held, start = _memory("VmRSS"), time.process_time()
+    answer = _judged(judge, seed, seconds)
+    used, taken = time.process_time() - start, _memory("VmHWM") - held
+    if used > seconds:
+        return f"takes {used:.1f} s"
+    return f"takes {taken / 2**30:.1f} GiB" if taken > MEMORY else answer
+
+
+def _judged(judge: Judge, seed: int, seconds: float) -> str | None:
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    try:
+        return judge(seed)
+    except _TimeIsUp:
+        return f"takes more than {seconds:g} s"
+    except BaseException as error:
+        return f"the judge failed: {type(error).__name__}: {str(error)[:200]}"
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+
+
+def _limit(seconds: float) -> None:
+    """Hard limits for the next mutant, and a new start for the resident peak."""
+    most = int(time.process_time() + 2 * seconds) + 1
+    resource.setrlimit(resource.RLIMIT_CPU, (most, resource.getrlimit(resource.RLIMIT_CPU)[1]))
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-    resource.setrlimit(resource.RLIMIT_DATA, (most + 2**30, hard))
+    resource.setrlimit(resource.RLIMIT_DATA, (_memory("VmData") + 2 * MEMORY, hard))  # private, not what files map
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def _memory(kind: str) -> int:
+    """Bytes of this process, of a kind that Linux counts: VmRSS, its peak VmHWM, or VmData."""
+    rows = Path("/proc/self/status").read_text().splitlines()
+    return next(int(row.split()[1]) * 1024 for row in rows if row.startswith(kind + ":"))
 
 
 def _time_is_up(number: int, frame: FrameType | None) -> None:

@@ -52,6 +52,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is
     "fit": ("fit", "planar_3r_x", "--param", "polynomial:4", "--samples", "2000", "--out", "out/c.orthocas", "--json"),
     "evaluate": ("evaluate", "chart.orthocas", "--samples", "20000", "--json"),
     "certify": ("certify", "chart.orthocas", "--out", "out/c.orthocas", "--json"),
+    "certify in processes": ("certify", "chart.orthocas", "--out", "out/c.orthocas", "--workers", "2", "--json"),
     "compare": ("compare", "planar_3r_x", *_SMALL_GRID, "--out", "out"),
     "simulate": ("simulate", "chart.orthocas", *_CONTROLLED, "--steps", "steps.json"),
     "codegen": ("codegen", "chart.orthocas", *_CONTROLLED, "--check"),
