@@ -108,6 +108,12 @@ def impedance() -> control.Impedance:
 
 
 @cache
+def second() -> oc.Task:
+    """A second task for projectors."""
+    return oc.Task.custom(planar().robot, "tilt", lambda q: q[0] + q[1] + q[2])
+
+
+@cache
 def steps() -> Reference:
     phi = fitted().chart.phi(planar().domain.centre)
     return Reference.steps(fitted().chart.labels, phi, [(0.1, {"x": float(phi[0]) + 0.02})], 0.5)
@@ -165,6 +171,11 @@ CONTROLLERS: dict[str, Callable[[], Controller]] = {
     "kinematic": lambda: control.Kinematic(fitted().chart, 1.0),
     "projector": lambda: control.Projector(planar(), 80.0, 10.0),
     "kinematic projector": lambda: control.KinematicProjector(planar(), 1.0, 0.5),
+    "projected coordinates": lambda: control.Projector(
+        planar(), 80.0, 10.0, second=fitted().chart, second_force=0.1, feed_forward=True
+    ),
+    "kinematic projected coordinates": lambda: control.KinematicProjector(planar(), 1.0, 0.5, second=fitted().chart),
+    "projector of a task": lambda: control.Projector(planar(), 80.0, 10.0, second=second()),
 }
 OBJECTS: dict[str, Callable[[], Any]] = {
     **CHARTS,

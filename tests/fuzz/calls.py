@@ -368,11 +368,20 @@ def _control() -> dict[str, Call]:
         "Kinematic": (control.Kinematic, {"chart": chart, "feedback": 1.0, "limit": None}),
         "Projector": (
             control.Projector,
-            {"problem": problem, "stiffness": 1.0, "posture_stiffness": 1.0, "damping_ratio": 0.7, "limit": None},
+            {
+                "problem": problem,
+                "stiffness": 1.0,
+                "posture_stiffness": 1.0,
+                "damping_ratio": 0.7,
+                "limit": None,
+                "second": chart,
+                "second_force": 1.0,
+                "feed_forward": False,
+            },
         ),
         "KinematicProjector": (
             control.KinematicProjector,
-            {"problem": problem, "feedback": 1.0, "posture_feedback": 1.0, "limit": None},
+            {"problem": problem, "feedback": 1.0, "posture_feedback": 1.0, "limit": None, "second": chart},
         ),
         "Reference.steps": (
             control.Reference.steps,
