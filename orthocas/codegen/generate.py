@@ -94,9 +94,10 @@ def generate_c(
 def _functions(chart: Chart, controller: Controller | None) -> list[ca.Function]:
     """The kernels, with matrices row by row. One kernel computes mass matrix, bias and gravity, which share much."""
     n, robot = chart.n, chart.problem.robot
-    q, dq = ca.MX.sym("q", n), ca.MX.sym("dq", n)
+    q, dq, v = (ca.MX.sym(name, n) for name in ("q", "dq", "v"))
     found = [
         ca.Function("chart", [q], [chart.function("phi")(q), chart.function("jacobian")(q).T]),
+        ca.Function("curvature", [q, dq, v], [chart.function("second_derivative")(q, dq, v)]),
         scalar_code(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)])),
     ]
     domain = chart.problem.domain

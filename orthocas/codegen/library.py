@@ -15,7 +15,7 @@ from orthocas.codegen.generated import GeneratedC
 from orthocas.control import Controller
 from orthocas.errors import CompileError
 
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 
 
 def compilers() -> tuple[str, ...]:
@@ -61,6 +61,17 @@ class CompiledLibrary:
         """phi (n,), J (n, n), status."""
         phi, J = np.empty(self.n), np.empty((self.n, self.n))
         return phi, J, self._call("chart", [q], [phi, J])
+
+    def check(self) -> float:
+        """Largest relative difference that the library finds between itself and the numbers it was generated with."""
+        run = self.function("check")
+        run.restype = ctypes.c_double
+        return float(run())
+
+    def curvature(self, q: Array, dq: Array, v: Array) -> tuple[Array, int]:
+        """dJ/dt v (n,), status."""
+        curvature = np.empty(self.n)
+        return curvature, self._call("chart_curvature", [q, dq, v], [curvature])
 
     def inverse(self, phi: Array, q_start: Array) -> tuple[Array, int]:
         """q (n,), status."""
