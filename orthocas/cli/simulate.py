@@ -100,8 +100,6 @@ def simulate(
         second=second,
     )
     require_options(controller, options)
-    if animation != "none":
-        require_format(animation)
     _require_plant(plant, rate)
     _require_folder(out, animation, force)
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
@@ -139,7 +137,9 @@ def simulate(
 
 
 def _require_folder(out: Path, animation: str, force: bool) -> None:
-    """Check, before anything is written, that the output folder exists or can be made, and holds no files of others."""
+    """Check, before anything is written, the format, and that the folder can be made or holds no files of others."""
+    if animation != "none":
+        require_format(animation)
     if out.exists() and not out.is_dir():
         raise InvalidValueError("--out", str(out), "a folder")
     require_writable(out / "report.json" if out.is_dir() else out, ArchiveError)
