@@ -79,10 +79,10 @@ class ControllerOptions:
     friction: str | None = None
     damping: str | None = None
     damping_stiffness: str | None = None
+    second: str | None = None
     model: str | None = None
     gravity: str | None = None
     inputs: str | None = None
-    second: str | None = None
 
 
 def require_options(name: str, options: ControllerOptions) -> None:

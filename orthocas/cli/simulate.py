@@ -94,11 +94,8 @@ def simulate(
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
-    options = ControllerOptions(
-        *(stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction),
-        *(damping, damping_stiffness),
-        second=second,
-    )
+    words = (stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction)
+    options = ControllerOptions(*words, damping, damping_stiffness, second)
     require_options(controller, options)
     _require_plant(plant, rate)
     _require_folder(out, animation, force)

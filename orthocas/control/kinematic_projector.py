@@ -15,7 +15,8 @@ from orthocas.control.controller import Command, fallback_function, guarded_grap
 from orthocas.control.gains import FEEDBACK, LIMIT, command_limit, non_negative_gains
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reference import Reference
-from orthocas.control.second_task import SecondTask, named_second, second_task
+from orthocas.control.second_task import SecondTask
+from orthocas.control.second_tasks import named_second, second_task
 from orthocas.problem import Problem
 from orthocas.showing import Shown
 from orthocas.tasks import Task

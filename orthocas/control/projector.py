@@ -32,7 +32,8 @@ from orthocas.control.gains import (
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.matched_stiffness import matched_posture_stiffness, matched_stiffness
 from orthocas.control.reference import Reference
-from orthocas.control.second_task import SecondTask, named_second, second_task
+from orthocas.control.second_task import SecondTask
+from orthocas.control.second_tasks import named_second, second_task
 from orthocas.control.two_task_forces import errors_and_damping, two_task_forces
 from orthocas.problem import Problem
 from orthocas.showing import Shown
