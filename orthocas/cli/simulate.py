@@ -127,10 +127,8 @@ def simulate(
     else:
         print_rows(run_rows(report, loaded.problem) | {"files": str(out)})
     _notes(law, report, interrupted)
-    if interrupted:
-        raise typer.Exit(130)
-    if run.outcome is Outcome.DIVERGED:
-        raise typer.Exit(_DIVERGED)
+    if code := 130 if interrupted else _DIVERGED * (run.outcome is Outcome.DIVERGED):
+        raise typer.Exit(code)
 
 
 def _require_folder(out: Path, animation: str, force: bool) -> None:
