@@ -23,6 +23,7 @@ SCRIPTS = (
     "lengths",
     "closed_loop",
     "control_tick",
+    "default_gains",
     "metric_loss",
     "against_torch",
     "paper_network",

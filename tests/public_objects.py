@@ -108,6 +108,12 @@ def impedance() -> control.Impedance:
 
 
 @cache
+def second() -> oc.Task:
+    """A second task for projectors."""
+    return oc.Task.custom(planar().robot, "tilt", lambda q: q[0] + q[1] + q[2])
+
+
+@cache
 def steps() -> Reference:
     phi = fitted().chart.phi(planar().domain.centre)
     return Reference.steps(fitted().chart.labels, phi, [(0.1, {"x": float(phi[0]) + 0.02})], 0.5)
@@ -138,6 +144,10 @@ def certificate() -> oc.Certificate:
     return oc.certify(fitted().chart)
 
 
+def run_time_model() -> control.RunTimeModel:
+    return control.RunTimeModel(payload=1.0, wrench=np.zeros(6), extra_torque=0.1)
+
+
 CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "certified chart": lambda: replace(fitted().chart, certificate=certificate()),
     "polynomial chart": lambda: fitted().chart,
@@ -155,10 +165,17 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
 CONTROLLERS: dict[str, Callable[[], Controller]] = {
     "impedance": impedance,
     "PD+": lambda: control.PDPlus(fitted().chart, 60.0, coupling="decoupled", damping="double_diagonal"),
+    "PD+ with inputs": lambda: control.PDPlus(fitted().chart, 60.0, damping_stiffness=50.0, model=run_time_model()),
+    "PD+ of a given model": lambda: control.PDPlus(fitted().chart, 60.0, model=control.RunTimeModel("given", "robot")),
     "PD+ of a network": lambda: control.PDPlus(network(), 60.0),
     "kinematic": lambda: control.Kinematic(fitted().chart, 1.0),
     "projector": lambda: control.Projector(planar(), 80.0, 10.0),
     "kinematic projector": lambda: control.KinematicProjector(planar(), 1.0, 0.5),
+    "projected coordinates": lambda: control.Projector(
+        planar(), 80.0, 10.0, second=fitted().chart, second_force=0.1, feed_forward=True
+    ),
+    "kinematic projected coordinates": lambda: control.KinematicProjector(planar(), 1.0, 0.5, second=fitted().chart),
+    "projector of a task": lambda: control.Projector(planar(), 80.0, 10.0, second=second()),
 }
 OBJECTS: dict[str, Callable[[], Any]] = {
     **CHARTS,
@@ -167,6 +184,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "fit": fitted,
     "robot": lambda: planar().robot,
     "task": lambda: planar().task,
+    "run-time model": run_time_model,
+    "modes": lambda: impedance().modes(),
     "custom task": lambda: with_idle_joint().problem.task,
     "inertia metric": lambda: planar().metric,
     "custom metric": lambda: Metric.from_spec(planar().robot, lambda q: ca.diag(2 + ca.cos(q))),

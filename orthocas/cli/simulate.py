@@ -21,6 +21,7 @@ from orthocas.cli.controller_argument import (
     Feedback,
     Limit,
     PostureStiffness,
+    SecondName,
     Stiffness,
     build_controller,
     require_options,
@@ -60,6 +61,7 @@ def simulate(
     coupling: CouplingName = None,
     damping: DampingName = None,
     posture_stiffness: PostureStiffness = None,
+    second: SecondName = None,
     feedback: Feedback = None,
     limit: Limit = None,
     damping_stiffness: DampingStiffness = None,
@@ -95,6 +97,7 @@ def simulate(
     options = ControllerOptions(
         *(stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction),
         *(damping, damping_stiffness),
+        second=second,
     )
     require_options(controller, options)
     if animation != "none":

@@ -107,10 +107,18 @@ def _control_values(controller: Controller) -> dict[str, str]:
         "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
         "commands_torque": str(int(torque)),
         "law": controller.formula,
-        "fallback": "the gravity torque, or zero where it is not finite" if torque else "zero velocity",
+        "fallback": _fallback(controller),
         "where": _EVERYWHERE if controller.chart is None else _IN_DOMAIN,
         "command": controller.command,
     }
+
+
+def _fallback(controller: Controller) -> str:
+    if controller.command == "velocity":
+        return "zero velocity"
+    if controller.settings.get("gravity") == "robot":
+        return "zero torque, because the robot compensates gravity"
+    return "the gravity torque, or zero where it is not finite"
 
 
 def _remark(controller: Controller, gain: str) -> str:

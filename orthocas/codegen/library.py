@@ -11,7 +11,7 @@ import numpy as np
 
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, require_shape
-from orthocas.codegen.generate import GeneratedC
+from orthocas.codegen.generated import GeneratedC
 from orthocas.control import Controller
 from orthocas.errors import CompileError
 
@@ -76,6 +76,19 @@ class CompiledLibrary:
         """Command (n,), status. Reference (3 k,) and gains hold the numbers of the C structs in order."""
         command = np.empty(self.n)
         return command, self._call("control", [q, dq, reference, gains], [command])
+
+    def low_pass(self, reference: Array, target: Array, omega: float, zeta: float, period: float) -> None:
+        """Move a reference (3 k,) by one step of the low pass towards a target (k,)."""
+        run = self.function("reference_low_pass")
+        run.argtypes, run.restype = [ctypes.c_void_p] * 2 + [ctypes.c_double] * 3, None
+        run(reference.ctypes.data, target.ctypes.data, omega, zeta, period)
+
+    def spline(self, start: Array, target: Array, duration: float, time: float) -> Array:
+        """The reference (3 k,) at a time on the spline from a reference to rest at a target (k,)."""
+        run, reference = self.function("reference_spline"), np.empty(3 * len(target))
+        run.argtypes, run.restype = [ctypes.c_void_p] * 2 + [ctypes.c_double] * 2 + [ctypes.c_void_p], None
+        run(start.ctypes.data, target.ctypes.data, duration, time, reference.ctypes.data)
+        return reference
 
     @property
     def domain(self) -> tuple[Array, Array]:
