@@ -48,9 +48,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="six pushes of one arm")
     options = parser.parse_args()
     arms, runs = (ARMS[:1], 6) if options.quick else (ARMS, options.runs)
-    print(
-        "| arm | left the domain | caught | below 2 rad/s after | at rest after | fastest joint | torque a tick | back |"
-    )
+    print("| arm | left | caught | below 2 rad/s after | at rest after | fastest joint | torque a tick | back |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for name in arms:
         found = pushes(chart_of(name, "position", "inertia"), runs)
