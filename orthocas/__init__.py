@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING
 
 from orthocas.cli.entry import is_command_line as _is_command_line
 from orthocas.cli.entry import leave_on_ctrl_c as _leave_on_ctrl_c
-from orthocas.comparing.workers import end_early_with_parent as _end_early_with_parent
-from orthocas.comparing.workers import knows_parent as _knows_parent
 
 if _is_command_line():
     _leave_on_ctrl_c()  # the imports below take a second
+
+from orthocas.comparing.workers import end_early_with_parent as _end_early_with_parent
+from orthocas.comparing.workers import knows_parent as _knows_parent
+
 if _knows_parent():
     _end_early_with_parent()
 

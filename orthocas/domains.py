@@ -305,7 +305,7 @@ def _inside(domain: Domain, samples: int, draw: Callable[[int], Array]) -> Array
     Raises:
         DomainError: if next to none of them does.
     """
-    found: list[Array] = []
+    found = [np.empty((0, len(domain.centre)))]
     drawn = kept = 0
     size = samples
     while kept < samples:

@@ -18,6 +18,7 @@ from orthocas.checks import Array
 from orthocas.comparing.report import Comparison
 from orthocas.control import Controller, Reference
 from orthocas.domains import sample_uniform
+from orthocas.fitting.clear_part import ClearPart
 from orthocas.fitting.fit import Fit
 from orthocas.metrics import Metric, metric_matrices
 from orthocas.samples import sample_problem
@@ -70,6 +71,13 @@ def cyclic() -> oc.Chart:
 
 
 @cache
+def clear() -> oc.Chart:
+    known = problems.get("planar_3r_xy")
+    problem = oc.Problem(known.robot, known.task, domain=known.domain, least_singular_value=0.1)
+    return oc.fit(problem, oc.Polynomial(2), samples=300).chart
+
+
+@cache
 def suggestion() -> Any:
     known = problems.get("planar_3r_xy")
     parametrisation = oc.Polynomial(2, cyclic="auto")
@@ -97,6 +105,12 @@ def on_planes() -> oc.Chart:
 @cache
 def impedance() -> control.Impedance:
     return control.Impedance(fitted().chart, 60.0, limit=90.0)
+
+
+@cache
+def second() -> oc.Task:
+    """A second task for projectors."""
+    return oc.Task.custom(planar().robot, "tilt", lambda q: q[0] + q[1] + q[2])
 
 
 @cache
@@ -130,6 +144,10 @@ def certificate() -> oc.Certificate:
     return oc.certify(fitted().chart)
 
 
+def run_time_model() -> control.RunTimeModel:
+    return control.RunTimeModel(payload=1.0, wrench=np.zeros(6), extra_torque=0.1)
+
+
 CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "certified chart": lambda: replace(fitted().chart, certificate=certificate()),
     "polynomial chart": lambda: fitted().chart,
@@ -139,6 +157,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "given chart": given,
     "chart with an idle joint": with_idle_joint,
     "cyclic chart": cyclic,
+    "chart of a clear box": clear,
     "circle chart": circle,
     "disk chart": disk,
     "linear leaf chart": on_planes,
@@ -146,10 +165,17 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
 CONTROLLERS: dict[str, Callable[[], Controller]] = {
     "impedance": impedance,
     "PD+": lambda: control.PDPlus(fitted().chart, 60.0, coupling="decoupled", damping="double_diagonal"),
+    "PD+ with inputs": lambda: control.PDPlus(fitted().chart, 60.0, damping_stiffness=50.0, model=run_time_model()),
+    "PD+ of a given model": lambda: control.PDPlus(fitted().chart, 60.0, model=control.RunTimeModel("given", "robot")),
     "PD+ of a network": lambda: control.PDPlus(network(), 60.0),
     "kinematic": lambda: control.Kinematic(fitted().chart, 1.0),
     "projector": lambda: control.Projector(planar(), 80.0, 10.0),
     "kinematic projector": lambda: control.KinematicProjector(planar(), 1.0, 0.5),
+    "projected coordinates": lambda: control.Projector(
+        planar(), 80.0, 10.0, second=fitted().chart, second_force=0.1, feed_forward=True
+    ),
+    "kinematic projected coordinates": lambda: control.KinematicProjector(planar(), 1.0, 0.5, second=fitted().chart),
+    "projector of a task": lambda: control.Projector(planar(), 80.0, 10.0, second=second()),
 }
 OBJECTS: dict[str, Callable[[], Any]] = {
     **CHARTS,
@@ -158,6 +184,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "fit": fitted,
     "robot": lambda: planar().robot,
     "task": lambda: planar().task,
+    "run-time model": run_time_model,
+    "modes": lambda: impedance().modes(),
     "custom task": lambda: with_idle_joint().problem.task,
     "inertia metric": lambda: planar().metric,
     "custom metric": lambda: Metric.from_spec(planar().robot, lambda q: ca.diag(2 + ca.cos(q))),
@@ -165,6 +193,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "check of a problem": lambda: oc.check(planar(), 100),
     "box": lambda: planar().domain,
     "unbounded box": lambda: cyclic().problem.domain,
+    "clear box": lambda: clear().problem.domain,
+    "clear part of a domain": lambda: ClearPart(0.1, 0.95),
     "torus": lambda: oc.Torus(3),
     "suggestion of a domain": suggestion,
     "width of a joint": lambda: suggestion().joints[0],

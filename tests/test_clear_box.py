@@ -21,7 +21,7 @@ from orthocas.control import ControlStatus
 from orthocas.domains import sample_evenly, sample_heavily, sample_uniform
 from orthocas.errors import ChartFileError, DomainError, InvalidValueError, UnreachableReferenceError
 from orthocas.fitting.clear_part import clear_part
-from orthocas.parametrisations import over_cyclic_joints
+from orthocas.parametrisations.cyclic_joints import over_cyclic_joints
 from orthocas.worst_points import worst_points
 
 Numbers = NDArray[np.float64]
@@ -42,7 +42,7 @@ def chart(problem: oc.Problem) -> oc.Chart:
 
 
 def by_hand(task: oc.Task, domain: oc.Box, q: Numbers) -> Numbers:
-    """Relative singular values from NumPy's SVD and central differences of the task, (N,), up to the scale's samples."""
+    """Relative singular values from NumPy's SVD and central differences of the task, up to its scale, (N,)."""
 
     def jacobians(points: Numbers) -> Numbers:
         steps = 1e-6 * np.eye(points.shape[1])
@@ -64,7 +64,7 @@ def test_points_are_inside_just_where_the_smallest_singular_value_is_large_enoug
     box = oc.Box(known.domain.centre, 0.7)
     points = sample_uniform(box, 2000, 1)
     values = by_hand(task, box, points)
-    clear = oc.ClearBox(box, task, float(np.median(values)))
+    clear = oc.ClearBox(box, task, 0.9 * float(np.minimum(np.median(values), by_hand(task, box, box.centre[None]))[0]))
     sure = np.abs(values / clear.least_singular_value - 1) > 0.03  # the scale is a mean of 256 samples
     assert sure.mean() > 0.8
     np.testing.assert_array_equal(oc.contains(clear, points)[sure], values[sure] > clear.least_singular_value)
@@ -99,19 +99,20 @@ def test_samples_lie_inside_and_follow_the_seed(problem: oc.Problem, draw: objec
     assert draw is sample_heavily or np.array_equal(points[: len(kept)], kept)
 
 
+def test_a_single_sample_is_drawn(problem: oc.Problem) -> None:
+    for domain in (WIDE, problem.domain):
+        assert [draw(domain, 1, 0).shape for draw in (sample_uniform, sample_heavily, sample_evenly)] == [(1, 3)] * 3
+
+
 def test_a_domain_of_which_nothing_is_left_is_refused_soon(problem: oc.Problem) -> None:
-    best = problem.domain.singular_values(sample_uniform(WIDE, 20_000, 0)).max()  # type: ignore[union-attr]
-    with pytest.raises(
-        DomainError, match=r"the centre of the domain has a relative singular value of 0\.\d+, expected"
-    ):
+    best = problem.domain.singular_values(sample_uniform(WIDE, 20_000, 0)).max()  # type: ignore[attr-defined]
+    with pytest.raises(DomainError, match=r"the centre of the domain has a relative singular value of 0\.\d+"):
         oc.Problem(problem.robot, problem.task, domain=WIDE, least_singular_value=2 * best)
-    tiny = oc.Box([0.6, 1.9, 0.8], 0.3)
-    here = oc.ClearBox(tiny, problem.task, 0.1)
     arm = oc.problems.get("iiwa")
-    lonely = oc.ClearBox(arm.domain, arm.task, float(here.singular_values(tiny.centre)) * 1e-6)
-    values = lonely.singular_values(sample_uniform(arm.domain, 20_000, 0))
-    peak = sample_uniform(arm.domain, 20_000, 0)[int(values.argmax())]
-    needle = oc.ClearBox(oc.Box(peak, 0.5), arm.task, float(values.max()) * 0.9999, lonely.scale)
+    measured, points = oc.ClearBox(arm.domain, arm.task, 1e-6), sample_uniform(arm.domain, 20_000, 0)
+    values = measured.singular_values(points)
+    around_the_best = oc.Box(points[int(values.argmax())], 0.5)
+    needle = oc.ClearBox(around_the_best, arm.task, 0.9999 * values.max(), measured.scale)
     with pytest.raises(DomainError, match=r"of \d+ points of its box lie in the domain, expected at least 0.1%"):
         sample_uniform(needle, 1000, 0)
 
@@ -197,12 +198,13 @@ def test_nothing_is_offered_where_the_centre_is_singular() -> None:
     assert clear_part(straight, found, None) is None
 
 
-def test_a_fit_says_which_option_helps(run: Run, tmp_path: Path) -> None:
-    words = ("fit", "planar_3r_xy", "--half-width", "0.8,1.2,1.2", "--param", "polynomial:3", "--seed", "0")
-    code, out, _ = run(*words, "--out", tmp_path / "whole.orthocas")
+def test_a_fit_says_which_option_helps(run: Run) -> None:
+    task = ("--half-width", "0.8,1.2,1.2", "--metric", "euclidean")
+    words = ("fit", "planar_3r_xy", *task, "--param", "polynomial:3")
+    code, out, _ = run(*words, "--out", "whole.orthocas")
     assert code == 0
     assert "--least-singular-value" in out
-    clear = tmp_path / "clear.orthocas"
+    clear = "clear.orthocas"
     code, out, _ = run(*words, "--least-singular-value", "0.2", "--out", clear, "--json")
     assert code == 0
     assert json.loads(out)["folded_samples"] == 0
@@ -211,7 +213,7 @@ def test_a_fit_says_which_option_helps(run: Run, tmp_path: Path) -> None:
     assert (told["domain"], told["least_singular_value"]) == ("clear box", 0.2)
     assert 0.5 < told["clear_share"] < 1
     assert len(told["row_scale"]) == 2
-    code, _, error = run(*words, "--least-singular-value", "3", "--out", tmp_path / "no.orthocas")
+    code, _, error = run(*words, "--least-singular-value", "3", "--out", "no.orthocas")
     assert code == 2
     assert "expected one above least_singular_value = 3" in error
     code, _, error = run("fit", "planar_3r_xy", "--domain", "auto", "--least-singular-value", "0.1")
@@ -337,7 +339,7 @@ def test_a_fold_in_the_clear_part_is_never_certified(problem: oc.Problem) -> Non
 
 
 def test_a_certificate_is_void_for_another_bound(chart: oc.Chart) -> None:
-    found = oc.certify(chart)
+    found = oc.certify(chart, time_limit=0)
     other = oc.Problem(chart.problem.robot, chart.problem.task, domain=WIDE, least_singular_value=0.3)
     with pytest.raises(oc.errors.CertifyError, match="void"):
         dataclasses.replace(chart, problem=other, certificate=found)
@@ -350,3 +352,11 @@ def test_threads_and_pickles_share_a_clear_box(problem: oc.Problem) -> None:
     with ThreadPoolExecutor(4) as pool:
         for found in pool.map(fresh.contains, [points] * 8):
             np.testing.assert_array_equal(found, wanted)
+
+
+def test_a_checkpoint_of_the_whole_box_is_not_resumed(problem: oc.Problem, tmp_path: Path) -> None:
+    arm = oc.Problem(problem.robot, problem.task, domain=oc.Box([0.6, 0.8, 0.8], 0.2))
+    barely = oc.Problem(problem.robot, problem.task, domain=arm.domain, least_singular_value=1e-6)  # same samples
+    oc.fit(arm, oc.Polynomial(2), samples=200, checkpoint=tmp_path / "state")
+    with pytest.raises(oc.errors.CheckpointError):
+        oc.fit(barely, oc.Polynomial(2), samples=200, checkpoint=tmp_path / "state")

@@ -123,6 +123,25 @@ def test_other_controllers_follow_the_same_file_and_are_judged_in_the_chart(run:
     assert trajectory.kind == ("torque" if name == "projector" else "velocity")
 
 
+@pytest.mark.usefixtures("blank")
+@pytest.mark.parametrize("name", ["projector", "kinematic_projector"])
+def test_projectors_move_extra_coordinates_on_request(run: Run, chart: oc.Chart, name: str) -> None:
+    """They follow the reference of the chart itself, with the stiffness of the chart's springs."""
+    report = report_of(run, name, "--second", "xi")
+    assert report["second"] == "xi"
+    assert report["tracking_error"]["x"] < (0.05 if name == "projector" else 1e-6)
+    assert Trajectory.load("out/trajectory.npz").labels == ("x", "xi1", "xi2")
+
+
+def test_gains_of_projectors_of_extra_coordinates(chart: oc.Chart) -> None:
+    options = ControllerOptions(second="xi")
+    law = build_controller("projector", chart, options, None)
+    direct = build_controller("impedance", chart, ControllerOptions(), None)
+    np.testing.assert_array_equal(law.gains["stiffness"], direct.gains["stiffness"])
+    options = ControllerOptions(second="xi", feedback="1,2,3")
+    assert build_controller("kinematic_projector", chart, options, None).gains["feedback"].tolist() == [1, 2, 3]
+
+
 def test_springs_that_are_not_given_put_the_modes_around_four_hertz(chart: oc.Chart) -> None:
     """The geometric mean of all modes over the domain, in the chart's coordinates and in the joints."""
     points = sample_uniform(chart.problem.domain, 256, 0)
@@ -206,6 +225,8 @@ def test_mujoco_is_another_plant(run: Run) -> None:
         ),
         (("pd_plus", "--feedback", "1"), "it belongs to kinematic, kinematic_projector"),
         (("pd_plus", "--posture-stiffness", "1"), "it belongs to projector"),
+        (("projector", "--second", "xi2"), "unknown second task 'xi2', known: joints, xi"),
+        (("impedance", "--second", "xi"), "it belongs to projector, kinematic_projector"),
         (("projector", "--coupling", "coupled"), "it belongs to impedance, pd_plus"),
         (("kinematic", "--mass-factor", "1.1"), "--mass-factor is 1.1, expected no --mass-factor with kinematic"),
         (("kinematic", "--friction", "1,1"), "it belongs to impedance, pd_plus, projector"),

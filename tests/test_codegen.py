@@ -261,7 +261,7 @@ def test_header_and_readme_tell_what_a_user_needs(pd_plus: Generated, planar_x: 
     generated, law = pd_plus
     header = (generated.folder / "arm.h").read_text()
     for name in planar_x.robot.joint_names:
-        assert re.search(rf"\d {name}\n", header)
+        assert re.search(rf"\d {name} \[rad\]: ", header)
     assert "x, xi1, xi2" in header
     assert f"{generated.stack_bytes} bytes" in header
     assert "#define ARM_JOINTS 3" in header
@@ -313,6 +313,29 @@ def test_command_writes_checks_and_refuses(planar_fit: Fit, run: Run) -> None:
         assert code == 2
         assert message in err
         assert not Path("other").exists()
+
+
+def test_command_chooses_the_model_at_run_time_and_prints_remarks(planar_xy: oc.Problem, run: Run) -> None:
+    oc.fit(planar_xy, oc.Linear()).chart.save("arm.orthocas")
+    words = ("codegen", "arm.orthocas", "--controller", "impedance", "--out", "c", "--name", "arm")
+    code, _, err = run(*words, "--damping", "square_root", "--stiffness", "1,10000,1")
+    assert code == 0
+    assert "the damping matrix (29) is indefinite in" in err
+    code, _, err = run(*words, "--inputs", "payload,wrench", "--stiffness", "100,0,50", "--damping-stiffness", "50")
+    assert (code, err) == (0, "")
+    header = Path("c/arm.h").read_text()
+    assert "double payload[10];" in header
+    assert "double damping_stiffness[3];" in header
+    code, _, err = run(*words, "--model", "given", "--gravity", "robot")
+    assert code == 0
+    assert "pass mass matrix and torques in every tick" in err
+    assert "its fallback is zero torque" in err
+    header = Path("c/arm.h").read_text()
+    assert "double mass_matrix[9];" in header
+    assert "gravity_torque" not in header
+    code, _, err = run(*words, "--model", "given", "--inputs", "payload")
+    assert code == 2
+    assert "the given model includes the load" in err
 
 
 @pytest.mark.slow

@@ -5,7 +5,9 @@ import json
 import math
 import multiprocessing
 import os
+import re
 import shutil
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -15,6 +17,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytest
+from programs import python
 
 import orthocas as oc
 from orthocas import solvers
@@ -23,7 +26,7 @@ from orthocas.comparing import cells, workers
 from orthocas.comparing.cells import Cell, CellResult, run_cell, run_cells
 from orthocas.comparing.figures import convergence_figure, front_figure
 from orthocas.comparing.report import Comparison
-from orthocas.errors import ChartFileError, Interrupted, InvalidValueError
+from orthocas.errors import ArchiveError, ChartFileError, Interrupted, InvalidValueError
 from orthocas.fitting.loss import Weights
 from orthocas.minimising.watch import Progress
 from orthocas.parametrisations import register
@@ -235,6 +238,31 @@ def test_processes_use_one_thread_each_and_leave_the_environment_alone(monkeypat
     with workers.starting_workers():
         pass
     assert "OMP_NUM_THREADS" not in os.environ
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux sets the limit")
+def test_full_disk_for_temporary_files_is_named() -> None:
+    """A limit on the size of files stands for a full disk."""
+    code = """
+import resource, orthocas as oc
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+try:
+    oc.compare(oc.problems.get("planar_3r_x"), [oc.Linear()], samples=30, held_out=50)
+except oc.errors.ArchiveError as error:
+    print(error)
+"""
+    pattern = r"cannot write the temporary file \S+/orthocas-\S+/0\.pickle: File too large\n"
+    assert re.fullmatch(pattern, python(code))
+
+
+def test_full_shared_memory_is_named(planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("orthocas.comparing.workers.ProcessPoolExecutor", full)
+    with pytest.raises(ArchiveError, match=r"No space left on device, expected room in /dev/shm"):
+        oc.compare(planar_x, [oc.Linear()], samples=30, held_out=50)
 
 
 def test_any_executor_does(planar_x: oc.Problem) -> None:

@@ -18,7 +18,8 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.postures.clear_box import ClearBox
 
-_SLACK = 1e-9  # for the rounding of unit vectors and of guards; guards are exact to 1e-13 or so
+_LENGTH = 1e-9  # of singular vectors: their deviation from 1 is far smaller
+_GUARDS = 1e-12  # of |J_x|^2: elimination in floating-point numbers is exact to less, so guards agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,8 @@ class OutsideJudge:
         across = between(left, J, np.broadcast_to(np.eye(right.shape[1]), right.shape))[-1]
         with np.errstate(invalid="ignore", over="ignore"):
             squared = (across.magnitude() ** 2).sum(axis=0) * UP
-        outside: Array = squared <= self.domain.least_singular_value**2 * (1 - _SLACK)
+            squared += _GUARDS * (J.magnitude() ** 2).sum(axis=(0, 1))
+        outside: Array = squared <= self.domain.least_singular_value**2 * (1 - _LENGTH)
         influences = np.abs(across.coefficients[1 : 1 + len(across.variables)]).sum(axis=1)
         return outside, np.array(across.variables)[np.argmax(np.nan_to_num(influences), axis=0)]
 

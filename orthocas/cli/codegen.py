@@ -20,6 +20,7 @@ from orthocas.cli.controller_argument import (
     Limit,
     ModelName,
     PostureStiffness,
+    SecondName,
     Stiffness,
     build_controller,
     require_options,
@@ -41,6 +42,7 @@ def codegen(
     coupling: CouplingName = None,
     damping: DampingName = None,
     posture_stiffness: PostureStiffness = None,
+    second: SecondName = None,
     feedback: Feedback = None,
     limit: Limit = None,
     damping_stiffness: DampingStiffness = None,
@@ -61,6 +63,7 @@ def codegen(
         model=model,
         gravity=gravity,
         inputs=inputs,
+        second=second,
     )
     if controller != _NONE:
         require_options(controller, options)

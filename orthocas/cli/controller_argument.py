@@ -13,7 +13,7 @@ from orthocas.errors import InvalidValueError
 
 CONTROLLERS = law_names()
 _OF_THE_PLANT = ("mass_factor", "friction")  # options for laws that command torques
-_CHOICES = ("coupling", "damping", "model", "gravity", "inputs")  # options that are words
+_CHOICES = ("coupling", "damping", "model", "gravity", "inputs", "second")  # options that are words
 
 Stiffness = Annotated[
     str | None,
@@ -46,8 +46,13 @@ InputNames = Annotated[
 PostureStiffness = Annotated[
     str | None,
     typer.Option(
-        "--posture-stiffness", help="Stiffness of the joint springs; for projector. Default: modes around 4 Hz."
+        "--posture-stiffness",
+        help="Stiffness of the springs in the second task; for projector. Default: modes around 4 Hz.",
     ),
+]
+SecondName = Annotated[
+    str | None,
+    typer.Option("--second", help="joints (default) or xi, what the projector moves; for projector laws."),
 ]
 Feedback = Annotated[
     str | None,
@@ -74,6 +79,7 @@ class ControllerOptions:
     friction: str | None = None
     damping: str | None = None
     damping_stiffness: str | None = None
+    second: str | None = None
     model: str | None = None
     gravity: str | None = None
     inputs: str | None = None

@@ -41,6 +41,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
     report = {
         "controller": controller.name,
         "coupling": controller.settings.get("coupling"),
+        "second": controller.settings.get("second"),
         "gains": controller.gains,
         "outcome": seen.outcome.value,
         "duration": float(seen.times[-1]),

@@ -21,6 +21,7 @@ from orthocas.cli.controller_argument import (
     Feedback,
     Limit,
     PostureStiffness,
+    SecondName,
     Stiffness,
     build_controller,
     require_options,
@@ -60,6 +61,7 @@ def simulate(
     coupling: CouplingName = None,
     damping: DampingName = None,
     posture_stiffness: PostureStiffness = None,
+    second: SecondName = None,
     feedback: Feedback = None,
     limit: Limit = None,
     damping_stiffness: DampingStiffness = None,
@@ -92,13 +94,9 @@ def simulate(
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
-    options = ControllerOptions(
-        *(stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction),
-        *(damping, damping_stiffness),
-    )
+    words = (stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction)
+    options = ControllerOptions(*words, damping, damping_stiffness, second)
     require_options(controller, options)
-    if animation != "none":
-        require_format(animation)
     _require_plant(plant, rate)
     _require_folder(out, animation, force)
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
@@ -129,14 +127,14 @@ def simulate(
     else:
         print_rows(run_rows(report, loaded.problem) | {"files": str(out)})
     _notes(law, report, interrupted)
-    if interrupted:
-        raise typer.Exit(130)
-    if run.outcome is Outcome.DIVERGED:
-        raise typer.Exit(_DIVERGED)
+    if code := 130 if interrupted else _DIVERGED * (run.outcome is Outcome.DIVERGED):
+        raise typer.Exit(code)
 
 
 def _require_folder(out: Path, animation: str, force: bool) -> None:
-    """Check, before anything is written, that the output folder exists or can be made, and holds no files of others."""
+    """Check, before anything is written, the format, and that the folder can be made or holds no files of others."""
+    if animation != "none":
+        require_format(animation)
     if out.exists() and not out.is_dir():
         raise InvalidValueError("--out", str(out), "a folder")
     require_writable(out / "report.json" if out.is_dir() else out, ArchiveError)

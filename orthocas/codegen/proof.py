@@ -76,6 +76,8 @@ def _compared(
     dq = rng.normal(size=q.shape)
     dq[len(q) - len(_corner_cases(chart.n)) :] = 0
     differences = _chart_and_dynamics(library, chart, *_spoiled(rng, q, dq))
+    differences["curvature"] = _curvature(library, chart, q, dq, rng)
+    differences["check"] = library.check()
     differences["inverse"] = _inverse(library, chart, q)
     if controller is not None:
         differences["control"] = _control(library, controller, q, dq, rng)
@@ -121,6 +123,15 @@ def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Ar
         name: _difference(np.array([row[k] for row in pushed]), _zero_unless(moving, value))
         for k, (name, value) in enumerate(wanted.items())
     }
+
+
+def _curvature(library: CompiledLibrary, chart: Chart, q: Array, dq: Array, rng: np.random.Generator) -> float:
+    """Largest relative difference of dJ/dt v where it has a value, with any v."""
+    v = rng.normal(size=q.shape)
+    wanted = Batched(chart.function("second_derivative"))(q, dq, v)[0]
+    found = [library.curvature(*row) for row in zip(q, dq, v, strict=True)]
+    good = np.isfinite(wanted).all(axis=1)
+    return _difference(np.array([row[0] for row in found]), _zero_unless(good, wanted))
 
 
 def _inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:

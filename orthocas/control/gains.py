@@ -6,11 +6,12 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.checks import Array, as_float_array, frozen_array, require_shape
 from orthocas.errors import InvalidValueError
 
-STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
+STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT, SECOND_FORCE = (  #: units of gains, in words
     "J per squared unit of the quantity, > 0",
     ">= 0, 1 is critical damping",
     "1/s, >= 0",
     "largest command per joint, > 0; INFINITY for no limit",
+    "J per unit of the second quantity",
 )
 
 
@@ -26,6 +27,11 @@ def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
     gains = _spread(name, value, length)
     _require(name, gains, gains >= 0, "numbers >= 0")
     return gains
+
+
+def finite_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers, (length,), from one number or (length,)."""
+    return _spread(name, value, length)
 
 
 def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:

@@ -115,7 +115,7 @@ class Safety:
         if unknown:
             raise InvalidValueError("setting", repr(unknown[0]), f"one of {', '.join(settings)}")
         spread = {name: _spread(name, value, settings[name]) for name, value in changes.items()}
-        return cls(**{**settings, **spread})  # type: ignore[arg-type]
+        return cls(**{**settings, **spread})
 
 
 def _joint_motion(controller: Controller, points: Array) -> Array:

@@ -113,7 +113,8 @@ class ClearBox(Box):
         """q (n, 1) -> the pivots (m, 1) of D^-1 J_x J_x^T D^-1 - bound^2 I; all are > 0 just where q is clear."""
         q = ca.SX.sym("q", len(self.centre))
         J = self.task.jacobian_function(q) / ca.repmat(ca.DM(self.scale), 1, len(self.centre))
-        left = J @ J.T - self.least_singular_value**2 * ca.SX.eye(self.task.m)
+        square = self.least_singular_value * self.least_singular_value  # ** raises OverflowError for bounds of a file
+        left = J @ J.T - square * ca.SX.eye(self.task.m)
         found = []
         for _ in range(self.task.m):
             found.append(left[0, 0])

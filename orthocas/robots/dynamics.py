@@ -10,7 +10,6 @@ import casadi as ca
 import numpy as np
 
 from orthocas.checks import Array
-from orthocas.robots.payload import payload_body
 from orthocas.robots.spatial import constant, skew, turn
 from orthocas.robots.tree import KinematicTree
 
@@ -188,9 +187,17 @@ def _bodies(tree: KinematicTree, payload: ca.SX | None) -> list[_Inertials]:
     bodies = [_Inertials(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
     if payload is not None and tree.tip_parent >= 0:
         body = bodies[tree.tip_parent]
-        mass, moment, inertia = payload_body(tree, payload)
+        mass, moment, inertia = _payload(tree, payload)
         bodies[tree.tip_parent] = _Inertials(body.mass + mass, body.moment + moment, body.inertia + inertia)
     return bodies
+
+
+def _payload(tree: KinematicTree, payload: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Mass, mass times centre (3, 1), and inertia (3, 3) about the body's origin, in the frame of the tip's body."""
+    R, p, mass = constant(tree.tip_rotation), constant(tree.tip_translation), payload[0]
+    centre = p + R @ payload[1:4]
+    turned = R @ ca.reshape(payload[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3) @ R.T
+    return mass, mass * centre, turned + mass * (ca.dot(centre, centre) * ca.SX.eye(3) - centre @ centre.T)
 
 
 def _regroup(tree: KinematicTree) -> list[_Body]:

@@ -1,8 +1,7 @@
-"""A load fixed to the tip: mass, centre of mass and inertia, as numbers and in expressions."""
+"""A load fixed to the tip: mass, centre of mass and inertia, as numbers."""
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -61,15 +60,6 @@ def with_payload(tree: KinematicTree, payload: ArrayLike) -> KinematicTree:
         centres=_replaced(tree.centres, i, together),
         inertias=_replaced(tree.inertias, i, inertia),
     )
-
-
-def payload_body(tree: KinematicTree, payload: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Mass, mass times centre (3, 1), and inertia (3, 3) about the body's origin, in the frame of the tip's body."""
-    R, p, mass = ca.SX(ca.DM(tree.tip_rotation)), ca.SX(ca.DM(tree.tip_translation)), payload[0]
-    centre = p + R @ payload[1:4]
-    turned = R @ ca.reshape(payload[4:][_MATRIX], 3, 3) @ R.T
-    about_origin = turned + mass * (ca.dot(centre, centre) * ca.SX.eye(3) - centre @ centre.T)
-    return mass, mass * centre, about_origin
 
 
 def _steiner(mass: float, offset: Array) -> Array:

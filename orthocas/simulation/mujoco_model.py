@@ -10,11 +10,12 @@ from orthocas.checks import Array
 from orthocas.errors import MissingExtraError, RobotError
 from orthocas.robots import KinematicTree
 from orthocas.robots.spatial import rotation_z_to
-from orthocas.simulation.mujoco_scene import Payload, Wall
+from orthocas.simulation.mujoco_scene import MuJoCo, Payload, Wall
 
 TIP = "tip"  #: name of the body at the tip frame; it carries the payload
 HAND = "hand"  #: name of the geom at the tip that touches the wall
-_STOP_TIME = 0.004  # [s] time constant of the stops, critically damped; MuJoCo's 0.02 is too soft for light wrists
+_STOP_TIME = 0.004  # [s] time constant of the stops, critically damped; MuJoCo's is 0.02 ...
+_STOP_IMPEDANCE = (0.99, 0.999)  # ... and 0.9 to 0.95, which lets a motor press a light wrist 0.1 rad beyond its stop
 _FAR = 1e9  # [rad] or [m]: MuJoCo's ranges have two ends
 
 
@@ -40,15 +41,7 @@ def handle_name(i: int) -> str:
     return f"handle{i}"
 
 
-def mujoco_model(
-    tree: KinematicTree,
-    viscous: Array,
-    coulomb: Array,
-    stops: bool = True,
-    effort_limits: bool = True,
-    payload: Payload | None = None,
-    wall: Wall | None = None,
-) -> Any:
+def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Array) -> Any:
     """An `mjModel` with the dynamics of a tree: M ddq + C dq + g = u - friction + loads.
 
     Joint i is "joint<i>", moved by the motor "motor<i>" (gear 1), and carries "body<i>" and the massless "handle<i>",
@@ -56,12 +49,9 @@ def mujoco_model(
 
     Args:
         tree: the robot.
+        scene: what else there is: stops, limits of effort, a payload, a wall.
         viscous: joint damping (n,) [N m s/rad] or [N s/m].
         coulomb: dry friction (n,) [N m] or [N], a constraint that MuJoCo solves (`frictionloss`).
-        stops: whether the joints stop at their limits.
-        effort_limits: whether the motors saturate at the limits of effort.
-        payload: a body fixed at the tip.
-        wall: a fixed wall that the tip can touch.
 
     Raises:
         MissingExtraError: if mujoco is not installed.
@@ -77,17 +67,17 @@ def mujoco_model(
         carrier = bodies[parent] if parent >= 0 else spec.worldbody
         bodies.append(_add_body(mj, carrier, body_name(i), tree.translations[i], tree.rotations[i]))
         _place_inertia(bodies[i].add_body(name=handle_name(i)), 0.0)
-        _add_joint(mj, bodies[i], tree, i, stops, viscous[i], coulomb[i])
-        _add_motor(mj, spec, i, tree.effort_limits[i] if effort_limits else np.inf)
+        _add_joint(mj, bodies[i], tree, i, scene.stops, viscous[i], coulomb[i])
+        _add_motor(mj, spec, i, tree.effort_limits[i] if scene.effort_limits else np.inf)
     carrier = bodies[tree.tip_parent] if tree.tip_parent >= 0 else spec.worldbody
     tip = _add_body(mj, carrier, TIP, tree.tip_translation, tree.tip_rotation)
-    if wall is not None:
-        _add_wall(mj, spec, tip, wall)
+    if scene.wall is not None:
+        _add_wall(mj, spec, tip, scene.wall)
     try:
         model = spec.compile()
     except ValueError as error:
         raise RobotError(f"MuJoCo refuses the robot: {str(error)[:200]}") from None
-    _set_inertias(mj, model, tree, payload)
+    _set_inertias(mj, model, tree, scene.payload)
     return model
 
 
@@ -116,6 +106,7 @@ def _add_joint(
     joint.limited = mj.mjtLimited.mjLIMITED_TRUE if limited else mj.mjtLimited.mjLIMITED_FALSE
     if limited:
         joint.range, joint.solref_limit = np.clip(ends, -_FAR, _FAR), (_STOP_TIME, 1.0)
+        joint.solimp_limit[:2] = _STOP_IMPEDANCE
 
 
 def _add_motor(mj: ModuleType, spec: Any, i: int, limit: float) -> None:

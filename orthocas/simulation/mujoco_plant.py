@@ -6,18 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_float_array, as_point, frozen_array, require_kind
+from orthocas.checks import Array, as_number, as_point, frozen_array, require_kind
 from orthocas.control.gains import non_negative_gains
 from orthocas.errors import InvalidValueError, SimulationError
 from orthocas.robots import Robot
 from orthocas.showing import Shown
 from orthocas.simulation.disturbances import Friction
 from orthocas.simulation.mujoco_model import HAND, handle_name, mujoco, mujoco_model
-from orthocas.simulation.mujoco_scene import TIMESTEP, Payload, Wall, require_positive
+from orthocas.simulation.mujoco_scene import TIMESTEP, MuJoCo, Payload, Wall
 from orthocas.simulation.places import Link, place_of
 
 _MOST_PARTS = 8  # of the longest step, for RK4
 _LARGEST = 1e10  # [N m] or [N]
+_MOST_STEPS = 100_000  # of the physics in a tick, about 5 s of computing
 _RUNAWAY = 1e6  # [rad/s] or [m/s]
 
 
@@ -35,7 +36,7 @@ class MuJoCoPlant(Shown):
         effort_limits: whether the motors saturate at the robot's limits of effort.
         payload: a body fixed at the tip.
         wall: a wall in the tip's way.
-        timestep: longest step of the physics [s], > 0.
+        timestep: longest step of the physics [s], from 1e-6 to 0.01.
 
     Raises:
         ShapeError, InvalidValueError: for arguments of the wrong shape, value or type.
@@ -67,14 +68,15 @@ class MuJoCoPlant(Shown):
         timestep: float = TIMESTEP,
     ) -> None:
         require_kind("robot", robot, Robot)
-        require_positive("timestep", timestep)
-        friction = friction or Friction()
+        scene = MuJoCo(robot, stops, effort_limits, payload, wall, timestep)
+        friction = Friction() if friction is None else friction
+        require_kind("friction", friction, Friction)
         viscous, coulomb = (
             non_negative_gains(name, getattr(friction, name), robot.n) for name in ("viscous", "coulomb")
         )
         self.robot = robot
         #: MuJoCo's model and data, for renderers and for looking; `step` owns them.
-        self.model: Any = mujoco_model(robot.tree, viscous, coulomb, stops, effort_limits, payload, wall)
+        self.model: Any = mujoco_model(robot.tree, scene, viscous, coulomb)
         self.data: Any = mujoco().MjData(self.model)
         self._step = mujoco().mj_step
         self._timestep = float(timestep)
@@ -194,17 +196,29 @@ class MuJoCoPlant(Shown):
             loads: further joint torques, which do not saturate, (n,) [N m] or [N].
 
         Raises:
-            InvalidValueError: if the torque is not finite, or so large that MuJoCo would take 0 in its place.
+            ShapeError, InvalidValueError: for torques that are not (n,) or not finite, and ticks that are too long.
             SimulationError: if the state has diverged.
         """
         data = self.data
-        count = max(1, ceil(seconds / self._longest - 1e-9))
-        self.model.opt.timestep = seconds / count
-        data.ctrl[:] = torque
-        if not np.abs(data.ctrl).max() < _LARGEST:
-            given = as_float_array("torque", torque).tolist()
-            raise InvalidValueError("torque", given, f"numbers up to {_LARGEST:g}")
-        data.qfrc_applied[self._dofs] = 0.0 if loads is None else loads
-        self._step(self.model, data, count)
+        data.ctrl[:] = self._checked("torque", torque)
+        data.qfrc_applied[self._dofs] = 0.0 if loads is None else self._checked("loads", loads)
+        self._step(self.model, data, self._divided(seconds))
         if not data.qvel @ data.qvel < _RUNAWAY**2:
             raise SimulationError(f"MuJoCo gave up at {self.time:g} s: joint velocities beyond {_RUNAWAY:g}")
+
+    def _checked(self, name: str, value: ArrayLike) -> Array:
+        """Joint torques (n,). MuJoCo would take 0 in place of NaN and of larger ones."""
+        if not isinstance(value, np.ndarray) or value.shape != (self.robot.n,) or value.dtype != float:
+            value = as_point(name, value, self.robot.n)
+        if not np.abs(value).max() < _LARGEST:
+            raise InvalidValueError(name, value.tolist(), f"numbers up to {_LARGEST:g}")
+        return value
+
+    def _divided(self, seconds: float) -> int:
+        """Into how many steps of the physics a tick is divided; sets their length."""
+        count = as_number("seconds", seconds) / self._longest - 1e-9
+        if not -1e-9 < count <= _MOST_STEPS:
+            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {_MOST_STEPS * self._longest:g}")
+        steps = max(1, ceil(count))
+        self.model.opt.timestep = seconds / steps
+        return steps

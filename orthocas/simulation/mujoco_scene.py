@@ -13,6 +13,8 @@ from orthocas.robots.tree_checks import require_body
 MUJOCO = "mujoco"  #: name of this plant
 TIMESTEP = 1e-3  #: longest step of the physics [s]
 
+_TIMESTEPS = (1e-6, 1e-2)  # [s] shortest and longest
+
 
 @dataclass(frozen=True, eq=False)
 class Payload:
@@ -68,7 +70,8 @@ class Wall:
             raise InvalidValueError("normal of a wall", normal.tolist(), "a direction other than zero")
         object.__setattr__(self, "normal", frozen_array("normal", normal / np.linalg.norm(normal), (3,)))
         for name in ("tip_radius", "size", "thickness", "time_constant"):
-            require_positive(f"{name} of a wall", getattr(self, name))
+            if not 0 < as_number(f"{name} of a wall", getattr(self, name)) < np.inf:
+                raise InvalidValueError(f"{name} of a wall", getattr(self, name), "a finite number > 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +87,7 @@ class MuJoCo:
         effort_limits: whether the motors saturate at the robot's limits of effort.
         payload: a body fixed at the tip, which the controller does not know.
         wall: a wall in the tip's way.
-        timestep: longest step of the physics [s], > 0.
+        timestep: longest step of the physics [s], from 1e-6 to 0.01.
     """
 
     robot: Robot | None = None
@@ -100,10 +103,6 @@ class MuJoCo:
                 require_kind(name, getattr(self, name), kind)
         require_kind("stops", self.stops, bool)
         require_kind("effort_limits", self.effort_limits, bool)
-        require_positive("timestep", self.timestep)
-
-
-def require_positive(name: str, value: float) -> None:
-    """Raise InvalidValueError unless the value is a finite number > 0."""
-    if not 0 < as_number(name, value) < np.inf:
-        raise InvalidValueError(name, value, "a finite number > 0")
+        shortest, longest = _TIMESTEPS
+        if not shortest <= as_number("timestep", self.timestep) <= longest:
+            raise InvalidValueError("timestep", self.timestep, f"a number from {shortest:g} to {longest:g}")

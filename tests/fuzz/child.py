@@ -86,7 +86,7 @@ def _in_one_child(campaign: str, judge: Judge, seeds: list[int], seconds: float)
     findings = []
     for done, seed in enumerate(seeds, start=1):
         try:
-            waited = here.poll(5 * seconds + (60 if done == 1 else 0))  # the first waits for imports too
+            waited = here.poll(20 * seconds + (60 if done == 1 else 0))  # on a busy machine; the first imports too
             what = here.recv() if waited else "hangs where Python cannot interrupt it"
         except EOFError:
             child.join()
