@@ -211,6 +211,10 @@ int main(int argc, char **argv) {
     fprintf(stderr, "usage: %s SCENE.xml LOG.csv\n", argv[0]);
     return 2;
   }
+  if (!(arm_check() < 1e-9)) {
+    fprintf(stderr, "the library computes other numbers here than where it was generated\n");
+    return 2;
+  }
   arm = open_robot(argv[1]);
   log = fopen(argv[2], "w");
   if (!log) {
