@@ -59,8 +59,8 @@ def build(out: Path) -> Path:
         raise SystemExit("this example needs MuJoCo: pip install orthocas[sim]")
     folders = {"ARM_FOLDER": out / "generated", "MUJOCO_FOLDER": Path(spec.submodule_search_locations[0])}
     settings = [f"-D{name}={folder.resolve()}" for name, folder in folders.items()]
-    for command in (["cmake", "-S", HERE, "-B", out / "build", *settings], ["cmake", "--build", out / "build"]):
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(["cmake", "-S", HERE, "-B", out / "build", *settings], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(["cmake", "--build", out / "build"], check=True, stdout=subprocess.DEVNULL)
     return (out / "build" / "arm_in_mujoco").resolve()
 
 
@@ -70,7 +70,7 @@ def draw_film(log: Log, chart: oc.Chart, out: Path) -> None:
     pushes = (log.push[ticks] > 0)[:, None] * PUSH
     path = out / "arm_in_mujoco.gif"
     try:
-        save_film(path, out / "scene.xml", log.q[ticks], pushes, [log.caption(k) for k in ticks], PERIOD)
+        save_film(path, out / "scene.xml", log.q[ticks], pushes, [log.caption(int(k)) for k in ticks], PERIOD)
     except Exception as error:  # renderers raise all kinds of errors
         print(f"MuJoCo cannot draw here ({error}); the film shows lines instead", file=sys.stderr)
         save_drawing(path, log, ticks, chart)

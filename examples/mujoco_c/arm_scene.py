@@ -5,6 +5,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from orthocas.robots import KinematicTree
@@ -76,10 +77,10 @@ def _add_looks(root: Element) -> None:
     _add(asset, "material", name="floor", texture="floor", texrepeat=(10, 10))
 
 
-def _add(parent: Element, tag: str, **attributes: object) -> Element:
+def _add(parent: Element, tag: str, **attributes: ArrayLike) -> Element:
     """A child with numbers written in full."""
     return ElementTree.SubElement(parent, tag, {name: _text(value) for name, value in attributes.items()})
 
 
-def _text(value: object) -> str:
+def _text(value: ArrayLike) -> str:
     return value if isinstance(value, str) else " ".join(f"{number:.17g}" for number in np.atleast_1d(value))

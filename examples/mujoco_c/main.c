@@ -163,7 +163,7 @@ static void move_reference(plan *wanted, double time, arm_status last, const dou
 }
 
 /* Answer to the status of a tick. */
-static void answer(plan *wanted, arm_state *state, arm_status status, const double q[N], const double dq[N]) {
+static void answer(plan *wanted, arm_state *state, arm_status status, const double dq[N]) {
   switch (status) {
     case ARM_CAUGHT: /* wait until the arm has been at rest for a while, then ask for the law again */
       wanted->quiet = fastest(dq) < QUIET ? wanted->quiet + 1 : 0;
@@ -172,8 +172,7 @@ static void answer(plan *wanted, arm_state *state, arm_status status, const doub
     case ARM_NEAR_BORDER: /* go no further */
       memcpy(wanted->target, wanted->reference.value, sizeof wanted->target);
       break;
-    case ARM_BAD_INPUT: /* the law keeps the arm safe; a program for a robot would report this */
-      fprintf(stderr, "bad input at q[0] = %g\n", q[0]);
+    case ARM_BAD_INPUT: /* the law keeps the arm safe; a program for a robot reports this, and ends if it stays */
       break;
     default: /* OK, SATURATED, RETURNING: go on */
       wanted->quiet = 0;
@@ -236,7 +235,7 @@ int main(int argc, char **argv) {
     read_robot(&arm, q, dq);
     move_reference(&wanted, time, status, q);
     status = arm_step(&state, safety, q, dq, &wanted.reference, &arm_default_gains, PERIOD, torque);
-    answer(&wanted, &state, status, q, dq);
+    answer(&wanted, &state, status, dq);
     (void)arm_chart(q, phi, jacobian);
     fprintf(log, "%.9g,%d,%.9g,%.9g", time, (int)status, push, contact(&arm));
     write_numbers(log, q, N);
