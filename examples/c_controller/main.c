@@ -1,5 +1,6 @@
 /*
- * A 1 kHz loop around a generated controller, with histograms of the computing time and the lateness of its ticks.
+ * A 1 kHz loop around a generated controller under supervision, with histograms of the computing time and the lateness
+ * of its ticks.
  *
  * Generate the library with the name `arm` (docs/c_controller.md). A simulation replaces the robot: forward dynamics
  * with the library's own mass matrix and bias, one semi-implicit Euler step per tick. For your robot, replace
@@ -20,8 +21,11 @@
 #endif
 
 #define N ARM_JOINTS
-#define PERIOD 0.001 /* [s] */
-#define BINS 24      /* of the histogram, each twice as wide as the previous one */
+#define PERIOD 0.001   /* [s] */
+#define SMOOTHNESS 4.0 /* natural frequency of the low pass of the reference [rad/s] */
+#define STEP 0.04      /* of the first extra coordinate, there and back */
+#define BETWEEN 1000   /* ticks between two steps */
+#define BINS 24        /* of the histogram, each twice as wide as the previous one */
 
 typedef struct {
   double q[N];
@@ -96,9 +100,10 @@ static void print_histogram(const char *title, const long counts[BINS]) {
 int main(int argc, char **argv) {
   const long ticks = argc > 1 ? atol(argv[1]) : 5000;
   const int paced = !(argc > 2 && strcmp(argv[2], "--free") == 0); /* --free: as fast as possible */
-  long computing[BINS] = {0}, late[BINS] = {0}, statuses[4] = {0}, tick;
-  double q[N], dq[N], torque[N], phi[N], start_phi[N], jacobian[N * N], error = 0.0, begin;
+  long computing[BINS] = {0}, late[BINS] = {0}, good = 0, cut = 0, near = 0, tick;
+  double q[N], dq[N], torque[N], target[N], phi[N], jacobian[N * N], error = 0.0, begin;
   arm_reference reference;
+  arm_state state;
   int i;
 
   if (ticks < 1) {
@@ -107,20 +112,25 @@ int main(int argc, char **argv) {
   }
   for (i = 0; i < N; ++i) /* start at the centre of the domain, or with a bent arm if it has no bounds */
     robot.q[i] = isfinite(arm_domain_lower[i]) ? 0.5 * (arm_domain_lower[i] + arm_domain_upper[i]) : 0.6;
-  arm_chart(robot.q, start_phi, jacobian);
-  memset(&reference, 0, sizeof reference);
+  arm_reference_at(robot.q, &reference);
+  memcpy(target, reference.value, sizeof target);
+  arm_start(&state, robot.q, NULL);
   begin = now();
   for (tick = 0; tick < ticks; ++tick) {
     double time = PERIOD * (double)tick, started, done;
     if (paced) sleep_until(begin + time);
     started = now();
     read_robot(q, dq);
-    /* Oscillate along the first extra coordinate, with a constant task value. */
-    for (i = 0; i < N; ++i) reference.value[i] = start_phi[i];
-    reference.value[ARM_TASK] += 0.02 * (1.0 - cos(2.0 * time));
-    reference.velocity[ARM_TASK] = 0.04 * sin(2.0 * time);
-    reference.acceleration[ARM_TASK] = 0.08 * cos(2.0 * time);
-    statuses[arm_control(q, dq, &reference, &arm_default_gains, torque)]++;
+    /* Move the first extra coordinate there and back; the task stays. */
+    if (tick % BETWEEN == BETWEEN / 2) target[ARM_TASK] += tick % (2 * BETWEEN) < BETWEEN ? STEP : -STEP;
+    arm_reference_low_pass(&reference, target, SMOOTHNESS, 1.0, PERIOD);
+    switch (arm_step(&state, &arm_default_safety, q, dq, &reference, &arm_default_gains, PERIOD, torque)) {
+      case ARM_OK: ++good; break;
+      case ARM_SATURATED: ++cut; break;
+      case ARM_NEAR_BORDER: ++near; break;
+      case ARM_CAUGHT: arm_resume(&state); break; /* your program: when the reason is gone (docs/c_controller.md) */
+      default: break;                             /* RETURNING: wait; BAD_INPUT: find the fault */
+    }
     done = now();
     write_robot(torque);
     computing[bin_of(1e6 * (done - started))]++;
@@ -130,8 +140,8 @@ int main(int argc, char **argv) {
   }
   print_histogram("computing time of a tick", computing);
   if (paced) print_histogram("lateness of a tick", late);
-  printf("statuses: %ld ok, %ld outside, %ld singular, %ld not finite\n", statuses[0], statuses[1], statuses[2],
-         statuses[3]);
+  printf("statuses: %ld ok, %ld saturated, %ld near the border, %ld others\n", good, cut, near,
+         ticks - good - cut - near);
   printf("largest deviation of the task: %.2e\n", error);
-  return statuses[0] == ticks ? 0 : 1;
+  return good == ticks ? 0 : 1;
 }

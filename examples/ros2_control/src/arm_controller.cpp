@@ -1,0 +1,148 @@
+#include "arm_controller/arm_controller.hpp"
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <exception>
+#include <limits>
+#include <memory>
+
+#include "hardware_interface/types/hardware_interface_type_values.hpp"
+#include "pluginlib/class_list_macros.hpp"
+
+namespace arm_controller {
+
+using controller_interface::CallbackReturn;
+using controller_interface::InterfaceConfiguration;
+using controller_interface::interface_configuration_type;
+using controller_interface::return_type;
+
+namespace {
+constexpr const char *COMMAND =
+    ARM_COMMANDS_TORQUE ? hardware_interface::HW_IF_EFFORT : hardware_interface::HW_IF_VELOCITY;
+constexpr double DAMPING = 1.0;  // of the low pass
+}  // namespace
+
+CallbackReturn ArmController::on_init() {
+  try {
+    auto_declare<std::vector<std::string>>("joints", {});
+    auto_declare<double>("smoothness", 3.0);
+  } catch (const std::exception &error) {
+    RCLCPP_ERROR(get_node()->get_logger(), "cannot declare parameters: %s", error.what());
+    return CallbackReturn::ERROR;
+  }
+  return CallbackReturn::SUCCESS;
+}
+
+InterfaceConfiguration ArmController::command_interface_configuration() const {
+  InterfaceConfiguration wanted{interface_configuration_type::INDIVIDUAL, {}};
+  for (const auto &joint : joints_) wanted.names.push_back(joint + "/" + COMMAND);
+  return wanted;
+}
+
+InterfaceConfiguration ArmController::state_interface_configuration() const {
+  InterfaceConfiguration wanted{interface_configuration_type::INDIVIDUAL, {}};
+  for (const auto &joint : joints_) {
+    wanted.names.push_back(joint + "/" + hardware_interface::HW_IF_POSITION);
+    wanted.names.push_back(joint + "/" + hardware_interface::HW_IF_VELOCITY);
+  }
+  return wanted;
+}
+
+CallbackReturn ArmController::on_configure(const rclcpp_lifecycle::State & /*previous*/) {
+  joints_ = get_node()->get_parameter("joints").as_string_array();
+  smoothness_ = get_node()->get_parameter("smoothness").as_double();
+  if (joints_.size() != ARM_JOINTS || !(smoothness_ > 0.0)) {
+    RCLCPP_ERROR(get_node()->get_logger(), "expected %d joints and smoothness > 0, received %zu joints and %g",
+                 ARM_JOINTS, joints_.size(), smoothness_);
+    return CallbackReturn::ERROR;
+  }
+  target_subscription_ = get_node()->create_subscription<std_msgs::msg::Float64MultiArray>(
+      "~/target", rclcpp::SystemDefaultsQoS(), [this](const std_msgs::msg::Float64MultiArray::SharedPtr message) {
+        if (message->data.size() != ARM_REFERENCE) {
+          RCLCPP_WARN(get_node()->get_logger(), "expected %d values, received %zu", ARM_REFERENCE,
+                      message->data.size());
+          return;
+        }
+        Target target;
+        target.number = ++received_;
+        std::copy(message->data.begin(), message->data.end(), target.value.begin());
+        box_.set(target);
+      });
+  resume_service_ = get_node()->create_service<std_srvs::srv::Trigger>(
+      "~/resume", [this](const std::shared_ptr<std_srvs::srv::Trigger::Request> /*request*/,
+                         std::shared_ptr<std_srvs::srv::Trigger::Response> response) {
+        resume_asked_ = true;
+        response->success = true;
+      });
+  status_publisher_ = get_node()->create_publisher<std_msgs::msg::UInt8>("~/status", rclcpp::SystemDefaultsQoS());
+  status_timer_ = get_node()->create_wall_timer(std::chrono::milliseconds(50), [this]() {
+    std_msgs::msg::UInt8 message;
+    message.data = static_cast<std::uint8_t>(status_.load());
+    status_publisher_->publish(message);
+  });
+  return CallbackReturn::SUCCESS;
+}
+
+CallbackReturn ArmController::on_activate(const rclcpp_lifecycle::State & /*previous*/) {
+  double q[ARM_JOINTS], dq[ARM_JOINTS];
+  if (state_interfaces_.size() != 2 * ARM_JOINTS || command_interfaces_.size() != ARM_JOINTS) {
+    RCLCPP_ERROR(get_node()->get_logger(), "the hardware lacks interfaces");
+    return CallbackReturn::ERROR;
+  }
+  read_robot(q, dq);
+  if (!std::all_of(q, q + ARM_JOINTS, [](double value) { return std::isfinite(value); })) {
+    RCLCPP_ERROR(get_node()->get_logger(), "the hardware reports no joint positions yet");
+    return CallbackReturn::ERROR;
+  }
+  arm_start(&state_, q, nullptr);
+  arm_reference_at(q, &reference_);
+  std::copy_n(reference_.value, ARM_REFERENCE, target_.value.begin());
+  target_.number = received_;  // targets from before the activation are void
+  resume_asked_ = false;
+  status_ = ARM_OK;
+  return CallbackReturn::SUCCESS;
+}
+
+CallbackReturn ArmController::on_deactivate(const rclcpp_lifecycle::State & /*previous*/) {
+  return CallbackReturn::SUCCESS;  // the hardware decides what an arm without a controller does
+}
+
+// Missing values become NaN: the supervised law then holds its last command, and says BAD_INPUT.
+void ArmController::read_robot(double *q, double *dq) const {
+  constexpr double missing = std::numeric_limits<double>::quiet_NaN();
+  for (std::size_t i = 0; i < ARM_JOINTS; ++i) {
+    q[i] = state_interfaces_[2 * i].get_optional().value_or(missing);
+    dq[i] = state_interfaces_[2 * i + 1].get_optional().value_or(missing);
+  }
+}
+
+// A low pass follows the targets while the law commands. Otherwise, the reference stays where the arm is.
+void ArmController::move_reference(const double *q, double period) {
+  const int last = status_;
+  const auto latest = box_.try_get();
+  const bool fresh = latest && latest->number != target_.number;
+  if (last == ARM_CAUGHT || last == ARM_RETURNING) {
+    arm_reference_at(q, &reference_);
+    std::copy_n(reference_.value, ARM_REFERENCE, target_.value.begin());
+    if (fresh) target_.number = latest->number;  // void: the arm is not where it was meant to start from
+    return;
+  }
+  if (fresh) target_ = *latest;
+  arm_reference_low_pass(&reference_, target_.value.data(), smoothness_, DAMPING, period);
+}
+
+return_type ArmController::update(const rclcpp::Time & /*time*/, const rclcpp::Duration &period) {
+  double q[ARM_JOINTS], dq[ARM_JOINTS], command[ARM_JOINTS];
+  bool written = true;
+  read_robot(q, dq);
+  move_reference(q, period.seconds());
+  if (resume_asked_.exchange(false)) arm_resume(&state_);
+  status_ = arm_step(&state_, &arm_default_safety, q, dq, &reference_, &arm_default_gains, period.seconds(), command);
+  for (std::size_t i = 0; i < ARM_JOINTS; ++i) written = command_interfaces_[i].set_value(command[i]) && written;
+  return written ? return_type::OK : return_type::ERROR;
+}
+
+}  // namespace arm_controller
+
+PLUGINLIB_EXPORT_CLASS(arm_controller::ArmController, controller_interface::ControllerInterface)
