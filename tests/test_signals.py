@@ -130,7 +130,7 @@ def test_ctrl_c_while_python_ends_needs_no_handler() -> None:
 def test_other_signals_end_in_order_after_compiled_code(name: str, tmp_path: Path) -> None:
     """What compiled code would lose is raised behind it, and handlers are put back."""
     number = getattr(signal, name)
-    before = signal.getsignal(number)
+    of_this_process = signal.signal(number, signal.SIG_DFL)  # under nohup it would be ignored, and stay so
     done = []
 
     def work() -> None:
@@ -138,10 +138,13 @@ def test_other_signals_end_in_order_after_compiled_code(name: str, tmp_path: Pat
             signal.raise_signal(number)
             done.append("the block goes on")
 
-    with pytest.raises(SystemExit) as stop:
-        work()
-    assert (stop.value.code, done) == (128 + number, ["the block goes on"])
-    assert signal.getsignal(number) is before
+    try:
+        with pytest.raises(SystemExit) as stop:
+            work()
+        assert (stop.value.code, done) == (128 + number, ["the block goes on"])
+        assert signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, of_this_process)
 
 
 def test_ignored_signals_stay_ignored() -> None:
