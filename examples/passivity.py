@@ -141,7 +141,7 @@ def cases(arm: Arm, name: str) -> Iterator[tuple[Impedance | Projector, Referenc
 def indefinite(arm: Arm) -> float:
     """Number of stiffnesses of coupled impedance control for which the damping (29) is indefinite somewhere."""
     drawn = (controller.stiffness for controller, *_ in cases(arm, "impedance, coupled"))
-    checks = [Impedance(arm.chart, stiffness).check_damping(100) for stiffness in drawn]
+    checks = [Impedance(arm.chart, stiffness, damping="square_root").check_damping(100) for stiffness in drawn]
     return float(sum(check.smallest_eigenvalue < 0 for check in checks))
 
 

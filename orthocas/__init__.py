@@ -39,6 +39,7 @@ from orthocas.involutivity import Involutivity, involutivity, lie_bracket
 from orthocas.metrics import Metric
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
 from orthocas.parametrisations import register as register_parametrisation
+from orthocas.postures.clear_box import ClearBox
 from orthocas.postures.suggest import suggest_domain
 from orthocas.problem import Problem, check
 from orthocas.quality import Report, evaluate
@@ -58,6 +59,7 @@ __all__ = [
     "Box",
     "Certificate",
     "Chart",
+    "ClearBox",
     "Comparison",
     "Fit",
     "Fourier",

@@ -1,7 +1,8 @@
 """Domains: the regions of joint space on which charts are fitted and evaluated, with seeded sampling."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -23,6 +24,8 @@ from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
 _MOST_JOINTS = 1000
 _MOST_SAMPLES = 10**12
 _POWERS = (1.0, 0.5, 0.25)  # of the distance from the middle: uniform, near faces, near corners
+_LEAST_SHARE, _TRIED = 1e-3, 10_000  # of the points of a box, at least so many, that have to lie in the domain
+_BLOCK = 1000  # fewest points to draw at once, after the first ones
 _WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes, and overflow later
 
 
@@ -111,7 +114,7 @@ class Box:
 
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie in the box: a bool, or (N,)."""
-        return contains(self, q)
+        return _between_borders(self, q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,17 +146,13 @@ class Torus:
 
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie on the torus: a bool, or (N,). All finite angles do."""
-        return contains(self, q)
+        return _between_borders(self, q)
 
 
 def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
     """Draw points uniformly from the domain, (samples, n)."""
-    require_count("samples", samples, most=_MOST_SAMPLES)
-    _require_seed(seed)
-    require_memory(f"{samples} samples", 32.0 * samples * len(domain.centre))
-    unit = np.random.default_rng(seed).uniform(-1.0, 1.0, (samples, len(domain.centre)))
-    points: Array = domain.centre + domain.half_width * unit
-    return points
+    rng = _generator(domain, samples, seed)
+    return _inside(domain, samples, lambda count: _scaled(domain, rng.uniform(-1.0, 1.0, (count, len(domain.centre)))))
 
 
 def sample_heavily(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
@@ -164,10 +163,15 @@ def sample_heavily(domain: Domain, samples: int, seed: int | tuple[int, ...]) ->
     Source:
         ours.
     """
-    powers = np.repeat(_POWERS, [samples - 2 * (samples // 3), samples // 3, samples // 3])
-    unit = (sample_uniform(domain, samples, seed) - domain.centre) / domain.half_width
-    points: Array = domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers[:, None]
-    return points
+    rng, third = _generator(domain, samples, seed), samples // 3
+
+    def draw(count: int, power: float) -> Array:
+        u = rng.uniform(-1.0, 1.0, (count, len(domain.centre)))
+        return _scaled(domain, np.sign(u) * np.abs(u) ** power)
+
+    sizes = (samples - 2 * third, third, third)
+    parts = [_inside(domain, size, partial(draw, power=power)) for size, power in zip(sizes, _POWERS, strict=True)]
+    return np.vstack(parts)
 
 
 def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
@@ -180,25 +184,25 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
     Source:
         M. Roberts, docs/references.md [R2018]. The use for training is ours.
     """
-    require_count("samples", samples, most=_MOST_SAMPLES)
-    _require_seed(seed)
-    n = len(domain.centre)
-    require_memory(f"{samples} samples", 32.0 * samples * n)
+    rng, n = _generator(domain, samples, seed), len(domain.centre)
     g = 1.5
     for _ in range(64):
         g = (1 + g) ** (1 / (n + 1))
-    shift = np.random.default_rng(seed).uniform(size=n)
-    unit = (shift + np.arange(1, samples + 1)[:, None] * g ** -np.arange(1.0, n + 1)) % 1.0
-    points: Array = domain.centre + domain.half_width * (2 * unit - 1)
-    return points
+    shift, done = rng.uniform(size=n), 0
+
+    def draw(count: int) -> Array:
+        nonlocal done
+        k = np.arange(done + 1, done + count + 1)[:, None]
+        done += count
+        return _scaled(domain, 2 * ((shift + k * g ** -np.arange(1.0, n + 1)) % 1.0) - 1)
+
+    return _inside(domain, samples, draw)
 
 
-def contains(domain: Domain, q: ArrayLike) -> Array:
-    """Whether points (n,) or (N, n) lie in the domain. Finite angles always lie on a torus."""
+def contains(domain: Domain, q: ArrayLike) -> Any:
+    """Whether points (n,) or (N, n) lie in the domain: a bool, or (N,). Finite angles always lie on a torus."""
     require_domain(domain)
-    points, single = as_point_set("q", q, len(domain.centre))
-    inside: Array = np.all(np.abs(points - domain.centre) <= reach(domain), axis=1)
-    return inside[0] if single else inside
+    return domain.contains(q)
 
 
 def require_domain(domain: Domain) -> None:
@@ -273,6 +277,48 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
         _raise_outside(robot, int(outside[0]), low, high)
 
 
+def _between_borders(domain: Domain, q: ArrayLike) -> Any:
+    """Whether points (n,) or (N, n) lie between the borders of a domain: a bool, or (N,)."""
+    points, single = as_point_set("q", q, len(domain.centre))
+    inside = np.all(np.abs(points - domain.centre) <= reach(domain), axis=1)
+    return inside[0] if single else inside
+
+
+def _generator(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> np.random.Generator:
+    """The generator of a seed, after checks of what is asked for."""
+    require_count("samples", samples, most=_MOST_SAMPLES)
+    for part in seed if isinstance(seed, tuple) else (seed,):
+        require_count("seed", part, least=0)
+    require_memory(f"{samples} samples", 32.0 * samples * len(domain.centre))
+    return np.random.default_rng(seed)
+
+
+def _scaled(domain: Domain, u: Array) -> Array:
+    """Points of the cube [-1, 1]^n in the box around the domain."""
+    points: Array = domain.centre + domain.half_width * u
+    return points
+
+
+def _inside(domain: Domain, samples: int, draw: Callable[[int], Array]) -> Array:
+    """The first points of a sequence that lie in the domain, (samples, n); `draw` returns the next so many points.
+
+    Raises:
+        DomainError: if next to none of them does.
+    """
+    found = [np.empty((0, len(domain.centre)))]
+    drawn = kept = 0
+    size = samples
+    while kept < samples:
+        if drawn >= _TRIED and kept < _LEAST_SHARE * drawn:
+            share = f"{kept} of {drawn} points of its box lie in the domain"
+            raise DomainError(f"{share}, expected at least {_LEAST_SHARE:.1%}: lower least_singular_value")
+        points = draw(size)
+        found.append(points[domain.contains(points)])
+        drawn, kept = drawn + size, kept + len(found[-1])
+        size = max(samples - kept, _BLOCK)
+    return np.concatenate(found)[:samples]
+
+
 def _joint_indices(name: str, values: Any, n: int) -> tuple[int, ...]:
     """Different indices of joints, sorted."""
     if not isinstance(values, list | tuple | range):
@@ -283,11 +329,6 @@ def _joint_indices(name: str, values: Any, n: int) -> tuple[int, ...]:
 
 def _wanted_half_width(robot: Robot) -> Array:
     return np.where(robot.tree.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
-
-
-def _require_seed(seed: int | tuple[int, ...]) -> None:
-    for part in seed if isinstance(seed, tuple) else (seed,):
-        require_count("seed", part, least=0)
 
 
 def _raise_outside(robot: Robot, i: int, low: Array, high: Array) -> None:

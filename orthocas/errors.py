@@ -132,6 +132,13 @@ class FoldedMapError(OrthocasError, ValueError):
         super().__init__(f"the map folds {folded} of {triangles} triangles, expected 0: improve the mesh (more cells)")
 
 
+class MissingExtraError(OrthocasError, ImportError):
+    """A package that only some features need is not installed."""
+
+    def __init__(self, feature: str, package: str, extra: str) -> None:
+        super().__init__(f"{feature} needs the package {package}: install it with pip install 'orthocas[{extra}]'")
+
+
 class SolveError(OrthocasError, RuntimeError):
     """A minimiser stopped without a usable result."""
 

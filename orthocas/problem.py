@@ -8,7 +8,9 @@ from orthocas.checks import Array, require_kind, require_shape, require_text
 from orthocas.domains import Domain, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
 from orthocas.metrics import Metric, MetricSpec, metric_matrices
+from orthocas.postures.clear_box import ClearBox, clear_domain
 from orthocas.postures.regular_box import regular_box
+from orthocas.postures.row_scale import row_scale
 from orthocas.robots import Robot
 from orthocas.showing import Shown, listed, number_list
 from orthocas.tasks import Task
@@ -27,10 +29,12 @@ class Problem(Shown):
         metric: "euclidean", "inertia", a constant SPD matrix (n, n), a map q -> A(q) on SX, or a Metric.
         domain: Box or Torus inside the joint limits. Default: `regular_box(robot, task)`, away from singular postures.
         name: for reports.
+        least_singular_value: leaves out of the domain, a Box, all positions where the relative singular value of the
+            task is smaller; see `orthocas.ClearBox`. Default: no bound.
 
     Raises:
         NotRedundantError: if m >= n.
-        DomainError: if the domain leaves the joint limits.
+        DomainError: if the domain leaves the joint limits, or its centre is nearer to a singular position than allowed.
         MetricError: if a constant metric is not SPD, or a joint moves no mass under "inertia". Metrics that depend on q
             are checked by `check`, and later at every sample.
 
@@ -56,6 +60,7 @@ class Problem(Shown):
         metric: Metric | MetricSpec = "euclidean",
         domain: Domain | None = None,
         name: str = "custom",
+        least_singular_value: float | None = None,
     ) -> None:
         if not isinstance(task, Task) or not isinstance(robot, Robot):
             raise InvalidValueError(
@@ -70,6 +75,7 @@ class Problem(Shown):
             raise InvalidValueError("domain", repr(domain), "a Box or a Torus")
         require_within_limits(robot, domain)
         task = task.with_reference_at(domain.centre)
+        domain = clear_domain(domain, task, least_singular_value)
         metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
         require_shape("metric", metric.function.size_out(0), (robot.n, robot.n))
         for key, value in (
@@ -104,6 +110,7 @@ class Problem(Shown):
             "task": self.task.heading,
             "metric": self.metric.name,
             "domain": f"{domain.name}, half-width {number_list(domain.half_width)}{self._endless}",
+            **({"clear": domain.heading} if isinstance(domain, ClearBox) else {}),
             "centre": number_list(domain.centre),
             "robot": self.robot.heading,
         }
@@ -121,7 +128,7 @@ class ProblemCheck:
 
     samples: int
     singular_samples: int  #: samples with a relative singular value of J_x below NEAR_SINGULAR
-    smallest_singular_value: float  #: of J_x with each row divided by its root mean square length
+    smallest_singular_value: float  #: relative one of J_x, see `orthocas.ClearBox`
     most_singular_point: tuple[float, ...]  #: joint position of the smallest singular value [rad] or [m]
 
     @property
@@ -133,7 +140,7 @@ class ProblemCheck:
 def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
     """Check the metric (SPD) and the rank of J_x on uniform samples of the domain.
 
-    Each row of J_x is first divided by its root mean square length over the domain, so that units do not matter.
+    Rows of J_x with the same unit are first divided by their root mean square length over the domain.
 
     Raises:
         MetricError: if A is not symmetric positive definite at a sample.
@@ -164,16 +171,19 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
 
 
 def relative_singular_values(problem: Problem, points: Array) -> Array:
-    """Smallest singular value of J_x at points (N, n), with each row divided by its root mean square length, (N,).
+    """Relative singular values of J_x at points (N, n), (N,); see `orthocas.ClearBox`.
+
+    Rows with the same unit are divided by their root mean square length at these points, or by the scale of a ClearBox.
 
     Raises:
         SingularTaskError: if a task component does not depend on any joint, or J_x is not finite at a point.
     """
     J = task_jacobians(problem, points)
-    scale = np.sqrt((J**2).sum(axis=2).mean(axis=0))
-    idle = np.flatnonzero(scale == 0)
+    idle = np.flatnonzero((J == 0).all(axis=(0, 2)))
     if idle.size:
         raise SingularTaskError(f"task component '{problem.task.labels[idle[0]]}' does not depend on any joint")
+    domain = problem.domain
+    scale = domain.scale if isinstance(domain, ClearBox) else row_scale(J, problem.task.units)
     return np.asarray(np.linalg.svd(J / scale[:, None], compute_uv=False)[:, -1])
 
 

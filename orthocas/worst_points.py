@@ -6,7 +6,7 @@ import numpy as np
 
 from orthocas.checks import Array
 from orthocas.coordinates.map import CoordinateMap
-from orthocas.domains import sample_heavily
+from orthocas.domains import contains, sample_heavily
 from orthocas.judging.gradients import Judged
 from orthocas.problem import Problem
 
@@ -44,7 +44,7 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) ->
     """Search the domain: uniform candidates, others near faces and corners, then local descent from the worst.
 
     Folds of charts lie in corners and in thin wedges, which uniform samples miss. Descent is a random search that keeps
-    what is worse. Points where a gradient vanishes, or a grown coordinate has no value, are left out.
+    what is worse and in the domain. Points where a gradient vanishes, or a grown coordinate has no value, are left out.
 
     Args:
         problem: problem of the coordinates.
@@ -72,11 +72,12 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) ->
 
 
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:
-    """Conditioning times the sign of det J at points of the cube, (N,)."""
-    judged = Judged.at(problem, coordinates, _joint_positions(problem, u))
+    """Conditioning times the sign of det J at points of the cube, (N,); NaN outside the domain."""
+    points = _joint_positions(problem, u)
+    judged = Judged.at(problem, coordinates, points)
     values = np.full(len(u), np.nan)
     values[judged.kept] = judged.signs * judged.conditioning
-    return values
+    return np.where(contains(problem.domain, points), values, np.nan)
 
 
 def _joint_positions(problem: Problem, u: Array) -> Array:

@@ -1,5 +1,9 @@
 """Problems and charts that several test files use."""
 
+from dataclasses import replace
+
+import numpy as np
+
 import orthocas as oc
 from orthocas import problems
 
@@ -18,3 +22,10 @@ def linear_on_the_torus() -> oc.Chart:
     robot = oc.Robot.planar([1, 1, 1], [3, 3, 3])
     problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Torus(3))
     return oc.fit(problem, oc.Linear(base=(0.6, 0.8, 0.8))).chart
+
+
+def with_upper_limit(robot: oc.Robot, joint: int, upper: float, effort: float = np.inf) -> oc.Robot:
+    """The robot with another upper limit of one joint, and equal limits of effort."""
+    limits = robot.tree.upper.copy()
+    limits[joint] = upper
+    return oc.Robot(replace(robot.tree, upper=limits, effort_limits=np.full(robot.n, effort)))

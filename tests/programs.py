@@ -8,6 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from orthocas.codegen import GeneratedC
+from orthocas.codegen.library import compilers
+
+PROGRAMS = Path(__file__).parent / "c"
+
 Run = Callable[..., tuple[int, str, str]]  #: words of a command line to exit code, standard output, standard error
 
 needs_c = pytest.mark.skipif(shutil.which("cc") is None and shutil.which("gcc") is None, reason="no C compiler")
@@ -24,3 +29,25 @@ def output_of(*words: str | Path, folder: Path | None = None) -> str:
 def python(code: str, folder: Path | None = None, *options: str) -> str:
     """What a new Python prints for some code."""
     return output_of(sys.executable, *options, "-c", code, folder=folder)
+
+
+def built(generated: GeneratedC, program: str, out: Path, *flags: str, compiler: str | None = None) -> Path:
+    """A program of tests/c with the generated code."""
+    target = out / Path(program).stem
+    sources = [str(PROGRAMS / program), str(generated.folder / "arm.c")]
+    command = [
+        compiler or compilers()[0],
+        "-std=c99",
+        "-O1",
+        "-g",
+        *flags,
+        f"-I{generated.folder}",
+        *sources,
+        "-o",
+        str(target),
+    ]
+    done = subprocess.run([*command, "-lm", "-pthread"], capture_output=True, text=True, check=False)
+    if done.returncode != 0 and "cannot find" in done.stderr:
+        pytest.skip("no sanitizer libraries")
+    assert done.returncode == 0, done.stderr
+    return target

@@ -18,10 +18,22 @@ from orthocas.checks import Array
 from orthocas.comparing.report import Comparison
 from orthocas.control import Controller, Reference
 from orthocas.domains import sample_uniform
+from orthocas.fitting.clear_part import ClearPart
 from orthocas.fitting.fit import Fit
 from orthocas.metrics import Metric, metric_matrices
 from orthocas.samples import sample_problem
-from orthocas.simulation import Friction, Noise, Push, Trajectory, coupling_index, simulate
+from orthocas.simulation import (
+    Friction,
+    MuJoCo,
+    Noise,
+    Payload,
+    Push,
+    Stops,
+    Trajectory,
+    Wall,
+    coupling_index,
+    simulate,
+)
 
 
 @cache
@@ -59,6 +71,13 @@ def cyclic() -> oc.Chart:
 
 
 @cache
+def clear() -> oc.Chart:
+    known = problems.get("planar_3r_xy")
+    problem = oc.Problem(known.robot, known.task, domain=known.domain, least_singular_value=0.1)
+    return oc.fit(problem, oc.Polynomial(2), samples=300).chart
+
+
+@cache
 def suggestion() -> Any:
     known = problems.get("planar_3r_xy")
     parametrisation = oc.Polynomial(2, cyclic="auto")
@@ -86,6 +105,12 @@ def on_planes() -> oc.Chart:
 @cache
 def impedance() -> control.Impedance:
     return control.Impedance(fitted().chart, 60.0, limit=90.0)
+
+
+@cache
+def second() -> oc.Task:
+    """A second task for projectors."""
+    return oc.Task.custom(planar().robot, "tilt", lambda q: q[0] + q[1] + q[2])
 
 
 @cache
@@ -119,6 +144,10 @@ def certificate() -> oc.Certificate:
     return oc.certify(fitted().chart)
 
 
+def run_time_model() -> control.RunTimeModel:
+    return control.RunTimeModel(payload=1.0, wrench=np.zeros(6), extra_torque=0.1)
+
+
 CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "certified chart": lambda: replace(fitted().chart, certificate=certificate()),
     "polynomial chart": lambda: fitted().chart,
@@ -128,6 +157,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "given chart": given,
     "chart with an idle joint": with_idle_joint,
     "cyclic chart": cyclic,
+    "chart of a clear box": clear,
     "circle chart": circle,
     "disk chart": disk,
     "linear leaf chart": on_planes,
@@ -135,10 +165,17 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
 CONTROLLERS: dict[str, Callable[[], Controller]] = {
     "impedance": impedance,
     "PD+": lambda: control.PDPlus(fitted().chart, 60.0, coupling="decoupled", damping="double_diagonal"),
+    "PD+ with inputs": lambda: control.PDPlus(fitted().chart, 60.0, damping_stiffness=50.0, model=run_time_model()),
+    "PD+ of a given model": lambda: control.PDPlus(fitted().chart, 60.0, model=control.RunTimeModel("given", "robot")),
     "PD+ of a network": lambda: control.PDPlus(network(), 60.0),
     "kinematic": lambda: control.Kinematic(fitted().chart, 1.0),
     "projector": lambda: control.Projector(planar(), 80.0, 10.0),
     "kinematic projector": lambda: control.KinematicProjector(planar(), 1.0, 0.5),
+    "projected coordinates": lambda: control.Projector(
+        planar(), 80.0, 10.0, second=fitted().chart, second_force=0.1, feed_forward=True
+    ),
+    "kinematic projected coordinates": lambda: control.KinematicProjector(planar(), 1.0, 0.5, second=fitted().chart),
+    "projector of a task": lambda: control.Projector(planar(), 80.0, 10.0, second=second()),
 }
 OBJECTS: dict[str, Callable[[], Any]] = {
     **CHARTS,
@@ -147,6 +184,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "fit": fitted,
     "robot": lambda: planar().robot,
     "task": lambda: planar().task,
+    "run-time model": run_time_model,
+    "modes": lambda: impedance().modes(),
     "custom task": lambda: with_idle_joint().problem.task,
     "inertia metric": lambda: planar().metric,
     "custom metric": lambda: Metric.from_spec(planar().robot, lambda q: ca.diag(2 + ca.cos(q))),
@@ -154,6 +193,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "check of a problem": lambda: oc.check(planar(), 100),
     "box": lambda: planar().domain,
     "unbounded box": lambda: cyclic().problem.domain,
+    "clear box": lambda: clear().problem.domain,
+    "clear part of a domain": lambda: ClearPart(0.1, 0.95),
     "torus": lambda: oc.Torus(3),
     "suggestion of a domain": suggestion,
     "width of a joint": lambda: suggestion().joints[0],
@@ -179,7 +220,12 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "trajectory": trajectory,
     "coupling": lambda: coupling_index(fitted().chart, steps(), trajectory()),
     "push": lambda: Push(0.5, 1.0, [1.0, 0.0, 0.0]),
+    "push at a link": lambda: Push(0.5, 1.0, [1.0, 0.0, 0.0], link="q2", point=[0.5, 0.0, 0.0]),
     "friction": lambda: Friction([1.0, 2.0, 3.0]),
+    "stops": lambda: Stops([1e4, 2e4, 3e4]),
+    "payload": lambda: Payload(1.0, [0.0, 0.0, 0.1], np.diag([0.1, 0.2, 0.25])),
+    "wall": lambda: Wall([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]),
+    "MuJoCo": lambda: MuJoCo(planar().robot, payload=Payload(1.0), wall=Wall([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0])),
     "noise": lambda: Noise(1e-3),
     "comparison": comparison,
     "generated C": generated_c,

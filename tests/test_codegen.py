@@ -134,7 +134,7 @@ def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: Generated, t
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("gains->stiffness", "gains->damping_ratio", "in control"),
+        ("gains->stiffness", "gains->damping_ratio", "control"),
         ("return inside(q)", "return 7 +", "failed"),
         ("return inside(q) ?", "return inside(q) + 1 ?", "the status of chart"),
         ("if (!(fabs(x[i]) <= LARGEST)) return 0;", "(void)x;", "the status of chart is . at"),
@@ -142,7 +142,7 @@ def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: Generated, t
         ("memcpy(q, now, sizeof now);", "", "inverse"),
         ("(error >= 0.0 && error <= SOLVED)", "(error < 1e300)", "in inverse"),
         ("arg[7] = gains->limit;", "arg[7] = arm_default_gains.limit;", "control"),
-        ("arg[5] = gains->stiffness;", "arg[5] = arm_default_gains.stiffness;", "in control"),
+        ("arg[5] = gains->stiffness;", "arg[5] = arm_default_gains.stiffness;", "control"),
         ("res[1] = bias;", "res[1] = gravity;", "in (bias|gravity)"),
     ],
 )
@@ -313,6 +313,29 @@ def test_command_writes_checks_and_refuses(planar_fit: Fit, run: Run) -> None:
         assert code == 2
         assert message in err
         assert not Path("other").exists()
+
+
+def test_command_chooses_the_model_at_run_time_and_prints_remarks(planar_xy: oc.Problem, run: Run) -> None:
+    oc.fit(planar_xy, oc.Linear()).chart.save("arm.orthocas")
+    words = ("codegen", "arm.orthocas", "--controller", "impedance", "--out", "c", "--name", "arm")
+    code, _, err = run(*words, "--damping", "square_root", "--stiffness", "1,10000,1")
+    assert code == 0
+    assert "the damping matrix (29) is indefinite in" in err
+    code, _, err = run(*words, "--inputs", "payload,wrench", "--stiffness", "100,0,50", "--damping-stiffness", "50")
+    assert (code, err) == (0, "")
+    header = Path("c/arm.h").read_text()
+    assert "double payload[10];" in header
+    assert "double damping_stiffness[3];" in header
+    code, _, err = run(*words, "--model", "given", "--gravity", "robot")
+    assert code == 0
+    assert "pass mass matrix and torques in every tick" in err
+    assert "its fallback is zero torque" in err
+    header = Path("c/arm.h").read_text()
+    assert "double mass_matrix[9];" in header
+    assert "gravity_torque" not in header
+    code, _, err = run(*words, "--model", "given", "--inputs", "payload")
+    assert code == 2
+    assert "the given model includes the load" in err
 
 
 @pytest.mark.slow

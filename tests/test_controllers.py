@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from charts import linear_on_the_torus, with_metric
-from scipy.linalg import block_diag, sqrtm
+from scipy.linalg import block_diag, eigvalsh, sqrtm
 
 import orthocas as oc
 from orthocas.casadi_tools.batch import Batched
@@ -24,6 +24,7 @@ from orthocas.control import (
     matched_stiffness,
 )
 from orthocas.control.controller import Controller
+from orthocas.control.status import FROM_THE_LAW
 from orthocas.domains import sample_uniform
 from orthocas.errors import (
     InvalidValueError,
@@ -85,7 +86,8 @@ def torque(controller: Controller, *state: Array, **gains: Any) -> tuple[Array, 
 
 
 def called(controller: Controller, s: State) -> Array:
-    command, status = torque(controller, s.q, s.dq, s.phi_d, s.dphi_d, s.ddphi_d)
+    unlimited = np.full(controller.problem.n, np.inf)
+    command, status = torque(controller, s.q, s.dq, s.phi_d, s.dphi_d, s.ddphi_d, limit=unlimited)
     assert status == ControlStatus.OK
     return command
 
@@ -116,7 +118,7 @@ def by_hand(chart: oc.Chart, s: State, K: Array, Z: Array, blocks: list[slice], 
 @pytest.mark.parametrize("law", [Impedance, PDPlus])
 def test_laws_equal_the_paper_written_out(arm_chart: oc.Chart, model: pin.Model, law: Any, coupling: Any) -> None:
     K, Z = np.linspace(10, 200, 7), np.linspace(0.3, 1.0, 7)
-    controller = law(arm_chart, K, Z, coupling)
+    controller = law(arm_chart, K, Z, coupling, "square_root")
     blocks = [slice(0, 7)] if coupling == "coupled" else [slice(0, 3), slice(3, 7)]
     for _ in range(5):
         s = State.random(arm_chart, model)
@@ -163,11 +165,11 @@ def test_double_diagonal_damping_is_used(planar_chart: oc.Chart) -> None:
 
 def test_damping_check_finds_indefinite_designs(planar_xy: oc.Problem) -> None:
     chart = oc.fit(planar_xy, oc.Linear()).chart
-    found = Impedance(chart, [1.0, 1e4, 1.0], 0.7).check_damping(500)
+    found = Impedance(chart, [1.0, 1e4, 1.0], 0.7, damping="square_root").check_damping(500)
     assert found.smallest_eigenvalue < -1e-3
     assert 0 < found.indefinite_share <= 1
     assert oc.contains(planar_xy.domain, found.worst_point)
-    assert Impedance(chart, [1.0, 1e4, 1.0], 0.7, damping="double_diagonal").check_damping(500).indefinite_share == 0
+    assert Impedance(chart, [1.0, 1e4, 1.0], 0.7).check_damping(500).indefinite_share == 0
 
 
 def test_kinematic_control_inverts_the_jacobian(arm_chart: oc.Chart, model: pin.Model) -> None:
@@ -276,7 +278,7 @@ class TestGuard:
             assert status == ControlStatus.OUTSIDE_DOMAIN
             np.testing.assert_allclose(command, gravity if law.command == "torque" else 0.0, atol=1e-12)
         for law in laws[3:]:
-            assert self.run(law, q, 1.0)[1] == ControlStatus.OK  # projectors have no domain
+            assert self.run(law, q, 1.0)[1] in FROM_THE_LAW  # projectors have no domain
 
     def test_singular_task_is_told(self, laws: list[Controller]) -> None:
         for law in laws[3:]:
@@ -336,10 +338,33 @@ class TestGuard:
 
     def test_limit_cuts_the_command(self, planar_chart: oc.Chart) -> None:
         q, far = planar_chart.problem.domain.centre, np.full(3, 10.0)
-        free = torque(Impedance(planar_chart, 50.0), q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))[0]
-        cut = torque(Impedance(planar_chart, 50.0, limit=[5, 6, 7]), q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))[0]
+        free, ok = torque(Impedance(planar_chart, 50.0), q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))
+        law = Impedance(planar_chart, 50.0, limit=[5, 6, 7])
+        cut, status = torque(law, q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))
         np.testing.assert_allclose(cut, np.clip(free, [-5, -6, -7], [5, 6, 7]))
         assert np.abs(free).max() > 7
+        assert (ok, status) == (ControlStatus.OK, ControlStatus.SATURATED)
+
+    @pytest.mark.parametrize("limit", [0.3, [0.2, 1.0, 0.4]])
+    def test_limit_of_velocities_keeps_their_direction(self, planar_chart: oc.Chart, limit: Any) -> None:
+        problem, wanted = planar_chart.problem, np.array([0.5, -0.3, 0.2])
+        q = problem.domain.centre
+        for law, of in ((Kinematic, planar_chart), (KinematicProjector, problem)):
+            k = len(law(of).labels)
+            rate = np.resize(wanted, k)
+            free, _ = torque(law(of), q, np.zeros(3), np.zeros(k), rate, np.zeros(k))
+            cut, status = torque(law(of, limit=limit), q, np.zeros(3), np.zeros(k), rate, np.zeros(k))
+            share = (np.broadcast_to(limit, 3) / np.abs(free)).min()
+            assert share < 1
+            np.testing.assert_allclose(cut, share * free, rtol=1e-12)
+            assert status == ControlStatus.SATURATED
+
+    def test_fallback_is_gravity_or_rest(self, laws: list[Controller]) -> None:
+        for law in laws:
+            q = law.problem.domain.centre
+            command = law.fallback(q, *law.gains.values()).full().ravel()
+            want = law.problem.robot.gravity(q) if law.command == "torque" else 0 * q
+            np.testing.assert_allclose(command, want, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -393,14 +418,99 @@ def test_posture_beyond_joint_limits_is_reported() -> None:
         law.require_reachable(reference, problem.domain.centre)
 
 
-def test_matched_stiffness_gives_springs_of_one_frequency(planar_chart: oc.Chart) -> None:
-    """K over the median inertia of each block is omega^2."""
-    points = sample_uniform(planar_chart.problem.domain, 256, 0)
-    J, M = planar_chart.jacobian(points), planar_chart.problem.robot.mass_matrix(points)
-    G = J @ np.linalg.solve(M, J.transpose(0, 2, 1))
-    inertia = np.concatenate([1 / G[:, :1, 0], np.diagonal(np.linalg.inv(G[:, 1:, 1:]), axis1=1, axis2=2)], axis=1)
-    np.testing.assert_allclose(matched_stiffness(planar_chart, 3.0), 9 * np.median(inertia, axis=0), rtol=1e-8)
-    joints = matched_posture_stiffness(planar_chart.problem, 3.0)
-    np.testing.assert_allclose(joints, 9 * np.median(np.diagonal(M, axis1=1, axis2=2), axis=0), rtol=1e-8)
+def test_matched_stiffness_has_its_modes_around_the_frequency(planar_chart: oc.Chart, arm_chart: oc.Chart) -> None:
+    """The geometric mean of the generalised eigenvalues of (K, M_phi) is omega^2, and no other K has less spread."""
+    for chart in (planar_chart, arm_chart):
+        inertias = _inertias(chart)
+        K = matched_stiffness(chart, 3.0)
+        logs = np.array([np.log(eigvalsh(np.diag(K), inertia) / 9.0) for inertia in inertias])
+        assert abs(logs.mean()) < 1e-5
+        least = (logs**2).sum(axis=1).mean()
+        rng = np.random.default_rng(3)
+        for factors in np.exp(0.05 * rng.normal(size=(10, chart.n))):
+            others = [np.log(eigvalsh(np.diag(K * factors), inertia) / 9.0) for inertia in inertias]
+            assert (np.square(others)).sum(axis=1).mean() > least
+
+
+def test_matched_stiffness_is_exact_where_the_inertia_is_constant_and_diagonal() -> None:
+    """Two sliding joints at right angles: x and xi move 3 kg and 2 kg, whatever the posture."""
+    model = pin.Model()
+    body = pin.SE3.Identity()
+    outer = model.addJoint(0, pin.JointModelPX(), body, "px")
+    inner = model.addJoint(outer, pin.JointModelPY(), body, "py")
+    for joint, mass in ((outer, 1.0), (inner, 2.0)):
+        model.appendBodyToJoint(joint, pin.Inertia(mass, np.zeros(3), np.eye(3)), body)
+    model.addFrame(pin.Frame("tip", inner, 0, body, pin.FrameType.OP_FRAME))
+    robot = oc.Robot.from_model(model, "tip")
+    problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box(np.zeros(2), 1.0))
+    chart = oc.fit(problem, oc.Linear()).chart
+    np.testing.assert_allclose(matched_stiffness(chart, 5.0), [75.0, 50.0 / chart.jacobian(np.zeros(2))[1, 1] ** 2])
+    np.testing.assert_allclose(matched_posture_stiffness(problem, 5.0), [75.0, 50.0])
     with pytest.raises(InvalidValueError, match="frequency"):
-        matched_stiffness(planar_chart, 0.0)
+        matched_stiffness(chart, 0.0)
+
+
+@pytest.mark.parametrize(("coupling", "damping"), [("coupled", "square_root"), ("decoupled", "double_diagonal")])
+def test_modes_are_those_of_the_simulated_dynamics(arm_chart: oc.Chart, coupling: Any, damping: Any) -> None:
+    """Stiffness and damping of the loop, from finite differences of the robot's acceleration under the law at rest."""
+    law = Impedance(arm_chart, matched_stiffness(arm_chart), 0.4, coupling, damping)
+    q, n = arm_chart.problem.domain.centre, arm_chart.n
+    phi, zero = arm_chart.phi(q), np.zeros(n)
+
+    def acceleration(state: Array) -> Array:
+        tau, _ = torque(law, state[:n], state[n:], phi, zero, zero)
+        return arm_chart.problem.robot.forward_dynamics(state[:n], state[n:], tau)
+
+    state, h = np.concatenate([q, zero]), 1e-5
+    columns = [(acceleration(state + h * unit) - acceleration(state - h * unit)) / (2 * h) for unit in np.eye(2 * n)]
+    slopes = np.array(columns).T
+    modes = law.modes(q)
+    np.testing.assert_allclose(
+        np.sort(np.sqrt(np.linalg.eigvals(-slopes[:, :n]).real)) / (2 * np.pi), modes.frequencies, 1e-5
+    )
+    rates = 2 * modes.damping_ratios * 2 * np.pi * modes.frequencies
+    assert rates.sum() == pytest.approx(-np.trace(slopes[:, n:]), rel=1e-6)
+    if damping == "double_diagonal" and coupling == "coupled":
+        np.testing.assert_allclose(modes.damping_ratios, 0.4, rtol=1e-6)
+
+
+def test_a_mode_is_unstable_beyond_its_delay(planar_chart: oc.Chart) -> None:
+    """A root of s^2 + (2 zeta omega s + omega^2) e^(-sT) crosses the imaginary axis at the longest delay T."""
+    modes = PDPlus(planar_chart, matched_stiffness(planar_chart), 0.7).modes(planar_chart.problem.domain.centre)
+    for frequency, ratio, delay in zip(modes.frequencies, modes.damping_ratios, modes.delays, strict=True):
+        omega = 2 * np.pi * frequency
+
+        def largest_real_part(T: float, omega: float = omega, ratio: float = ratio) -> float:
+            s = 1j * omega * 1.5
+            for _ in range(50):  # Newton
+                late = np.exp(-s * T)
+                value = s**2 + (2 * ratio * omega * s + omega**2) * late
+                slope = 2 * s + (2 * ratio * omega - T * (2 * ratio * omega * s + omega**2)) * late
+                s -= value / slope
+            return float(s.real)
+
+        assert largest_real_part(0.98 * delay) < 0 < largest_real_part(1.02 * delay)
+
+
+def test_default_gains_hold_an_arm_whose_masses_are_off() -> None:
+    """Static solution of J^T K e = 0.2 g on the plant with 1.2 times the mass: sag up to 20 mm, inside the domain."""
+    problem = oc.problems.get("iiwa")
+    chart = oc.fit(problem, oc.Polynomial(3), weights=(1000, 30, 150, 1)).chart
+    law, plant = PDPlus.on_chart(chart), problem.robot.with_scaled_masses(1.2)
+    rng = np.random.default_rng(5)
+    for start in problem.domain.centre + 0.6 * problem.domain.half_width * rng.uniform(-1, 1, (5, 7)):
+        q = start
+        for _ in range(30):
+            wrong = plant.gravity(q) - problem.robot.gravity(q)
+            e = -np.linalg.solve(chart.jacobian(q).T, wrong) / law.stiffness
+            q = chart.inverse(chart.phi(start) + e, q)
+        assert oc.contains(problem.domain, q)
+        sag = np.linalg.norm(problem.robot.tip_position(q) - problem.robot.tip_position(start))
+        assert 1e-3 < sag < 0.02
+
+
+def _inertias(chart: oc.Chart) -> Array:
+    points = sample_uniform(chart.problem.domain, 256, 0)
+    J, M = chart.jacobian(points), chart.problem.robot.mass_matrix(points)
+    half = np.linalg.inv(J)
+    return np.asarray(half.transpose(0, 2, 1) @ M @ half)

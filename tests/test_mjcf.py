@@ -188,7 +188,7 @@ def write(folder: Path, body: str = "", before: str = "", after: str = "") -> Pa
         ('<joint range="l4"/>', "range of <joint> of body 'b' is 'l4', expected 2 numbers"),
         ('<joint axis="0 0 0"/>', "axis of <joint> of body 'b' is '0 0 0', expected a vector that is not zero"),
         ('<joint axis="0 0 nan"/>', "axis of <joint> of body 'b' is '0 0 nan'"),
-        ('<joint range="1 -1"/>', r"limits \[0.0174533, -0.0174533\]"),
+        ('<joint range="1 -1"/>', r"range \[1, -1\]"),
         ('<joint type="screw"/>', "type of <joint> of body 'b' is 'screw'"),
         ('<joint armature="-1"/>', "armature -1"),
         ('<joint class="none"/>', "<joint class='none'> of body 'b' is of class 'none', known: main"),
@@ -322,3 +322,39 @@ def test_long_chain_of_includes_is_refused(tmp_path: Path) -> None:
         (tmp_path / f"{i}.xml").write_text(f'<mujoco><include file="{i + 1}.xml"/></mujoco>')
     with pytest.raises(RobotError, match="nest more than 200 deep"):
         oc.Robot.from_mjcf(tmp_path / "0.xml", "b")
+
+
+ACTUATORS = """<default><position forcerange="-3 3"/><default class="strong">
+<general forcerange="-40 50"/></default></default>
+<worldbody><body>{}<body>{}<body>{}<body>{}<body>{}</body></body></body></body></body></worldbody>
+<actuator><general class="strong" joint="a" gear="2 0 0" gainprm="1e4"/><motor joint="b" gear="-4"/>
+<general class="strong" joint="c" gainprm="1e4"/><motor joint="e" forcelimited="false"/></actuator>"""
+
+
+def test_effort_limits_are_the_largest_forces_that_mujoco_applies(tmp_path: Path) -> None:
+    """Defaults shared by kinds of actuators, gears, sides that differ, and a range at the joint."""
+    extra = {"c": ' actuatorfrcrange="-25 30"', "d": ' actuatorfrcrange="-5 6"'}
+    joints = [f'<joint name="{k}"{extra.get(k, "")}/><geom size="0.1" pos="0.1 0 0"/>' for k in "abcde"]
+    path = tmp_path / "robot.xml"
+    path.write_text(f"<mujoco>{ACTUATORS.format(*joints)}</mujoco>")
+    limits = oc.Robot.from_mjcf(path).effort_limits
+    np.testing.assert_array_equal(limits, [80, 12, 25, 5, np.inf])  # two sides: what both reach
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    reached = []
+    for sign in (-1, 1):
+        data.ctrl[:] = sign * 1e6
+        data.ctrl[1] *= -1  # its gear turns the sign
+        mujoco.mj_forward(model, data)
+        reached.append(sign * data.qfrc_actuator)
+    np.testing.assert_array_equal(np.min(reached, axis=0)[[0, 1, 2]], limits[:3])
+
+
+def test_forces_of_one_sign_are_no_limit_of_effort_and_empty_ranges_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    text = '<mujoco><worldbody><body><joint actuatorfrcrange="{}"/><geom size="1"/></body></worldbody></mujoco>'
+    path.write_text(text.format("0 10"))
+    assert np.isinf(oc.Robot.from_mjcf(path).effort_limits).all()
+    path.write_text(text.format("3 -3"))
+    with pytest.raises(RobotError, match=r"has actuatorfrcrange \[3, -3\], expected the first below the second"):
+        oc.Robot.from_mjcf(path)

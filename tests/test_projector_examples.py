@@ -6,6 +6,7 @@ import cyclic_motion
 import hidden_spring
 import numpy as np
 import passivity
+import projected_coordinates
 import pytest
 import self_motion_on_command
 
@@ -61,6 +62,31 @@ def test_hidden_spring_stays_loaded_and_discharges(tmp_path: Path) -> None:
     assert n["projector_energy_at_the_end_J"] < 1
     assert n["projector_peak_speed_after"] > 10 * n["impedance_peak_speed_after"]
     assert n["impedance_energy_before_tip_moves_J"] < 1e-3 < n["impedance_energy_on_the_way_J"]
+
+
+def test_projected_coordinates_keep_what_joint_springs_lose(tmp_path: Path) -> None:
+    n = projected_coordinates.main(tmp_path, quick=True)
+    assert (tmp_path / "projected_coordinates.png").stat().st_size > 10_000
+    for size in projected_coordinates.SIZES:
+        of = f"planar_3r_xy {size}"
+        # the projector removes little of the force in xi, less than 1 / 4 of what it removes of joint springs
+        assert n[f"{of} fitted: removed"] < n[f"{of} linear: removed"] < 0.25 * n[f"{of} joints: removed"]
+        for name in ("linear", "fitted"):
+            # what is left disturbs the task, unless the projector removes it
+            assert n[f"{of} {name} direct PD+: x <- xi"] > 1e-4
+            assert n[f"{of} {name} projected PD+: x <- xi"] < 1e-7
+            # energy falls to nothing, directly and behind the projector
+            for kind in ("direct", "projected"):
+                assert n[f"{of} {name} {kind}, damping 0.7: runs with a rise"] == 0
+                assert n[f"{of} {name} {kind}, damping 0.7: V left"] < 1e-6
+            # only a law without a projector returns the joints exactly
+            assert n[f"{of} {name} direct: drift, feedback 0"] < 1e-5 < n[f"{of} {name} projected: drift, feedback 1"]
+            assert n[f"{of} {name} direct, damping 0.1: runs with a rise"] == 0
+        joints = f"{of} joints projected, damping 0.7"
+        assert n[f"{joints}: runs with a rise"] == n[f"{joints}: runs"]
+        assert n[f"{joints}: V left"] > 0.1
+    assert n["hidden spring, joints: energy [J]"] > 35
+    assert n["hidden spring, fitted: energy [J]"] < 0.1
 
 
 def test_joints_drift_with_the_pseudo_inverse_only(tmp_path: Path) -> None:

@@ -397,6 +397,41 @@ def test_effort_and_velocity_limits_come_from_the_file() -> None:
     assert np.isinf(oc.Robot.planar([1.0, 1.0], [1.0, 1.0]).velocity_limits).all()
 
 
+@pytest.mark.parametrize("name", [name for name in ROBOTS if "continuous" not in name])  # its file has no limits
+def test_limits_of_effort_and_velocity_of_real_files_are_pinocchios(name: str) -> None:
+    model, tip = arm(name)
+    robot = oc.Robot.from_model(model, tip)
+    np.testing.assert_array_equal(robot.effort_limits, model.effortLimit)
+    np.testing.assert_array_equal(robot.velocity_limits, model.velocityLimit)
+    assert np.isfinite(robot.effort_limits).all()
+    for changed in (robot.with_scaled_masses(2.0), robot.with_tool([0, 0, 0.1])):
+        np.testing.assert_array_equal(changed.effort_limits, robot.effort_limits)
+        np.testing.assert_array_equal(changed.velocity_limits, robot.velocity_limits)
+
+
+def test_limits_of_the_iiwa_are_those_of_its_data_sheet(iiwa: oc.Problem) -> None:
+    np.testing.assert_array_equal(iiwa.robot.effort_limits, [176, 176, 110, 110, 110, 40, 40])
+    np.testing.assert_allclose(np.degrees(iiwa.robot.velocity_limits), [98, 98, 100, 130, 140, 180, 180])
+    facts = iiwa.robot.facts()
+    assert (facts["effort"], facts["velocity"][:11]) == ("176, 176, 110, 110, 110, 40, 40", "1.71, 1.71,")
+    assert "effort" not in oc.Robot.planar([1.0], [1.0]).facts()
+
+
+@pytest.mark.parametrize("what", ["effort", "velocity"])
+def test_negative_limits_are_refused_by_name(tmp_path: Path, what: str) -> None:
+    path = one_joint(tmp_path)
+    path.write_text(path.read_text().replace(f'{what}="1"', f'{what}="-7"'))
+    with pytest.raises(RobotError, match=rf"arm\.urdf: {what} of <limit> of joint 'j' is '-7', expected a number >= 0"):
+        oc.Robot.from_urdf(path, "a")
+
+
+def test_limits_of_a_model_are_not_nan() -> None:
+    model = planar_model([1.0, 1.0], [1.0, 1.0])
+    model.effortLimit = np.array([1.0, np.nan])
+    with pytest.raises(RobotError, match="joint 'q2' has the effort limit nan, expected a number >= 0"):
+        oc.Robot.from_model(model, "tip")
+
+
 @pytest.mark.parametrize(
     ("written", "effort", "velocity"),
     [

@@ -95,7 +95,7 @@ def test_the_main_objects_have_tables(name: str) -> None:
         ("problem", ["planar_3r_x", "m = 1", "inertia", "half-width 0.3927"]),
         ("polynomial chart", ["polynomial:3", "x, xi1, xi2", "seed 0"]),
         ("fit", ["polynomial:3", "converged"]),
-        ("impedance", ["torque", "60", "coupled", "square_root"]),
+        ("impedance", ["torque", "60", "coupled", "double_diagonal"]),
         ("steps", ["0.5 s", "2 segments"]),
         ("comparison", ["2 fits", "polynomial:1", "task std"]),
     ],

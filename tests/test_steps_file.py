@@ -76,6 +76,13 @@ def test_start_low_pass_and_pushes_are_taken_over(chart: oc.Chart, tmp_path: Pat
     np.testing.assert_array_equal(plan.pushes[1].load(3), [0, 0, 0, 1, 2, 3])
 
 
+def test_pushes_act_at_links_and_points(chart: oc.Chart, tmp_path: Path) -> None:
+    pushes = [{**PUSH, "link": "q2", "point": [0.5, 0.1, 0]}, {**PUSH, "link": 2}, PUSH, {**PUSH, "point": [0, 0, 1]}]
+    plan = read_steps(written(tmp_path, changed(STEPS, pushes=pushes)), chart)
+    assert [push.link for push in plan.pushes] == ["q2", 2, None, None]
+    assert [push.point.tolist() for push in plan.pushes] == [[0.5, 0.1, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]]
+
+
 @pytest.mark.parametrize("name", ["steps_planar_3r_x.json", "steps_iiwa.json"])
 def test_examples_are_steps_files(name: str, chart: oc.Chart, iiwa_fit: Any) -> None:
     path = Path(__file__).parent.parent / "examples" / name
@@ -138,7 +145,10 @@ PUSH = {"start": 1, "duration": 0.1, "force": [1, 0, 0]}
         ({"points": [ONE, ONE]}, "points[1].time is 1.0, expected at least 1.001"),
         (changed(STEPS, pushes=1), "pushes is 1, expected a list"),
         (changed(STEPS, pushes=[{**PUSH, "mass": 1}]), "pushes[0] has an unknown key 'mass', known: start, duration"),
-        (changed(STEPS, pushes=[{"start": 1, "duration": 1}]), "expected a 'force' at the tip or a 'torque'"),
+        (
+            changed(STEPS, pushes=[{"start": 1, "duration": 1}]),
+            "expected a 'force' at the tip or a link, or a 'torque'",
+        ),
         (
             changed(STEPS, pushes=[{**PUSH, "start": 9}]),
             "pushes[0].start is 9.0, expected below the end of the run at 4",
@@ -147,6 +157,25 @@ PUSH = {"start": 1, "duration": 0.1, "force": [1, 0, 0]}
         (changed(STEPS, pushes=[{**PUSH, "duration": 0}]), "pushes[0].duration is 0"),
         (changed(STEPS, pushes=[{**PUSH, "force": [1]}]), "pushes[0].force is [1], expected a list of 3 numbers"),
         (changed(STEPS, pushes=[{**PUSH, "torque": [1]}]), "pushes[0].torque is [1], expected a list of 3 numbers"),
+        (
+            changed(STEPS, pushes=[{**PUSH, "link": "elbow"}]),
+            'pushes[0].link is "elbow", expected the index of a joint',
+        ),
+        (changed(STEPS, pushes=[{**PUSH, "link": 3}]), "pushes[0].link is 3, expected the index of a joint"),
+        (changed(STEPS, pushes=[{**PUSH, "link": -1}]), "pushes[0].link is -1, expected the index of a joint"),
+        (changed(STEPS, pushes=[{**PUSH, "link": True}]), "pushes[0].link is true, expected the index of a joint"),
+        (changed(STEPS, pushes=[{**PUSH, "link": 1.5}]), "pushes[0].link is 1.5, expected the index of a joint"),
+        (changed(STEPS, pushes=[{**PUSH, "link": None}]), "pushes[0].link is null, expected the index of a joint"),
+        (changed(STEPS, pushes=[{**PUSH, "link": ["q1"]}]), 'pushes[0].link is ["q1"], expected the index of a joint'),
+        (
+            changed(STEPS, pushes=[{**PUSH, "link": "arm"}]),
+            "of a joint from 0, or a name: q1, q2, q3",
+        ),
+        (changed(STEPS, pushes=[{**PUSH, "point": [1, 2]}]), "pushes[0].point is [1, 2], expected a list of 3 numbers"),
+        (
+            changed(STEPS, pushes=[{"start": 1, "duration": 1, "torque": [0, 0, 1], "link": 1}]),
+            "pushes[0] has a 'link' but no 'force', expected both or none of them",
+        ),
     ],
 )
 def test_a_mistake_is_named_with_file_and_place(chart: oc.Chart, tmp_path: Path, content: Any, message: str) -> None:

@@ -29,6 +29,7 @@ class Certificate(Shown):
     fold: tuple[tuple[float, ...], ...] = ()  #: two joint positions where det J differs in sign, the second in the fold
     boxes: int = 0  #: judged to find the proof
     seconds: float = field(default=0.0)
+    least_singular_value: float = 0.0  #: of a ClearBox; parts proved to lie outside it count as proved. 0: no ClearBox
 
     def __post_init__(self) -> None:
         for name in ("fingerprint", "method"):
@@ -49,7 +50,7 @@ class Certificate(Shown):
 
     @property
     def share(self) -> float:
-        """Share of the domain's volume that is proved."""
+        """Share of the domain's volume that is proved, of the whole box for a ClearBox."""
         return 0.0 if self.fold else self.regular.share
 
     @property
@@ -65,6 +66,8 @@ class Certificate(Shown):
         if self.injective is not None:
             half = (self.injective.high - self.injective.low) / 2
             facts["one-to-one"] = f"on the box of half-width {number_list(half)} around the centre"
+        if self.least_singular_value > 0:
+            facts["left out"] = f"where the task's relative singular value is at most {self.least_singular_value:g}"
         low, high = self.unproved
         if len(low) and not self.fold:
             largest = int(np.argmax((high - low).prod(axis=1)))

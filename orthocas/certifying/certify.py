@@ -10,10 +10,11 @@ from orthocas.certificates.certificate import METHOD, Certificate
 from orthocas.certificates.subdivision import OPEN, Subdivision
 from orthocas.certifying.chart_rows import chart_rows
 from orthocas.certifying.judges import InjectivityJudge, RegularityJudge, injectivity_judge
+from orthocas.certifying.outside import judge_of
 from orthocas.certifying.search import Limits, Look, Search, distances, largest_first, nearest_first
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_number, require_at_least, require_kind
-from orthocas.domains import Box, Domain, reach
+from orthocas.domains import Box, Domain, contains, reach
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.files.chart_file import fingerprint
 from orthocas.minimising.watch import Monitor, Progress, silent
@@ -40,6 +41,9 @@ def certify(
     numbers and those of the chart are taken as they are in the file. Samples are no part of the proof; they only find
     folds early. Also proved is the largest box, a scaled copy of the domain, on which phi is one-to-one by a
     sufficient condition: the symmetric part of J(centre)^-1 J(q) is positive definite.
+
+    In a `ClearBox`, parts need no proof that are proved, by the same arithmetic, to lie outside: the relative singular
+    value of the task is at most the bound there. They count as proved in the share of the box.
 
     Args:
         chart: a fitted chart.
@@ -69,7 +73,8 @@ def certify(
     start = time.monotonic()
     limits = Limits(seconds=checked_options(chart, time_limit, executor))
     bound = checked_bound(chart, bound)
-    judge = RegularityJudge(chart_rows(chart), bound)
+    rows = chart_rows(chart)
+    judge = judge_of(chart, rows, bound)
     base = whole_domain(chart.problem.domain) if resume is None else _resumed(chart, bound, resume)
     search = Search(judge, base, limits, largest_first(base), executor)
     injective: Subdivision | None = None
@@ -82,7 +87,7 @@ def certify(
         search.run(_shown(monitor, "regular"))
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
-            judge_too = injectivity_judge(judge.rows, chart.problem.domain.centre)
+            judge_too = injectivity_judge(rows, chart.problem.domain.centre)
             injective = _one_to_one(judge_too, base, left, executor, monitor)
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
@@ -190,10 +195,12 @@ def _suspects(chart: Chart) -> Array:
     unit = rng.uniform(-1, 1, (_SAMPLES, chart.n))
     powers = rng.choice([1.0, 0.5, 0.25], (_SAMPLES, 1))
     points = np.vstack([domain.centre, domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers])
+    points = points[contains(domain, points)]
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
     worst = int(np.argmin(volumes * np.sign(volumes[0])))
-    return points[[0, worst]]
+    suspects: Array = points[[0, worst]]
+    return suspects
 
 
 def _one_to_one(
@@ -252,6 +259,7 @@ def _certificate(
         fold,
         before[0] + search.judged,
         before[1] + seconds,
+        getattr(chart.problem.domain, "least_singular_value", 0.0),
     )
 
 

@@ -9,7 +9,8 @@ from orthocas.certificates.certificate import Certificate
 from orthocas.certificates.subdivision import PROVED, Subdivision
 from orthocas.certifying.certify import checked_options, require_same
 from orthocas.certifying.chart_rows import chart_rows
-from orthocas.certifying.judges import Judge, RegularityJudge, Verdicts, injectivity_judge
+from orthocas.certifying.judges import Judge, Verdicts, injectivity_judge
+from orthocas.certifying.outside import judge_of
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.errors import CertifyError
@@ -51,7 +52,7 @@ def check_certificate(
     require_same(chart, certificate)
     rows = chart_rows(chart)
     mapped: Mapped = map if executor is None else executor.map
-    regular = _judged(RegularityJudge(rows, certificate.bound), certificate.regular, mapped, monitor)
+    regular = _judged(judge_of(chart, rows, certificate.bound), certificate.regular, mapped, monitor)
     signs = {int(sign) for verdicts in regular for sign in np.unique(verdicts.sign) if sign}
     least = min((float(verdicts.conditioning.min()) for verdicts in regular), default=0.0)
     holds = all(verdicts.proved.all() for verdicts in regular) and len(signs) < 2 and least >= certificate.conditioning

@@ -13,14 +13,19 @@ from orthocas.cli.controller_argument import (
     CouplingName,
     DampingName,
     DampingRatio,
+    DampingStiffness,
     Feedback,
+    GravityName,
+    InputNames,
     Limit,
+    ModelName,
     PostureStiffness,
+    SecondName,
     Stiffness,
     build_controller,
     require_options,
 )
-from orthocas.cli.output import AsJson, Force, print_json, print_rows
+from orthocas.cli.output import AsJson, Force, note, print_json, print_rows
 from orthocas.codegen import GeneratedC, Proof, check_c, generate_c
 from orthocas.errors import InvalidValueError
 
@@ -37,8 +42,13 @@ def codegen(
     coupling: CouplingName = None,
     damping: DampingName = None,
     posture_stiffness: PostureStiffness = None,
+    second: SecondName = None,
     feedback: Feedback = None,
     limit: Limit = None,
+    damping_stiffness: DampingStiffness = None,
+    model: ModelName = None,
+    gravity: GravityName = None,
+    inputs: InputNames = None,
     check: Annotated[
         bool, typer.Option("--check", help="Compile the C and compare it with Python on 1000 states.")
     ] = False,
@@ -46,7 +56,15 @@ def codegen(
     json: AsJson = False,
 ) -> None:
     """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
-    options = ControllerOptions(stiffness, damping_ratio, coupling, posture_stiffness, feedback, damping=damping)
+    options = ControllerOptions(
+        *(stiffness, damping_ratio, coupling, posture_stiffness, feedback),
+        damping=damping,
+        damping_stiffness=damping_stiffness,
+        model=model,
+        gravity=gravity,
+        inputs=inputs,
+        second=second,
+    )
     if controller != _NONE:
         require_options(controller, options)
     elif options != ControllerOptions() or limit is not None:
@@ -56,12 +74,15 @@ def codegen(
         loaded.function("xi")  # raises for grown charts
         law = None if controller == _NONE else build_controller(controller, loaded, options, limit)
         generated = generate_c(loaded, out, law, name, force)
+        remarks = [] if law is None else law.remarks()
     proof = check_c(generated, loaded, law) if check else None
     report = _report(generated, proof)
     if json:
         print_json(report)
     else:
         print_rows(_rows(report))
+    for remark in remarks:
+        note(remark)
 
 
 def _report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:

@@ -13,13 +13,11 @@ from orthocas.errors import InvalidValueError
 
 CONTROLLERS = law_names()
 _OF_THE_PLANT = ("mass_factor", "friction")  # options for laws that command torques
-_CHOICES = ("coupling", "damping")  # options that are words
+_CHOICES = ("coupling", "damping", "model", "gravity", "inputs", "second")  # options that are words
 
 Stiffness = Annotated[
     str | None,
-    typer.Option(
-        "--stiffness", help='"100", or "100,50,..." per quantity; default: 2 Hz springs at the median inertia.'
-    ),
+    typer.Option("--stiffness", help='"100", or "100,50,..." per quantity; default: modes around 4 Hz.'),
 ]
 DampingRatio = Annotated[
     str | None, typer.Option("--damping-ratio", help='"0.7", or "0.7,1,..." per quantity; default: 0.7.')
@@ -28,18 +26,43 @@ CouplingName = Annotated[
     str | None, typer.Option("--coupling", help="coupled (default) or decoupled; for impedance and pd_plus.")
 ]
 DampingName = Annotated[
-    str | None, typer.Option("--damping", help="square_root (default) or double_diagonal; for impedance and pd_plus.")
+    str | None, typer.Option("--damping", help="double_diagonal (default) or square_root; for impedance and pd_plus.")
+]
+DampingStiffness = Annotated[
+    str | None,
+    typer.Option(
+        "--damping-stiffness", help="Design the damping for this stiffness, so that --stiffness may be 0 in places."
+    ),
+]
+ModelName = Annotated[
+    str | None, typer.Option("--model", help="own (default), or given: mass matrix and torques become inputs.")
+]
+GravityName = Annotated[
+    str | None, typer.Option("--gravity", help="law (default) compensates gravity; robot: the robot does so itself.")
+]
+InputNames = Annotated[
+    str | None, typer.Option("--inputs", help="Additional inputs: payload, wrench, extra_torque, with commas between.")
 ]
 PostureStiffness = Annotated[
     str | None,
-    typer.Option("--posture-stiffness", help="Stiffness of the joint springs; for projector. Default: 2 Hz springs."),
+    typer.Option(
+        "--posture-stiffness",
+        help="Stiffness of the springs in the second task; for projector. Default: modes around 4 Hz.",
+    ),
+]
+SecondName = Annotated[
+    str | None,
+    typer.Option("--second", help="joints (default) or xi, what the projector moves; for projector laws."),
 ]
 Feedback = Annotated[
     str | None,
     typer.Option("--feedback", help="Feedback gain [1/s]; for kinematic and kinematic_projector. Default: 0."),
 ]
 Limit = Annotated[
-    str | None, typer.Option("--limit", help='Largest torque or speed, "50" or "50,40,..." per joint; default: none.')
+    str | None,
+    typer.Option(
+        "--limit", help='Largest torque or speed, "50" or "50,40,..." per joint; default: the limits of the robot.'
+    ),
 ]
 
 
@@ -55,6 +78,11 @@ class ControllerOptions:
     mass_factor: float | None = None
     friction: str | None = None
     damping: str | None = None
+    damping_stiffness: str | None = None
+    second: str | None = None
+    model: str | None = None
+    gravity: str | None = None
+    inputs: str | None = None
 
 
 def require_options(name: str, options: ControllerOptions) -> None:

@@ -1,6 +1,6 @@
 """`orthocas fit`: from a robot to a chart file."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,6 +75,14 @@ def fit(
     centre: CentreText = None,
     home: HomeName = None,
     half_width: HalfWidth = None,
+    least_singular_value: Annotated[
+        float | None,
+        typer.Option(
+            "--least-singular-value",
+            parser=number,
+            help="Leave positions out of the domain where the task's relative singular value is smaller, such as 0.1.",
+        ),
+    ] = None,
     domain: DomainText = None,
     leak_deg: Annotated[
         float | None, typer.Option("--leak-deg", parser=number, help="Largest leak for --domain auto [deg]; default 8.")
@@ -117,7 +125,7 @@ def fit(
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
-    words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width)
+    words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width, least_singular_value)
     bounds = _bounds(domain, leak_deg, conditioning)
     built = build_problem(problem, words) if bounds is None else None
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
@@ -184,10 +192,15 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
         rows["exact"] = f"joints that do not move the task: {', '.join(result.idle_joints)}"
     if result.cyclic_joints:
         rows["cyclic"] = f"holds at all positions of {', '.join(result.cyclic_joints)}"
-    if result.problem_check.singular_samples:
-        check = result.problem_check
+    check, offer = result.problem_check, result.clear_part
+    if check.singular_samples:
         at = ", ".join(f"{value:.2f}" for value in check.most_singular_point)
         rows["singular"] = f"{check.singular_share:.2%} of the domain is near-singular, worst at q = ({at})"
+        if offer is None:
+            rows["singular"] += "; --domain auto, or another --centre or --home, stays clear"
+    if offer is not None:
+        bound, share = offer.least_singular_value, offer.share
+        rows["clear part"] = f"--least-singular-value {bound:g} leaves out singular positions and keeps {share:.1%}"
     rows["chart"] = str(target)
     return rows
 
@@ -213,6 +226,7 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
         "cyclic_joints": list(result.cyclic_joints),
         "near_singular_share": check.singular_share,
         "most_singular_point": list(check.most_singular_point),
+        "clear_part": None if result.clear_part is None else asdict(result.clear_part),
         "stages": [
             {
                 "parametrisation": stage.label,

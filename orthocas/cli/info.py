@@ -17,10 +17,12 @@ from orthocas.cli.problem_argument import (
     build_robot,
     is_robot_file,
 )
+from orthocas.domains import Domain
 from orthocas.errors import SingularTaskError
 from orthocas.files.json import plain
 from orthocas.involutivity import involutivity
 from orthocas.parametrisations import cyclic_joints
+from orthocas.postures.clear_box import ClearBox
 from orthocas.problem import Problem, check
 from orthocas.robots import Robot
 
@@ -85,11 +87,23 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "centre": problem.domain.centre.tolist(),
         "half_width": problem.domain.half_width.tolist(),
         "unbounded_joints": [problem.robot.joint_names[k] for k in getattr(problem.domain, "unbounded", ())],
+        **_clear(problem.domain),
         "cyclic_joints": list(cyclic_joints(problem)),
         "near_singular_share": found.singular_share,
         "most_singular_point": list(found.most_singular_point),
         **_involutivity(problem),
         **_robot(problem.robot),
+    }
+
+
+def _clear(domain: Domain) -> dict[str, Any]:
+    """What a ClearBox leaves of its box."""
+    if not isinstance(domain, ClearBox):
+        return {}
+    return {
+        "least_singular_value": domain.least_singular_value,
+        "row_scale": domain.scale.tolist(),
+        "clear_share": domain.share,
     }
 
 

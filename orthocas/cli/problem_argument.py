@@ -67,6 +67,7 @@ class ProblemOptions:
     centre: str | None = None
     home: str | None = None
     half_width: str | None = None
+    least_singular_value: float | None = None
 
     def given(self) -> bool:
         """Whether any option was given."""
@@ -114,7 +115,8 @@ def build_problem(name: str, options: ProblemOptions) -> Problem:
     if centre is not None or half_width is not None:
         domain = default_box(base.robot, base.domain.centre if centre is None else centre, half_width)
     task = base.task if options.task is None else Task.named(base.robot, options.task)
-    return Problem(base.robot, task, base.metric if options.metric is None else options.metric, domain, name)
+    metric = base.metric if options.metric is None else options.metric
+    return Problem(base.robot, task, metric, domain, name, options.least_singular_value)
 
 
 def suggested(
@@ -133,6 +135,9 @@ def suggested(
     """
     if options.half_width is not None:
         raise InvalidValueError("--half-width", options.half_width, "none with --domain auto, which finds it")
+    if options.least_singular_value is not None:
+        given = options.least_singular_value
+        raise InvalidValueError("--least-singular-value", given, "none with --domain auto, which stays clear by itself")
     base = None if is_robot_file(name) else build_problem(name, options)
     robot = build_robot(name, options) if base is None else base.robot
     task = Task.named(robot, options.task or "position") if base is None else base.task
@@ -169,7 +174,8 @@ def _from_file(name: str, options: ProblemOptions) -> Problem:
     centre = _centre(robot, options)
     centre = regular_box(robot, task).centre if centre is None else centre
     domain = default_box(robot, centre, _half_width(options))
-    return Problem(robot, task, "euclidean" if options.metric is None else options.metric, domain, Path(name).stem)
+    metric = "euclidean" if options.metric is None else options.metric
+    return Problem(robot, task, metric, domain, Path(name).stem, options.least_singular_value)
 
 
 def _centre(robot: Robot, options: ProblemOptions) -> Array | None:

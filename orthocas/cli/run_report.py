@@ -33,7 +33,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
         seen: the run in the chart's coordinates.
         seconds: computing time [s].
     """
-    bad = np.flatnonzero(seen.status != ControlStatus.OK)
+    bad = np.flatnonzero(seen.fell_back)
     first = int(bad[0]) if bad.size else None
     inside = np.asarray(contains(chart.problem.domain, seen.q))
     judged = plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
@@ -41,6 +41,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
     report = {
         "controller": controller.name,
         "coupling": controller.settings.get("coupling"),
+        "second": controller.settings.get("second"),
         "gains": controller.gains,
         "outcome": seen.outcome.value,
         "duration": float(seen.times[-1]),
@@ -52,6 +53,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
             "since": None if first is None else float(seen.times[first]),
             "reason": None if first is None else _REASONS[ControlStatus(int(seen.status[first]))],
         },
+        "saturated_share": float(seen.saturated.mean()),
         "share_inside_domain": float(inside.mean()),
         "command": seen.kind,
         "largest_command": dict(zip(seen.joint_names, largest, strict=True)),
@@ -84,6 +86,8 @@ def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
             f"task angle mean {task['mean']:.2f}, std {task['std']:.2f} deg (the paper's cosines)"
         )
     rows["command"] = f"at most {command:.4g} {unit}, {joint}"
+    if report["saturated_share"]:
+        rows["limit"] = f"reached for {report['saturated_share']:.1%} of the run"
     if energy := report["energy"]:
         rows["energy"] = (
             f"V at most {_text(energy['storage_largest'])} J, at the end {_text(energy['storage_end'])} J; "

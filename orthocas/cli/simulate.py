@@ -10,15 +10,18 @@ import typer
 
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.chart import Chart
+from orthocas.checks import require_known
 from orthocas.cli.controller_argument import (
     CONTROLLERS,
     ControllerOptions,
     CouplingName,
     DampingName,
     DampingRatio,
+    DampingStiffness,
     Feedback,
     Limit,
     PostureStiffness,
+    SecondName,
     Stiffness,
     build_controller,
     require_options,
@@ -33,13 +36,16 @@ from orthocas.files.atomic import output_folder, published, require_replaceable_
 from orthocas.files.json import to_json
 from orthocas.files.ours import is_listed
 from orthocas.minimising.watch import Monitor
-from orthocas.simulation import Friction, Noise, Outcome, Trajectory
+from orthocas.robots import Robot
+from orthocas.simulation import Friction, MuJoCo, Noise, Outcome, Trajectory
 from orthocas.simulation.animation import FORMATS, require_format, save_animation
 from orthocas.simulation.figure import trajectory_figure, units_of
+from orthocas.simulation.mujoco_scene import MUJOCO
 from orthocas.simulation.run import simulate as run_closed_loop
 from orthocas.simulation.steps_file import Plan, read_steps
 
 _FILES = ("trajectory.npz", "coordinates.png", "report.json")
+CVODES = "cvodes"  #: the default plant
 _DIVERGED = 1  # exit code when the integrator gave up: the input was valid but the run failed
 
 
@@ -55,11 +61,16 @@ def simulate(
     coupling: CouplingName = None,
     damping: DampingName = None,
     posture_stiffness: PostureStiffness = None,
+    second: SecondName = None,
     feedback: Feedback = None,
     limit: Limit = None,
+    damping_stiffness: DampingStiffness = None,
     rate: Annotated[
         float | None, typer.Option("--rate", parser=number, help="Control rate [Hz]; default: continuous control.")
     ] = None,
+    plant: Annotated[
+        str, typer.Option("--plant", help="Simulator: cvodes, or mujoco (needs --rate and the extra [sim]).")
+    ] = CVODES,
     mass_factor: Annotated[
         float | None,
         typer.Option("--mass-factor", parser=number, help="True masses divided by those of the controller's model."),
@@ -83,12 +94,10 @@ def simulate(
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
-    options = ControllerOptions(
-        stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction, damping
-    )
+    words = (stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction)
+    options = ControllerOptions(*words, damping, damping_stiffness, second)
     require_options(controller, options)
-    if animation != "none":
-        require_format(animation)
+    _require_plant(plant, rate)
     _require_folder(out, animation, force)
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         loaded = Chart.load(chart)
@@ -97,7 +106,7 @@ def simulate(
         law = build_controller(controller, loaded, options, limit)
     conditions = {
         "control_rate": rate,
-        "plant": None if mass_factor is None else loaded.problem.robot.with_scaled_masses(mass_factor),
+        "plant": _plant(plant, loaded.problem.robot, mass_factor),
         "friction": None if friction is None else Friction(*_pair("--friction", friction)),
         "noise": _noise(law, noise, seed, rate),
     }
@@ -118,19 +127,32 @@ def simulate(
     else:
         print_rows(run_rows(report, loaded.problem) | {"files": str(out)})
     _notes(law, report, interrupted)
-    if interrupted:
-        raise typer.Exit(130)
-    if run.outcome is Outcome.DIVERGED:
-        raise typer.Exit(_DIVERGED)
+    if code := 130 if interrupted else _DIVERGED * (run.outcome is Outcome.DIVERGED):
+        raise typer.Exit(code)
 
 
 def _require_folder(out: Path, animation: str, force: bool) -> None:
-    """Check, before anything is written, that the output folder exists or can be made, and holds no files of others."""
+    """Check, before anything is written, the format, and that the folder can be made or holds no files of others."""
+    if animation != "none":
+        require_format(animation)
     if out.exists() and not out.is_dir():
         raise InvalidValueError("--out", str(out), "a folder")
     require_writable(out / "report.json" if out.is_dir() else out, ArchiveError)
     names = [*_FILES] if animation == "none" else [*_FILES, f"animation.{animation}"]
     require_replaceable_files(out, names, force)
+
+
+def _require_plant(plant: str, rate: float | None) -> None:
+    """Raise UnknownNameError for other plants, and InvalidValueError for MuJoCo without a sampled controller."""
+    require_known("plant", plant, (CVODES, MUJOCO))
+    if plant == MUJOCO and rate is None:
+        raise InvalidValueError("--plant", plant, "--rate as well, because MuJoCo runs with a sampled controller")
+
+
+def _plant(plant: str, model: Robot, mass_factor: float | None) -> Robot | MuJoCo | None:
+    """The true robot, or MuJoCo with it; None if it is the controller's model."""
+    robot = None if mass_factor is None else model.with_scaled_masses(mass_factor)
+    return MuJoCo(robot) if plant == MUJOCO else robot
 
 
 def _pair(option: str, text: str) -> tuple[float, float]:

@@ -3,12 +3,14 @@
 from orthocas.codegen.generate import GeneratedC, generate_c
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
 from orthocas.codegen.proof import Proof, check_c
+from orthocas.codegen.supervisor import Supervisor
 from orthocas.codegen.ticks import Ticks, control_tick, time_ticks
 
 __all__ = [
     "CompiledLibrary",
     "GeneratedC",
     "Proof",
+    "Supervisor",
     "Ticks",
     "check_c",
     "compile_shared",

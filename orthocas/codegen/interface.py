@@ -1,7 +1,6 @@
 """The contents of the generated files: names, sizes, tables and comments."""
 
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib.resources import files
 from string import Template
 
@@ -10,9 +9,15 @@ import numpy as np
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
+from orthocas.codegen.check import check_values
+from orthocas.codegen.description import description_values
 from orthocas.codegen.kernels import Kernels
-from orthocas.control import Controller
-from orthocas.domains import borders, reach
+from orthocas.codegen.numbers import numbers
+from orthocas.codegen.supervision import supervision_values
+from orthocas.codegen.words import words
+from orthocas.control import Controller, Safety
+from orthocas.domains import Domain, borders, contains, reach
+from orthocas.postures.clear_box import ClearBox
 from orthocas.version import VERSION
 
 _MAX_EVALUATIONS = 100  # largest number of chart evaluations in one call of the inverse map
@@ -21,15 +26,19 @@ _EVERYWHERE = "This law uses no chart, so the status is never OUTSIDE_DOMAIN."
 
 
 def template_values(
-    chart: Chart, controller: Controller | None, name: str, kernels: Kernels, stack_bytes: int
+    chart: Chart,
+    controller: Controller | None,
+    safety: Safety | None,
+    name: str,
+    kernels: Kernels,
+    stack_bytes: int,
 ) -> dict[str, str]:
     """The values of all placeholders in the templates."""
     problem = chart.problem
     domain = problem.domain
     lower, upper = borders(domain)
-    somewhere = np.round(domain.centre + 0.5 * domain.half_width, 3)
-    joints, labels = _words(problem.robot.joint_names), _words(chart.labels)
-    slides = [" (prismatic)" if sliding else "" for sliding in problem.robot.tree.prismatic]
+    somewhere = _somewhere(domain)
+    joints = words(problem.robot.joint_names)
     values = {
         "name": name,
         "NAME": name.upper(),
@@ -38,28 +47,28 @@ def template_values(
         "casadi_version": ca.CasadiMeta.version(),
         **_sizes(chart),
         "joint_list": ", ".join(joints),
-        "joint_lines": "\n".join(f" *   {i} {joint}{slides[i]}" for i, joint in enumerate(joints)),
-        "task_labels": ", ".join(labels[: chart.m]),
-        "extra_labels": ", ".join(labels[chart.m :]),
-        "domain_lines": _domain_lines(joints, lower, upper),
+        **description_values(chart),
+        "domain_lines": _domain_lines(joints, lower, upper) + _clear_line(domain),
         "certificate": _certificate(chart),
-        "domain_lower": _numbers(lower),
-        "domain_upper": _numbers(upper),
-        "domain_centre": _numbers(domain.centre),
-        "domain_reach": _numbers(reach(domain)),
-        "phi_sizes": _numbers(chart.phi_sizes),
+        "domain_lower": numbers(lower),
+        "domain_upper": numbers(upper),
+        "domain_centre": numbers(domain.centre),
+        "domain_reach": numbers(reach(domain)),
+        "phi_sizes": numbers(chart.phi_sizes),
         "max_evaluations": str(_MAX_EVALUATIONS),
         "stack_bytes": str(stack_bytes),
-        "check_q": _numbers(somewhere),
-        "check_phi": _numbers(chart.phi(somewhere)),
+        "check_q": numbers(somewhere),
+        **check_values(chart, controller, somewhere),
         "kernels": kernels.code,
     }
     for kernel, sizes in kernels.work.items():
         for word, size in zip(("arg", "res", "iw", "w"), sizes, strict=True):
             values[f"{kernel}_{word}"] = str(max(1, size))
-    if controller is not None:
-        values |= _control_values(controller)
-    for template in ("control.h", "control.c", "control.md"):
+    if controller is not None and safety is not None:
+        values |= _control_values(controller) | supervision_values(controller, safety)
+        values["compose"] = filled(f"compose_{controller.command}.c", values)
+    values |= _clear_values(domain, values)
+    for template in ("control.h", "control.c", "check_control.c", "control.md", "supervisor.h", "supervisor.c"):
         values[template.replace(".", "_")] = "" if controller is None else filled(template, values)
     return values
 
@@ -69,20 +78,11 @@ def _sizes(chart: Chart) -> dict[str, str]:
     return {name: str(size) for name, size in sizes.items()}
 
 
-def _words(names: Iterable[str]) -> list[str]:
-    """Names on one printable line each, safe in C comments (also with trigraphs) and in CMake templates."""
-    return [re.sub(r"[@\\]+|/(?=\*)|\*(?=/)|\?(?=\?)", " ", _printable(name)) for name in names]
-
-
-def _printable(text: str) -> str:
-    return "".join(letter if letter.isprintable() else " " for letter in text)
-
-
 def _title(chart: Chart, controller: Controller | None) -> str:
     what = "chart" if controller is None else f"{controller.name} controller"
     problem, label = chart.problem, chart.coordinates.label
     title = f"{what} of {problem.name}: {label}, task {problem.task.name}, metric {problem.metric.name}"
-    return _words([title])[0]
+    return words([title])[0]
 
 
 def _control_values(controller: Controller) -> dict[str, str]:
@@ -90,22 +90,30 @@ def _control_values(controller: Controller) -> dict[str, str]:
     torque = controller.command == "torque"
     return {
         "k": str(len(controller.labels)),
-        "reference_labels": ", ".join(_words(controller.labels)),
+        "reference_labels": ", ".join(words(controller.labels)),
         "gain_fields": "\n".join(f"  double {gain}[{len(gains[gain])}];{_remark(controller, gain)}" for gain in gains),
-        "gain_values": ",\n".join(f"  {{{_numbers(value)}}}" for value in gains.values()),
-        "gain_table": "\n".join(f"| `{gain}` | {_numbers(value)} |" for gain, value in gains.items()),
+        "gain_values": ",\n".join(f"  {{{numbers(value)}}}" for value in gains.values()),
+        "gain_table": "\n".join(f"| `{gain}` | {numbers(value)} |" for gain, value in gains.items()),
         "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
         "commands_torque": str(int(torque)),
         "law": controller.formula,
-        "fallback": "the gravity torque, or zero where it is not finite" if torque else "zero velocity",
+        "fallback": _fallback(controller),
         "where": _EVERYWHERE if controller.chart is None else _IN_DOMAIN,
         "command": controller.command,
     }
 
 
+def _fallback(controller: Controller) -> str:
+    if controller.command == "velocity":
+        return "zero velocity"
+    if controller.settings.get("gravity") == "robot":
+        return "zero torque, because the robot compensates gravity"
+    return "the gravity torque, or zero where it is not finite"
+
+
 def _remark(controller: Controller, gain: str) -> str:
     units = controller.gain_units.get(gain)
-    return "" if units is None else f" /* {_words([units])[0]} */"
+    return "" if units is None else f" /* {words([units])[0]} */"
 
 
 def _certificate(chart: Chart) -> str:
@@ -123,10 +131,24 @@ def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
     return "\n".join(f" *   {name}: {range_}" for name, range_ in zip(names, ranges, strict=True))
 
 
-def _numbers(values: Array) -> str:
-    """C literals that convert back to exactly the same numbers."""
-    words = {np.inf: "INFINITY", -np.inf: "-INFINITY"}
-    return ", ".join(words.get(float(value), repr(float(value))) for value in values)
+def _clear_line(domain: Domain) -> str:
+    """The condition of a ClearBox."""
+    if not isinstance(domain, ClearBox):
+        return ""
+    return f"\n *   and the {domain.heading},\n *   or else the status is OUTSIDE_DOMAIN"
+
+
+def _clear_values(domain: Domain, values: Mapping[str, str]) -> dict[str, str]:
+    """The test of a ClearBox, and its call; for other domains there is none."""
+    if not isinstance(domain, ClearBox):
+        return {"is_clear": "1", "clear_c": ""}
+    return {"is_clear": "is_clear(q)", "clear_c": filled("clear.c", values)}
+
+
+def _somewhere(domain: Domain) -> Array:
+    """A joint position of the domain between its centre and a corner, (n,)."""
+    shares = [0.5**k for k in range(1, 20) if contains(domain, domain.centre + 0.5**k * domain.half_width)]
+    return np.round(domain.centre + (shares[0] if shares else 0.0) * domain.half_width, 3)
 
 
 def filled(template: str, values: Mapping[str, str]) -> str:

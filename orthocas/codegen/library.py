@@ -5,16 +5,17 @@ import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, require_shape
-from orthocas.codegen.generate import GeneratedC
+from orthocas.codegen.generated import GeneratedC
 from orthocas.control import Controller
 from orthocas.errors import CompileError
 
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 
 
 def compilers() -> tuple[str, ...]:
@@ -61,6 +62,17 @@ class CompiledLibrary:
         phi, J = np.empty(self.n), np.empty((self.n, self.n))
         return phi, J, self._call("chart", [q], [phi, J])
 
+    def check(self) -> float:
+        """Largest relative difference that the library finds between itself and the numbers it was generated with."""
+        run = self.function("check")
+        run.restype = ctypes.c_double
+        return float(run())
+
+    def curvature(self, q: Array, dq: Array, v: Array) -> tuple[Array, int]:
+        """dJ/dt v (n,), status."""
+        curvature = np.empty(self.n)
+        return curvature, self._call("chart_curvature", [q, dq, v], [curvature])
+
     def inverse(self, phi: Array, q_start: Array) -> tuple[Array, int]:
         """q (n,), status."""
         q = np.empty(self.n)
@@ -76,6 +88,19 @@ class CompiledLibrary:
         command = np.empty(self.n)
         return command, self._call("control", [q, dq, reference, gains], [command])
 
+    def low_pass(self, reference: Array, target: Array, omega: float, zeta: float, period: float) -> None:
+        """Move a reference (3 k,) by one step of the low pass towards a target (k,)."""
+        run = self.function("reference_low_pass")
+        run.argtypes, run.restype = [ctypes.c_void_p] * 2 + [ctypes.c_double] * 3, None
+        run(reference.ctypes.data, target.ctypes.data, omega, zeta, period)
+
+    def spline(self, start: Array, target: Array, duration: float, time: float) -> Array:
+        """The reference (3 k,) at a time on the spline from a reference to rest at a target (k,)."""
+        run, reference = self.function("reference_spline"), np.empty(3 * len(target))
+        run.argtypes, run.restype = [ctypes.c_void_p] * 2 + [ctypes.c_double] * 2 + [ctypes.c_void_p], None
+        run(start.ctypes.data, target.ctypes.data, duration, time, reference.ctypes.data)
+        return reference
+
     @property
     def domain(self) -> tuple[Array, Array]:
         """Lower and upper bounds, (n,) each."""
@@ -85,6 +110,14 @@ class CompiledLibrary:
     def default_gains(self, count: int) -> Array:
         """The gains that the library was generated with, (count,)."""
         return self._table("default_gains", count)
+
+    def function(self, name: str) -> Any:
+        """A function of the library, by its name without the prefix."""
+        return getattr(self._c, f"{self.name}_{name}")
+
+    def address(self, name: str) -> Any:
+        """Pointer to a constant of the library, by its name without the prefix."""
+        return ctypes.addressof(ctypes.c_char.in_dll(self._c, f"{self.name}_{name}"))
 
     def _table(self, name: str, count: int) -> Array:
         return np.array((ctypes.c_double * count).in_dll(self._c, f"{self.name}_{name}"))

@@ -1,5 +1,6 @@
 """`--check`: compares compiled C with the Python that it was generated from."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,6 +76,8 @@ def _compared(
     dq = rng.normal(size=q.shape)
     dq[len(q) - len(_corner_cases(chart.n)) :] = 0
     differences = _chart_and_dynamics(library, chart, *_spoiled(rng, q, dq))
+    differences["curvature"] = _curvature(library, chart, q, dq, rng)
+    differences["check"] = library.check()
     differences["inverse"] = _inverse(library, chart, q)
     if controller is not None:
         differences["control"] = _control(library, controller, q, dq, rng)
@@ -120,6 +123,15 @@ def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Ar
         name: _difference(np.array([row[k] for row in pushed]), _zero_unless(moving, value))
         for k, (name, value) in enumerate(wanted.items())
     }
+
+
+def _curvature(library: CompiledLibrary, chart: Chart, q: Array, dq: Array, rng: np.random.Generator) -> float:
+    """Largest relative difference of dJ/dt v where it has a value, with any v."""
+    v = rng.normal(size=q.shape)
+    wanted = Batched(chart.function("second_derivative"))(q, dq, v)[0]
+    found = [library.curvature(*row) for row in zip(q, dq, v, strict=True)]
+    good = np.isfinite(wanted).all(axis=1)
+    return _difference(np.array([row[0] for row in found]), _zero_unless(good, wanted))
 
 
 def _inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
@@ -183,11 +195,40 @@ def _random_gains(controller: Controller, rows: int, rng: np.random.Generator) -
     """Random gains around those of the controller, (rows, length) each; limits are finite or, at times, infinite."""
     gains = []
     for name, gain in controller.gains.items():
-        values = np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
+        values = _RANDOM.get(name, _scaled)(gain, rows, rng)
         if name == "limit":
             values[7::40, 0] = rng.choice([0.0, -1.0, np.nan, np.inf], size=len(values[7::40]))
         gains.append(values)
     return gains
+
+
+def _scaled(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    return np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
+
+
+def _shifted(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    return np.asarray(gain + rng.normal(size=(rows, len(gain))))
+
+
+def _payloads(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    """Payloads of up to 2 kg, within some 0.1 m of the tip, with positive definite inertias."""
+    mass, factors = rng.uniform(0, 2, (rows, 1)), 0.05 * rng.normal(size=(rows, 3, 3))
+    inertia = factors @ factors.transpose(0, 2, 1)
+    return np.hstack([mass, 0.1 * rng.normal(size=(rows, 3)), inertia[:, *np.triu_indices(3)]])
+
+
+def _symmetric(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    """The matrix (n * n,) times one factor and plus a diagonal, so that it stays symmetric positive definite."""
+    n = round(len(gain) ** 0.5)
+    diagonal = np.eye(n) * rng.uniform(0, 0.1, (rows, 1, n))
+    return np.asarray((gain.reshape(n, n) * rng.uniform(0.5, 1.5, (rows, 1, 1)) + diagonal).reshape(rows, -1))
+
+
+_RANDOM: Mapping[str, Callable[[Array, int, np.random.Generator], Array]] = {  # inputs that are not just positive
+    "payload": _payloads,
+    "mass_matrix": _symmetric,
+    **dict.fromkeys(("wrench", "extra_torque", "coriolis_torque", "gravity_torque"), _shifted),
+}
 
 
 def _are_numbers(*arrays: Array) -> NDArray[np.bool_]:

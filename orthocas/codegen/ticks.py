@@ -13,6 +13,7 @@ from orthocas.checks import Array
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
 from orthocas.control import Controller, PDPlus
+from orthocas.domains import contains
 from orthocas.errors import CompileError
 from orthocas.files.drafts import draft_folder
 
@@ -77,5 +78,6 @@ def _states(law: Controller) -> Array:
     """States inside the domain with references nearby, (64, 2 n + 3 k)."""
     rng, domain, n, k = np.random.default_rng(0), law.problem.domain, law.problem.n, len(law.labels)
     q = domain.centre + 0.4 * domain.half_width * rng.uniform(-1, 1, (_STATES, n))
+    q[~contains(domain, q)] = domain.centre
     reference = np.array([law.measured(point).full().ravel() for point in q]) + 0.01 * rng.normal(size=(_STATES, k))
     return np.hstack([q, rng.normal(size=(_STATES, n)), reference, rng.normal(size=(_STATES, 2 * k))])

@@ -83,6 +83,11 @@ class Controller(Protocol):
         ...
 
     @property
+    def fallback(self) -> ca.Function:
+        """q (n, 1), gains -> command without the law (n, 1): the gravity torque, or zero for velocity controllers."""
+        ...
+
+    @property
     def energy(self) -> ca.Function | None:
         """The same inputs -> storage V [J] and power dissipated by damping [W]; None for velocity controllers."""
         ...
@@ -147,12 +152,20 @@ def guarded_graph(
     fallback: ca.MX,
     volume: ca.MX,
     domain: Domain | None,
+    keep_direction: bool = False,
 ) -> ca.Function:
     """The graph of a controller: its law, protected by the guard of `orthocas.control.status`."""
     numbers = ca.vertcat(*(value for key, value in inputs.items() if key != "limit"))
-    check = guard(domain, command.shape[0], numbers.shape[0])
+    check = guard(domain, command.shape[0], numbers.shape[0], keep_direction)
     safe, status = check(command, fallback, inputs["limit"], inputs["q"], numbers, volume)
     return named_function(name, inputs, {"command": safe, "status": status})
+
+
+def fallback_function(inputs: dict[str, ca.MX], command: ca.MX) -> ca.Function:
+    """The fallback of a controller as a function of q and its gains."""
+    state = ("dq", "reference", "reference_velocity", "reference_acceleration")
+    chosen = {key: value for key, value in inputs.items() if key not in state}
+    return named_function("fallback", chosen, {"command": command})
 
 
 def named_function(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:

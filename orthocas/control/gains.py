@@ -6,11 +6,12 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.checks import Array, as_float_array, frozen_array, require_shape
 from orthocas.errors import InvalidValueError
 
-STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
+STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT, SECOND_FORCE = (  #: units of gains, in words
     "J per squared unit of the quantity, > 0",
     ">= 0, 1 is critical damping",
     "1/s, >= 0",
     "largest command per joint, > 0; INFINITY for no limit",
+    "J per unit of the second quantity",
 )
 
 
@@ -28,10 +29,15 @@ def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
     return gains
 
 
-def command_limit(name: str, value: ArrayLike | None, length: int) -> Array:
-    """Numbers > 0, (length,); infinite if `value` is None."""
-    value = np.inf if value is None else value
-    limit = np.array(np.broadcast_to(_one_or(name, value, length), (length,)))
+def finite_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers, (length,), from one number or (length,)."""
+    return _spread(name, value, length)
+
+
+def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:
+    """Numbers > 0, (n,), possibly infinite; the limits of the robot if `value` is None."""
+    length = len(default)
+    limit = np.array(np.broadcast_to(_one_or(name, default if value is None else value, length), (length,)))
     _require(name, limit, limit > 0, "positive numbers")
     limit.setflags(write=False)
     return limit

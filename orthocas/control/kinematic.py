@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind
-from orthocas.control.controller import Command, guarded_graph, law_facts, named_inputs
+from orthocas.control.controller import Command, fallback_function, guarded_graph, law_facts, named_inputs
 from orthocas.control.gains import FEEDBACK, LIMIT, command_limit, non_negative_gains
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.reachability import joint_path
@@ -27,7 +27,7 @@ class Kinematic(Shown):
     Args:
         chart: a chart with a closed expression (not a grown one).
         feedback: diagonal of Lambda, >= 0, (n,) or one number [1/s]; the paper uses 0.
-        limit: largest speed of each joint, (n,) or one number [rad/s] or [m/s]; default no limit.
+        limit: largest speed of each joint, (n,) or one number [rad/s] or [m/s]; default those of the robot.
 
     Raises:
         ShapeError, InvalidValueError: for settings of the wrong shape or value.
@@ -54,7 +54,7 @@ class Kinematic(Shown):
         chart.function("xi")  # raises for grown charts
         object.__setattr__(self, "chart", chart)
         object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))
-        object.__setattr__(self, "limit", command_limit("limit", limit, chart.n))
+        object.__setattr__(self, "limit", command_limit("limit", limit, chart.problem.robot.velocity_limits))
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
@@ -105,7 +105,12 @@ class Kinematic(Shown):
         rate = inputs["reference_velocity"] + inputs["feedback"] * error
         scale = median_volume(problem, self.chart.function("jacobian"), problem.metric, (n,))
         velocity = B @ (Lambda @ rate)  # J^-1 = A^-1 J^T (J A^-1 J^T)^-1
-        return guarded_graph(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain)
+        return guarded_graph(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain, True)
+
+    @cached_property
+    def fallback(self) -> ca.Function:
+        """q, gains -> zero velocity."""
+        return fallback_function(named_inputs(self.chart.n, self.gains, 0), ca.MX(self.chart.n, 1))
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""

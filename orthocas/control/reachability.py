@@ -8,6 +8,7 @@ from orthocas.checks import Array, as_point, require_kind
 from orthocas.control.reference import Reference
 from orthocas.domains import borders, contains
 from orthocas.errors import InvalidValueError, InverseError, UnreachableReferenceError
+from orthocas.postures.clear_box import ClearBox
 
 
 def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
@@ -41,6 +42,8 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
 
 def _outside(chart: Chart, q: Array) -> str:
     domain = chart.problem.domain
+    if isinstance(domain, ClearBox) and not domain.is_clear(q[None])[0]:
+        return f"the task {domain.told(q)}"
     low, high = borders(domain)
     i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))
     low, high = low[i], high[i]

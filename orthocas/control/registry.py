@@ -3,8 +3,9 @@
 from orthocas.checks import require_known
 from orthocas.control.controller import Law
 from orthocas.control.kinematic import Kinematic
+from orthocas.control.kinematic_projector import KinematicProjector
 from orthocas.control.operational_space import Impedance, PDPlus
-from orthocas.control.projector import KinematicProjector, Projector
+from orthocas.control.projector import Projector
 from orthocas.errors import InvalidValueError
 
 _LAWS: dict[str, type[Law]] = {}

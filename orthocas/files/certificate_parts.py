@@ -30,6 +30,7 @@ def certificate_to_data(certificate: Certificate) -> tuple[dict[str, Any], dict[
         "fold": [list(point) for point in certificate.fold],
         "boxes": certificate.boxes,
         "seconds": certificate.seconds,
+        **({"least_singular_value": certificate.least_singular_value} if certificate.least_singular_value else {}),
     }
     return header, arrays
 
@@ -55,6 +56,7 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         tuple(tuple(float(value) for value in point) for point in fold),
         require_count("boxes of a certificate", int(_number(data, "boxes")), least=0),
         _number(data, "seconds"),
+        _number(data, "least_singular_value") if "least_singular_value" in data else 0.0,
     )
 
 

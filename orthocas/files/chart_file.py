@@ -15,7 +15,7 @@ from orthocas.certificates import Certificate
 from orthocas.checks import require_count, require_known, require_text
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
-from orthocas.domains import Box, Domain, Torus, sample_uniform
+from orthocas.domains import Box, Domain, Torus, require_within_limits, sample_uniform
 from orthocas.errors import ChartFileError, InvalidValueError, OrthocasError
 from orthocas.files.archive import Kind, read_archive, write_archive
 from orthocas.files.certificate_parts import certificate_from_data, certificate_to_data
@@ -24,6 +24,7 @@ from orthocas.files.npy import Stored, to_npy
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
 from orthocas.parametrisations import JointSpace, parametrisation_from_data, parametrisation_to_data
+from orthocas.postures.clear_box import CLEAR_BOX, ClearBox
 from orthocas.problem import Problem
 from orthocas.robots import KinematicTree, Robot
 from orthocas.tasks import Task
@@ -68,7 +69,9 @@ def _content(problem: Problem, coordinates: CoordinateMap) -> tuple[dict[str, An
     tree = problem.robot.tree
     numbers = {f.name: getattr(tree, f.name) for f in fields(tree)}
     arrays = {f"robot_{name}": value for name, value in numbers.items() if isinstance(value, np.ndarray)}
-    arrays |= {"domain_centre": problem.domain.centre, "domain_half_width": problem.domain.half_width}
+    domain = problem.domain
+    arrays |= {"domain_centre": domain.centre, "domain_half_width": domain.half_width}
+    arrays |= {"domain_row_scale": domain.scale} if isinstance(domain, ClearBox) else {}
     description, numbers_of_coordinates = _coordinates_to_data(coordinates)
     arrays |= numbers_of_coordinates
     header = {
@@ -77,8 +80,9 @@ def _content(problem: Problem, coordinates: CoordinateMap) -> tuple[dict[str, An
             "name": problem.name,
             "task": _with_tape(problem.task.recipe, problem.task.function),
             "metric": _with_tape(problem.metric.recipe, problem.metric.function),
-            "domain": problem.domain.name,
-            **({"unbounded": list(problem.domain.unbounded)} if isinstance(problem.domain, Box) else {}),
+            "domain": domain.name,
+            **({"unbounded": list(domain.unbounded)} if isinstance(domain, Box) else {}),
+            **({"least_singular_value": domain.least_singular_value} if isinstance(domain, ClearBox) else {}),
         },
         "coordinates": description,
     }
@@ -203,17 +207,23 @@ def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTre
 
 
 def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
-    require_known("domain", part(data, "domain", str), ("box", "torus"))
+    domain = _domain(robot.n, data, arrays)
+    task, metric = _task(robot, part(data, "task", dict)), _metric(robot, part(data, "metric", dict))
+    if data["domain"] == CLEAR_BOX and isinstance(domain, Box):
+        require_within_limits(robot, domain)  # before the task is evaluated there
+        scale = part(arrays, "domain_row_scale", np.ndarray)
+        domain = ClearBox(domain, task, part(data, "least_singular_value", float), scale)
+    return Problem(robot, task, metric, domain, part(data, "name", str))
+
+
+def _domain(n: int, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Domain:
+    """The box or torus of a file; for a ClearBox its box."""
+    kind = part(data, "domain", str)
+    require_known("domain", kind, ("box", "torus", CLEAR_BOX))
+    if kind == "torus":
+        return Torus(n)
     unbounded = part(data, "unbounded", list) if "unbounded" in data else ()  # missing in older files
-    box = Box(part(arrays, "domain_centre", np.ndarray), part(arrays, "domain_half_width", np.ndarray), unbounded)
-    domain: Domain = Torus(robot.n) if data["domain"] == "torus" else box
-    return Problem(
-        robot,
-        _task(robot, part(data, "task", dict)),
-        _metric(robot, part(data, "metric", dict)),
-        domain,
-        part(data, "name", str),
-    )
+    return Box(part(arrays, "domain_centre", np.ndarray), part(arrays, "domain_half_width", np.ndarray), unbounded)
 
 
 def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:

@@ -12,6 +12,7 @@ from orthocas.checks import as_path, require_kind
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.errors import Interrupted
 from orthocas.fitting.checkpoint import Checkpoint, Stage
+from orthocas.fitting.clear_part import ClearPart, clear_part
 from orthocas.fitting.continuation import Continuation
 from orthocas.fitting.fold_search import FoldSearch
 from orthocas.fitting.gauge import aligned, in_closed_form, in_gauge, normalised
@@ -54,6 +55,7 @@ class Fit(Shown):
     idle_joints: tuple[str, ...]  #: names of joints that are exact coordinates themselves
     worst: WorstPoints | None  #: result of the last search for folds; None if there was none
     seconds: float  #: of this run; the seconds of stages include earlier runs of a checkpoint
+    clear_part: ClearPart | None = None  #: a smaller domain to fit on, if this one touches near-singular positions
 
     @property
     def cyclic_joints(self) -> tuple[str, ...]:
@@ -79,6 +81,7 @@ class Fit(Shown):
             "least conditioning": "not searched" if self.worst is None else self.worst.told,
             **({"cyclic joints": listed(self.cyclic_joints)} if self.cyclic_joints else {}),
             "near singular": f"{self.problem_check.singular_share:.3%} of the domain",
+            **({"offer": f"a {self.clear_part.told}"} if self.clear_part else {}),
         }
 
 
@@ -171,6 +174,7 @@ def fit(
         idle_joints=tuple(problem.robot.joint_names[i] for i in idle),
         worst=worst,
         seconds=time.perf_counter() - start,
+        clear_part=clear_part(problem, found, worst),
     )
     if result.status is Status.INTERRUPTED:
         raise Interrupted(result)

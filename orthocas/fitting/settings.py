@@ -11,6 +11,7 @@ from orthocas.errors import InvalidValueError
 from orthocas.fitting.loss import WeightNumbers, Weights
 from orthocas.minimising.solver import Solver
 from orthocas.parametrisations import Parametrisation, Polynomial
+from orthocas.postures.clear_box import ClearBox
 from orthocas.problem import Problem
 from orthocas.samples import sample_problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt
@@ -116,4 +117,6 @@ def _digest(problem: Problem) -> str:
     samples = sample_problem(problem, *_TELLTALE)
     parts = [samples.points, samples.task_jacobian]
     parts += [] if samples.metric_inverse is None else [samples.metric_inverse]
+    domain = problem.domain
+    parts += [np.append(domain.scale, domain.least_singular_value)] if isinstance(domain, ClearBox) else []
     return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]

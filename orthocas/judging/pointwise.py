@@ -7,7 +7,7 @@ import numpy as np
 
 from orthocas.checks import Array
 from orthocas.coordinates.map import CoordinateMap
-from orthocas.domains import borders
+from orthocas.domains import borders, contains
 from orthocas.judging.gradients import Judged
 from orthocas.problem import Problem
 from orthocas.showing import Shown, number_list
@@ -19,7 +19,7 @@ class PointQuality(Shown):
 
     leak_deg: Array  #: leak of each coordinate [deg], (r,) or (N, r); 0 is perfect
     conditioning: Array  #: smallest singular value of the normalised gradients, () or (N,); 1 perfect, 0 singular
-    border_distance: Array  #: to the nearest face of the domain, () or (N,); < 0 outside, inf for a torus [rad] or [m]
+    border_distance: Array  #: to the nearest face of the domain, () or (N,), <= 0 outside, inf for a torus [rad] or [m]
 
     def facts(self) -> dict[str, str]:
         """The worst values of the set, or those of the one position."""
@@ -53,4 +53,5 @@ def point_quality(problem: Problem, coordinates: CoordinateMap, points: Array) -
     conditioning[judged.kept] = judged.conditioning
     lower, upper = borders(problem.domain)
     distance = np.minimum(points - lower, upper - points).min(axis=1)
+    distance = np.where(contains(problem.domain, points), distance, np.minimum(distance, 0.0))  # too near a singularity
     return PointQuality(leak, conditioning, distance)

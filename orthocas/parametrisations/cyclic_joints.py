@@ -4,6 +4,7 @@ import numpy as np
 
 from orthocas.checks import Array, require_kind
 from orthocas.domains import Box, sample_uniform
+from orthocas.postures.clear_box import ClearBox
 from orthocas.problem import NEAR_SINGULAR, Problem, relative_singular_values
 
 _SAMPLES, _POSITIONS = 24, 6  # joint positions, and other positions of one joint at each of them
@@ -56,7 +57,9 @@ def over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
             unbounded.add(k)
         else:
             centre[k] = (low + high) / 2
-    return Problem(robot, problem.task, problem.metric, Box(centre, half_width, sorted(unbounded)), problem.name)
+    wider = Box(centre, half_width, sorted(unbounded))
+    wider = domain.within(wider) if isinstance(domain, ClearBox) else wider
+    return Problem(robot, problem.task, problem.metric, wider, problem.name)
 
 
 def _range(problem: Problem, k: int) -> tuple[float, float]:

@@ -9,6 +9,7 @@ from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array
 from orthocas.domains import Box, default_box, default_half_width, sample_evenly
 from orthocas.errors import NotRedundantError
+from orthocas.postures.row_scale import row_scale
 from orthocas.robots import Robot
 from orthocas.tasks import Task
 
@@ -77,7 +78,7 @@ class Judge:
         jacobian = Batched(task.centred_jacobian_function)
         points = sample_evenly(box, _JUDGES, 0)
         J = _finite(jacobian(points, np.broadcast_to(box.centre, points.shape))[0].reshape(-1, task.m, robot.n))
-        return cls(robot, task.m, jacobian, box.centre, _row_scale(J, task.units))
+        return cls(robot, task.m, jacobian, box.centre, row_scale(J, task.units))
 
     def regularity(self, centres: Array, samples: int) -> Array:
         """Smallest singular values of [J_x; N^T] on the boxes around centres (N, n), (N, samples + 1).
@@ -122,16 +123,6 @@ def _one_joint_moved(posture: Array, way: Array) -> Array:
             moved.append(posture.copy())
             moved[-1][i] = bend * way[i]
     return np.array(moved)
-
-
-def _row_scale(J: Array, units: tuple[str, ...]) -> Array:
-    """Root mean square length of the rows of each unit, (m,). It does not depend on how axes are turned; 1 if zero."""
-    squares = (J**2).sum(axis=2).mean(axis=0)
-    groups = [unit or f"own {i}" for i, unit in enumerate(units)]
-    means = [
-        np.mean([square for square, other in zip(squares, groups, strict=True) if other == mine]) for mine in groups
-    ]
-    return np.sqrt([mean if mean > 0 else 1.0 for mean in means])
 
 
 def _finite(J: Array) -> Array:

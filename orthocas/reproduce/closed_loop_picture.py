@@ -12,7 +12,6 @@ from matplotlib.lines import Line2D
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
-from orthocas.control import ControlStatus
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.planar_loop import GENTLE, INTERLEAVED, Arm, Run, follow, task_angle_std
 from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, THIRD, TICK, new_figure
@@ -60,9 +59,7 @@ def draw_joints(axes: Any, run: Run) -> None:
 def finish(axes: Any, run: Run) -> None:
     """Set ticks, grid and limits of a panel over time; shade in grey where the controller used its fallback."""
     times = run.trajectory.times
-    axes.fill_between(
-        times, 0, 1, where=run.trajectory.status != ControlStatus.OK, transform=axes.get_xaxis_transform(), color="0.85"
-    )
+    axes.fill_between(times, 0, 1, where=run.trajectory.fell_back, transform=axes.get_xaxis_transform(), color="0.85")
     axes.set_xlim(0, times[-1])
     axes.set_xticks(np.arange(1, times[-1] + 0.1, 4))
     _style(axes)

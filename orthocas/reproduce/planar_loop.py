@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
-from orthocas.control import ControlStatus, Impedance, PDPlus, Reference
+from orthocas.control import Impedance, PDPlus, Reference
 from orthocas.control.damping import DampingDesign
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import Box, Domain, Torus
@@ -143,7 +143,7 @@ class Run:
     @property
     def share_not_ok(self) -> float:
         """Share of instants at which the controller used its fallback."""
-        return float(np.mean(self.trajectory.status != ControlStatus.OK))
+        return float(np.mean(self.trajectory.fell_back))
 
     def numbers(self, prefix: str = "") -> dict[str, float]:
         """Coupling indices, errors and missed targets of each coordinate, fallbacks, and the size of the motion."""

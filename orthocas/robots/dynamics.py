@@ -17,6 +17,15 @@ _Z = ca.SX([0, 0, 1])
 
 
 @dataclass
+class _Inertials:
+    """Inertial parameters of a body as expressions, about the body frame's origin."""
+
+    mass: ca.SX
+    moment: ca.SX  # m c, (3, 1)
+    inertia: ca.SX  # (3, 3)
+
+
+@dataclass
 class _Body:
     """Inertial parameters about the body frame's origin."""
 
@@ -25,13 +34,14 @@ class _Body:
     inertia: Array  # about the origin, (3, 3)
 
 
-def mass_matrix(tree: KinematicTree, q: ca.SX) -> ca.SX:
-    """M(q), (n, n), symmetric positive definite, [kg m^2] for revolute joints. The diagonal includes rotor inertias."""
+def mass_matrix(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None) -> ca.SX:
+    """M(q), (n, n), symmetric positive definite, [kg m^2] for revolute joints. The diagonal includes rotor inertias.
+
+    A payload (10, 1) is mass, centre in the tip frame, and inertia about it: Ixx, Ixy, Ixz, Iyy, Iyz, Izz.
+    """
     joints = _joint_transforms(tree, q)
-    bodies = _regroup(tree)
-    mass = [ca.SX(body.mass) for body in bodies]
-    moment = [constant(body.moment) for body in bodies]
-    inertia = [constant(body.inertia) for body in bodies]
+    bodies = _bodies(tree, payload)
+    mass, moment, inertia = ([getattr(body, name) for body in bodies] for name in ("mass", "moment", "inertia"))
     M = ca.SX.zeros(tree.n, tree.n)
     for i in reversed(range(tree.n)):
         force, torque = _unit_acceleration_wrench(tree, i, mass[i], moment[i], inertia[i])
@@ -52,10 +62,12 @@ def mass_matrix(tree: KinematicTree, q: ca.SX) -> ca.SX:
     return M
 
 
-def inverse_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, ddq: ca.SX, gravity: Array) -> ca.SX:
+def inverse_dynamics(
+    tree: KinematicTree, q: ca.SX, dq: ca.SX, ddq: ca.SX, gravity: Array, payload: ca.SX | None = None
+) -> ca.SX:
     """tau = M ddq + C dq + g, (n, 1) [N m] or [N], for a gravity acceleration (3,) in the world."""
     joints = _joint_transforms(tree, q)
-    bodies = _regroup(tree)
+    bodies = _bodies(tree, payload)
     states: list[tuple[ca.SX, ca.SX, ca.SX]] = []  # angular velocity, angular acceleration matrix, linear acceleration
     accelerations: list[ca.SX] = []
     at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-gravity))
@@ -82,18 +94,18 @@ def forward_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, gravi
     return ca.ldl_solve(tau - bias(tree, q, dq, gravity), D, LT, order)
 
 
-def bias(tree: KinematicTree, q: ca.SX, dq: ca.SX, gravity: Array) -> ca.SX:
+def bias(tree: KinematicTree, q: ca.SX, dq: ca.SX, gravity: Array, payload: ca.SX | None = None) -> ca.SX:
     """C(q, dq) dq + g(q), (n, 1)."""
-    return inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity)
+    return inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity, payload)
 
 
-def coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX) -> ca.SX:
+def coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, payload: ca.SX | None = None) -> ca.SX:
     """C(q, v) w with the Christoffel form of C, (n, 1), by polarisation of the quadratic form C(q, v) v.
 
     C(q, v) w = (c(v + w) - c(v - w)) / 4 with c(v) = C(q, v) v. It is bilinear and symmetric in (v, w).
     """
     weightless = np.zeros(3)
-    return (bias(tree, q, v + w, weightless) - bias(tree, q, v - w, weightless)) / 4
+    return (bias(tree, q, v + w, weightless, payload) - bias(tree, q, v - w, weightless, payload)) / 4
 
 
 @dataclass
@@ -136,7 +148,7 @@ def _joint_transforms(tree: KinematicTree, q: ca.SX) -> list[_JointTransform]:
 def _joint_forces(
     tree: KinematicTree,
     joints: list[_JointTransform],
-    bodies: list[_Body],
+    bodies: list[_Inertials],
     states: list[tuple[ca.SX, ca.SX, ca.SX]],
     accelerations: list[ca.SX],
 ) -> ca.SX:
@@ -146,7 +158,7 @@ def _joint_forces(
     tau = ca.SX.zeros(tree.n)
     for i in reversed(range(tree.n)):
         omega, U, a = states[i]
-        moment, inertia = constant(bodies[i].moment), constant(bodies[i].inertia)
+        moment, inertia = bodies[i].moment, bodies[i].inertia
         force = forces[i] + bodies[i].mass * a + U @ moment
         torque = torques[i] + inertia @ accelerations[i] + ca.cross(omega, inertia @ omega) + ca.cross(moment, a)
         tau[i] = _along_joint(tree, i, force, torque)
@@ -168,6 +180,24 @@ def _unit_acceleration_wrench(
     if tree.joint_kinds[i] == "prismatic":
         return mass * _Z, ca.cross(moment, _Z)
     return ca.cross(_Z, moment), inertia[:, 2]
+
+
+def _bodies(tree: KinematicTree, payload: ca.SX | None) -> list[_Inertials]:
+    """The regrouped bodies, with the payload on the one that carries the tip."""
+    bodies = [_Inertials(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
+    if payload is not None and tree.tip_parent >= 0:
+        body = bodies[tree.tip_parent]
+        mass, moment, inertia = _payload(tree, payload)
+        bodies[tree.tip_parent] = _Inertials(body.mass + mass, body.moment + moment, body.inertia + inertia)
+    return bodies
+
+
+def _payload(tree: KinematicTree, payload: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Mass, mass times centre (3, 1), and inertia (3, 3) about the body's origin, in the frame of the tip's body."""
+    R, p, mass = constant(tree.tip_rotation), constant(tree.tip_translation), payload[0]
+    centre = p + R @ payload[1:4]
+    turned = R @ ca.reshape(payload[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3) @ R.T
+    return mass, mass * centre, turned + mass * (ca.dot(centre, centre) * ca.SX.eye(3) - centre @ centre.T)
 
 
 def _regroup(tree: KinematicTree) -> list[_Body]:

@@ -2,6 +2,7 @@
 
 import casadi as ca
 
+from orthocas.checks import Array
 from orthocas.robots.spatial import constant, turn
 from orthocas.robots.tree import KinematicTree
 
@@ -42,6 +43,20 @@ def tip_jacobian(tree: KinematicTree, q: ca.SX) -> ca.SX:
         else:
             J[:3, i], J[3:, i] = ca.cross(axis, p_tip - p), axis
         i = tree.parents[i]
+    return J
+
+
+def point_jacobian(tree: KinematicTree, q: ca.SX, body: int, point: Array) -> ca.SX:
+    """Jacobian (3, n) of a point (3,) [m] that is fixed in a body's frame: d(position in the world)/dt = J dq."""
+    poses = body_poses(tree, q)
+    J = ca.SX(3, tree.n)
+    if body >= 0:
+        R, p = poses[body]
+        position = p + R @ constant(point)
+    while body >= 0:
+        R, p = poses[body]
+        J[:, body] = R[:, 2] if tree.joint_kinds[body] == "prismatic" else ca.cross(R[:, 2], position - p)
+        body = tree.parents[body]
     return J
 
 

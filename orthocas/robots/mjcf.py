@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from orthocas.errors import RobotError
 from orthocas.robots.mjcf_document import MAIN, Document
+from orthocas.robots.mjcf_efforts import Ranges, effort_of_actuators
 from orthocas.robots.mjcf_inertias import MassRules, Placed, body_inertia
 from orthocas.robots.mjcf_poses import Angles, pose, shape_pose
 from orthocas.robots.xml_files import MOST_LINKS
@@ -22,7 +23,7 @@ _READ = ("inertial", "joint", "freejoint", "geom", "site", "body")
 
 
 def model_from_mjcf(path: str | Path) -> pin.Model:
-    """Read the kinematics, masses, armatures, joint limits and gravity of an MJCF file.
+    """Read the kinematics, masses, armatures, limits of position and effort, and gravity of an MJCF file.
 
     The model has a frame for every body, named site and joint. If they share a name, `frame_index` prefers the body to
     the site, and the site to the joint. Bodies and joints without a name are called body<i> and joint<i>, with MuJoCo's
@@ -76,7 +77,8 @@ class _Builder:
         self._document = document
         self._angles = Angles.of(compiler)
         self._rules = MassRules.of(compiler)
-        self._autolimits = compiler.flag("autolimits", True)
+        self._ranges = Ranges(compiler.flag("autolimits", True))
+        self._efforts = effort_of_actuators(document, self._ranges)
         self._model = pin.Model()
         self._names: dict[str, set[str]] = {"body": {"world"}, "joint": set(), "site": set()}
         self._masses: list[tuple[int, pin.SE3, pin.Inertia]] = []
@@ -176,25 +178,15 @@ class _Builder:
         """Add a hinge or a slide. In the pose of the file its position is `ref`."""
         axis = turn @ joint.direction("axis", (0, 0, 1))
         unit = self._angles.unit if kind == "hinge" else 1.0
-        lower, upper = self._limits(joint, unit)
+        lower, upper = self._ranges.of(joint) * unit
         back = -axis * joint.number("ref", 0) * unit
         shift = pin.SE3(pin.exp3(back), np.zeros(3)) if kind == "hinge" else pin.SE3(np.eye(3), back)
         make = pin.JointModelRevoluteUnaligned if kind == "hinge" else pin.JointModelPrismaticUnaligned
-        free = np.full(1, np.inf)
-        limits = free, free, np.array([lower]), np.array([upper])
+        effort = min(
+            self._ranges.reach(joint, "actuatorfrcrange", "actuatorfrclimited"), self._efforts.get(name, np.inf)
+        )
+        limits = np.array([effort]), np.full(1, np.inf), np.array([lower]), np.array([upper])
         return int(self._model.addJoint(parent, make(axis), placement * shift, name, *limits))
-
-    def _limits(self, joint: Attributes, unit: float) -> tuple[float, float]:
-        """Limits [rad] or [m]. A joint with a range is limited unless the file says otherwise."""
-        limited = joint.keyword("limited", ("true", "false", "auto"), "auto")
-        lower, upper = joint.numbers("range", 2, (0, 0)) * unit
-        if limited == "false" or (limited == "auto" and lower == upper == 0):
-            return -np.inf, np.inf
-        if limited == "auto" and not self._autolimits:
-            raise joint.error("has range but not limited, expected both because the compiler's autolimits is 'false'")
-        if lower >= upper:
-            raise joint.error(f"has limits [{lower:g}, {upper:g}], expected the first below the second")
-        return lower, upper
 
     def _add_sites(self, parts: list[_Part], joint: int, placement: pin.SE3, body: str) -> None:
         for part in parts:

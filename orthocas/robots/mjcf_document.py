@@ -5,7 +5,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from orthocas.errors import RobotError
-from orthocas.robots.mjcf_schema import DEFAULTS, KNOWN, ORIENTATIONS, SECTIONS
+from orthocas.robots.mjcf_schema import ACTUATORS, DEFAULTS, KNOWN, ORIENTATIONS, SECTIONS
 from orthocas.robots.xml_files import MOST_DEPTH, MOST_ELEMENTS, read_xml
 from orthocas.robots.xml_values import Attributes
 
@@ -62,7 +62,7 @@ class Document:
         """
         label = self.label(element, body)
         name = self.known_class(element.get("class", childclass), label)
-        values = _over(self._classes[name].get(element.tag, {}), _own(element, label))
+        values = _over(self._classes[name].get(_kind(element.tag), {}), _own(element, label))
         return Attributes(label.file, label.element, values)
 
     def known_class(self, name: str, label: Attributes) -> str:
@@ -115,13 +115,19 @@ class Document:
         settings = {tag: dict(values) for tag, values in inherited.items()}
         for child in section:
             if child.tag != "default":
-                settings[child.tag] = _over(settings.get(child.tag, {}), _own(child, self.label(child)))
+                kind = _kind(child.tag)
+                settings[kind] = _over(settings.get(kind, {}), _own(child, self.label(child)))
         self._classes[name] = settings
         for child in section.findall("default"):
             inner = self.label(child).text("class")
             if inner in self._classes:
                 raise self.label(child).error(f"defines class '{inner}' a second time")
             self._define(child, inner, settings)
+
+
+def _kind(tag: str) -> str:
+    """The name under which a default class keeps the settings of an element."""
+    return "general" if tag in ACTUATORS else tag
 
 
 def _own(element: Element, label: Attributes) -> dict[str, str]:

@@ -16,6 +16,11 @@ SECTIONS = _words(
     statistic tendon visual worldbody"""
 )
 
+#: Actuators. They share one default per class, whichever of these elements sets it.
+ACTUATORS = _words(
+    "adhesion cylinder damper dcmotor general intvelocity motor muscle orientation plugin position velocity"
+)
+
 #: Elements of a default class.
 DEFAULTS = _words(
     """adhesion camera cylinder damper dcmotor default equality general geom intvelocity joint light material mesh motor

@@ -38,8 +38,8 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         armatures=np.array([model.armature[model.joints[i].idx_v] for i in bodies]),
         lower=_limits(model, model.lowerPositionLimit, continuous, -np.inf),
         upper=_limits(model, model.upperPositionLimit, continuous, np.inf),
-        effort_limits=_largest(model, model.effortLimit),
-        velocity_limits=_largest(model, model.velocityLimit),
+        effort_limits=_largest(model, "effort", model.effortLimit),
+        velocity_limits=_largest(model, "velocity", model.velocityLimit),
         tip_name=tip,
         tip_parent=carrier - 1,
         tip_rotation=snap(turns[carrier].T @ frame.placement.rotation),
@@ -102,7 +102,14 @@ def _limits(model: pin.Model, limits: Array, continuous: list[bool], unlimited: 
     return np.array([unlimited if abs(value) > _UNLIMITED else value for value in values])
 
 
-def _largest(model: pin.Model, limits: Array) -> Array:
-    """Limits of effort or velocity, one per joint. 0 means no limit: many files use it as a placeholder."""
+def _largest(model: pin.Model, what: str, limits: Array) -> Array:
+    """Limits of effort or velocity, one per joint. 0 means no limit: many files use it as a placeholder.
+
+    Raises:
+        RobotError: if a limit is negative or NaN. The message names the joint.
+    """
     values = np.array([limits[joint.idx_v] for joint in model.joints[1:]])
+    for name, value in zip(list(model.names)[1:], values, strict=True):
+        if not value >= 0:
+            raise RobotError(f"joint '{name}' has the {what} limit {value:g}, expected a number >= 0 (0: unlimited)")
     return np.where((values > 0) & (values < _UNLIMITED), values, np.inf)

@@ -17,6 +17,7 @@ from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots import dynamics, files, kinematics, planar
 from orthocas.robots.homes import model_states, postures, srdf_states
 from orthocas.robots.mjcf import model_from_mjcf
+from orthocas.robots.payload import PAYLOAD, with_payload
 from orthocas.robots.pinocchio_model import frame_index, tree_from_model
 from orthocas.robots.tool import with_tool
 from orthocas.robots.tree import KinematicTree
@@ -134,6 +135,18 @@ class Robot(Shown):
         """
         return type(self)(with_tool(self.tree, tool), self.homes)
 
+    def with_payload(self, payload: ArrayLike) -> Self:
+        """The same robot carrying a load that is fixed to the tip.
+
+        Args:
+            payload: mass [kg] of a point at the tip, (4,) with the centre of mass in the tip frame [m], or (10,) also
+                with the inertia about that centre, in axes of the tip frame: Ixx, Ixy, Ixz, Iyy, Iyz, Izz [kg m^2].
+
+        Raises:
+            InvalidValueError: if the payload has another form, a negative mass, or an indefinite inertia.
+        """
+        return type(self)(with_payload(self.tree, payload), self.homes)
+
     def home(self, name: str) -> Array:
         """A named posture (n,) of the robot's files.
 
@@ -181,7 +194,7 @@ class Robot(Shown):
         return self.tree.velocity_limits
 
     def facts(self) -> dict[str, str]:
-        """Joints, limits, tip and mass."""
+        """Joints, limits, tip and mass. Limits of effort and velocity are left out if the file has none."""
         tree = self.tree
         sliding = [name for name, slides in zip(tree.joint_names, tree.prismatic, strict=True) if slides]
         return {
@@ -190,6 +203,8 @@ class Robot(Shown):
             **({"prismatic": listed(sliding)} if sliding else {}),
             "lower": number_list(self.lower),
             "upper": number_list(self.upper),
+            **({"effort": number_list(self.effort_limits)} if np.isfinite(self.effort_limits).any() else {}),
+            **({"velocity": number_list(self.velocity_limits)} if np.isfinite(self.velocity_limits).any() else {}),
         }
 
     def mass_matrix(self, q: Any) -> Any:
@@ -237,6 +252,9 @@ class Robot(Shown):
     def function(self, name: str) -> ca.Function:
         """The CasADi function behind a method, for code generation and larger graphs.
 
+        `mass_matrix`, `gravity`, `bias` and `coriolis_product` also exist as `mass_matrix_with_payload` and so on, with
+        the ten numbers of `with_payload` as a further argument.
+
         Raises:
             UnknownNameError: if there is no such function.
         """
@@ -253,7 +271,7 @@ class Robot(Shown):
 
     def _built_function(self, name: str) -> ca.Function:
         names, expression = _FUNCTIONS[name]
-        arguments = [ca.SX.sym(argument, self.n) for argument in names]
+        arguments = [ca.SX.sym(argument, PAYLOAD if argument == "payload" else self.n) for argument in names]
         return dense_function(name, arguments, [expression(self.tree, *arguments)], names)
 
     def _call(self, name: str, *arguments: Any) -> Any:
@@ -291,5 +309,15 @@ _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {  # argum
         lambda tree, q, dq, tau: dynamics.forward_dynamics(tree, q, dq, tau, tree.gravity),
     ),
     "coriolis_product": (("q", "v", "w"), dynamics.coriolis_product),
+    "mass_matrix_with_payload": (("q", "payload"), dynamics.mass_matrix),
+    "gravity_with_payload": (
+        ("q", "payload"),
+        lambda tree, q, payload: dynamics.bias(tree, q, ca.SX(tree.n, 1), tree.gravity, payload),
+    ),
+    "bias_with_payload": (
+        ("q", "dq", "payload"),
+        lambda tree, q, dq, payload: dynamics.bias(tree, q, dq, tree.gravity, payload),
+    ),
+    "coriolis_product_with_payload": (("q", "v", "w", "payload"), dynamics.coriolis_product),
 }
 _MATRICES = ("mass_matrix", "tip_rotation", "tip_jacobian")

@@ -11,7 +11,7 @@ _WITH_AXIS = ("revolute", "continuous", "prismatic")
 
 
 def check_urdf(path: str | Path, root: ElementTree.Element) -> None:
-    """Refuse joints with a zero axis, joints in loops, and files with more links than any robot has.
+    """Refuse zero axes, negative limits of effort and velocity, loops of joints, and more links than any robot has.
 
     Pinocchio's parser checks lengths of vectors, numbers and limits.
 
@@ -25,7 +25,26 @@ def check_urdf(path: str | Path, root: ElementTree.Element) -> None:
         axis = joint.find("axis")
         if axis is not None and joint.get("type") in _WITH_AXIS:
             Attributes(str(path), f"<axis> of joint '{joint.get('name')}'", axis.attrib).direction("xyz")
+        _require_limits(path, joint)
     _require_tree(path, root)
+
+
+def _require_limits(path: str | Path, joint: ElementTree.Element) -> None:
+    """Limits of effort and velocity are not negative; Pinocchio's parser refuses some, and names no joint."""
+    limit = joint.find("limit")
+    label = f"<limit> of joint '{joint.get('name')}'"
+    for what in ("effort", "velocity"):
+        text = "" if limit is None else limit.get(what, "")
+        if _is_negative(text):
+            raise RobotError(f"{path}: {what} of {label} is '{text[:80]}', expected a number >= 0 (0: unlimited)")
+
+
+def _is_negative(text: str) -> bool:
+    """Whether a text is a number below 0; whether it is a number at all is left to Pinocchio's parser."""
+    try:
+        return float(text) < 0
+    except ValueError:
+        return False
 
 
 def _require_tree(path: str | Path, root: ElementTree.Element) -> None:

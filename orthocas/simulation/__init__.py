@@ -2,7 +2,9 @@
 
 from orthocas.simulation.breakdown import Breakdown, task_acceleration_breakdown
 from orthocas.simulation.coupling import Coupling, coupling_index
-from orthocas.simulation.disturbances import Friction, Noise, Push
+from orthocas.simulation.disturbances import Friction, Noise, Push, Stops
+from orthocas.simulation.mujoco_plant import MuJoCoPlant
+from orthocas.simulation.mujoco_scene import MuJoCo, Payload, Wall
 from orthocas.simulation.run import simulate
 from orthocas.simulation.trajectory import Outcome, Trajectory
 
@@ -10,10 +12,15 @@ __all__ = [
     "Breakdown",
     "Coupling",
     "Friction",
+    "MuJoCo",
+    "MuJoCoPlant",
     "Noise",
     "Outcome",
+    "Payload",
     "Push",
+    "Stops",
     "Trajectory",
+    "Wall",
     "coupling_index",
     "simulate",
     "task_acceleration_breakdown",

@@ -15,7 +15,8 @@ from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.errors import SimulationError
 from orthocas.robots import Robot
-from orthocas.simulation.disturbances import Friction
+from orthocas.simulation.disturbances import Friction, Stops
+from orthocas.simulation.loads import Loads
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +26,8 @@ class ClosedLoop:
     controller: Controller
     plant: Robot  #: the true robot, which may differ from the controller's model
     friction: Friction
+    loads: Loads
+    stops: Stops | None = None
 
     @property
     def n(self) -> int:
@@ -38,19 +41,21 @@ class ClosedLoop:
 
     @property
     def stiff(self) -> bool:
-        """Whether friction makes an implicit method necessary."""
-        return bool(np.any(np.asarray(self.friction.coulomb)))
+        """Whether friction or stops make an implicit method necessary."""
+        return self.stops is not None or bool(np.any(np.asarray(self.friction.coulomb)))
 
     @cached_property
     def plant_rate(self) -> ca.Function:
-        """state, command (n, 1), load (3 + n, 1) -> rate of the state."""
+        """state, command (n, 1), load (`Loads.size`, 1) -> rate of the state."""
         n = self.n
         q, dq, command, load = (
-            ca.SX.sym(name, size) for name, size in (("q", n), ("dq", n), ("u", n), ("load", 3 + n))
+            ca.SX.sym(name, size) for name, size in (("q", n), ("dq", n), ("u", n), ("load", self.loads.size))
         )
         if not self.torque:
             return ca.Function("plant", [q, command, load], [command])
-        external = self.plant.tip_jacobian(q)[:3, :].T @ load[:3] + load[3:]
+        external = self.loads.joint_torques(q, load)
+        if self.stops is not None:
+            external += self.stops.torque(self.plant.tree, q, dq)
         ddq = self.plant.forward_dynamics(q, dq, command + external - self.friction.torque(dq))
         return ca.Function("plant", [ca.vertcat(q, dq), command, load], [ca.vertcat(dq, ddq)])
 
@@ -65,7 +70,7 @@ class ClosedLoop:
         """state, time since the start of a segment, parameters of the segment, load -> rate of the state."""
         state = ca.MX.sym("state", self.plant_rate.size1_in(0))
         t, parameters = ca.MX.sym("t"), ca.MX.sym("parameters", reference.profile.size1_in(1))
-        load = ca.MX.sym("load", 3 + self.n)
+        load = ca.MX.sym("load", self.loads.size)
         command, _ = self.commanded(state, reference.profile.call([t, parameters]))
         rate = ca.Function("rate", [state, t, parameters, load], [self.plant_rate(state, command, load)])
         return scalar_code(rate) if self.controller.function.is_a("SXFunction") else rate

@@ -11,7 +11,7 @@ from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.simulation.closed_loop import ClosedLoop, Piece, cvodes_options, run_compiled
-from orthocas.simulation.disturbances import Push, loads_at
+from orthocas.simulation.disturbances import Push
 
 _OUTPUTS = 25  # instants per integrator call: one integrator serves all calls, and Ctrl-C waits for one call at most
 
@@ -19,9 +19,7 @@ _OUTPUTS = 25  # instants per integrator call: one integrator serves all calls, 
 _SAME = 1e-9  # [s]: events closer than this differ only by rounding
 
 
-def integrate(
-    loop: ClosedLoop, reference: Reference, pushes: tuple[Push, ...], start: Array, step: float, tolerance: float
-) -> Iterator[Piece]:
+def integrate(loop: ClosedLoop, reference: Reference, start: Array, step: float, tolerance: float) -> Iterator[Piece]:
     """Yield pieces of 25 instants, from just after the start to the end of the reference.
 
     Raises:
@@ -30,9 +28,9 @@ def integrate(
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         run = _integrator(loop, reference, tolerance)
     state = start
-    for begin, end in _pieces(reference, pushes, step * _OUTPUTS):
+    for begin, end in _pieces(reference, loop.loads.pushes, step * _OUTPUTS):
         middle = np.array([(begin + end) / 2])
-        segment, load = int(reference.segment(middle)[0]), loads_at(pushes, middle, loop.n)[0]
+        segment, load = int(reference.segment(middle)[0]), loop.loads.at(middle)[0]
         since = begin - reference.times[segment]
         p = np.concatenate([[end - begin, since], reference.parameters[segment], load])
         states = np.asarray(run_compiled(run, x0=ca.DM(state), p=ca.DM(p))["xf"]).T

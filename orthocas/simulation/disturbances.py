@@ -7,8 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.checks import Array, as_float_array, frozen_array, require_count, require_shape
-from orthocas.control.gains import non_negative_gains
+from orthocas.control.gains import non_negative_gains, positive_gains
 from orthocas.errors import InvalidValueError
+from orthocas.robots import KinematicTree
+from orthocas.simulation.places import Link, require_link
 
 _STICTION_SPEED = 0.01  # [rad/s] or [m/s]: above twice this speed, Coulomb friction is nearly at its full value
 
@@ -20,17 +22,28 @@ class Push:
     Args:
         start: [s], >= 0.
         duration: [s], > 0.
-        force: at the tip, in world axes, (3,) [N]; default no force.
+        force: in world axes, (3,) [N]; default no force.
         torque: at the joints, (n,) [N m] or [N]; default no torque.
+        link: where the force acts: a link, by the name or the index of the joint that moves it; default the tip.
+        point: where on the link, in its frame, or in that of the tip, (3,) [m]. Frames of links are those of
+            `Robot.tree`: the origin is on the joint's axis, which is z.
     """
 
     start: float
     duration: float
     force: Array
     torque: Array | None
+    link: Link
+    point: Array
 
     def __init__(
-        self, start: float, duration: float, force: ArrayLike = (0.0, 0.0, 0.0), torque: ArrayLike | None = None
+        self,
+        start: float,
+        duration: float,
+        force: ArrayLike = (0.0, 0.0, 0.0),
+        torque: ArrayLike | None = None,
+        link: Link = None,
+        point: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
         for name, value, want in (("start", start, ">= 0"), ("duration", duration, "> 0")):
             number = as_float_array(f"{name} of a push", value)
@@ -41,6 +54,9 @@ class Push:
         object.__setattr__(self, "duration", float(duration))
         object.__setattr__(self, "force", frozen_array("force", force, (3,)))
         object.__setattr__(self, "torque", None if torque is None else frozen_array("torque", torque, (None,)))
+        require_link(link)
+        object.__setattr__(self, "link", link)
+        object.__setattr__(self, "point", frozen_array("point", point, (3,)))
 
     @property
     def end(self) -> float:
@@ -52,23 +68,6 @@ class Push:
         torque = np.zeros(n) if self.torque is None else self.torque
         require_shape("torque of a push", torque.shape, (n,))
         return np.concatenate([self.force, torque])
-
-
-def loads_at(pushes: tuple[Push, ...], times: Array, n: int) -> Array:
-    """Sum of the loads at times (N,), (N, 3 + n). A push acts from its start until just before its end."""
-    loads = np.zeros((len(times), 3 + n))
-    for push in pushes:
-        loads[(times >= push.start) & (times < push.end)] += push.load(n)
-    return loads
-
-
-def mean_loads(pushes: tuple[Push, ...], starts: Array, length: float, n: int) -> Array:
-    """Mean loads over time intervals of equal length, (N, 3 + n), so that a short push keeps its impulse."""
-    loads = np.zeros((len(starts), 3 + n))
-    for push in pushes:
-        overlap = np.minimum(starts + length, push.end) - np.maximum(starts, push.start)
-        loads += np.maximum(overlap, 0.0)[:, None] / length * push.load(n)
-    return loads
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +88,33 @@ class Friction:
         coulomb = ca.DM(non_negative_gains("coulomb", self.coulomb, dq.shape[0]))
         friction: ca.SX = viscous * dq + coulomb * ca.tanh(dq / _STICTION_SPEED)
         return friction
+
+
+@dataclass(frozen=True, eq=False)
+class Stops:
+    """Joint stops tau_s = -stiffness p max(0, 1 + damping dp/dt), where p is how far a joint is beyond its limit.
+
+    The damping grows with p, as in the contact model of Hunt and Crossley, so the torque is continuous and never pulls.
+
+    Args:
+        stiffness: > 0, (n,) or one number [N m/rad] or [N/m].
+        damping: >= 0, (n,) or one number [s/rad] or [s/m].
+    """
+
+    stiffness: ArrayLike = 2e4
+    damping: ArrayLike = 1.0
+
+    def torque(self, tree: KinematicTree, q: ca.SX, dq: ca.SX) -> ca.SX:
+        """Torque of the stops on the joints, (n, 1)."""
+        stiffness = positive_gains("stiffness of stops", self.stiffness, tree.n)
+        damping = non_negative_gains("damping of stops", self.damping, tree.n)
+        torque = ca.SX(tree.n, 1)
+        for i in range(tree.n):
+            for limit, side in ((tree.lower[i], -1.0), (tree.upper[i], 1.0)):
+                if np.isfinite(limit):
+                    beyond = ca.fmax(0, side * (q[i] - limit))
+                    torque[i] -= side * stiffness[i] * beyond * ca.fmax(0, 1 + side * damping[i] * dq[i])
+        return torque
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from orthocas.checks import Array
-from orthocas.control.status import ControlStatus
+from orthocas.control.status import FROM_THE_LAW, ControlStatus
 from orthocas.problem import Problem
 from orthocas.simulation.trajectory import Trajectory
 
@@ -57,7 +57,7 @@ def trajectory_figure(trajectory: Trajectory, units: Mapping[str, str] | None = 
 
 def draw_quantities(panels: Array, trajectory: Trajectory, units: Mapping[str, str], drawn: bool = True) -> None:
     """Draw the reference and, if `drawn`, the actual value of each quantity in its own axes."""
-    good = (trajectory.status == ControlStatus.OK) & np.isfinite(trajectory.value).all(axis=1)
+    good = ~trajectory.fell_back & np.isfinite(trajectory.value).all(axis=1)
     seen = np.vstack(
         [trajectory.value[good], trajectory.reference]
     )  # chart coordinates are meaningless outside the domain
@@ -79,7 +79,7 @@ def shade_fallback(axes: Axes, trajectory: Trajectory) -> None:
     edges = np.flatnonzero(np.diff(trajectory.status)) + 1
     for start, end in zip([0, *edges], [*edges, len(trajectory.times) - 1], strict=True):
         status = ControlStatus(int(trajectory.status[start]))
-        if status is not ControlStatus.OK:
+        if status not in FROM_THE_LAW:
             axes.axvspan(trajectory.times[start], trajectory.times[end], color=FALLBACK, alpha=0.15, linewidth=0)
 
 
@@ -96,7 +96,7 @@ def _draw_others(panels: Array, trajectory: Trajectory, units: Mapping[str, str]
     panels[1].plot(trajectory.times, trajectory.command, linewidth=1.3)
     panels[1].set_ylabel(f"torque [{force}]" if torque else f"velocity [{speed}]", fontsize=9)
     if torque:
-        storage = np.where(trajectory.status == ControlStatus.OK, trajectory.storage, np.nan)
+        storage = np.where(trajectory.fell_back, np.nan, trajectory.storage)
         panels[2].plot(trajectory.times, storage, color=_STORAGE, linewidth=1.3)
         panels[2].set_ylabel("storage V [J]", fontsize=9)
     for axes in panels:
@@ -114,7 +114,7 @@ def _title(trajectory: Trajectory) -> str:
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
         text += f": {trajectory.outcome.value}, run ended early"
-    reasons = {ControlStatus(int(status)) for status in np.unique(trajectory.status)} - {ControlStatus.OK}
+    reasons = {ControlStatus(int(status)) for status in np.unique(trajectory.status)} - {*FROM_THE_LAW}
     if reasons:
         text += "\nred: fallback, " + ", ".join(reason.name.lower().replace("_", " ") for reason in sorted(reasons))
     return text

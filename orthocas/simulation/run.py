@@ -1,26 +1,27 @@
 """`simulate`: runs a controller, a reference and a robot in closed loop."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched
-from orthocas.checks import Array, as_number, as_point, require_kind
-from orthocas.control.controller import Controller, require_controller
+from orthocas.checks import Array, as_number, as_point
+from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
 from orthocas.minimising.watch import Monitor, Progress, silent
-from orthocas.robots import Robot
 from orthocas.simulation.closed_loop import ClosedLoop, Piece
 from orthocas.simulation.continuous import integrate
-from orthocas.simulation.disturbances import Friction, Noise, Push
+from orthocas.simulation.disturbances import Friction, Noise, Push, Stops
+from orthocas.simulation.loads import Loads
+from orthocas.simulation.physics import run_physics
+from orthocas.simulation.run_checks import Plant, plant_of, require_fitting, require_kinds
 from orthocas.simulation.sampled import run_ticks
 from orthocas.simulation.trajectory import Outcome, Trajectory
 
 TOLERANCE = 1e-8  #: relative and absolute, of CVODES
-
-_MOST_TICKS = 1e7  # of a sampled run
 
 
 def simulate(
@@ -31,18 +32,20 @@ def simulate(
     dq_start: ArrayLike | None = None,
     step: float = 0.01,
     control_rate: float | None = None,
-    plant: Robot | None = None,
+    plant: Plant = None,
     pushes: Sequence[Push] = (),
     friction: Friction | None = None,
+    stops: Stops | None = None,
     noise: Noise | None = None,
     must_be_reachable: bool = True,
     tolerance: float = TOLERANCE,
     monitor: Monitor = silent,
 ) -> Trajectory:
-    """Simulate a closed loop with SUNDIALS (CVODES) for the duration of the reference.
+    """Simulate a closed loop for the duration of the reference, with SUNDIALS (CVODES) or with MuJoCo.
 
     With a torque controller, the robot obeys M ddq + C dq + g = tau + loads - friction ([AS2023] eq. (26)). With a
-    velocity controller it follows its commands perfectly, dq = command.
+    velocity controller it follows its commands perfectly, dq = command. In MuJoCo, joints also stop at their limits,
+    motors saturate at the robot's limits of effort, and the tip may touch a wall.
 
     Args:
         controller: see `orthocas.control`.
@@ -52,9 +55,11 @@ def simulate(
         step: longest time between two instants of the result [s].
         control_rate: ticks per second of a sampled controller, which holds its command between ticks. The instants of
             the result are then the ticks. Default: a controller in continuous time.
-        plant: the true robot, for example `robot.with_scaled_masses(1.1)`; default the controller's model.
-        pushes: external loads.
+        plant: the true robot, for example `robot.with_scaled_masses(1.1)`; default the controller's model. Or "mujoco",
+            or `MuJoCo(robot, ...)`: the robot in MuJoCo, for sampled torque controllers (extra `orthocas[sim]`).
+        pushes: external loads, at the tip, at links or at joints.
         friction: friction in the joints.
+        stops: joint stops for CVODES; default none. For torque controllers only. MuJoCo has its own.
         noise: noise on the measurements of a sampled controller.
         must_be_reachable: whether to raise an error, before the run, if the reference leaves the domain.
         tolerance: relative and absolute tolerance of CVODES.
@@ -65,7 +70,8 @@ def simulate(
 
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.
-        ShapeError, InvalidValueError: for arguments of the wrong shape, value or type.
+        MissingExtraError: if MuJoCo is the plant and not installed.
+        ShapeError, InvalidValueError, UnknownNameError: for arguments of the wrong shape, value or type.
         Interrupted: after Ctrl-C; its `result` is the trajectory up to there, with outcome INTERRUPTED.
 
     Example:
@@ -80,8 +86,9 @@ def simulate(
         >>> trajectory.outcome.value, bool(abs(trajectory.value - trajectory.reference).max() < 0.01)
         ('complete', True)
     """
-    _require_kinds(controller, reference, plant, pushes, friction, noise)
-    loop = ClosedLoop(controller, plant or controller.problem.robot, friction or Friction())
+    require_kinds(controller, reference, pushes, {Friction: friction, Stops: stops, Noise: noise})
+    robot, scene = plant_of(plant, controller)
+    loop = ClosedLoop(controller, robot, friction or Friction(), Loads(robot.tree, pushes), stops)
     for name, value in (
         ("step", step),
         ("tolerance", tolerance),
@@ -89,18 +96,17 @@ def simulate(
     ):
         if not 0 < as_number(name, value) < np.inf:
             raise InvalidValueError(name, value, "a finite number > 0")
-    _require_fitting(loop, reference, tuple(pushes), friction, noise, control_rate)
+    require_fitting(loop, reference, friction, noise, control_rate, scene is not None)
     start = _start_state(loop, q_start, dq_start)
     if must_be_reachable:
         controller.require_reachable(reference, start[: loop.n])
-    loads = tuple(pushes)
     pieces: list[Piece] = []
     outcome = Outcome.COMPLETE
-    running = (
-        integrate(loop, reference, loads, start, step, tolerance)
-        if control_rate is None
-        else run_ticks(loop, reference, loads, start, control_rate, noise or Noise(), tolerance)
-    )
+    if control_rate is None:
+        running = integrate(loop, reference, start, step, tolerance)
+    else:
+        ticks = partial(run_physics, scene=scene) if scene else partial(run_ticks, tolerance=tolerance)
+        running = ticks(loop, reference, start, control_rate, noise or Noise())
     try:
         for piece in running:
             pieces.append(piece)
@@ -118,25 +124,6 @@ def simulate(
     return run
 
 
-def _require_kinds(
-    controller: Controller,
-    reference: Reference,
-    plant: Robot | None,
-    pushes: Sequence[Push],
-    friction: Friction | None,
-    noise: Noise | None,
-) -> None:
-    """Raise InvalidValueError for objects of the wrong class."""
-    require_controller(controller)
-    require_kind("reference", reference, Reference)
-    for name, value, kind in (("plant", plant, Robot), ("friction", friction, Friction), ("noise", noise, Noise)):
-        if value is not None:
-            require_kind(name, value, kind)
-    require_kind("pushes", pushes, Sequence)
-    for push in pushes:
-        require_kind("an entry of pushes", push, Push)
-
-
 def _progress(name: str, time: float, duration: float) -> Progress:
     return Progress(f"simulate {name}", time / duration, f"{time:.1f} s")
 
@@ -150,41 +137,6 @@ def _start_state(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | Non
             )
         return q
     return np.concatenate([q, np.zeros(loop.n) if dq_start is None else as_point("dq_start", dq_start, loop.n)])
-
-
-def _require_fitting(
-    loop: ClosedLoop,
-    reference: Reference,
-    pushes: Sequence[Push],
-    friction: Friction | None,
-    noise: Noise | None,
-    control_rate: float | None,
-) -> None:
-    """Raise InvalidValueError for arguments that would be ignored, or fail later with a less clear message."""
-    controller = loop.controller
-    if reference.labels != controller.labels:
-        raise InvalidValueError(
-            "labels of the reference", reference.labels, f"those of the controller {controller.labels}"
-        )
-    if loop.n != controller.problem.n:
-        raise InvalidValueError("joints of the plant", loop.n, f"{controller.problem.n}, as in the controller's robot")
-    if not loop.torque and (pushes or friction is not None or loop.plant is not controller.problem.robot):
-        raise InvalidValueError(
-            "pushes, friction or plant", "given", "none of them, because forces do not affect a velocity controller"
-        )
-    late = [push.start for push in pushes if push.start >= reference.duration]
-    if late:
-        raise InvalidValueError("start of a push", late[0], f"a time before the end at {reference.duration:g} s")
-    if control_rate is not None and as_number("control_rate", control_rate) * reference.duration < 1:
-        raise InvalidValueError("control_rate", control_rate, f"at least one tick in {reference.duration:g} s")
-    if control_rate is not None and as_number("control_rate", control_rate) * reference.duration > _MOST_TICKS:
-        raise InvalidValueError(
-            "control_rate", control_rate, f"at most {_MOST_TICKS:g} ticks in {reference.duration:g} s"
-        )
-    if noise is not None and control_rate is None:
-        raise InvalidValueError(
-            "noise", noise, "no noise without control_rate, because white noise needs control ticks"
-        )
 
 
 def _trajectory(

@@ -9,7 +9,7 @@ from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.simulation.closed_loop import ClosedLoop, Piece, cvodes_options, run_compiled
-from orthocas.simulation.disturbances import Noise, Push, mean_loads
+from orthocas.simulation.disturbances import Noise
 
 _TICKS = 50  # ticks per integrator call
 
@@ -17,7 +17,6 @@ _TICKS = 50  # ticks per integrator call
 def run_ticks(
     loop: ClosedLoop,
     reference: Reference,
-    pushes: tuple[Push, ...],
     start: Array,
     rate: float,
     noise: Noise,
@@ -33,7 +32,7 @@ def run_ticks(
     columns = (
         np.hstack(reference.sample(times)),
         noise.sample(ticks, loop.n)[:, : loop.plant_rate.size1_in(0)],
-        mean_loads(pushes, times, 1 / rate, loop.n),
+        loop.loads.mean(times, 1 / rate),
     )
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         run = _tick(loop, 1 / rate, len(reference.labels), tolerance).mapaccum(_TICKS)
@@ -55,7 +54,7 @@ def _filled(rows: Array) -> Array:
 def _tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Function:
     """state, reference with derivatives (3 k, 1), noise, load -> state after the tick, command, status."""
     size = loop.plant_rate.size1_in(0)
-    x, u, w = ca.SX.sym("x", size), ca.SX.sym("u", loop.n), ca.SX.sym("load", 3 + loop.n)
+    x, u, w = ca.SX.sym("x", size), ca.SX.sym("u", loop.n), ca.SX.sym("load", loop.loads.size)
     plant = ca.integrator(
         "plant",
         "cvodes",
@@ -65,7 +64,7 @@ def _tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Funct
         cvodes_options(tolerance, loop.stiff),
     )
     state, reference = ca.MX.sym("state", size), ca.MX.sym("reference", 3 * k)
-    noise, load = ca.MX.sym("noise", size), ca.MX.sym("load", 3 + loop.n)
+    noise, load = ca.MX.sym("noise", size), ca.MX.sym("load", loop.loads.size)
     command, status = loop.commanded(state + noise, (reference[:k], reference[k : 2 * k], reference[2 * k :]))
     end = plant(x0=state, p=ca.vertcat(command, load))["xf"]
     return ca.Function("tick", [state, reference, noise, load], [end, command, status])

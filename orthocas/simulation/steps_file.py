@@ -15,6 +15,7 @@ from orthocas.simulation.disturbances import Push
 from orthocas.simulation.strict_json import Reader
 
 _MOST_INSTANTS = 1e6
+_LONGEST = 200  # most characters of the names of joints in an error
 _SHORTEST = 1e-3  # time between points, and length of a run or a push [s]
 _WITH_STEPS = ("steps", "duration", "start", "natural_frequency", "damping_ratio", "pushes")
 _WITH_POINTS = ("points", "start", "pushes")
@@ -56,7 +57,7 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
             raise reader.fault(
                 f"the run needs {instants:.3g} instants to show every swing, expected at most {_MOST_INSTANTS:g}"
             )
-        pushes = _pushes(reader, data.get("pushes", []), chart.n, reference.duration)
+        pushes = _pushes(reader, data.get("pushes", []), chart.problem.robot.joint_names, reference.duration)
     except StepsFileError:
         raise
     except OrthocasError as error:
@@ -108,18 +109,33 @@ def _change(reader: Reader, data: object, where: str, before: Mapping[str, float
     return reader.number(entry.get("time"), f"{where}.time", least=0.0), targets
 
 
-def _pushes(reader: Reader, data: object, n: int, run_ends: float) -> tuple[Push, ...]:
+def _pushes(reader: Reader, data: object, joint_names: tuple[str, ...], run_ends: float) -> tuple[Push, ...]:
     pushes = []
     for k, item in enumerate(reader.items(data, "pushes")):
         where = f"pushes[{k}]"
-        entry = reader.fields(item, where, ("start", "duration", "force", "torque"))
+        entry = reader.fields(item, where, ("start", "duration", "force", "torque", "link", "point"))
         if not entry.keys() & {"force", "torque"}:
-            raise reader.wrong(where, entry, "a 'force' at the tip or a 'torque' at the joints")
+            raise reader.wrong(where, entry, "a 'force' at the tip or a link, or a 'torque' at the joints")
         start = reader.number(entry.get("start"), f"{where}.start", least=0.0)
         if start >= run_ends:
             raise reader.wrong(f"{where}.start", start, f"below the end of the run at {run_ends:g}")
         duration = reader.number(entry.get("duration"), f"{where}.duration", least=_SHORTEST)
         force = reader.numbers(entry.get("force", [0.0] * 3), f"{where}.force", 3)
-        torque = reader.numbers(entry.get("torque", [0.0] * n), f"{where}.torque", n)
-        pushes.append(Push(start, duration, force, torque))
+        torque = reader.numbers(entry.get("torque", [0.0] * len(joint_names)), f"{where}.torque", len(joint_names))
+        pushes.append(Push(start, duration, force, torque, *_place(reader, entry, where, joint_names)))
     return tuple(pushes)
+
+
+def _place(
+    reader: Reader, entry: Mapping[str, Any], where: str, joint_names: tuple[str, ...]
+) -> tuple[str | int | None, Array]:
+    """Where the force of a push acts: a link (None: the tip), and a point (3,) in its frame."""
+    for key in ("link", "point"):
+        if key in entry and "force" not in entry:
+            raise reader.fault(f"{where} has a '{key}' but no 'force', expected both or none of them")
+    link = entry.get("link")
+    whole = isinstance(link, int) and not isinstance(link, bool) and 0 <= link < len(joint_names)
+    if "link" in entry and not whole and link not in joint_names:
+        names = ", ".join(joint_names)[:_LONGEST]
+        raise reader.wrong(f"{where}.link", link, f"the index of a joint from 0, or a name: {names}")
+    return link, reader.numbers(entry.get("point", [0.0] * 3), f"{where}.point", 3)

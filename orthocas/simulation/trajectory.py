@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import cumulative_simpson
 
 from orthocas.checks import Array, as_float_array, as_path, frozen_indices, require_known, require_shape, require_text
-from orthocas.control.status import ControlStatus
+from orthocas.control.status import FROM_THE_LAW, ControlStatus
 from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
 from orthocas.files.atomic import published, require_writable
 from orthocas.files.json import part
@@ -80,6 +81,16 @@ class Trajectory(Shown):
         return np.asarray(self.storage - self.storage[0] + lost)
 
     @property
+    def fell_back(self) -> NDArray[np.bool_]:
+        """Where the command was the fallback instead of the law's, (N,)."""
+        return ~np.isin(self.status, FROM_THE_LAW)
+
+    @property
+    def saturated(self) -> NDArray[np.bool_]:
+        """Where the limit cut the command of the law, (N,)."""
+        return np.asarray(self.status == ControlStatus.SATURATED)
+
+    @property
     def storage_rise(self) -> float:
         """Largest rise of V above an earlier value [J]; 0 for a passive controller and a reference at rest."""
         return float((self.storage - np.minimum.accumulate(self.storage)).max())
@@ -92,13 +103,14 @@ class Trajectory(Shown):
     def facts(self) -> dict[str, str]:
         """Outcome, errors, commands, and whether the controller used its fallback."""
         errors = zip(self.labels, self.tracking_error, strict=True)
-        bad = np.count_nonzero(self.status)
+        bad, cut = np.count_nonzero(self.fell_back), np.count_nonzero(self.saturated)
         facts = {
             "run": f"{self.controller}, {self.times[-1]:.4g} s: {self.outcome.value}",
             "instants": f"{len(self.times)} of {self.q.shape[1]} joints",
             "largest error": listed(f"{label} {error:.3g}" for label, error in errors),
             f"largest {self.kind}": number_list(np.abs(self.command).max(axis=0)),
             "fallback": f"at {bad} instants" if bad else "never",
+            "limit reached": f"at {cut} instants" if cut else "never",
         }
         return facts if np.isnan(self.storage).any() else facts | {"storage rise": f"{self.storage_rise:.3g} J"}
 

@@ -75,7 +75,7 @@ static void random_position(double *q, int near_singular) {
 static int status_is_right(int status, const double *q, int numbers) {
   if (!numbers) return status == ARM_NOT_FINITE;
   if (!inside(q)) return status == ARM_OUTSIDE_DOMAIN;
-  return status == ARM_OK || status == ARM_SINGULAR;
+  return status == ARM_OK || status == ARM_SATURATED || status == ARM_SINGULAR;
 }
 
 static int others_are_right(const double *q, const double *dq) {
@@ -97,7 +97,7 @@ static int others_are_right(const double *q, const double *dq) {
 }
 
 int main(void) {
-  long k, counts[4] = {0, 0, 0, 0};
+  long k, counts[5] = {0, 0, 0, 0, 0};
   for (k = 0; k < TICKS; ++k) {
     double q[N], dq[N], command[N];
     arm_reference reference;
@@ -120,6 +120,6 @@ int main(void) {
       if (!(fabs(command[i]) <= LIMIT)) return 2;
     if (k % 16 < 2 && !others_are_right(q, dq)) return 3;
   }
-  printf("%ld %ld %ld %ld\n", counts[0], counts[1], counts[2], counts[3]);
+  printf("%ld %ld %ld %ld %ld\n", counts[0], counts[1], counts[2], counts[3], counts[4]);
   return 0;
 }

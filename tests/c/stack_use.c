@@ -14,6 +14,7 @@
 static char stack[SIZE] __attribute__((aligned(4096)));
 static double q[N], dq[N], phi[N], vector[N], matrix[N * N];
 static arm_reference reference;
+static arm_state state;
 
 static void *nothing(void *unused) { return unused; }
 static void *mathematics(void *unused) { /* the first call of a function of libm goes through the dynamic linker */
@@ -24,6 +25,9 @@ static void *chart(void *unused) { return arm_chart(q, phi, matrix), unused; }
 static void *inverse(void *unused) { return arm_inverse(phi, q, vector), unused; }
 static void *dynamics(void *unused) { return arm_dynamics(q, dq, matrix, vector, phi), unused; }
 static void *control(void *unused) { return arm_control(q, dq, &reference, &arm_default_gains, vector), unused; }
+static void *supervised(void *unused) {
+  return arm_step(&state, &arm_default_safety, q, dq, &reference, &arm_default_gains, 1e-3, vector), unused;
+}
 
 static long used(void *(*call)(void *)) {
   pthread_t thread;
@@ -39,14 +43,15 @@ static long used(void *(*call)(void *)) {
 }
 
 int main(void) {
-  void *(*calls[])(void *) = {chart, inverse, dynamics, control};
+  void *(*calls[])(void *) = {chart, inverse, dynamics, control, supervised};
   int i;
   long empty;
   for (i = 0; i < N; ++i) q[i] = 0.1 * (i + 1);
   used(mathematics);
-  for (i = 0; i < 4; ++i) used(calls[i]);
+  arm_start(&state, q, 0);
+  for (i = 0; i < 5; ++i) used(calls[i]);
   empty = used(nothing);
-  for (i = 0; i < 4; ++i) printf("%ld ", used(calls[i]) - empty);
+  for (i = 0; i < 5; ++i) printf("%ld ", used(calls[i]) - empty);
   printf("\n");
   return 0;
 }

@@ -143,13 +143,41 @@ def _objects() -> dict[str, Any]:
         "other robot": problems.get("iiwa").robot,
         "weights": oc.Weights(),
         "push": simulation.Push(0.1, 0.1),
+        "push at a link": simulation.Push(0.1, 0.1, [1.0, 0, 0], link="q3", point=[1.0, 0, 0]),
+        "MuJoCo": simulation.MuJoCo(robot),
+        "stops": simulation.Stops(),
     }
 
 
 @cache
 def good_calls() -> dict[str, Call]:
     """What can be called, with arguments that work and take little time."""
-    return {**_makers(), **_functions(), **_methods(), **_control()}
+    return {**_makers(), **_functions(), **_methods(), **_control(), **_physics()}
+
+
+def _physics() -> dict[str, Call]:
+    """MuJoCo as plant."""
+    robot, q = planar().robot, np.array([0.3, 0.4, 0.5])
+    payload, wall = simulation.Payload(1.0), simulation.Wall([9.0, 0, 0], [-1.0, 0, 0])
+    options = {"stops": True, "effort_limits": True, "payload": payload, "wall": wall, "timestep": 1e-3}
+    return {
+        "Stops": (lambda **given: _stopped(robot, simulation.Stops(**given)), {"stiffness": 1e4, "damping": [1.0] * 3}),
+        "Payload": (simulation.Payload, {"mass": 1.0, "centre": q, "inertia": np.eye(3)}),
+        "Wall": (simulation.Wall, {"point": q, "normal": q, "tip_radius": 0.1, "size": 1.0, "time_constant": 0.01}),
+        "MuJoCo": (simulation.MuJoCo, {"robot": robot, **options}),
+        "MuJoCoPlant": (simulation.MuJoCoPlant, {"robot": robot, "friction": simulation.Friction(0.1, 0.1), **options}),
+        "plant.reset": (lambda **given: _plant(robot).reset(**given), {"q": q, "dq": q}),
+        "plant.push": (lambda **given: _plant(robot).push(**given), {"force": q, "link": 1, "point": q}),
+        "plant.step": (lambda **given: _plant(robot).step(**given), {"torque": q, "seconds": 0.01, "loads": q}),
+    }
+
+
+def _stopped(robot: oc.Robot, stops: simulation.Stops) -> ca.SX:
+    return stops.torque(robot.tree, ca.SX.sym("q", 3), ca.SX.sym("dq", 3))
+
+
+def _plant(robot: oc.Robot) -> simulation.MuJoCoPlant:
+    return simulation.MuJoCoPlant(robot)
 
 
 def _makers() -> dict[str, Call]:
@@ -321,15 +349,39 @@ def _control() -> dict[str, Call]:
     changes = [(0.1, {"x": 0.5})]
     return {
         "Impedance": (control.Impedance, {**gains, "limit": None}),
+        "Impedance with a free coordinate": (
+            control.Impedance,
+            {
+                "chart": chart,
+                "stiffness": [0.0, 50.0, 50.0],
+                "damping_stiffness": 50.0,
+                "model": control.RunTimeModel(payload=1.0),
+            },
+        ),
+        "RunTimeModel": (
+            control.RunTimeModel,
+            {"source": "own", "gravity": "law", "payload": [1.0, 0, 0, 0.1], "wrench": [0.0] * 6, "extra_torque": 0.1},
+        ),
+        "with_payload": (problem.robot.with_payload, {"payload": [1.0, 0, 0, 0, 1, 0, 0, 1, 0, 1]}),
+        "modes": (law.modes, {"q": centre}),
         "PDPlus": (control.PDPlus, {**gains, "limit": [1.0, 2.0, 3.0]}),
         "Kinematic": (control.Kinematic, {"chart": chart, "feedback": 1.0, "limit": None}),
         "Projector": (
             control.Projector,
-            {"problem": problem, "stiffness": 1.0, "posture_stiffness": 1.0, "damping_ratio": 0.7, "limit": None},
+            {
+                "problem": problem,
+                "stiffness": 1.0,
+                "posture_stiffness": 1.0,
+                "damping_ratio": 0.7,
+                "limit": None,
+                "second": chart,
+                "second_force": 1.0,
+                "feed_forward": False,
+            },
         ),
         "KinematicProjector": (
             control.KinematicProjector,
-            {"problem": problem, "feedback": 1.0, "posture_feedback": 1.0, "limit": None},
+            {"problem": problem, "feedback": 1.0, "posture_feedback": 1.0, "limit": None, "second": chart},
         ),
         "Reference.steps": (
             control.Reference.steps,
@@ -346,12 +398,28 @@ def _control() -> dict[str, Call]:
         "matched_posture_stiffness": (control.matched_posture_stiffness, {"problem": problem}),
         "law_of": (control.law_of, {"name": "impedance"}),
         "control.register": (control.register, {"law": None}),
-        "Push": (simulation.Push, {"start": 0.1, "duration": 0.1, "force": [1.0, 0, 0], "torque": [0.0, 0, 0]}),
+        "Push": (
+            simulation.Push,
+            {
+                "start": 0.1,
+                "duration": 0.1,
+                "force": [1.0, 0, 0],
+                "torque": [0.0, 0, 0],
+                "link": 1,
+                "point": [0.1, 0, 0],
+            },
+        ),
         "Friction": (simulation.Friction, {"viscous": [1.0, 1, 1], "coulomb": 0.1}),
         "Noise": (simulation.Noise, {"position": 0.1, "velocity": 0.1, "seed": 0}),
         "simulate": (
             oc.simulate,
-            {"controller": law, "reference": reference, "q_start": centre, "step": 0.1, "pushes": (), "friction": None},
+            {"controller": law, "reference": reference, "q_start": centre, "step": 0.1, "pushes": (), "friction": None}
+            | {"stops": None},
+        ),
+        "simulate in MuJoCo": (
+            oc.simulate,
+            {"controller": law, "reference": reference, "q_start": centre, "control_rate": 50.0, "plant": "mujoco"}
+            | {"pushes": [simulation.Push(0.1, 0.1, [1.0, 0, 0], link=1)], "friction": simulation.Friction(0.1, 0.1)},
         ),
         "simulate sampled": (
             oc.simulate,

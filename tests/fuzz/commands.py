@@ -46,6 +46,10 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--lock",), ("j1=0", "j1", "=", "j1=nan", "j1=x", "nowhere=1", "l1=0=1", "j1=1e300")),
     **dict.fromkeys(("--tool", "--centre", "--half-width", "--weights", "--friction", "--noise"), _LISTS),
     **dict.fromkeys(("--stiffness", "--damping-ratio", "--posture-stiffness", "--feedback", "--limit"), _LISTS),
+    "--damping-stiffness": _LISTS,
+    "--model": ("own", "given", "", "x"),
+    "--gravity": ("law", "robot", "", "9.81"),
+    "--inputs": ("payload", "payload,wrench,extra_torque", "payload,payload", ",", "", "mass"),
     **dict.fromkeys(("--bound", "--seconds"), (*NUMBERS, "0.1")),
     "--workers": ("0", "-1", "1", "1.5", ""),
     **dict.fromkeys(("--seed", "--seeds", "--samples", "--held-out", "--jobs"), _COUNTS),
@@ -54,11 +58,13 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--domain": ("auto", "box", ""),
     **dict.fromkeys(("--out", "--checkpoint"), ("out", "out/x/y", ".", "", "chart.orthocas", "/dev/null/x", "x" * 300)),
     **dict.fromkeys(("--coupling", "--damping", "--animation"), ("coupled", "square_root", "none", "mp5", "")),
+    "--second": ("joints", "xi", "x2", ""),
     "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose", "position:xx", "position+axis", ""),
     "--metric": ("euclidean", "inertia", "identity"),
     "--param": _WORDS,
     "--solver": _SOLVERS,
     "--controller": _LAWS,
+    "--plant": ("mujoco", "cvodes", "MuJoCo", ""),
     "--steps": _FILES,
     "--name": ("arm", "int", "1arm", "a b", "math", "é", "x" * 200, "main"),
 }
@@ -71,10 +77,12 @@ _LAW_OPTIONS = (
     "--coupling",
     "--damping",
     "--posture-stiffness",
+    "--second",
     "--feedback",
     "--limit",
+    "--damping-stiffness",
 )
-_RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--seed")
+_RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--seed", "--plant")
 _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = {  # targets, options, other options
     "fit": (
         _PROBLEMS,
@@ -103,7 +111,11 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},
         (*_LAW_OPTIONS, *_RUN_OPTIONS),
     ),
-    "codegen": (_FILES, {"--controller": "pd_plus", "--out": "out"}, (*_LAW_OPTIONS, "--name")),
+    "codegen": (
+        _FILES,
+        {"--controller": "pd_plus", "--out": "out"},
+        (*_LAW_OPTIONS, "--name", "--model", "--gravity", "--inputs"),
+    ),
 }
 
 

@@ -12,6 +12,7 @@ import orthocas as oc
 from fuzz.child import Finding, run
 from fuzz.mutants import NUMBERS, OTHERS, TEXTS, Rng, changed_data, flipped, pick
 from fuzz.sealed_files import judged
+from orthocas.simulation.loads import Loads
 from orthocas.simulation.steps_file import read_steps
 
 ONE_STEP = {"time": 0.5, "move": {"x": 0.1}}
@@ -27,6 +28,8 @@ ORIGINALS: tuple[dict[str, Any], ...] = (
         "pushes": [
             {"start": 1, "duration": 0.2, "force": [10, 0, -1]},
             {"start": 2, "duration": 1, "torque": [1, 2, 3]},
+            {"start": 1, "duration": 0.5, "force": [0, 5, 0], "link": "q2", "point": [0.5, 0, 0]},
+            {"start": 1, "duration": 0.5, "force": [0, 5, 0], "link": 1},
         ],
     },
 )
@@ -56,7 +59,7 @@ def use(path: Path) -> None:
         assert np.isfinite(values).all(), "the reference is not finite"
     assert len(plan.reference.grid()) < 10**7
     for push in plan.pushes:
-        assert push.load(3).shape == (6,)
+        assert Loads(_chart().problem.robot.tree, [push]).size == 6
         assert push.start < duration
 
 

@@ -1,0 +1,142 @@
+"""Default gains: modes of the closed loop, and what they hold when the model is wrong (PD+, MuJoCo, 1 kHz, 5 ms delay).
+
+Three arms with cubic coordinates on boxes of about +-0.6 rad or the paper's. The robot in MuJoCo has other masses
+than the law's model, or carries 1 kg that the law does not know, at the tip. Five starts in the inner 60 % of each box:
+hold still for 1.5 s, then a step of 40 mm in x and one in the first extra coordinate, 1.5 s each, through the low pass
+of the paper; smaller ones, or in the other direction, where these leave the domain.
+"""
+
+import argparse
+from collections import deque
+from contextlib import suppress
+from importlib.metadata import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+import orthocas as oc
+from orthocas import problems
+from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
+from orthocas.control import ControlStatus, PDPlus, Reference
+from orthocas.control.matched_stiffness import mobility
+from orthocas.domains import sample_uniform
+from orthocas.errors import UnreachableReferenceError
+from orthocas.simulation import MuJoCoPlant
+
+CASES = (  # robot, task, metric
+    *(("iiwa", "position", "euclidean"), ("iiwa", "position", "inertia"), ("iiwa", "pose", "euclidean")),
+    *(("panda", "position", "euclidean"), ("panda", "position", "inertia"), ("panda", "pose", "euclidean")),
+    *(("xarm7", "position", "euclidean"), ("xarm7", "position", "inertia"), ("xarm7", "pose", "euclidean")),
+)
+ROBOTS = {  # of the package example-robot-data: file, tip, locked joints, centre and half-widths of the box
+    "panda": (
+        *("panda_description/urdf/panda.urdf", "panda_hand", {"panda_finger_joint1": 0.0}),
+        (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4),
+        (0.6, 0.6, 0.6, 0.6, 0.8, 0.6, 1.2),
+    ),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef", None, (0.0, 0.0177, 0.0, 0.9119, 0.0, 0.7243, 0.0), 0.6),
+}
+PLANTS = {
+    "-20 %": lambda robot: robot.with_scaled_masses(0.8),
+    "+20 %": lambda robot: robot.with_scaled_masses(1.2),
+    "1 kg": lambda robot: robot.with_payload(1.0),
+}
+RATE = 1000.0  # [Hz]
+DELAY = 5  # ticks from the measurement to the torque
+HOLD, STEP, XI = 1.5, 0.04, 0.15  # [s], [m], [1]
+
+
+def chart_of(name: str, task: str, metric: str) -> oc.Chart:
+    """Cubic coordinates."""
+    if name in problems.names():
+        known = problems.get(name)
+        robot, box = known.robot, known.domain
+    else:
+        file, tip, locked, centre, half_width = ROBOTS[name]
+        path = next(Path(str(f.locate())).resolve() for f in files("example-robot-data") or [] if str(f).endswith(file))
+        robot, box = oc.Robot.from_file(path, tip, locked), oc.Box(centre, half_width)
+    problem = oc.Problem(robot, oc.Task.named(robot, task, box.centre), metric, box, name)
+    return oc.fit(problem, oc.Polynomial(3), weights=(1000, 30, 150, 1)).chart
+
+
+def modes_row(label: str, law: PDPlus) -> str:
+    """Medians of slowest and fastest mode, fastest anywhere, and the same with springs of 2 Hz at single inertias."""
+    chart, points = law.chart, sample_uniform(law.problem.domain, 256, 0)
+    W, m = mobility(chart, points, chart.problem.robot), chart.m
+    blocks = [np.diagonal(np.linalg.inv(W[:, part, part]), axis1=1, axis2=2) for part in (slice(m), slice(m, None))]
+    before = PDPlus(chart, (4 * np.pi) ** 2 * np.median(np.hstack(blocks), axis=0)).modes(points)
+    words = [label]
+    for modes in (before, law.modes(points)):
+        low, high = np.median(modes.frequencies[:, [0, -1]], axis=0)
+        words += [f"{low:.1f} to {high:.1f}", f"{modes.frequencies.max():.1f}", f"{1e3 * modes.delays.min():.1f}"]
+    return f"| {' | '.join(words)} |"
+
+
+def sag_row(label: str, law: PDPlus, starts: int) -> str:
+    """Largest distances from the reference at rest and in motion [mm], and ticks in which the law had to give up."""
+    words = [label]
+    with TemporaryDirectory() as folder:
+        generated = oc.generate_c(law.chart, folder, law, "law")
+        library = CompiledLibrary(compile_shared(generated, Path(folder)), "law", law.problem.n)
+        for make in PLANTS.values():
+            plant = MuJoCoPlant(make(law.problem.robot))
+            found = np.array([followed(law, library, plant, start) for start in starts_of(law, starts)])
+            held, moving, lost = found[:, 0].max(), found[:, 1].max(), int((found[:, 2] > 0).sum())
+            words.append(f"{1e3 * held:.1f}, {1e3 * moving:.1f}" + (f", {lost} left" if lost else ""))
+    return f"| {' | '.join(words)} |"
+
+
+def starts_of(law: PDPlus, count: int) -> np.ndarray:
+    """Postures in the inner 60 % of the domain, the first at its centre."""
+    domain = law.problem.domain
+    places = np.random.default_rng(3).uniform(-0.6, 0.6, (count, law.problem.n))
+    places[0] = 0
+    return np.asarray(domain.centre + domain.half_width * places)
+
+
+def motion(law: PDPlus, q: np.ndarray) -> Reference:
+    """The steps, in the directions and sizes that stay within the domain."""
+    start, x, xi = law.chart.phi(q), 0, law.chart.m
+    for size in (1.0, -1.0, 0.5, -0.5, 0.25, -0.25):
+        changes = [(HOLD, {law.labels[x]: start[x] + size * STEP}), (2 * HOLD, {law.labels[xi]: start[xi] + size * XI})]
+        reference = Reference.steps(law.labels, start, changes, 3 * HOLD)
+        with suppress(UnreachableReferenceError):
+            law.require_reachable(reference, q)
+            return reference
+    return Reference.steps(law.labels, start, [], 3 * HOLD)
+
+
+def followed(law: PDPlus, library: CompiledLibrary, plant: MuJoCoPlant, q: np.ndarray) -> list[float]:
+    """Distance of the tip from the reference: at rest after holding, and the largest of all; ticks without the law."""
+    gains, m = gain_numbers(law), min(3, law.chart.m)
+    reference = np.hstack(motion(law, q).sample(np.arange(0, 3 * HOLD, 1 / RATE)))
+    plant.reset(q)
+    late = deque([law.problem.robot.gravity(q)] * DELAY)
+    distances, lost = [], 0
+    for row in reference:
+        command, status = library.control(plant.q, plant.dq, row, gains)
+        lost += status not in (ControlStatus.OK, ControlStatus.SATURATED)
+        distances.append(np.linalg.norm(law.chart.phi(plant.q)[:m] - row[:m]))
+        late.append(command)
+        plant.step(late.popleft(), 1 / RATE)
+        if lost > 100:
+            break
+    return [distances[min(len(distances), round(HOLD * RATE)) - 1], max(distances), lost]
+
+
+def main(quick: bool = False) -> list[str]:
+    """Print both tables; `quick` takes one arm and one start."""
+    laws = {f"{', '.join(case)}": PDPlus.on_chart(chart_of(*case)) for case in (CASES[:1] if quick else CASES)}
+    rows = [modes_row(label, law) for label, law in laws.items()]
+    print("\n".join(rows), flush=True)
+    for label, law in laws.items():
+        rows.append(sag_row(label, law, 1 if quick else 5))
+        print(rows[-1], flush=True)
+    return rows
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    main(parser.parse_args().quick)

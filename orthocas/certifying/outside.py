@@ -1,0 +1,82 @@
+"""Boxes that need no proof, because they are proved to lie outside a ClearBox (ours)."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from orthocas.casadi_tools.batch import dense_function
+from orthocas.casadi_tools.threads import one_blas_thread
+from orthocas.certifying.chart_rows import ChartRows, GraphRows, joint_models
+from orthocas.certifying.elimination import between, singular_vectors
+from orthocas.certifying.graph import TaylorGraph
+from orthocas.certifying.judges import Judge, RegularityJudge, Verdicts
+from orthocas.certifying.monomials import Variables
+from orthocas.certifying.rounding import UP
+from orthocas.certifying.task_rows import task_rows
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.postures.clear_box import ClearBox
+
+_LENGTH = 1e-9  # of singular vectors: their deviation from 1 is far smaller
+_GUARDS = 1e-12  # of |J_x|^2: elimination in floating-point numbers is exact to less, so guards agree
+
+
+@dataclass(frozen=True, eq=False)
+class OutsideJudge:
+    """Counts boxes as proved, without a sign, that lie outside a ClearBox: s(q) <= bound all over the box.
+
+    s(q) <= |v^T D^-1 J_x(q)| for every unit vector v; v is the singular vector of the smallest singular value at the
+    middle of the box. Another judge judges the other boxes, and their det J must have the sign of the middle of the
+    domain: a box with the other sign is halved until its parts lie outside, or a fold shows.
+    """
+
+    inside: RegularityJudge
+    rows: GraphRows  #: D^-1 J_x, or C(q) D^-1 J_x with orthogonal C
+    domain: ClearBox
+    sign: float  #: of det J at the centre of the domain
+    variables: Variables
+
+    def __call__(self, low: Array, high: Array) -> Verdicts:
+        """Judge boxes between corners (boxes, n)."""
+        found = self.inside(low, high)
+        near = np.flatnonzero(~self.domain.is_clear((low + high) / 2))  # others do not lie outside
+        outside, widest = np.zeros(len(low), dtype=bool), found.widest.copy()
+        if near.size:
+            with one_blas_thread():
+                outside[near], widest[near] = self._lie_outside(low[near], high[near])
+        return Verdicts(
+            proved=(found.proved & (found.sign == self.sign)) | outside,
+            regular=found.regular & ~outside,
+            sign=np.where(outside, 0, found.sign),
+            conditioning=np.where(outside, np.inf, found.conditioning),
+            widest=widest,
+        )
+
+    def _lie_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """Whether boxes lie outside, and the joint to halve to find out."""
+        J = self.rows(joint_models(low, high, self.variables)[0])
+        left, right = singular_vectors(J)
+        across = between(left, J, np.broadcast_to(np.eye(right.shape[1]), right.shape))[-1]
+        with np.errstate(invalid="ignore", over="ignore"):
+            squared = (across.magnitude() ** 2).sum(axis=0) * UP
+            squared += _GUARDS * (J.magnitude() ** 2).sum(axis=(0, 1))
+        outside: Array = squared <= self.domain.least_singular_value**2 * (1 - _LENGTH)
+        influences = np.abs(across.coefficients[1 : 1 + len(across.variables)]).sum(axis=1)
+        return outside, np.array(across.variables)[np.argmax(np.nan_to_num(influences), axis=0)]
+
+
+def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
+    """The judge of a chart: of its whole box or, in a ClearBox, of what is not proved to lie outside."""
+    judge, domain = RegularityJudge(rows, bound), chart.problem.domain
+    if not isinstance(domain, ClearBox):
+        return judge
+    q = ca.SX.sym("q", chart.n)
+    task, same = chart.problem.task, bool((domain.scale == domain.scale[0]).all())
+    turned, allowance = task_rows(task, domain) if same else (task.jacobian_function, 0.0)
+    J = ca.densify(turned(q) / ca.repmat(ca.DM(domain.scale), 1, chart.n))
+    graph = TaylorGraph.of(dense_function("scaled_rows", [q], [J]), "the task")
+    sign = float(judge(domain.centre[None], domain.centre[None]).sign[0])  # rows have other scales than the chart's
+    variables = tuple(k for k in range(chart.n) if ca.depends_on(J, q[k]))
+    own = GraphRows(graph, chart.m, allowance / float(domain.scale.min()) * UP)
+    return OutsideJudge(judge, own, domain, sign, variables)

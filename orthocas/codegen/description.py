@@ -1,0 +1,63 @@
+"""What the header of generated C says about robot, frames, task and chart."""
+
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.codegen.words import words
+from orthocas.files.chart_file import fingerprint
+from orthocas.robots.tip_turn import TipTurn
+from orthocas.tasks import Task
+
+_ORIENTATION = (
+    "2 sin(angle / 2) axis of the rotation from the reference to the tip, in world axes: near the reference, the\n"
+    " *   rotation vector [rad]. The reference, row by row: "
+)
+_TILT = (
+    "tilt of the tip's {axis} axis from the reference direction, near it in [rad]. The frame of that direction in the\n"
+    " *   world, row by row: "
+)
+
+
+def description_values(chart: Chart) -> dict[str, str]:
+    """Values of the placeholders that describe the chart and its robot."""
+    tree = chart.problem.robot.tree
+    limits = [f"{low:.6g} to {high:.6g}" for low, high in zip(tree.lower, tree.upper, strict=True)]
+    slides = ["m" if sliding else "rad" for sliding in tree.prismatic]
+    joints = zip(words(tree.joint_names), slides, limits, tree.velocity_limits, tree.effort_limits, strict=True)
+    return {
+        "joint_lines": "\n".join(
+            f" *   {i} {name} [{unit}]: {limit}, at most {_or_unknown(speed)} {unit}/s, "
+            f"{_or_unknown(effort)} {'N' if unit == 'm' else 'N m'}"
+            for i, (name, unit, limit, speed, effort) in enumerate(joints)
+        ),
+        "task_labels": ", ".join(_with_units(chart.problem.task)),
+        "orientation": _orientation(chart.problem.task),
+        "extra_labels": ", ".join(words(chart.labels[chart.m :])),
+        "tip": words([tree.tip_name])[0],
+        "gravity": _row(tree.gravity),
+        "fingerprint": fingerprint(chart.problem, chart.coordinates),
+    }
+
+
+def _with_units(task: Task) -> list[str]:
+    units = [f" [{unit}]" if unit else "" for unit in task.units]
+    return [label + unit for label, unit in zip(words(task.labels), words(units), strict=True)]
+
+
+def _orientation(task: Task) -> str:
+    """The convention of orientation components, and their reference rotation."""
+    turn = TipTurn.of_kind(task.recipe["kind"])
+    if turn is None or "reference" not in task.recipe:
+        return ""
+    first = turn.labels[3 if turn.with_position else 0]
+    convention = _ORIENTATION if turn.axis is None else _TILT.format(axis=turn.axis)
+    return f"\n *   {first}, ...: {convention}{_row(np.ravel(task.recipe['reference']))}"
+
+
+def _or_unknown(limit: float) -> str:
+    return f"{limit:.6g}" if np.isfinite(limit) else "unknown"
+
+
+def _row(values: Array) -> str:
+    return ", ".join(f"{value:.9g}" for value in values)

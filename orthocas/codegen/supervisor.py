@@ -1,0 +1,100 @@
+"""Calls the supervised law of a compiled library from Python, for simulations and tests."""
+
+import ctypes
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.checks import Array, as_point
+from orthocas.codegen.library import CompiledLibrary, gain_numbers
+from orthocas.control import Controller, ControlStatus, Safety
+
+_POINTER = ctypes.c_void_p
+
+
+class Supervisor:
+    """One supervised law: the state in C, and the functions that change it.
+
+    Args:
+        library: a compiled library with this controller.
+        controller: the law.
+        safety: other settings than those that the library was generated with.
+    """
+
+    def __init__(self, library: CompiledLibrary, controller: Controller, safety: Safety | None = None) -> None:
+        self._n, self._k = library.n, len(controller.labels)
+        self._functions = {name: library.function(name) for name in ("start", "take_over", "resume", "step")}
+        self._functions["step"].argtypes = [*[_POINTER] * 6, ctypes.c_double, _POINTER]
+        self._safety = library.address("default_safety") if safety is None else _packed(safety)
+        self._state = _state_type(self._n, self._k)()
+        self._command = np.zeros(self._n)
+        self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
+
+    def start(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
+        """Begin at joint positions (n,), with the command (n,) that the robot executes now; default the fallback."""
+        given = None if command is None else _pointer(as_point("command", command, self._n))
+        self._functions["start"](self._here, _pointer(as_point("q", q, self._n)), given)
+
+    def take_over(self, q: ArrayLike, command: ArrayLike) -> None:
+        """Take over from another controller while the arm moves."""
+        points = [_pointer(as_point(name, value, self._n)) for name, value in (("q", q), ("command", command))]
+        self._functions["take_over"](self._here, *points)
+
+    def resume(self) -> None:
+        """Ask for the law again."""
+        self._functions["resume"](self._here)
+
+    def step(self, q: Array, dq: Array, reference: Array, period: float = 1e-3) -> tuple[Array, ControlStatus]:
+        """Command (n,) and status of one control period. The reference is [value, velocity, acceleration], (3 k,)."""
+        inputs = [np.ascontiguousarray(part, dtype=float) for part in (q, dq, reference, self.gains)]
+        if [part.size for part in inputs[:3]] != [self._n, self._n, 3 * self._k]:
+            raise ValueError(f"sizes {[part.size for part in inputs[:3]]}, expected {self._n, self._n, 3 * self._k}")
+        status = self._functions["step"](
+            self._here, self._safety, *map(_pointer, inputs), float(period), _pointer(self._command)
+        )
+        return self._command.copy(), ControlStatus(status)
+
+    def __getattr__(self, name: str) -> Any:
+        """The fields of the state in C: mode, cause, weight, anchor, ..."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        value = getattr(self._state, name)
+        return np.array(value) if isinstance(value, ctypes.Array) else value
+
+    @property
+    def _here(self) -> Any:
+        return ctypes.byref(self._state)
+
+
+def _state_type(n: int, k: int) -> type[ctypes.Structure]:
+    joints, quantities = ctypes.c_double * n, ctypes.c_double * k
+    names = ("q", "dq", "command", "law", "anchor", "safe")
+    layout = [
+        *((name, ctypes.c_int) for name in ("mode", "cause", "asked", "bad_ticks", "stale_ticks")),
+        *((name, ctypes.c_double) for name in ("weight", "brake")),
+        *((name, joints) for name in names),
+        *((name, quantities) for name in ("offset", "integral", "value", "velocity", "acceleration")),
+    ]
+    return type("State", (ctypes.Structure,), {"_fields_": layout})
+
+
+def _packed(safety: Safety) -> Any:
+    """The settings as the C struct."""
+    values = {field.name: getattr(safety, field.name) for field in fields(Safety)}
+    layout = [(name, _kind(value)) for name, value in values.items()]
+    struct = type("Safety", (ctypes.Structure,), {"_fields_": layout})()
+    for name, value in values.items():
+        setattr(struct, name, tuple(value.tolist()) if isinstance(value, np.ndarray) else value)
+    return ctypes.pointer(struct)
+
+
+def _kind(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return ctypes.c_double * value.size
+    return ctypes.c_int if isinstance(value, int) else ctypes.c_double
+
+
+def _pointer(array: Array) -> Any:
+    return array.ctypes.data_as(_POINTER)

@@ -1,0 +1,172 @@
+"""What a law learns of the robot at run time: payload, contact forces, extra torque, or the model itself (ours)."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.checks import Array, as_float_array, frozen_array, require_finite, require_known, require_shape
+from orthocas.errors import InvalidValueError
+from orthocas.problem import Problem
+from orthocas.robots.payload import payload_numbers
+from orthocas.robots.robot import Robot
+
+Source = Literal["own", "given"]
+Gravity = Literal["law", "robot"]
+SOURCES: tuple[Source, ...] = ("own", "given")
+GRAVITIES: tuple[Gravity, ...] = ("law", "robot")
+INPUTS = ("payload", "wrench", "extra_torque")  #: inputs that may be asked for by name
+
+_UNITS: Mapping[str, str] = {
+    "payload": "at the tip: mass [kg], centre in the tip frame [m], inertia xx, xy, xz, yy, yz, zz about it [kg m^2]",
+    "wrench": "that the tip exerts on its surroundings, in world axes: force [N], torque about the tip [N m]",
+    "extra_torque": "added to the command, for example against friction [N m] or [N]",
+    "mass_matrix": "M(q) of the robot in every tick, symmetric, row by row",
+    "coriolis_torque": "C(q, dq) dq of the robot in every tick [N m] or [N]",
+    "gravity_torque": "g(q) of the robot in every tick [N m] or [N]",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class RunTimeModel:
+    """Where a law gets its model from, and which additional inputs it has.
+
+    Every value that is not None becomes an input of the law, among its gains, and this value is its default.
+
+    Args:
+        source: `own` computes mass matrix, Coriolis forces and gravity from the robot of the problem; `given` makes
+            them inputs, for robots that report their own model. PD+ needs C(q, dq) w with the desired velocity w, and
+            robots report C(q, dq) dq only. So PD+ then cancels the Coriolis forces of the true motion, and uses
+            dJ/dt dq. The coupled loop becomes M_phi dde + D de + K e = 0, which tracks as well, but is no longer
+            passive, because M_phi changes without a Coriolis term to match.
+        gravity: `law` adds g(q) to the command; `robot` leaves it out, for robots that compensate it themselves. The
+            fallback is then zero torque.
+        payload: mass, (4,) mass and centre, or (10,) also inertia; see `Robot.with_payload`. It acts on mass matrix,
+            Coriolis forces, gravity and fallback. Not with `given`, because the robot's model includes its load.
+        wrench: force and torque (6,) that the tip exerts on its surroundings [N], [N m] in world axes; adds
+            J_tip^T wrench. To cancel a measured force on the tip, pass its negative.
+        extra_torque: (n,) or one number, added to the command, for example against friction [N m] or [N].
+
+    Raises:
+        ShapeError, InvalidValueError, UnknownNameError: for values of the wrong shape or name, or payload with `given`.
+    """
+
+    source: Source = "own"
+    gravity: Gravity = "law"
+    payload: ArrayLike | None = None
+    wrench: ArrayLike | None = None
+    extra_torque: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        require_known("source of the model", self.source, SOURCES)
+        require_known("gravity", self.gravity, GRAVITIES)
+        if self.payload is not None:
+            if self.source == "given":
+                raise InvalidValueError("payload", self.payload, "none, because the given model includes the load")
+            object.__setattr__(self, "payload", payload_numbers("payload", self.payload))
+        if self.wrench is not None:
+            object.__setattr__(self, "wrench", frozen_array("wrench", self.wrench, (6,)))
+
+    @classmethod
+    def with_inputs(cls, source: Source, gravity: Gravity, inputs: Iterable[str]) -> "RunTimeModel":
+        """The model with inputs by name, which are zero by default.
+
+        Raises:
+            UnknownNameError: for a name other than payload, wrench and extra_torque.
+        """
+        chosen = tuple(inputs)
+        for name in chosen:
+            require_known("input", name, INPUTS)
+        zeros: dict[str, ArrayLike] = {"payload": 0.0, "wrench": np.zeros(6), "extra_torque": 0.0}
+        return cls(source, gravity, **{name: zeros[name] for name in chosen})
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The choices that differ from the default."""
+        chosen = {"model": self.source, "gravity": self.gravity}
+        return {name: word for name, word in chosen.items() if word not in ("own", "law")}
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Meaning of the inputs, in words, by name."""
+        return _UNITS
+
+    def gains(self, problem: Problem, coriolis: bool) -> dict[str, Array]:
+        """The default values of the inputs by name; a given model is that of the centre of the domain at rest."""
+        found: dict[str, Array] = {}
+        for name in ("payload", "wrench"):
+            if (value := getattr(self, name)) is not None:
+                found[name] = value
+        if self.extra_torque is not None:
+            found["extra_torque"] = _per_joint(self.extra_torque, problem.n)
+        if self.source == "given":
+            robot, q = problem.robot, problem.domain.centre
+            found["mass_matrix"] = frozen_array("mass_matrix", robot.mass_matrix(q).ravel(), (problem.n**2,))
+            if coriolis:
+                found["coriolis_torque"] = np.zeros(problem.n)
+            if self.gravity == "law":
+                found["gravity_torque"] = frozen_array("gravity_torque", robot.gravity(q), (problem.n,))
+        return found
+
+    def remarks(self) -> list[str]:
+        """What to know before the law is switched on."""
+        found = []
+        if self.source == "given":
+            found.append(
+                "the robot's model is an input of this law: pass mass matrix and torques in every tick, because their "
+                "defaults hold only at rest at the centre of the domain"
+            )
+        if self.gravity == "robot":
+            found.append("this law leaves gravity to the robot: its fallback is zero torque")
+        return found
+
+    def robot(self, problem: Problem) -> Robot:
+        """The robot with the default payload, for analysis."""
+        return problem.robot if self.payload is None else problem.robot.with_payload(self.payload)
+
+    def own_mass_matrix(self, robot: Robot, inputs: Mapping[str, ca.MX]) -> ca.MX:
+        """M(q) from the robot of the problem, with the payload."""
+        return _of(robot, "mass_matrix", inputs, inputs["q"])
+
+    def mass_matrix(self, robot: Robot, inputs: Mapping[str, ca.MX]) -> ca.MX:
+        """M(q), (n, n), computed or given."""
+        if self.source == "given":
+            return ca.reshape(inputs["mass_matrix"], robot.n, robot.n)
+        return self.own_mass_matrix(robot, inputs)
+
+    def gravity_torque(self, robot: Robot, inputs: Mapping[str, ca.MX]) -> ca.MX:
+        """The part of the command that holds the robot at rest, (n, 1)."""
+        if self.gravity == "robot":
+            return ca.MX(robot.n, 1)
+        return inputs["gravity_torque"] if self.source == "given" else _of(robot, "gravity", inputs, inputs["q"])
+
+    def coriolis_torque(self, robot: Robot, inputs: Mapping[str, ca.MX], w: ca.MX) -> ca.MX:
+        """C(q, dq) w, (n, 1); the given C(q, dq) dq instead if the model is given."""
+        if self.source == "given":
+            return inputs["coriolis_torque"]
+        return _of(robot, "coriolis_product", inputs, inputs["q"], inputs["dq"], w)
+
+    def feed_forward(self, robot: Robot, inputs: Mapping[str, ca.MX]) -> ca.MX:
+        """J_tip^T wrench + extra_torque, (n, 1), as far as they are inputs."""
+        torque = ca.MX(robot.n, 1)
+        if "wrench" in inputs:
+            torque += robot.tip_jacobian(inputs["q"]).T @ inputs["wrench"]
+        return torque + inputs["extra_torque"] if "extra_torque" in inputs else torque
+
+
+def _of(robot: Robot, name: str, inputs: Mapping[str, ca.MX], *arguments: ca.MX) -> ca.MX:
+    """A function of the robot, with the payload if that is an input."""
+    if "payload" in inputs:
+        return robot.function(f"{name}_with_payload")(*arguments, inputs["payload"])
+    return robot.function(name)(*arguments)
+
+
+def _per_joint(value: ArrayLike, n: int) -> Array:
+    given = as_float_array("extra_torque", value)
+    require_finite("extra_torque", given)
+    if given.ndim:
+        require_shape("extra_torque", given.shape, (n,))
+    return frozen_array("extra_torque", np.broadcast_to(given, (n,)), (n,))

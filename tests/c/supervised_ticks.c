@@ -1,0 +1,98 @@
+/* Hostile ticks of a supervised law: positions that wander through the domain and out of it, now and then NaN,
+ * infinities, huge numbers, wrong turns, references that stand still and claim to move, and late ticks.
+ *
+ * Compile with -DTICKS=, -DLIMIT= and -DSINGULAR= (unused). Prints how often each status came. Exits with 1 at a wrong
+ * status, 2 at a command that is not finite or beyond the limit, 3 at a change beyond the rate, 4 at a state that makes
+ * no sense. */
+#include <math.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <string.h>
+
+#include "arm.h"
+
+#define N ARM_JOINTS
+#define K ARM_REFERENCE
+
+static uint64_t seed = 88172645463325252ULL;
+
+static double uniform(void) { /* -1 to 1 */
+  seed ^= seed << 13;
+  seed ^= seed >> 7;
+  seed ^= seed << 17;
+  return (double)(seed >> 11) / 4503599627370496.0 - 1.0;
+}
+
+static int spoil(double *x, int count) {
+  static const double bad[] = {NAN, INFINITY, -INFINITY, 1e300, -1e150};
+  if (uniform() < 0.99) return 0;
+  x[(int)((uniform() + 1.0) * 0.4999 * count)] = bad[(int)((uniform() + 1.0) * 2.499)];
+  return 1;
+}
+
+static int state_makes_sense(const arm_state *state) {
+  int i;
+  if (!(state->weight >= 0.0 && state->weight <= 1.0 && state->brake >= 0.0 && state->brake <= 1.0)) return 0;
+  for (i = 0; i < N; ++i)
+    if (!isfinite(state->q[i]) || !isfinite(state->anchor[i]) || !isfinite(state->law[i])) return 0;
+  for (i = 0; i < K; ++i)
+    if (!isfinite(state->offset[i]) || !isfinite(state->integral[i]) || !isfinite(state->reference.value[i])) return 0;
+  return 1;
+}
+
+static int status_is_right(int status, const arm_state *state, int measured, int referred) {
+  if (!measured) return status == ARM_BAD_INPUT;
+  if (state->mode == ARM_CATCHER) return status == ARM_CAUGHT || status == ARM_BAD_INPUT;
+  if (state->mode == ARM_RETURN) return status == ARM_RETURNING || status == ARM_BAD_INPUT;
+  if (!referred) return status == ARM_BAD_INPUT;
+  return status == ARM_OK || status == ARM_SATURATED || status == ARM_NEAR_BORDER || status == ARM_BAD_INPUT;
+}
+
+int main(void) {
+  long k, counts[11] = {0};
+  double q[N], dq[N], command[N], before[N];
+  arm_state state;
+  arm_reference reference;
+  int i;
+  for (i = 0; i < N; ++i) q[i] = 0.5 * (arm_domain_lower[i] + arm_domain_upper[i]);
+  memset(dq, 0, sizeof dq);
+  arm_start(&state, q, 0);
+  memcpy(before, state.command, sizeof before);
+  for (k = 0; k < TICKS; ++k) {
+    double measured_q[N], measured_dq[N], period = uniform() > 0.98 ? 0.05 * (1.0 + uniform()) : 1e-3;
+    int status, measured, referred;
+    for (i = 0; i < N; ++i) {
+      const double middle = 0.5 * (arm_domain_lower[i] + arm_domain_upper[i]);
+      if (k % 4000 < 1200) dq[i] += 0.2 * uniform() - 0.02 * dq[i]; /* wanders */
+      else dq[i] += 1e-4 * uniform() - 0.02 * dq[i] - 0.001 * (q[i] - middle); /* comes back */
+      measured_q[i] = q[i] += 1e-3 * dq[i];
+      measured_dq[i] = dq[i];
+    }
+    if (k % 1000 == 0) arm_reference_at(q, &reference);
+    for (i = 0; i < K; ++i) reference.velocity[i] = k % 7000 < 100 ? 0.1 : 0.0; /* stands still and claims to move */
+    if (k % 1500 == 0) arm_resume(&state);
+    if (k % 50000 == 49999) arm_take_over(&state, q, before);
+    if (uniform() > 0.999) measured_q[0] += 6.283185307179586;
+    measured = !spoil(measured_q, N) & !spoil(measured_dq, N);
+    {
+      arm_reference seen = reference;
+      referred = !spoil((double *)&seen, 3 * K);
+      if (uniform() > 0.999) period = uniform() > 0.0 ? NAN : -period;
+      if (!(period > 0.0)) measured = 0;
+      status = (int)arm_step(&state, &arm_default_safety, measured_q, measured_dq, &seen, &arm_default_gains, period,
+                             command);
+    }
+    if (status < 0 || status > 10 || !status_is_right(status, &state, measured, referred)) return 1;
+    counts[status]++;
+    for (i = 0; i < N; ++i) {
+      const double time = period > 0.0 ? fmin(period, arm_default_safety.longest_period) : 0.0;
+      if (!(fabs(command[i]) <= LIMIT)) return 2;
+      if (!(fabs(command[i] - before[i]) <= arm_default_safety.command_rate[i] * time * (1.0 + 1e-9) + 1e-9)) return 3;
+    }
+    if (!state_makes_sense(&state)) return 4;
+    memcpy(before, command, sizeof before);
+  }
+  for (i = 0; i < 11; ++i) printf("%ld ", counts[i]);
+  printf("\n");
+  return 0;
+}
