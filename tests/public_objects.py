@@ -185,6 +185,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "robot": lambda: planar().robot,
     "task": lambda: planar().task,
     "run-time model": run_time_model,
+    "safety": lambda: control.Safety.of(impedance(), fade_in=0.1),
     "modes": lambda: impedance().modes(),
     "custom task": lambda: with_idle_joint().problem.task,
     "inertia metric": lambda: planar().metric,

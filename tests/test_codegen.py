@@ -261,7 +261,7 @@ def test_header_and_readme_tell_what_a_user_needs(pd_plus: Generated, planar_x: 
     generated, law = pd_plus
     header = (generated.folder / "arm.h").read_text()
     for name in planar_x.robot.joint_names:
-        assert re.search(rf"\d {name}\n", header)
+        assert re.search(rf"\d {name} \[rad\]: ", header)
     assert "x, xi1, xi2" in header
     assert f"{generated.stack_bytes} bytes" in header
     assert "#define ARM_JOINTS 3" in header

@@ -61,11 +61,12 @@ def test_python_block_of_the_page_on_control_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_python_block_of_the_page_on_domains_runs(tmp_path: Path) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "domains.md").read_text(), flags=re.DOTALL)
-    printed = python(code, tmp_path).splitlines()
+def test_python_blocks_of_the_page_on_domains_run(tmp_path: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "domains.md").read_text(), flags=re.DOTALL)
+    printed = python("\n".join(blocks), tmp_path).splitlines()
     assert printed[0].startswith("DomainSuggestion: half-width 3.142")
-    assert printed[-1] == "('q1',) True"
+    assert printed[-2] == "('q1',) True"
+    assert 0.81 < float(printed[-1]) < 0.84  # the share of the box that is clear
 
 
 @pytest.mark.slow

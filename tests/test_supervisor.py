@@ -222,6 +222,21 @@ def test_a_bad_reference_is_held(supervisor: Supervisor, chart: oc.Chart) -> Non
     assert statuses[-1] is ControlStatus.BAD_INPUT
 
 
+def test_a_reference_that_comes_to_rest_is_never_stale(
+    supervisor: Supervisor, library: CompiledLibrary, chart: oc.Chart
+) -> None:
+    """The low pass approaches its target for ever, but its value stops where the last bit stops changing."""
+    q = chart.problem.domain.centre
+    supervisor.start(q)
+    reference = at_rest(chart, q)
+    target = reference[:3] + np.array([1e-3, 0.0, 0.0])
+    for _ in range(15_000):
+        library.low_pass(reference, target, 3.0, 0.7, TICK)
+        _, status = supervisor.step(q, np.zeros(3), reference, TICK)
+        assert status is not ControlStatus.BAD_INPUT
+    assert np.abs(reference[3:6]).max() > 0
+
+
 def test_a_late_tick_calls_the_catcher(supervisor: Supervisor, chart: oc.Chart) -> None:
     q = chart.problem.domain.centre
     supervisor.start(q)
@@ -246,6 +261,58 @@ def test_integral_action_removes_sag_and_does_not_wind_up(
         assert (np.abs(supervisor.integral) <= Safety.of(law).integral_limit + 1e-15).all()
     assert sag[3.0] < 0.01 * sag[0.0]
     assert sag[0.0] > 1e-3
+
+
+def test_springs_and_dampers_keep_away_from_joint_limits(
+    library: CompiledLibrary, law: Controller, chart: oc.Chart
+) -> None:
+    q, speed = chart.problem.domain.centre, np.array([0.0, 0.1, 0.0])
+    upper = q + np.array([1.0, 0.02, 1.0])
+    settings, commands = Safety.of(law), []
+    for safety in (settings, Safety.of(law, upper=upper, stop_zone=0.05)):
+        supervisor = Supervisor(library, law, safety)
+        supervisor.take_over(q, chart.problem.robot.gravity(q))
+        for _ in range(400):  # until the limit of change is no matter any more
+            towards, _ = supervisor.step(q, speed, at_rest(chart, q), TICK)
+        for _ in range(400):
+            away, _ = supervisor.step(q, -speed, at_rest(chart, q), TICK)
+        commands += [towards, away]
+    spring, damper = settings.stop_stiffness[1] * 0.03, settings.stop_damping[1] * 0.1
+    np.testing.assert_allclose(commands[0] - commands[2], [0.0, spring + damper, 0.0], atol=1e-9)
+    np.testing.assert_allclose(commands[1] - commands[3], [0.0, spring, 0.0], atol=1e-9)
+
+
+def test_another_chart_takes_over_while_the_arm_moves(
+    supervisor: Supervisor, chart: oc.Chart, law: Controller, tmp_path: Path
+) -> None:
+    """The next reference is that of the posture asked for now, so that the torque hardly changes."""
+    other = oc.fit(chart.problem, oc.Polynomial(4), weights=(1000, 30, 150, 0.1, 1000), samples=1500, seed=5).chart
+    next_law = PDPlus.on_chart(other, limit=120.0)
+    generated = oc.generate_c(other, tmp_path, next_law, "arm")
+    after = Supervisor(CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3), next_law)
+    q = chart.problem.domain.centre
+    wanted = np.array([0.2, -0.1, 0.15])  # joint velocity
+    arm = Arm(chart.problem.robot, q, wanted)
+    supervisor.take_over(q, chart.problem.robot.gravity(q))
+    for k in range(200):
+        command, _ = supervisor.step(arm.q, arm.dq, moving(chart, q + k * TICK * wanted, wanted), TICK)
+        arm.move(command)
+    after.take_over(arm.q, command)
+    statuses = []
+    for k in range(200, 400):
+        before = command
+        command, status = after.step(arm.q, arm.dq, moving(other, q + k * TICK * wanted, wanted), TICK)
+        assert np.abs(command - before).max() <= 1.0 + 1e-9
+        arm.move(command)
+        statuses.append(status)
+    assert set(statuses) <= {ControlStatus.OK, ControlStatus.SATURATED}
+    np.testing.assert_allclose(arm.q, q + 400 * TICK * wanted, atol=2e-3)
+
+
+def moving(chart: oc.Chart, q: Array, dq: Array) -> Array:
+    """The reference of a joint motion without acceleration."""
+    curvature = chart.function("second_derivative")(q, dq, dq).full().ravel()
+    return np.concatenate([chart.phi(q), chart.jacobian(q) @ dq, curvature])
 
 
 def test_references_equal_those_of_python(library: CompiledLibrary, chart: oc.Chart) -> None:

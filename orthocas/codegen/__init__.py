@@ -1,6 +1,7 @@
 """Charts and controllers as small C libraries."""
 
-from orthocas.codegen.generate import GeneratedC, generate_c
+from orthocas.codegen.generate import generate_c
+from orthocas.codegen.generated import GeneratedC
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
 from orthocas.codegen.proof import Proof, check_c
 from orthocas.codegen.supervisor import Supervisor

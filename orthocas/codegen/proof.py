@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from orthocas.casadi_tools.batch import Batched
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind
-from orthocas.codegen.generate import GeneratedC
+from orthocas.codegen.generated import GeneratedC
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
 from orthocas.control import Controller, ControlStatus
 from orthocas.control.status import LARGEST
@@ -130,7 +130,7 @@ def _curvature(library: CompiledLibrary, chart: Chart, q: Array, dq: Array, rng:
     v = rng.normal(size=q.shape)
     wanted = Batched(chart.function("second_derivative"))(q, dq, v)[0]
     found = [library.curvature(*row) for row in zip(q, dq, v, strict=True)]
-    good = np.isfinite(wanted).all(axis=1)
+    good = np.asarray(np.isfinite(wanted).all(axis=1))
     return _difference(np.array([row[0] for row in found]), _zero_unless(good, wanted))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.checks import Array, as_number, frozen_array, require_count
+from orthocas.checks import Array, as_float_array, as_number, require_count, require_shape
 from orthocas.control.controller import Controller, require_controller
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError
@@ -59,7 +59,7 @@ class Safety:
             value = getattr(self, field.name)
             if field.name == "hold_ticks":
                 require_count("hold_ticks", value, least=0)
-            elif field.type == "float" or field.type is float:
+            elif field.type is float:
                 _require_number(field.name, value)
             else:
                 object.__setattr__(self, field.name, _numbers(field.name, value))
@@ -115,7 +115,7 @@ class Safety:
         if unknown:
             raise InvalidValueError("setting", repr(unknown[0]), f"one of {', '.join(settings)}")
         spread = {name: _spread(name, value, settings[name]) for name, value in changes.items()}
-        return cls(**{**settings, **spread})  # type: ignore[arg-type]
+        return cls(**{**settings, **spread})
 
 
 def _joint_motion(controller: Controller, points: Array) -> Array:
@@ -131,8 +131,10 @@ def _spread(name: str, value: ArrayLike, default: object) -> object:
     """One number for all entries of an array; other values are checked."""
     if not isinstance(default, np.ndarray):
         return value
-    given = np.asarray(value)
-    return np.full(default.shape, given) if given.ndim == 0 else frozen_array(name, given, default.shape)
+    given = as_float_array(name, value)
+    if given.ndim:
+        require_shape(name, given.shape, default.shape)
+    return np.full(default.shape, given)
 
 
 def _require_number(name: str, value: float) -> None:
@@ -141,7 +143,7 @@ def _require_number(name: str, value: float) -> None:
 
 
 def _numbers(name: str, value: ArrayLike) -> Array:
-    array = np.array(value, dtype=float)
+    array = np.array(as_float_array(name, value))
     may_be_infinite = name in ("command_rate", "speed_limit", "lower", "upper", "error_limit")
     if array.ndim != 1 or np.isnan(array).any() or (not may_be_infinite and np.isinf(array).any()):
         raise InvalidValueError(name, array.tolist(), "a list of numbers")

@@ -277,6 +277,10 @@ def _functions() -> dict[str, Call]:
         "evaluate": (oc.evaluate, {"chart": chart, "samples": 50, "seed": 1}),
         "evaluate points": (oc.evaluate, {"chart": chart, "samples": None, "seed": None, "points": [q, q]}),
         "generate_c": (oc.generate_c, {"chart": chart, "out": "c", "controller": impedance(), "name": "arm"}),
+        "generate_c with settings": (
+            oc.generate_c,
+            {"chart": chart, "out": "c", "controller": impedance(), "safety": control.Safety.of(impedance())},
+        ),
         "grow": (
             oc.grow,
             {"problem": problems.get("planar_2r"), "level": 1.0, "leaf": None, "origin": [1.0, 0.0], "cells": None},
@@ -364,6 +368,10 @@ def _control() -> dict[str, Call]:
         ),
         "with_payload": (problem.robot.with_payload, {"payload": [1.0, 0, 0, 0, 1, 0, 0, 1, 0, 1]}),
         "modes": (law.modes, {"q": centre}),
+        "Safety.of": (
+            control.Safety.of,
+            {"controller": law, "fade_in": 0.1, "command_rate": 100.0, "error_limit": [0.1, 0.1, 0.1], "hold_ticks": 5},
+        ),
         "PDPlus": (control.PDPlus, {**gains, "limit": [1.0, 2.0, 3.0]}),
         "Kinematic": (control.Kinematic, {"chart": chart, "feedback": 1.0, "limit": None}),
         "Projector": (
