@@ -130,7 +130,7 @@ def test_ctrl_c_while_python_ends_needs_no_handler() -> None:
 def test_other_signals_end_in_order_after_compiled_code(name: str, tmp_path: Path) -> None:
     """What compiled code would lose is raised behind it, and handlers are put back."""
     number = getattr(signal, name)
-    before = signal.getsignal(number)
+    of_this_process = signal.signal(number, signal.SIG_DFL)  # under nohup it would be ignored, and stay so
     done = []
 
     def work() -> None:
@@ -138,10 +138,13 @@ def test_other_signals_end_in_order_after_compiled_code(name: str, tmp_path: Pat
             signal.raise_signal(number)
             done.append("the block goes on")
 
-    with pytest.raises(SystemExit) as stop:
-        work()
-    assert (stop.value.code, done) == (128 + number, ["the block goes on"])
-    assert signal.getsignal(number) is before
+    try:
+        with pytest.raises(SystemExit) as stop:
+            work()
+        assert (stop.value.code, done) == (128 + number, ["the block goes on"])
+        assert signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, of_this_process)
 
 
 def test_ignored_signals_stay_ignored() -> None:
@@ -210,6 +213,29 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     with patch("tempfile.tempdir", str(tmp_path / "tmp")):
         assert list(run_cells([])) == []
     assert not list((tmp_path / "tmp").glob("orthocas-*"))  # ... but the next comparison does
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.skipif(signal.getsignal(signal.SIGHUP) is signal.SIG_IGN, reason="nohup is for children too")
+def test_hang_up_ends_a_comparison_without_a_traceback(tmp_path: Path) -> None:
+    """It reaches all processes of a terminal at once, that of multiprocessing which frees semaphores included."""
+    (tmp_path / "tmp").mkdir()
+    grid = ("--param", "mlp:8x8", "--param", "mlp:9x9", "--solver", "adam", "--jobs", "2", "--out", "out")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "orthocas", "compare", "planar_3r_x", *grid],
+        cwd=tmp_path,
+        env=os.environ | {"TMPDIR": str(tmp_path / "tmp")},
+        start_new_session=True,
+        stderr=subprocess.PIPE,
+    )
+    wait_until(lambda: len(session_of(process.pid)) == 4, 60)
+    time.sleep(2)
+    os.killpg(process.pid, signal.SIGHUP)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (128 + signal.SIGHUP, b"")
+    wait_until(lambda: not session_of(process.pid), 5)
+    assert not list((tmp_path / "tmp").iterdir())
 
 
 _SLOW_IMPORTS = """

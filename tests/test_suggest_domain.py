@@ -12,7 +12,7 @@ from public_objects import suggestion
 import orthocas as oc
 from orthocas import problems
 from orthocas.domains import sample_heavily
-from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, UnknownNameError
+from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, SingularTaskError, UnknownNameError
 from orthocas.minimising.watch import Progress
 from orthocas.postures.home import home_posture
 from orthocas.postures.probe import Prober, leak_and_conditioning
@@ -142,6 +142,13 @@ def test_bad_arguments_are_refused() -> None:
         oc.suggest_domain(robot, task, HOME, conditioning=1)
     with pytest.raises(NotRedundantError):
         oc.suggest_domain(robot, oc.Task.custom(robot, "all", lambda q: q))
+
+
+def test_task_that_no_joint_changes_is_refused() -> None:
+    """The axis of a planar arm always stands upright."""
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
+    with pytest.raises(SingularTaskError, match="task component 'tilt_x' does not depend on any joint"):
+        oc.suggest_domain(robot, oc.Task.axis(robot, "z"))
 
 
 def test_progress_is_reported_and_ctrl_c_ends_the_search() -> None:

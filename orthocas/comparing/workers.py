@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context, parent_process, resource_tracker
 from multiprocessing.connection import wait
 from multiprocessing.synchronize import Event
 
@@ -38,7 +38,11 @@ def shared_event() -> Event:
 
 @contextmanager
 def _shared_memory_named() -> Iterator[None]:
+    """Name the shared memory in errors, and let the process of multiprocessing that frees it outlive a hang-up."""
     try:
+        if hasattr(signal, "SIGHUP"):
+            with _blocked(signal.SIGHUP):  # which that process inherits, for ever
+                resource_tracker.ensure_running()
         yield
     except OSError as error:  # which names no file
         raise ArchiveError(f"cannot share memory with processes: {error.strerror}, expected room in /dev/shm") from None
@@ -55,7 +59,7 @@ def starting_workers() -> Iterator[None]:
     before = {name: os.environ.get(name) for name in given}
     os.environ.update(given)
     try:
-        with _interrupts_blocked():
+        with _blocked(signal.SIGINT):
             yield
     finally:
         for name, value in before.items():
@@ -109,11 +113,11 @@ def _wait_for_parent() -> None:
 
 
 @contextmanager
-def _interrupts_blocked() -> Iterator[None]:
+def _blocked(number: signal.Signals) -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
     try:
         yield
     finally:

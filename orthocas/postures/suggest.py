@@ -20,7 +20,7 @@ from orthocas.postures.home import home_posture
 from orthocas.postures.probe import Bounds, Miss, Prober, Verdict, judged_chart
 from orthocas.postures.suggestion import JUDGES, DomainSuggestion, JointWidth, Reason
 from orthocas.postures.widest import WidestBox
-from orthocas.problem import Problem
+from orthocas.problem import Problem, check
 from orthocas.robots import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
 from orthocas.samples import sample_problem
@@ -30,6 +30,7 @@ LEAK_DEG, CONDITIONING = 8.0, 0.2  #: what is asked by default
 _MARGIN = 1.25  # trial charts keep a higher conditioning, since a fit is judged at more points
 _FARTHEST = np.pi  # largest half-width of a revolute joint [rad]: a full turn
 _LONGEST = 1.0  # largest half-width of a prismatic joint without limits [m]
+_CHECKED = 200  # samples that tell whether the task can be regular at all, and which joints are idle
 _SHRINK, _TRIES = 0.92, 8  # after a fit that misses a bound
 
 
@@ -66,6 +67,7 @@ def suggest_domain(
 
     Raises:
         DomainError: if the home lies at a joint limit, or no box around it keeps the bounds.
+        SingularTaskError: if the task is singular everywhere.
         UnknownNameError: if there is no posture of that name.
         InvalidValueError, NotRedundantError: if an argument is invalid.
         KeyboardInterrupt: after Ctrl-C; `Interrupted` with the fit on the box found, if it comes during a fit.
@@ -89,6 +91,7 @@ def suggest_domain(
     posture = home_posture(robot, task, home)
     room = np.minimum(_room(robot, posture.q), _farthest(robot))
     problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_unit(robot), room)))
+    check(problem, _CHECKED)
     joints = _Joints.of(problem)
     prober = Prober(problem, joints.active, joints.cyclic)
     stricter = replace(bounds, conditioning=min(1.0, _MARGIN * bounds.conditioning))
@@ -117,7 +120,7 @@ class _Joints:
 
     @classmethod
     def of(cls, problem: Problem) -> "_Joints":
-        idle = idle_joints(problem, sample_problem(problem, 200, 0))[-problem.r :]
+        idle = idle_joints(problem, sample_problem(problem, _CHECKED, 0))[-problem.r :]
         return cls(problem.robot.joint_names, tuple(idle), cyclic_joints(problem))
 
     @property
