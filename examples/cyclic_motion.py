@@ -48,11 +48,11 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     cycles = 3 if quick else CYCLES
     chart = oc.fit(oc.problems.get("iiwa"), oc.Polynomial(3 if quick else 4)).chart
     cases = [
-        Case("pseudo-inverse", KinematicProjector(chart.problem), TIGHT, "#d95f02"),
-        Case("pseudo-inverse, loose", KinematicProjector(chart.problem), LOOSE, "#222222", ":"),
-        Case("xi constant, loose", Kinematic(chart), LOOSE, "#66c2a5", "--"),
-        Case("xi constant", Kinematic(chart), TIGHT, "#1b9e77"),
-        Case("xi constant, feedback", Kinematic(chart, FEEDBACK), TIGHT, "#1f5fa8"),
+        Case("pseudo-inverse", KinematicProjector(chart.problem, limit=np.inf), TIGHT, "#d95f02"),
+        Case("pseudo-inverse, loose", KinematicProjector(chart.problem, limit=np.inf), LOOSE, "#222222", ":"),
+        Case("xi constant, loose", Kinematic(chart, limit=np.inf), LOOSE, "#66c2a5", "--"),
+        Case("xi constant", Kinematic(chart, limit=np.inf), TIGHT, "#1b9e77"),
+        Case("xi constant, feedback", Kinematic(chart, FEEDBACK, np.inf), TIGHT, "#1f5fa8"),
     ]
     runs = [repeat(case, chart, cycles) for case in cases]
     drifts = [drift(run, cycles) for run in runs]

@@ -99,7 +99,7 @@ def test_speeds_that_overflow_give_zeros(tmp_path: Path) -> None:
     *values, status = library.dynamics(np.full(3, 1e90), np.full(3, 1e90))
     assert status == ControlStatus.NOT_FINITE
     assert not any(value.any() for value in values)
-    assert "1 PX (prismatic)" in (tmp_path / "arm.h").read_text()
+    assert "1 PX [m]: " in (tmp_path / "arm.h").read_text()
 
 
 def test_valgrind_finds_nothing(pd_plus: Generated, tmp_path: Path) -> None:
@@ -137,7 +137,10 @@ def test_object_holds_no_state_and_calls_only_mathematics(pd_plus: Generated, tm
     rows = [line.split()[-2:] for line in symbols.splitlines()]
     assert {kind for kind, _ in rows} <= {"T", "t", "R", "r", "U"}
     public = {name for kind, name in rows if kind in "TR"}
-    functions, tables = ["chart", "inverse", "dynamics", "control"], ["default_gains", "domain_lower", "domain_upper"]
+    functions, tables = (
+        ["chart", "chart_curvature", "check", "inverse", "dynamics", "control"],
+        ["default_gains", "domain_lower", "domain_upper"],
+    )
     functions += ["start", "take_over", "resume", "step", "reference_at", "reference_low_pass", "reference_spline"]
     tables += ["default_safety"]
     assert public == {f"arm_{name}" for name in (*functions, *tables)}

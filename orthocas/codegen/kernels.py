@@ -40,11 +40,20 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     names = [function.name() for function in functions]
     code = "\n\n".join(_without_warnings(items[name]) for name in _needed(items, names))
     code = re.sub(r"\bcasadi_inf\b", "INFINITY", re.sub(r"\bcasadi_nan\b", "NAN", code))
+    code = _with_explicit_conditions(code)
     code = re.sub(r"CASADI_CAST\((\w+), ([^()]+)\)", r"(\1)(\2)", code)
     code = re.sub(r"\bcasadi_real\b", "double", re.sub(r"\bcasadi_int\b", "int", code))
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)
     work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), doubles[f.name()]) for f in functions}
     return Kernels(code, work)
+
+
+def _with_explicit_conditions(code: str) -> str:
+    """Compare numbers with zero where C would convert them to truth values; clang warns of such conversions."""
+    name = r"\(?(\*?\w+(?:\+\+|\[\w+\])?)\)?"
+    code = re.sub(rf"\({name}\?", r"((\1 != 0)?", code)
+    code = re.sub(rf"\(! ?{name} ?\)", r"(\1 == 0)", code)
+    return re.sub(rf"\({name}(&&|\|\|){name}\)", r"((\1 != 0)\2(\3 != 0))", code)
 
 
 _PRODUCT = re.compile(r"casadi_mtimes_dense\((\w+), (\d+), (\d+), (\w+), (\d+), (\w+), 0\)")

@@ -35,7 +35,7 @@ def draw(quick: bool) -> Drawing:
     """Draw task, coordinates and joints over time; the numbers tell how exactly the arm returns."""
     chart = fit(problems.get("iiwa"), Polynomial(4), weights=PAPER_LOSS).chart
     reference = journey(chart)
-    run = simulate(Kinematic(chart), reference, chart.problem.domain.centre, tolerance=_TOLERANCE)
+    run = simulate(Kinematic(chart, limit=np.inf), reference, chart.problem.domain.centre, tolerance=_TOLERANCE)
     figure = new_figure(6.2)
     panes = figure.subplots(3, 1, sharex=True)
     names = [rf"$\xi_{k + 1}$" for k in range(chart.r)]
