@@ -65,6 +65,7 @@ class Loop:
     encoders: bool = False
     coulomb: float = 0.0  #: friction, as a share of COULOMB
     push: tuple[float, ...] = (0.0, 0.0, 0.0)  #: [N]
+    stops: bool = True  #: of the joints
 
 
 IDEAL = Loop()
@@ -143,7 +144,7 @@ def textbook(name: str, law: TextbookLaw) -> Law:
 
 def followed(law: Law, robot: oc.Robot, q: Array, motion: Motion, loop: Loop = IDEAL) -> Run:
     """Run a law on the arm in MuJoCo, from rest at q."""
-    plant = MuJoCoPlant(robot, friction=Friction(coulomb=loop.coulomb * np.array(COULOMB)))
+    plant = MuJoCoPlant(robot, friction=Friction(coulomb=loop.coulomb * np.array(COULOMB)), stops=loop.stops)
     plant.reset(q)
     plant.push(loop.push)
     encoders = Encoders(q, TICK * loop.every)
@@ -224,17 +225,17 @@ def elbow_motion(chart: oc.Chart, run: Run) -> float:
     return float(1e3 * np.linalg.norm(points - points[0], axis=2).max())
 
 
-def pushed(law: Law, chart: oc.Chart, q: Array) -> Array:
-    """Largest motions of the flange along and across a push, and across at rest, over three axes [mm]."""
-    found = []
-    for axis, push in enumerate(PUSH * np.eye(3)):
-        run = followed(law, chart.problem.robot, q, held(chart, q, 2.0), Loop(push=tuple(push)))
-        moved = 1e3 * (chart.task(run.q) - chart.task(q))
-        across = np.linalg.norm(np.delete(moved, axis, axis=1), axis=1)
-        found.append([np.abs(moved[:, axis]).max(), across.max(), across[-1]])
-        if run.status:
-            found[-1] = [np.nan] * 3
-    return np.max(found, axis=0)
+def pushed(law: Law, chart: oc.Chart, starts: Array) -> Array:
+    """Motions of the flange along and across pushes, and across at rest, (starts, axes, 3) [mm]; NaN if it left."""
+    found = np.full((len(starts), 3, 3), np.nan)
+    for q, row in zip(starts, found, strict=True):
+        for axis, push in enumerate(PUSH * np.eye(3)):
+            run = followed(law, chart.problem.robot, q, held(chart, q, 2.0), Loop(push=tuple(push)))
+            moved = 1e3 * (chart.task(run.q) - chart.task(q))
+            across = np.linalg.norm(np.delete(moved, axis, axis=1), axis=1)
+            if not run.status:
+                row[axis] = np.abs(moved[:, axis]).max(), across.max(), across[-1]
+    return found
 
 
 def hidden_energy(law: Law, chart: oc.Chart, starts: Array) -> float:
@@ -250,37 +251,36 @@ def hidden_energy(law: Law, chart: oc.Chart, starts: Array) -> float:
 
 
 def against_textbook(chart: oc.Chart, laws: list[Law], starts: Array) -> list[str]:
-    """The first table: what a law does to the flange."""
+    """The first table: what a law does to the flange. Pushes count if no law leaves the domain."""
     robot, xis = chart.problem.robot, chart.labels[chart.m :]
     rows = [
-        "| | flange while xi moves | elbow | push: along | across | across at rest | noise |",
-        "| --- |" + " --- |" * 6,
+        "| | flange while xi moves | elbow | push: along | across | across at rest | left | noise |",
+        "|" + " --- |" * 8,
     ]
     moves = [(q, step_of(chart, q, xi)) for q in starts for xi in xis]
-    for law in laws:
+    pushes = np.array([pushed(law, chart, starts) for law in laws])
+    stayed = np.isfinite(pushes).all(axis=(0, 3))
+    for law, push in zip(laws, pushes, strict=True):
         runs = [(motion, followed(law, robot, q, motion)) for q, motion in moves]
-        lost = [run.status for _, run in runs if run.status]
-        error = max(flange_error(chart, run, motion) for motion, run in runs)
-        elbow = max(elbow_motion(chart, run) for _, run in runs)
-        push = np.max([pushed(law, chart, q) for q in starts], axis=0)
         noise = [followed(law, robot, q, motion, Loop(encoders=True)).noise for q, motion in moves[: len(xis)]]
         words = [
-            f"{error:.3f} mm{f', {len(lost)} {lost[0]}' if lost else ''}",
-            f"{elbow:.0f} mm",
-            *(f"{value:.1f} mm" for value in push),
+            f"{max(flange_error(chart, run, motion) for motion, run in runs):.3f} mm",
+            f"{max(elbow_motion(chart, run) for _, run in runs):.0f} mm",
+            *(f"{value:.1f} mm" for value in push[stayed].max(axis=0)),
+            f"{np.isnan(push[..., 0]).sum()} of {stayed.size}",
             f"{np.sqrt(np.mean(np.square(noise))):.2f} N m",
         ]
         rows.append(f"| {law.name} | {' | '.join(words)} |")
-        print("\n".join(rows[-1:] if law is not laws[0] else rows), flush=True)
+    print("\n".join(rows), flush=True)
     return rows
 
 
 def returning(chart: oc.Chart, laws: list[Law], starts: Array, cycles: int) -> list[str]:
-    """The second table: drift after circles, and energy in springs that the task does not feel."""
+    """The third table: drift after circles without stops, and energy in springs that the task does not feel."""
     rows = ["| | drift | largest flange error | hidden energy |", "| --- | --- | --- | --- |"]
     motion = circles(chart, starts[0], cycles)
     for law in laws:
-        run = followed(law, chart.problem.robot, starts[0], motion)
+        run = followed(law, chart.problem.robot, starts[0], motion, Loop(stops=False))
         drift = run.status or f"{np.linalg.norm(run.q[-1] - starts[0]):.1e} rad"
         words = [f"{drift}", f"{flange_error(chart, run, motion):.2f} mm", f"{hidden_energy(law, chart, starts):.2g} J"]
         rows.append(f"| {law.name} | {' | '.join(words)} |")
@@ -302,7 +302,7 @@ LOOPS = {
 
 
 def imperfect(chart: oc.Chart, laws: list[Law], starts: Array, loops: dict[str, Loop]) -> list[str]:
-    """The third table: largest errors of the flange while x moves and while xi moves, and how many runs went wrong."""
+    """The second table: largest errors of the flange while x moves and while xi moves, and how many runs went wrong."""
     rows = [f"| | {' | '.join(law.name for law in laws)} |", "| --- |" + " --- |" * len(laws)]
     groups = ((chart.labels[: chart.m], STEP), (chart.labels[chart.m :], None))
     moves = [[(q, step_of(chart, q, label, size)) for q in starts for label in labels] for labels, size in groups]
