@@ -24,6 +24,7 @@ SCRIPTS = (
     "closed_loop",
     "control_tick",
     "default_gains",
+    "operational_space",
     "metric_loss",
     "against_torch",
     "paper_network",
