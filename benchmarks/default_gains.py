@@ -47,8 +47,8 @@ DELAY = 5  # ticks from the measurement to the torque
 HOLD, STEP, XI = 1.5, 0.04, 0.15  # [s], [m], [1]
 
 
-def chart_of(name: str, task: str, metric: str) -> oc.Chart:
-    """Cubic coordinates."""
+def problem_of(name: str, task: str, metric: str) -> oc.Problem:
+    """An arm with its box."""
     if name in problems.names():
         known = problems.get(name)
         robot, box = known.robot, known.domain
@@ -56,8 +56,12 @@ def chart_of(name: str, task: str, metric: str) -> oc.Chart:
         file, tip, locked, centre, half_width = ROBOTS[name]
         path = next(Path(str(f.locate())).resolve() for f in files("example-robot-data") or [] if str(f).endswith(file))
         robot, box = oc.Robot.from_file(path, tip, locked), oc.Box(centre, half_width)
-    problem = oc.Problem(robot, oc.Task.named(robot, task, box.centre), metric, box, name)
-    return oc.fit(problem, oc.Polynomial(3), weights=(1000, 30, 150, 1)).chart
+    return oc.Problem(robot, oc.Task.named(robot, task, box.centre), metric, box, name)
+
+
+def chart_of(name: str, task: str, metric: str) -> oc.Chart:
+    """Cubic coordinates."""
+    return oc.fit(problem_of(name, task, metric), oc.Polynomial(3), weights=(1000, 30, 150, 1)).chart
 
 
 def modes_row(label: str, law: PDPlus) -> str:
@@ -81,16 +85,16 @@ def sag_row(label: str, law: PDPlus, starts: int) -> str:
         library = CompiledLibrary(compile_shared(generated, Path(folder)), "law", law.problem.n)
         for make in PLANTS.values():
             plant = MuJoCoPlant(make(law.problem.robot))
-            found = np.array([followed(law, library, plant, start) for start in starts_of(law, starts)])
+            found = np.array([followed(law, library, plant, start) for start in starts_of(law.problem, starts)])
             held, moving, lost = found[:, 0].max(), found[:, 1].max(), int((found[:, 2] > 0).sum())
             words.append(f"{1e3 * held:.1f}, {1e3 * moving:.1f}" + (f", {lost} left" if lost else ""))
     return f"| {' | '.join(words)} |"
 
 
-def starts_of(law: PDPlus, count: int) -> np.ndarray:
+def starts_of(problem: oc.Problem, count: int) -> np.ndarray:
     """Postures in the inner 60 % of the domain, the first at its centre."""
-    domain = law.problem.domain
-    places = np.random.default_rng(3).uniform(-0.6, 0.6, (count, law.problem.n))
+    domain = problem.domain
+    places = np.random.default_rng(3).uniform(-0.6, 0.6, (count, problem.n))
     places[0] = 0
     return np.asarray(domain.centre + domain.half_width * places)
 

@@ -92,6 +92,15 @@ def test_coulomb_friction_holds_what_is_below_it(panda: tuple[pin.Model, oc.Robo
     assert np.abs(moves.q - Q).max() > 0.05
 
 
+def test_light_joints_hardly_creep_below_their_coulomb_friction() -> None:
+    robot = oc.problems.get("iiwa").robot  # the last joint has an inertia of 3e-4 kg m^2
+    plant = MuJoCoPlant(robot, friction=Friction(coulomb=0.3))
+    plant.reset(np.zeros(7))
+    for _ in range(500):
+        plant.step(robot.gravity(plant.q) + 0.1, 1e-3)
+    assert np.abs(plant.dq).max() < 0.005
+
+
 @pytest.mark.slow
 def test_stops_hold(panda: tuple[pin.Model, oc.Robot], plant: MuJoCoPlant) -> None:
     robot = panda[1]

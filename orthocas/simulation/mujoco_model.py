@@ -16,6 +16,7 @@ TIP = "tip"  #: name of the body at the tip frame; it carries the payload
 HAND = "hand"  #: name of the geom at the tip that touches the wall
 _STOP_TIME = 0.004  # [s] time constant of the stops, critically damped; MuJoCo's is 0.02 ...
 _STOP_IMPEDANCE = (0.99, 0.999)  # ... and 0.9 to 0.95, which lets a motor press a light wrist 0.1 rad beyond its stop
+_FRICTION_IMPEDANCE = (0.999, 0.999)  # with MuJoCo's, a light wrist creeps at 0.4 rad/s below its friction
 _FAR = 1e9  # [rad] or [m]: MuJoCo's ranges have two ends
 
 
@@ -101,6 +102,7 @@ def _add_joint(
     kind = mj.mjtJoint.mjJNT_SLIDE if tree.joint_kinds[i] == "prismatic" else mj.mjtJoint.mjJNT_HINGE
     joint = body.add_joint(name=f"joint{i}", type=kind, axis=(0, 0, 1), armature=tree.armatures[i])
     joint.damping[0], joint.frictionloss = viscous, coulomb
+    joint.solimp_friction[:2] = _FRICTION_IMPEDANCE
     ends = np.array([tree.lower[i], tree.upper[i]])
     limited = stops and bool(np.isfinite(ends).any())
     joint.limited = mj.mjtLimited.mjLIMITED_TRUE if limited else mj.mjtLimited.mjLIMITED_FALSE
