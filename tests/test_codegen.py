@@ -52,6 +52,16 @@ def test_every_controller_equals_its_python(planar_chart: oc.Chart, tmp_path: Pa
         assert generated.stack_bytes < 20_000
 
 
+@needs_c
+def test_law_of_a_weak_arm_is_compared_beyond_its_limits(planar_chart: oc.Chart, tmp_path: Path) -> None:
+    """At random states and default gains its limit cuts every command."""
+    law = PDPlus(planar_chart, 50.0, limit=[0.1, 0.1, 0.1])
+    assert (
+        check_c(oc.generate_c(planar_chart, tmp_path, law), planar_chart, law, states=100).differences["control"]
+        < 1e-10
+    )
+
+
 @pytest.mark.parametrize("parametrisation", [oc.Linear(), oc.Fourier(2), oc.MLP((5, 4))], ids=lambda p: p.label)
 def test_every_family_equals_its_python(planar_xy: oc.Problem, parametrisation: Any, tmp_path: Path) -> None:
     chart = oc.fit(planar_xy, parametrisation, samples=300).chart

@@ -197,6 +197,7 @@ def _random_gains(controller: Controller, rows: int, rng: np.random.Generator) -
     for name, gain in controller.gains.items():
         values = _RANDOM.get(name, _scaled)(gain, rows, rng)
         if name == "limit":
+            values[::3] = np.inf  # states of a weak arm may all saturate, which would say little of the law
             values[7::40, 0] = rng.choice([0.0, -1.0, np.nan, np.inf], size=len(values[7::40]))
         gains.append(values)
     return gains
