@@ -109,6 +109,7 @@ def test_after_the_start_the_law_commands(supervisor: Supervisor, chart: oc.Char
     np.testing.assert_allclose(command, want.full().ravel(), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_pushed_out_it_is_caught_holds_and_returns_when_asked(supervisor: Supervisor, chart: oc.Chart) -> None:
     domain = chart.problem.domain
     q = domain.centre + 0.9 * domain.half_width
@@ -134,6 +135,7 @@ def test_pushed_out_it_is_caught_holds_and_returns_when_asked(supervisor: Superv
     assert speeds.max() < 0.8
 
 
+@pytest.mark.slow
 def test_the_catcher_takes_energy_and_never_adds_any(supervisor: Supervisor, chart: oc.Chart) -> None:
     """Kinetic energy plus the spring of the catcher does not rise, but for the errors of ticks and integration."""
     domain, robot = chart.problem.domain, chart.problem.robot
@@ -247,6 +249,7 @@ def test_a_late_tick_calls_the_catcher(supervisor: Supervisor, chart: oc.Chart) 
         assert supervisor.step(q, np.zeros(3), at_rest(chart, q), period)[1] is ControlStatus.BAD_INPUT
 
 
+@pytest.mark.slow
 def test_integral_action_removes_sag_and_does_not_wind_up(
     library: CompiledLibrary, law: Controller, chart: oc.Chart
 ) -> None:
@@ -376,10 +379,10 @@ def test_settings_in_c_are_those_of_python(generated: GeneratedC, law: Controlle
         assert first[1] == second[1]
 
 
-@pytest.mark.parametrize("flags", [("-fsanitize=address,undefined", "-fno-sanitize-recover=all"), ("-O2",)])
-def test_a_million_hostile_ticks_stay_bounded_with_the_right_status(
-    generated: GeneratedC, tmp_path: Path, flags: tuple[str, ...]
-) -> None:
+@pytest.mark.slow
+def test_a_million_hostile_ticks_stay_bounded_with_the_right_status(generated: GeneratedC, tmp_path: Path) -> None:
+    """Under the address and undefined-behaviour sanitizers; the program itself checks commands, states and statuses."""
+    flags = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     program = built(
         generated, "supervised_ticks.c", tmp_path, "-DTICKS=1000000L", "-DLIMIT=120.0", "-DSINGULAR=0", *flags
     )
