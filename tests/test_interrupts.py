@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from orthocas import solvers
 from orthocas.casadi_tools import interrupts
 from orthocas.errors import Interrupted
 from orthocas.minimising.solver import Status
+from orthocas.minimising.watch import Progress
 
 FITS = {
     "network, lbfgs": (oc.MLP((32, 32)), solvers.LBFGS(max_iterations=100_000, tolerance=0.0), {}),
@@ -52,6 +54,24 @@ def test_ctrl_c_at_any_moment(planar_x: oc.Problem, name: str, seconds: float) -
     if found is not None:
         assert found.status is Status.INTERRUPTED
         assert np.isfinite(found.chart.xi(planar_x.domain.centre)).all()
+
+
+def test_ctrl_c_that_a_library_swallows_ends_a_fit_all_the_same(planar_x: oc.Problem) -> None:
+    """CasADi's Python has places with `except: pass`; here the monitor is one."""
+    shares = []
+
+    def swallow(progress: Progress) -> None:
+        shares.append(progress.fraction)
+        if len(shares) == 3:
+            with suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(Interrupted) as stopped:
+        oc.fit(planar_x, oc.MLP((8, 8)), solvers.LBFGS(max_iterations=1000, tolerance=0.0), monitor=swallow)
+    assert stopped.value.result.status is Status.INTERRUPTED
+    assert len(shares) < 10
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_deferred_interrupt_comes_at_the_end_and_the_handler_is_put_back() -> None:

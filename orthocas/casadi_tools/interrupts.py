@@ -4,8 +4,8 @@ An exception cannot pass through CasADi's compiled code: it comes out as another
 code runs, a signal is only recorded. When the code returns, or earlier where `check` is called, Ctrl-C becomes
 KeyboardInterrupt, and the signals of `ended_in_order` become SystemExit.
 
-Some of CasADi's Python swallows exceptions of all kinds (`except: pass` in `vertcat` and others). A command line that
-`remembers` Ctrl-C ends as interrupted all the same.
+Some of CasADi's Python swallows exceptions of all kinds (`except: pass` in `vertcat` and others). A command line or
+a fit that remembers Ctrl-C (`remembered`) ends as interrupted all the same.
 """
 
 import signal
@@ -85,8 +85,12 @@ def ended_in_order() -> Iterator[None]:
 def remembered() -> Iterator[Callable[[], bool]]:
     """A function that tells whether Ctrl-C has come during the block, even if its exception got lost.
 
-    Where something other than Python's own handler is in charge, it tells what compiled code held back only.
+    Where something other than Python's own handler is in charge, it tells what compiled code held back only. Other
+    threads than the main one get no signals.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
     memory, before = _Note(), signal.getsignal(signal.SIGINT)
     _memories.append(memory)
     if before is signal.default_int_handler:
@@ -96,6 +100,13 @@ def remembered() -> Iterator[Callable[[], bool]]:
     finally:
         _memories.remove(memory)
         signal.signal(signal.SIGINT, before)
+
+
+def check_remembered() -> None:
+    """Raise the Ctrl-C that came during the innermost `remembered` block and got lost; for long loops."""
+    lost = bool(_memories) and _memories[-1].number is not None
+    if lost and threading.current_thread() is threading.main_thread():
+        raise KeyboardInterrupt
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from orthocas.casadi_tools.interrupts import remembered
 from orthocas.chart import Chart
 from orthocas.checks import as_path, require_kind
 from orthocas.coordinates.fitted import Coordinates
@@ -153,6 +154,22 @@ def fit(
     warn_unless_savable(settings.parametrisation)
     if isinstance(settings.parametrisation, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))
+    with remembered() as pressed:
+        result = _fitted(problem, settings, monitor, checkpoint, align_to, start)
+        if result.status is Status.INTERRUPTED or pressed():
+            raise Interrupted(result)
+    return result
+
+
+def _fitted(
+    problem: Problem,
+    settings: FitSettings,
+    monitor: Monitor,
+    checkpoint: str | Path | None,
+    align_to: Chart | None,
+    start: float,
+) -> Fit:
+    """Fit with settings that are checked; `start` is when the fit began."""
     found = check(problem, seed=settings.seed)
     first = sample_problem(problem, 200, (settings.seed, _FIRST_SAMPLES))
     if settings.parametrisation.closed_form is not None:
@@ -167,7 +184,7 @@ def fit(
         if stages:
             centre = problem.domain.centre
             coordinates = in_gauge(coordinates, centre) if align_to is None else aligned(coordinates, align_to, first)
-    result = Fit(
+    return Fit(
         chart=Chart(problem, coordinates, _notes(stages, settings, worst)),
         stages=stages,
         problem_check=found,
@@ -176,9 +193,6 @@ def fit(
         seconds=time.perf_counter() - start,
         clear_part=clear_part(problem, found, worst),
     )
-    if result.status is Status.INTERRUPTED:
-        raise Interrupted(result)
-    return result
 
 
 def _minimised(

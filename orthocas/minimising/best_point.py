@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from orthocas.casadi_tools.interrupts import check_remembered
 from orthocas.checks import Array
 from orthocas.minimising.objective import Objective
 from orthocas.minimising.solver import SolveResult, Status
@@ -60,6 +61,7 @@ class BestPoint:
         The state holds everything that decides how the run goes on. The solver does not change its arrays in place
         later.
         """
+        check_remembered()
         self.iterations += 1
         self.keep(**state)
         self.watch.report(self.iterations / limit, self.value)
