@@ -41,19 +41,19 @@ def supervision_values(controller: Controller, safety: Safety) -> dict[str, str]
         "domain_half_width": numbers(domain.half_width),
         "bordered": _flags(bordered),
         "turning": _flags(endless),
-        "safety_fields": "\n".join(_field(name, value, controller) for name, value in _numbers(safety).items()),
+        "safety_fields": "\n".join(_field(name, value) for name, value in _numbers(safety).items()),
         "safety_values": ",\n".join(f"  {_literal(value)}" for value in _numbers(safety).values()),
         "fallback_arguments": "\n".join(f"  arg[{1 + i}] = gains->{gain};" for i, gain in enumerate(controller.gains)),
     }
 
 
 _TORQUE = """It compensates gravity, damps with the mass matrix,
- * holds the arm with a spring that gives way under too much force, and never adds energy."""
+ * holds the arm with a spring that gives way under too much force."""
 _VELOCITY = """It stops the arm and holds it."""
 
 _MEANING: Mapping[str, str] = {
     "command_rate": "largest change of the command per second",
-    "speed_limit": "joint speed at which the catcher takes over; ten times as fast is a bad measurement",
+    "speed_limit": "joint speed at which the catcher takes over; 30 times as fast is a bad measurement",
     "rest_speed": "joint speed below which the arm counts as slow",
     "near_margin": "distance to the border, in half-widths, at which NEAR_BORDER and damping begin",
     "catch_margin": "distance to the border at which the catcher takes over",
@@ -82,7 +82,7 @@ def _numbers(safety: Safety) -> dict[str, object]:
     return {field.name: getattr(safety, field.name) for field in fields(safety)}
 
 
-def _field(name: str, value: object, controller: Controller) -> str:
+def _field(name: str, value: object) -> str:
     size = f"[{value.size}]" if isinstance(value, np.ndarray) else ""
     kind = "int" if name == "hold_ticks" else "double"
     return f"  {kind} {name}{size}; /* {_MEANING[name]} */"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_point
+from orthocas.checks import Array, as_point, require_shape
 from orthocas.codegen.library import CompiledLibrary, gain_numbers
 from orthocas.control import Controller, ControlStatus, Safety
 
@@ -49,8 +49,9 @@ class Supervisor:
     def step(self, q: Array, dq: Array, reference: Array, period: float = 1e-3) -> tuple[Array, ControlStatus]:
         """Command (n,) and status of one control period. The reference is [value, velocity, acceleration], (3 k,)."""
         inputs = [np.ascontiguousarray(part, dtype=float) for part in (q, dq, reference, self.gains)]
-        if [part.size for part in inputs[:3]] != [self._n, self._n, 3 * self._k]:
-            raise ValueError(f"sizes {[part.size for part in inputs[:3]]}, expected {self._n, self._n, 3 * self._k}")
+        sizes = {"q": self._n, "dq": self._n, "reference": 3 * self._k}
+        for (name, size), part in zip(sizes.items(), inputs, strict=False):  # C would read beyond the end
+            require_shape(name, part.shape, (size,))
         status = self._functions["step"](
             self._here, self._safety, *map(_pointer, inputs), float(period), _pointer(self._command)
         )

@@ -31,7 +31,7 @@ class Safety:
     """
 
     command_rate: Array  #: largest change of the command [N m/s], [rad/s^2]
-    speed_limit: Array  #: joint speed at which the catcher takes over; ten times as fast is a bad measurement [rad/s]
+    speed_limit: Array  #: joint speed at which the catcher takes over; 30 times as fast is a bad measurement [rad/s]
     rest_speed: Array  #: joint speed below which the arm counts as slow [rad/s]
     near_margin: float  #: where NEAR_BORDER and additional damping begin
     catch_margin: float  #: where the catcher takes over, also if the arm would get there while the law fades out
