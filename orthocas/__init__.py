@@ -30,6 +30,7 @@ from orthocas.comparing.compare import compare
 from orthocas.comparing.report import Comparison
 from orthocas.distil import distil
 from orthocas.domains import Box, Torus, contains, default_box
+from orthocas.exporting import export
 from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.loss import Weights
 from orthocas.fitting.loss import register as register_loss_term
@@ -87,6 +88,7 @@ __all__ = [
     "distil",
     "errors",
     "evaluate",
+    "export",
     "fit",
     "generate_c",
     "grow",

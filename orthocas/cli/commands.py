@@ -9,6 +9,7 @@ from orthocas.cli.codegen import codegen
 from orthocas.cli.compare import compare
 from orthocas.cli.entry import INTERRUPTED
 from orthocas.cli.evaluate import evaluate
+from orthocas.cli.export import export
 from orthocas.cli.fit import fit
 from orthocas.cli.info import info
 from orthocas.cli.reproduce import reproduce
@@ -31,6 +32,7 @@ app.command()(compare)
 app.command()(reproduce)
 app.command()(simulate)
 app.command()(codegen)
+app.command()(export)
 
 
 def _complain(text: str) -> None:

@@ -276,6 +276,7 @@ def _functions() -> dict[str, Call]:
         ),
         "evaluate": (oc.evaluate, {"chart": chart, "samples": 50, "seed": 1}),
         "evaluate points": (oc.evaluate, {"chart": chart, "samples": None, "seed": None, "points": [q, q]}),
+        "export": (oc.export, {"chart": chart, "to": "numpy", "path": "module.py", "force": False}),
         "generate_c": (oc.generate_c, {"chart": chart, "out": "c", "controller": impedance(), "name": "arm"}),
         "generate_c with settings": (
             oc.generate_c,
