@@ -142,7 +142,11 @@ class Chart(Shown):
         """Task values and extra coordinates stacked, (n,) or (N, n)."""
         if isinstance(q, ca.SX | ca.MX):
             return self._expression("phi", q)
-        return np.concatenate([self.task(q), self.xi(q)], axis=-1)
+        points, single = as_point_set("q", q, self.n)
+        phi = np.empty((len(points), self.n))
+        self.problem.task.batched.into(phi[:, : self.m], points)
+        self._coordinates_into("xi", phi[:, self.m :], points)
+        return phi[0] if single else phi
 
     @overload
     def jacobian(self, q: Symbolic) -> Symbolic: ...
@@ -153,7 +157,9 @@ class Chart(Shown):
         if isinstance(q, ca.SX | ca.MX):
             return self._expression("jacobian", q)
         points, single = as_point_set("q", q, self.n)
-        J = np.concatenate([task_jacobians(self.problem, points), self.coordinates.jacobian(points)], axis=1)
+        J = np.empty((len(points), self.n, self.n))
+        task_jacobians(self.problem, points, J[:, : self.m])
+        self._coordinates_into("jacobian", J[:, self.m :], points)
         return J[0] if single else J
 
     def quality(self, q: ArrayLike) -> PointQuality:
@@ -229,6 +235,13 @@ class Chart(Shown):
         """Evaluate a function at a CasADi column (n, 1)."""
         require_shape("q", q.shape, (self.n, 1))
         return self.function(name)(q)
+
+    def _coordinates_into(self, name: str, results: Array, points: Array) -> None:
+        """Write xi or its Jacobian at points (N, n) to part of an array."""
+        if isinstance(self.coordinates, Coordinates):
+            self.coordinates.into(name, results, points)
+        else:
+            results[...] = getattr(self.coordinates, name)(points)
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Write a self-contained chart file. It replaces a chart file of that name, and with `force` any other file.
