@@ -74,9 +74,9 @@ def _solved(chart: "Chart", starts: Array, targets: Array, sign: float) -> tuple
             break
     error = np.abs((chart.phi(q) - targets) / sizes).max(axis=1)
     near = np.linalg.norm(q - starts, axis=1) <= _FARTHEST * first + 1e-9
-    good = np.asarray(chart.problem.domain.contains(q), dtype=bool)
-    good &= (error < _TOLERANCE) & near
-    good[good] = np.sign(np.linalg.det(_jacobian(chart, q[good]))) == sign
+    good = np.logical_and.reduce([error < _TOLERANCE, near, chart.problem.domain.contains(q)])
+    rows = np.flatnonzero(good)
+    good[rows] = np.sign(np.linalg.det(_jacobian(chart, q[rows]))) == sign
     return q, good
 
 
