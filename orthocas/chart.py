@@ -22,6 +22,8 @@ from orthocas.files.chart_file import fingerprint, read_chart, write_chart
 from orthocas.growing import GrownCoordinates
 from orthocas.judging.pointwise import PointQuality, point_quality
 from orthocas.problem import Problem, task_jacobians, task_sizes
+from orthocas.reaching.intervals import XiRange, xi_range
+from orthocas.reaching.self_motion import SelfMotion, self_motion
 from orthocas.showing import Shown, listed
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
@@ -185,6 +187,68 @@ class Chart(Shown):
         if single:
             found = PointQuality(found.leak_deg[0], found.conditioning[0], found.border_distance[0])
         return found
+
+    def xi_range(self, q: ArrayLike) -> XiRange:
+        """How far each extra coordinate reaches alone from q, the task value and the other coordinates held.
+
+        For each coordinate, the curve through q along which only that coordinate changes is followed in both directions
+        until it leaves the domain or meets a fold. The ends are exact to 1e-9; the path between them is checked at
+        steps of at most 0.1 rad or m.
+
+        Args:
+            q: a joint position (n,) inside the domain.
+
+        Returns:
+            An `Interval` for each coordinate: lowest and highest value, and what stops it there.
+
+        Raises:
+            ShapeError, InvalidValueError: if q is not a joint position inside the domain.
+
+        Source:
+            ours.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
+            >>> print(chart.xi_range([0.6, 0.8, 0.8])["xi1"])
+            Interval: xi1 in [-0.3359, 0.2538], 0 now
+              low   joint 'q2' at 0.4073
+              high  joint 'q3' at 0.4073
+        """
+        return xi_range(self, q)
+
+    def self_motion(self, q: ArrayLike, step: float = 0.05, samples: int = 1000) -> SelfMotion:
+        """What can move at the task value of q without leaving the domain.
+
+        With r = 1 it is the curve through q, followed along the null space of J_x in both directions until it leaves
+        the domain or closes. It goes on where the coordinate turns back. With r > 1 it is a set of points on a lattice
+        in xi, filled from q on, and as far as the chart does not fold. All points have the task value of q to 1e-9.
+
+        Args:
+            q: a joint position (n,) inside the domain.
+            step: for r = 1: the largest distance of points along the curve [rad] or [m].
+            samples: for r > 1: about how many points, at most 10,000.
+
+        Returns:
+            Joint positions, their coordinates, and how far each coordinate reaches: exactly for r = 1, at least so far
+            for r > 1. With r = 1 a `SelfMotionCurve`, with the length of the curve and whether it closes.
+
+        Raises:
+            ShapeError, InvalidValueError: if q is not a joint position inside the domain, or a number is out of range.
+
+        Source:
+            ours.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
+            >>> motion = chart.self_motion([0.6, 0.8, 0.8])
+            >>> motion.closed, motion.q.shape[1], round(float(abs(chart.task(motion.q) - motion.x).max()), 9)
+            (False, 3, 0.0)
+        """
+        return self_motion(self, q, step, samples)
 
     def inverse(self, phi: ArrayLike, q_start: ArrayLike, tolerance: float = 1e-9) -> Array:
         """Solve phi(q) = phi for q: fitted charts by Newton's method with line search, grown ones along the flow.
