@@ -437,6 +437,11 @@ def _control() -> dict[str, Call]:
             {"controller": law, "reference": reference, "q_start": centre, "control_rate": 50.0, "dq_start": centre * 0}
             | {"noise": None, "plant": None},
         ),
+        "simulate supervised": (
+            oc.simulate,
+            {"controller": law, "reference": reference, "q_start": centre, "control_rate": 50.0, "resume_after": 1.0}
+            | {"safety": control.Safety.of(law)},
+        ),
         "coupling_index": (
             simulation.coupling_index,
             {"chart": chart, "reference": reference, "trajectory": trajectory()},
