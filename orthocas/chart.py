@@ -13,15 +13,26 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.certificates.certificate import Certificate
-from orthocas.checks import Array, as_path, as_point_set, require_at_least, require_kind, require_known, require_shape
+from orthocas.checks import (
+    Array,
+    as_float_array,
+    as_path,
+    as_point_set,
+    require_at_least,
+    require_kind,
+    require_known,
+    require_shape,
+)
 from orthocas.coordinates.fitted import Coordinates
-from orthocas.coordinates.inverse import NewtonInverse, error_scale, require_solved
 from orthocas.coordinates.map import CoordinateMap, InvertibleMap
-from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.files.chart_file import fingerprint, read_chart, write_chart
 from orthocas.growing import GrownCoordinates
+from orthocas.inverting import FewRows, Inverse, Newton, OwnInverse, PhiMap, PointFunctions, Solutions
 from orthocas.judging.pointwise import PointQuality, point_quality
 from orthocas.problem import Problem, task_jacobians, task_sizes
+from orthocas.reaching.intervals import XiRange, xi_range
+from orthocas.reaching.self_motion import SelfMotion, self_motion
 from orthocas.showing import Shown, listed
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
@@ -186,35 +197,121 @@ class Chart(Shown):
             found = PointQuality(found.leak_deg[0], found.conditioning[0], found.border_distance[0])
         return found
 
-    def inverse(self, phi: ArrayLike, q_start: ArrayLike, tolerance: float = 1e-9) -> Array:
+    def xi_range(self, q: ArrayLike) -> XiRange:
+        """How far each extra coordinate reaches alone from q, the task value and the other coordinates held.
+
+        For each coordinate, the curve through q along which only that coordinate changes is followed in both directions
+        until it leaves the domain or meets a fold. The ends are exact to 1e-9; the path between them is checked at
+        steps of at most 0.1 rad or m.
+
+        Args:
+            q: a joint position (n,) inside the domain.
+
+        Returns:
+            An `Interval` for each coordinate: lowest and highest value, and what stops it there.
+
+        Raises:
+            ShapeError, InvalidValueError: if q is not a joint position inside the domain.
+
+        Source:
+            ours.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
+            >>> print(chart.xi_range([0.6, 0.8, 0.8])["xi1"])
+            Interval: xi1 in [-0.3359, 0.2538], 0 now
+              low   joint 'q2' at 0.4073
+              high  joint 'q3' at 0.4073
+        """
+        return xi_range(self, q)
+
+    def self_motion(self, q: ArrayLike, step: float = 0.05, samples: int = 1000) -> SelfMotion:
+        """What can move at the task value of q without leaving the domain.
+
+        With r = 1 it is the curve through q, followed along the null space of J_x in both directions until it leaves
+        the domain or closes. It goes on where the coordinate turns back. With r > 1 it is a set of points on a lattice
+        in xi, filled from q on, and as far as the chart does not fold. All points have the task value of q to 1e-9.
+
+        Args:
+            q: a joint position (n,) inside the domain.
+            step: for r = 1: the largest distance of points along the curve [rad] or [m].
+            samples: for r > 1: about how many points, at most 10,000.
+
+        Returns:
+            Joint positions, their coordinates, and how far each coordinate reaches: exactly for r = 1, at least so far
+            for r > 1. With r = 1 a `SelfMotionCurve`, with the length of the curve and whether it closes.
+
+        Raises:
+            ShapeError, InvalidValueError: if q is not a joint position inside the domain, or a number is out of range.
+
+        Source:
+            ours.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
+            >>> motion = chart.self_motion([0.6, 0.8, 0.8])
+            >>> motion.closed, motion.q.shape[1], round(float(abs(chart.task(motion.q) - motion.x).max()), 9)
+            (False, 3, 0.0)
+        """
+        return self_motion(self, q, step, samples)
+
+    def inverse(self, phi: ArrayLike, q_start: ArrayLike | None = None, tolerance: float = 1e-9) -> Array:
         """Solve phi(q) = phi for q: fitted charts by Newton's method with line search, grown ones along the flow.
 
         Args:
             phi: target values, (n,) or (N, n).
-            q_start: initial guess (n,), or (N, n) with one guess per row of phi. For grown coordinates it selects the
-                number of full turns and the sheet of a linear leaf.
+            q_start: initial guess (n,), or (N, n) with one guess per row of phi; default: starts that are found as in
+                `solve`. For grown coordinates it selects the number of full turns and the sheet of a linear leaf.
             tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
 
         Returns:
             q, (n,) or (N, n). It may lie outside the domain; check with `orthocas.contains`.
 
         Raises:
-            InverseError: if there is no solution near q_start, or J becomes singular on the way. The message names the
-                rows.
+            InverseError: if no solution is found, or J is singular there. The message names the rows.
+        """
+        targets, single = as_point_set("phi", phi, self.n)
+        if q_start is not None:
+            as_point_set("q_start", q_start, self.n)
+        q = self.solve(targets, q_start, tolerance=tolerance).require(inside=False).q
+        return q[0] if single else q
+
+    def solve(self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
+        """Solve phi(q) = phi for q, with a status for each row: a row that fails does not disturb the others.
+
+        Newton's method works on all rows at once. With `q_start`, it searches from there only, and q is the solution
+        near the start. Otherwise it starts at a rough inverse of phi, a polynomial fitted to points of the domain.
+        Rows that do not lead to a solution inside the domain start again at its centre, and at the 8 points of a table
+        whose phi is nearest.
+
+        Args:
+            phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
+            q_start: initial guess (n,), or (N, n) with one guess per row of phi.
+            tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
+
+        Returns:
+            `Solutions` with q (N, n), status, iterations, error and distance (N,); N = 1 for one phi.
+
+        Raises:
+            ShapeError: if a row has another number of entries, or q_start another number of rows.
+
+        Source:
+            ours: docs/inverse.md.
         """
         require_at_least("tolerance", tolerance, 0)
-        targets, single = as_point_set("phi", phi, self.n)
-        starts, _ = as_point_set("q_start", q_start, self.n)
-        if len(starts) not in (1, len(targets)):
-            raise ShapeError("q_start", starts.shape, targets.shape)
-        starts = np.broadcast_to(starts, targets.shape)
-        if isinstance(self.coordinates, InvertibleMap):
-            solutions = self.coordinates.inverse(targets, starts)
-        else:
-            solutions = self._newton.solve(targets, starts)
-        solutions = solutions.reshape(-1, self.n)
-        self._require_solved(solutions, targets, tolerance)
-        return solutions[0] if single else solutions
+        targets = self._rows("phi", phi)
+        starts = None if q_start is None else self._rows("q_start", q_start)
+        if starts is None and isinstance(self.coordinates, InvertibleMap):
+            starts = self.problem.domain.centre[None]
+        if starts is not None:
+            if len(starts) not in (1, len(targets)):
+                raise ShapeError("q_start", starts.shape, targets.shape)
+            starts = np.broadcast_to(starts, targets.shape)
+        return self._inverse.solve(targets, starts, float(tolerance))
 
     def function(self, name: str) -> ca.Function:
         """The CasADi function behind a method: xi, phi, jacobian, task, task_jacobian or second_derivative.
@@ -286,19 +383,26 @@ class Chart(Shown):
         return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
 
     @cached_property
-    def _newton(self) -> NewtonInverse:
-        return NewtonInverse(self._functions["phi"], self.phi_sizes)
+    def _inverse(self) -> Inverse:
+        phi_map = PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes)
+        if isinstance(self.coordinates, InvertibleMap):
+            return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map, self.m))
+        points = PointFunctions.of(self.function("phi"), self.function("jacobian"))
+        return Inverse(self.problem, phi_map, FewRows(phi_map, points, Newton(phi_map)))
 
-    def _require_solved(self, solutions: Array, targets: Array, tolerance: float) -> None:
-        """Check solutions of the inverse map by evaluating them."""
-        finite = np.asarray(np.isfinite(solutions).all(axis=1))
-        safe = np.where(finite[:, None], solutions, self.problem.domain.centre)
-        difference = self.phi(safe) - targets
-        if isinstance(self.coordinates, InvertibleMap) and self.coordinates.turn:
-            turn = self.coordinates.turn
-            difference[:, self.m :] -= turn * np.round(difference[:, self.m :] / turn)
-        relative = np.abs(difference / error_scale(targets, self.phi_sizes)).max(axis=1)
-        require_solved(np.where(finite, relative, np.inf), self.jacobian(safe), self.phi_sizes, tolerance)
+    def _jacobian_or_nan(self, points: Array) -> Array:
+        """J at points (N, n), with NaN where the task has no finite Jacobian."""
+        try:
+            return self.jacobian(points)
+        except SingularTaskError:
+            J_x = self.problem.task.batched_jacobian(points)[0].reshape(-1, self.m, self.n)
+            return np.concatenate([J_x, self.coordinates.jacobian(points)], axis=1)
+
+    def _rows(self, name: str, value: ArrayLike) -> Array:
+        """One point or a set, as `as_point_set` takes them, but finite or not, (N, n)."""
+        array = as_float_array(name, value)
+        as_point_set(name, np.zeros_like(array), self.n)
+        return array.reshape(-1, self.n)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -32,6 +32,11 @@ class ControlStatus(IntEnum):
     TOO_FAST = 9  #: why the catcher took over: a joint was faster than its limit
     LATE = 10  #: why the catcher took over: a tick came too late
 
+    @property
+    def words(self) -> str:
+        """For example 'near border'."""
+        return self.name.lower().replace("_", " ")
+
 
 #: statuses of commands that are not the fallback
 FROM_THE_LAW = (ControlStatus.OK, ControlStatus.SATURATED, ControlStatus.NEAR_BORDER)

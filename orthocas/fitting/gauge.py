@@ -48,9 +48,10 @@ def in_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
     the positive direction. Idle joints stay last.
     """
     g = coordinates.jacobian(centre[None, :])[0, : len(coordinates.offset)]
-    moved = (g**2 @ np.arange(g.shape[1])) / (g**2).sum(axis=1)
+    size = (g**2).sum(axis=1)
+    moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)  # g = 0: a fold at the centre
     largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]
-    return _rearranged(coordinates, np.argsort(moved, kind="stable"), np.sign(largest))
+    return _rearranged(coordinates, np.argsort(moved, kind="stable"), np.where(largest < 0, -1.0, 1.0))
 
 
 def aligned(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordinates:
