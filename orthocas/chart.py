@@ -22,6 +22,8 @@ from orthocas.files.chart_file import fingerprint, read_chart, write_chart
 from orthocas.growing import GrownCoordinates
 from orthocas.judging.pointwise import PointQuality, point_quality
 from orthocas.problem import Problem, task_jacobians, task_sizes
+from orthocas.reaching.intervals import XiRange, xi_range
+from orthocas.reaching.self_motion import SelfMotion, self_motion
 from orthocas.showing import Shown, listed
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
@@ -142,7 +144,11 @@ class Chart(Shown):
         """Task values and extra coordinates stacked, (n,) or (N, n)."""
         if isinstance(q, ca.SX | ca.MX):
             return self._expression("phi", q)
-        return np.concatenate([self.task(q), self.xi(q)], axis=-1)
+        points, single = as_point_set("q", q, self.n)
+        phi = np.empty((len(points), self.n))
+        self.problem.task.batched.into(phi[:, : self.m], points)
+        self._coordinates_into("xi", phi[:, self.m :], points)
+        return phi[0] if single else phi
 
     @overload
     def jacobian(self, q: Symbolic) -> Symbolic: ...
@@ -153,7 +159,9 @@ class Chart(Shown):
         if isinstance(q, ca.SX | ca.MX):
             return self._expression("jacobian", q)
         points, single = as_point_set("q", q, self.n)
-        J = np.concatenate([task_jacobians(self.problem, points), self.coordinates.jacobian(points)], axis=1)
+        J = np.empty((len(points), self.n, self.n))
+        task_jacobians(self.problem, points, J[:, : self.m])
+        self._coordinates_into("jacobian", J[:, self.m :], points)
         return J[0] if single else J
 
     def quality(self, q: ArrayLike) -> PointQuality:
@@ -179,6 +187,68 @@ class Chart(Shown):
         if single:
             found = PointQuality(found.leak_deg[0], found.conditioning[0], found.border_distance[0])
         return found
+
+    def xi_range(self, q: ArrayLike) -> XiRange:
+        """How far each extra coordinate reaches alone from q, the task value and the other coordinates held.
+
+        For each coordinate, the curve through q along which only that coordinate changes is followed in both directions
+        until it leaves the domain or meets a fold. The ends are exact to 1e-9; the path between them is checked at
+        steps of at most 0.1 rad or m.
+
+        Args:
+            q: a joint position (n,) inside the domain.
+
+        Returns:
+            An `Interval` for each coordinate: lowest and highest value, and what stops it there.
+
+        Raises:
+            ShapeError, InvalidValueError: if q is not a joint position inside the domain.
+
+        Source:
+            ours.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
+            >>> print(chart.xi_range([0.6, 0.8, 0.8])["xi1"])
+            Interval: xi1 in [-0.3359, 0.2538], 0 now
+              low   joint 'q2' at 0.4073
+              high  joint 'q3' at 0.4073
+        """
+        return xi_range(self, q)
+
+    def self_motion(self, q: ArrayLike, step: float = 0.05, samples: int = 1000) -> SelfMotion:
+        """What can move at the task value of q without leaving the domain.
+
+        With r = 1 it is the curve through q, followed along the null space of J_x in both directions until it leaves
+        the domain or closes. It goes on where the coordinate turns back. With r > 1 it is a set of points on a lattice
+        in xi, filled from q on, and as far as the chart does not fold. All points have the task value of q to 1e-9.
+
+        Args:
+            q: a joint position (n,) inside the domain.
+            step: for r = 1: the largest distance of points along the curve [rad] or [m].
+            samples: for r > 1: about how many points, at most 10,000.
+
+        Returns:
+            Joint positions, their coordinates, and how far each coordinate reaches: exactly for r = 1, at least so far
+            for r > 1. With r = 1 a `SelfMotionCurve`, with the length of the curve and whether it closes.
+
+        Raises:
+            ShapeError, InvalidValueError: if q is not a joint position inside the domain, or a number is out of range.
+
+        Source:
+            ours.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
+            >>> motion = chart.self_motion([0.6, 0.8, 0.8])
+            >>> motion.closed, motion.q.shape[1], round(float(abs(chart.task(motion.q) - motion.x).max()), 9)
+            (False, 3, 0.0)
+        """
+        return self_motion(self, q, step, samples)
 
     def inverse(self, phi: ArrayLike, q_start: ArrayLike, tolerance: float = 1e-9) -> Array:
         """Solve phi(q) = phi for q: fitted charts by Newton's method with line search, grown ones along the flow.
@@ -229,6 +299,13 @@ class Chart(Shown):
         """Evaluate a function at a CasADi column (n, 1)."""
         require_shape("q", q.shape, (self.n, 1))
         return self.function(name)(q)
+
+    def _coordinates_into(self, name: str, results: Array, points: Array) -> None:
+        """Write xi or its Jacobian at points (N, n) to part of an array."""
+        if isinstance(self.coordinates, Coordinates):
+            self.coordinates.into(name, results, points)
+        else:
+            results[...] = getattr(self.coordinates, name)(points)
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Write a self-contained chart file. It replaces a chart file of that name, and with `force` any other file.

@@ -59,6 +59,10 @@ def test_evaluate_json_has_the_promised_keys(run: Run, saved: str) -> None:
 
 def test_info_shows_charts_problems_and_robots(run: Run, saved: str) -> None:
     assert "polynomial:3" in run("info", saved)[1]
+    chart, told = oc.load(saved), json.loads(run("info", saved, "--json")[1])
+    reach = chart.xi_range(chart.problem.domain.centre)
+    assert told["xi_range"]["xi1"] == [reach.low[0], reach.high[0]]
+    assert told["xi_stops"]["xi1"][0] == str(reach["xi1"].low_stop)
     assert json.loads(run("info", "planar_2r", "--json")[1])["domain"] == "torus"
     path = str(robot_data("panda_description/urdf/panda.urdf"))
     code, out, _ = run("info", path, "--tip", "panda_hand", "--json")

@@ -1,5 +1,6 @@
 """References: steps through the low pass, splines through points, and what leaves the domain."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,18 @@ def test_reference_that_leaves_the_domain_is_reported_with_time_and_joint(planar
     far = Reference.steps(planar_chart.labels, start, [(1.0, {"x": 5.0})], 4.0)  # the arm is 3 m long
     with pytest.raises(UnreachableReferenceError, match=r"at t = 1"):
         joint_path(planar_chart, far, q0)
+
+
+def test_coordinate_that_cannot_be_reached_is_named_with_its_range(planar_chart: oc.Chart) -> None:
+    q0 = planar_chart.problem.domain.centre
+    start, reach = planar_chart.phi(q0), planar_chart.xi_range(q0)["xi1"]
+    away = Reference.steps(planar_chart.labels, start, [(1.0, {"xi1": 0.6})], 4.0)
+    stopped = f"xi1 = 0.6 is asked for, at the last x it reaches [{reach.low:.3g}"
+    with pytest.raises(UnreachableReferenceError, match=re.escape(stopped)) as caught:
+        joint_path(planar_chart, away, q0)
+    assert str(caught.value).endswith(f"stopped by joint '{reach.high_stop.joint}' at {reach.high_stop.value:.4g}")
+    within = Reference.steps(planar_chart.labels, start, [(1.0, {"xi1": 0.9 * reach.high})], 4.0)
+    assert len(joint_path(planar_chart, within, q0)) == len(within.grid())
 
 
 def test_reference_with_other_labels_is_refused(planar_chart: oc.Chart) -> None:

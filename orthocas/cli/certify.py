@@ -18,7 +18,7 @@ from orthocas.chart import Chart
 from orthocas.checks import require_count
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
 from orthocas.cli.progress import terminal_monitor
-from orthocas.comparing.workers import begin_worker, starting_workers, worker_pool
+from orthocas.comparing.workers import begin_worker, starting_workers, worker_pool, workers_killed_on_error
 from orthocas.errors import Interrupted
 from orthocas.files.archive import require_free
 from orthocas.files.chart_file import CHART
@@ -109,7 +109,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor | None]:
         with scheduler_executor(scheduler) as executor:
             yield executor
     elif workers > 1:
-        with worker_pool(workers, begin_worker, os.getpid()) as executor:
+        with worker_pool(workers, begin_worker, os.getpid()) as executor, workers_killed_on_error():
             with starting_workers():
                 for _ in range(workers):  # each call starts a process
                     executor.submit(os.getpid)

@@ -17,8 +17,9 @@ from orthocas.cli.problem_argument import (
     build_robot,
     is_robot_file,
 )
+from orthocas.coordinates.map import InvertibleMap
 from orthocas.domains import Domain
-from orthocas.errors import SingularTaskError
+from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.files.json import plain
 from orthocas.involutivity import involutivity
 from orthocas.parametrisations import cyclic_joints
@@ -43,6 +44,7 @@ def info(
             **_problem(chart.problem),
             "parametrisation": chart.coordinates.label,
             "parameters": chart.coordinates.size,
+            **_reach(chart),
             "notes": dict(chart.notes),
             **({"certificate": as_dict(chart.certificate)} if chart.certificate else {}),
         }
@@ -93,6 +95,20 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "most_singular_point": list(found.most_singular_point),
         **_involutivity(problem),
         **_robot(problem.robot),
+    }
+
+
+def _reach(chart: Chart) -> dict[str, Any]:
+    """How far each coordinate reaches alone from the centre of the domain, and what stops it there."""
+    if isinstance(chart.coordinates, InvertibleMap):  # grown coordinates take seconds
+        return {}
+    try:
+        reach = chart.xi_range(chart.problem.domain.centre)
+    except InvalidValueError:  # the task is not finite there
+        return {}
+    return {
+        "xi_range": {part.label: [plain(part.low), plain(part.high)] for part in reach},
+        "xi_stops": {part.label: [str(part.low_stop), str(part.high_stop)] for part in reach},
     }
 
 

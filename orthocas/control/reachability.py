@@ -28,16 +28,32 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
     times = reference.grid()
     values = reference.sample(times)[0]
     path, q = np.empty((len(times), chart.n)), q_start
+    targets = reference.targets[reference.segment(times)]
     for k, value in enumerate(values):
         where = f"at t = {times[k]:.3g} s, at {_list(reference.labels, value)}"
         try:
-            q = chart.inverse(value, q)
+            new = chart.inverse(value, q)
         except InverseError as error:
-            raise UnreachableReferenceError(f"the reference cannot be reached {where}: {error}") from None
-        if not contains(chart.problem.domain, q):
-            raise UnreachableReferenceError(f"the reference leaves the domain {where}: {_outside(chart, q)}")
-        path[k] = q
+            text = f"the reference cannot be reached {where}: {error}{_too_far(chart, q, targets[k])}"
+            raise UnreachableReferenceError(text) from None
+        if not contains(chart.problem.domain, new):
+            text = f"the reference leaves the domain {where}: {_outside(chart, new)}{_too_far(chart, q, targets[k])}"
+            raise UnreachableReferenceError(text)
+        path[k] = q = new
     return path
+
+
+def _too_far(chart: Chart, q: Array, target: Array) -> str:
+    """The coordinate whose target lies farthest outside what it reaches from q (n,); empty if there is none."""
+    reach, wanted = chart.xi_range(q), target[chart.m :]
+    beyond = np.maximum(reach.low - wanted, wanted - reach.high)
+    k = int(np.argmax(beyond))
+    if beyond[k] <= 0:
+        return ""
+    interval = reach[k]
+    stop = interval.low_stop if wanted[k] < interval.low else interval.high_stop
+    told = f"at the last x it reaches [{interval.low:.4g}, {interval.high:.4g}], stopped by {stop}"
+    return f"; {interval.label} = {wanted[k]:.4g} is asked for, {told}"
 
 
 def _outside(chart: Chart, q: Array) -> str:

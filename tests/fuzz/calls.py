@@ -11,7 +11,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from public_objects import circle, fitted, impedance, planar, steps, trajectory
+from public_objects import circle, clear, fitted, impedance, planar, steps, trajectory
 
 import orthocas as oc
 from fuzz.child import Finding, run, verdict
@@ -336,6 +336,9 @@ def _methods() -> dict[str, Call]:
         "grown.quality": (grown.quality, {"q": [q[:2], q[:2]]}),
         "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "tolerance": 1e-9}),
         "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
+        "chart.xi_range": (chart.xi_range, {"q": q}),
+        "chart.self_motion": (chart.self_motion, {"q": q, "samples": 20}),
+        "curve of self_motion": (clear().self_motion, {"q": clear().problem.domain.centre, "step": 0.1}),
         "chart.function": (chart.function, {"name": "phi"}),
         "chart.save": (chart.save, {"path": "chart.orthocas"}),
         "run.save": (trajectory().save, {"path": "run.npz"}),
