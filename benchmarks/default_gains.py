@@ -8,7 +8,8 @@ of the paper; smaller ones, or in the other direction, where these leave the dom
 
 import argparse
 from collections import deque
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib.metadata import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,6 +23,7 @@ from orthocas.control import ControlStatus, PDPlus, Reference
 from orthocas.control.matched_stiffness import mobility
 from orthocas.domains import sample_uniform
 from orthocas.errors import UnreachableReferenceError
+from orthocas.problems.iiwa import urdf_path
 from orthocas.simulation import MuJoCoPlant
 
 CASES = (  # robot, task, metric
@@ -35,7 +37,7 @@ ROBOTS = {  # of the package example-robot-data: file, tip, locked joints, centr
         (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4),
         (0.6, 0.6, 0.6, 0.6, 0.8, 0.6, 1.2),
     ),
-    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef", None, (0.0, 0.0177, 0.0, 0.9119, 0.0, 0.7243, 0.0), 0.6),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef", {}, (0.0, 0.0177, 0.0, 0.9119, 0.0, 0.7243, 0.0), 0.6),
 }
 PLANTS = {
     "-20 %": lambda robot: robot.with_scaled_masses(0.8),
@@ -47,15 +49,26 @@ DELAY = 5  # ticks from the measurement to the torque
 HOLD, STEP, XI = 1.5, 0.04, 0.15  # [s], [m], [1]
 
 
+@contextmanager
+def robot_file(name: str) -> Iterator[tuple[Path, str, dict[str, float]]]:
+    """URDF file of an arm, its tip and its locked joints."""
+    if name in problems.names():
+        with urdf_path() as path:
+            yield path, "link_ee", {}
+        return
+    file, tip, locked = ROBOTS[name][:3]
+    yield (
+        next(Path(str(f.locate())).resolve() for f in files("example-robot-data") or [] if str(f).endswith(file)),
+        tip,
+        locked,
+    )
+
+
 def problem_of(name: str, task: str, metric: str) -> oc.Problem:
     """An arm with its box."""
-    if name in problems.names():
-        known = problems.get(name)
-        robot, box = known.robot, known.domain
-    else:
-        file, tip, locked, centre, half_width = ROBOTS[name]
-        path = next(Path(str(f.locate())).resolve() for f in files("example-robot-data") or [] if str(f).endswith(file))
-        robot, box = oc.Robot.from_file(path, tip, locked), oc.Box(centre, half_width)
+    with robot_file(name) as (path, tip, locked):
+        robot = oc.Robot.from_file(path, tip, locked)
+    box = problems.get(name).domain if name in problems.names() else oc.Box(*ROBOTS[name][3:])
     return oc.Problem(robot, oc.Task.named(robot, task, box.centre), metric, box, name)
 
 
