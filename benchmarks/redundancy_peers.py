@@ -16,7 +16,7 @@ them, and the fastest joint; targets found from the middle of the domain within 
 positions in the domain, and in the whole joint range; one tick.
 
 Peers get whole postures where a chart gets xi: those of the chart's inverse map. Needs pin-pink, mink, daqp and ssik
-(the extra `bench`); rows of those that are not installed are left out.
+(the extra `peers`); rows of those that are not installed are left out.
 """
 
 import argparse

@@ -26,6 +26,7 @@ SCRIPTS = (
     "default_gains",
     "safety",
     "operational_space",
+    "redundancy_peers",
     "metric_loss",
     "against_torch",
     "paper_network",

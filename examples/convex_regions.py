@@ -4,7 +4,7 @@ IRIS-ZO grows a polytope around a posture, in the coordinates that a function ma
 inverse map at fixed x, so that every point of the polytope has the tool in its place. Points without a joint position
 inside the domain violate a constraint of IRIS-ZO. In the end, new points of the polytope are checked.
 
-Needs `drake` (the extra `bench`) and a C compiler.
+Needs `drake` (the extra `peers`) and a C compiler.
 """
 
 import argparse

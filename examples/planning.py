@@ -10,7 +10,7 @@ straight way. RRT-Connect plans
 With a tool that moves as well, it plans in (x, xi) and in q, both 7 numbers.
 
 All use the same clearance of links and spheres, the same step between checks, and one thread. The time in xi includes
-the search for postures from which the inverse map starts. Needs `ompl` (the extra `bench`) and a C compiler.
+the search for postures from which the inverse map starts. Needs `ompl` (the extra `peers`) and a C compiler.
 """
 
 import argparse
