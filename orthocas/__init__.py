@@ -35,6 +35,7 @@ from orthocas.fitting.loss import Weights
 from orthocas.fitting.loss import register as register_loss_term
 from orthocas.fitting.symbolic_loss import loss
 from orthocas.grow import grow
+from orthocas.inverting import InverseStatus, Solutions
 from orthocas.involutivity import Involutivity, involutivity, lie_bracket
 from orthocas.metrics import Metric
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
@@ -65,6 +66,7 @@ __all__ = [
     "Fourier",
     "Given",
     "GrownChart",
+    "InverseStatus",
     "Involutivity",
     "Linear",
     "Metric",
@@ -72,6 +74,7 @@ __all__ = [
     "Problem",
     "Report",
     "Robot",
+    "Solutions",
     "Task",
     "Torus",
     "Weights",

@@ -17,6 +17,7 @@ from orthocas.checks import (
     Array,
     as_float_array,
     as_path,
+    as_point,
     as_point_set,
     require_at_least,
     require_kind,
@@ -25,10 +26,10 @@ from orthocas.checks import (
 )
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap, InvertibleMap
-from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
+from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError, SingularTaskError
 from orthocas.files.chart_file import fingerprint, read_chart, write_chart
 from orthocas.growing import GrownCoordinates
-from orthocas.inverting import FewRows, Inverse, Newton, OwnInverse, PhiMap, PointFunctions, Solutions
+from orthocas.inverting import FewRows, Inverse, Nearest, Newton, OwnInverse, PhiMap, PointFunctions, Solutions
 from orthocas.judging.pointwise import PointQuality, point_quality
 from orthocas.problem import Problem, task_jacobians, task_sizes
 from orthocas.showing import Shown, listed
@@ -210,7 +211,9 @@ class Chart(Shown):
         q = self.solve(targets, q_start, tolerance=tolerance).require(inside=False).q
         return q[0] if single else q
 
-    def solve(self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
+    def solve(
+        self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9, inside: bool = False
+    ) -> Solutions:
         """Solve phi(q) = phi for q, with a status for each row: a row that fails does not disturb the others.
 
         Newton's method works on all rows at once. With `q_start`, it searches from there only, and q is the solution
@@ -222,12 +225,16 @@ class Chart(Shown):
             phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
             q_start: initial guess (n,), or (N, n) with one guess per row of phi.
             tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
+            inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
+                other starts, get the q inside with the same x and the nearest xi that Ipopt finds (10 ms a row),
+                status NEAREST, or OUT_OF_REACH if none has that x. Not for grown coordinates.
 
         Returns:
             `Solutions` with q (N, n), status, iterations, error and distance (N,); N = 1 for one phi.
 
         Raises:
             ShapeError: if a row has another number of entries, or q_start another number of rows.
+            NoExpressionError: if `inside` is asked of grown coordinates.
 
         Source:
             ours: docs/inverse.md.
@@ -241,7 +248,33 @@ class Chart(Shown):
             if len(starts) not in (1, len(targets)):
                 raise ShapeError("q_start", starts.shape, targets.shape)
             starts = np.broadcast_to(starts, targets.shape)
-        return self._inverse.solve(targets, starts, float(tolerance))
+        if inside and isinstance(self.coordinates, InvertibleMap):
+            raise NoExpressionError("`inside` needs coordinates with an expression, expected a fitted chart")
+        return self._inverse.solve(targets, starts, float(tolerance), bool(inside))
+
+    def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
+        """All q inside the domain with phi(q) = phi that a search from 1,026 starts finds.
+
+        A chart that does not fold has one at most. The search is no proof: it may miss solutions near folds.
+
+        Args:
+            phi: target values, (n,).
+            tolerance: as in `solve`.
+
+        Returns:
+            Different solutions, the one nearest to the centre of the domain first, (k, n).
+
+        Example:
+            >>> import numpy as np
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[1.0, 1.0])
+            >>> problem = oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Box([0.5, 0.5], 1.0))
+            >>> chart = oc.fit(problem, oc.Linear()).chart  # it folds
+            >>> len(chart.solutions(chart.phi([0.4, 0.3])))
+            2
+        """
+        require_at_least("tolerance", tolerance, 0)
+        return self._inverse.all_inside(as_point("phi", phi, self.n), float(tolerance))
 
     def function(self, name: str) -> ca.Function:
         """The CasADi function behind a method: xi, phi, jacobian, task, task_jacobian or second_derivative.
@@ -310,8 +343,9 @@ class Chart(Shown):
         phi_map = PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes)
         if isinstance(self.coordinates, InvertibleMap):
             return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map, self.m))
-        points = PointFunctions.of(self.function("phi"), self.function("jacobian"))
-        return Inverse(self.problem, phi_map, FewRows(phi_map, points, Newton(phi_map)))
+        phi = self.function("phi")
+        local = FewRows(phi_map, PointFunctions.of(phi, self.function("jacobian")), Newton(phi_map))
+        return Inverse(self.problem, phi_map, local, Nearest(self.problem, phi, phi_map))
 
     def _jacobian_or_nan(self, points: Array) -> Array:
         """J at points (N, n), with NaN where the task has no finite Jacobian."""

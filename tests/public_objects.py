@@ -211,6 +211,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "report": lambda: oc.evaluate(fitted().chart, 500),
     "quality of a point": lambda: fitted().chart.quality(planar().domain.centre),
     "quality of points": lambda: fitted().chart.quality(points_of(fitted().chart)),
+    "solutions": lambda: fitted().chart.solve([[1.6, 0.1, 0.1], [9.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]),
     "involutivity": lambda: oc.involutivity(planar(), 100),
     "singular point": lambda: oc.singular_points(problems.get("planar_2r"))[0],
     "jump": lambda: oc.jumps(circle())[0],

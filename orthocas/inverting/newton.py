@@ -182,7 +182,8 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
     try:
         found = np.asarray(np.linalg.inv(matrices), dtype=float)
     except np.linalg.LinAlgError:  # it does not say which
-        singular = np.asarray(np.linalg.slogdet(matrices)[0] == 0)
+        with np.errstate(invalid="ignore"):
+            singular = np.asarray(np.linalg.slogdet(matrices)[0] == 0)
         found = np.empty_like(matrices)
         found[~singular] = np.linalg.inv(matrices[~singular])
         found[singular] = np.linalg.pinv(matrices[singular])

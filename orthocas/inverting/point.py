@@ -27,7 +27,7 @@ class PointFunctions:
     """The two functions of a chart that `PointSolver` calls."""
 
     inverted: ca.Function  #: q, scale -> the inverse H of J / scale, and |J| |H|
-    chord: ca.Function  #: q, H, target, scale -> q after 3 steps, its residual, and the error at each of the 4 points
+    chord: ca.Function  #: q, H, target, scale -> q after 3 steps, its residual, and |residual| at each of the 4 points
 
     @classmethod
     def of(cls, phi: ca.Function, jacobian: ca.Function) -> "PointFunctions":
@@ -40,11 +40,11 @@ class PointFunctions:
         H = ca.MX.sym("H", n, n)
         inverted = dense_function("inverted", [q, scale], invert.call([jacobian(q) / ca.repmat(scale, 1, n)]))
         now, residual = q, (target - phi(q)) / scale
-        errors = [ca.norm_inf(residual)]
+        errors = [ca.norm_2(residual)]  # norm_inf drops NaN
         for _ in range(_STEPS):
             now = now + H @ residual
             residual = (target - phi(now)) / scale
-            errors.append(ca.norm_inf(residual))
+            errors.append(ca.norm_2(residual))
         return cls(inverted, dense_function("chord", [q, H, target, scale], [now, residual, ca.vertcat(*errors)]))
 
 
@@ -80,7 +80,7 @@ class PointSolver:
         self.iterations = 0
         for _ in range(_REFRESHES):
             self._refresh()
-            if not self.step():
+            if not self.condition[0] < SUSPICIOUS or not self.step():
                 return False
             self.q[:] = self.reached
             self.iterations += _STEPS
@@ -110,11 +110,11 @@ class FewRows:
 
     @staticmethod
     def _row(solver: PointSolver, attempt: Attempt, k: int, given: tuple[Array, Array, Array]) -> bool:
-        """Solve a row; returns whether that succeeded."""
+        """Solve a row; returns whether that succeeded, which it does not near singular J."""
         solver.q[:], solver.target[:], solver.scale[:] = given
         done = solver.solve()
         attempt.q[k], attempt.residual[k] = solver.q, solver.residual
-        attempt.iterations[k], attempt.suspicious[k] = solver.iterations, not solver.condition[0] < SUSPICIOUS
+        attempt.iterations[k] = solver.iterations
         return done
 
 

@@ -335,6 +335,8 @@ def _methods() -> dict[str, Call]:
         "chart.quality": (chart.quality, {"q": q}),
         "grown.quality": (grown.quality, {"q": [q[:2], q[:2]]}),
         "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "tolerance": 1e-9}),
+        "chart.solve": (chart.solve, {"phi": phi, "q_start": q, "tolerance": 1e-9, "inside": True}),
+        "chart.solutions": (chart.solutions, {"phi": phi, "tolerance": 1e-9}),
         "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
         "chart.function": (chart.function, {"name": "phi"}),
         "chart.save": (chart.save, {"path": "chart.orthocas"}),

@@ -1,0 +1,237 @@
+"""The inverse map: batches with a status for each row, starts, the domain, trackers, derivatives, and compiled C."""
+
+import numpy as np
+import pytest
+from public_objects import circle, clear
+
+import orthocas as oc
+from orthocas import problems
+from orthocas.domains import sample_uniform
+from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
+from orthocas.fitting.fit import Fit
+from orthocas.inverting.newton import inverses
+
+FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
+BEYOND = (oc.InverseStatus.OUTSIDE_DOMAIN, oc.InverseStatus.LIMIT)
+
+
+@pytest.fixture(scope="module")
+def arm() -> oc.Chart:
+    """A planar arm with one coordinate."""
+    return oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(3), samples=300).chart
+
+
+def beyond_domain(chart: oc.Chart, count: int, share: float) -> np.ndarray:
+    """Joint positions of a domain that is wider by a share."""
+    domain = chart.problem.domain
+    points: np.ndarray = domain.centre + share * (sample_uniform(domain, count, 3) - domain.centre)
+    return points
+
+
+def test_every_point_of_the_domain_is_found_without_a_start(iiwa_fit: Fit) -> None:
+    chart = iiwa_fit.chart
+    q = sample_uniform(chart.problem.domain, 3000, 5)
+    solutions = chart.solve(chart.phi(q))
+    assert solutions.found.all()
+    assert solutions.error.max() <= 1e-9
+    np.testing.assert_allclose(chart.phi(solutions.q), chart.phi(q), atol=1e-9)
+    np.testing.assert_allclose(solutions.q, q, atol=1e-7)  # this chart does not fold, so they are the same points
+    np.testing.assert_allclose(chart.inverse(chart.phi(q)), q, atol=1e-7)
+
+
+def test_rows_do_not_depend_on_each_other(iiwa_fit: Fit) -> None:
+    """Rows out of reach, outside the domain and without numbers leave the others as they are."""
+    chart = iiwa_fit.chart
+    q = sample_uniform(chart.problem.domain, 40, 6)
+    phi = chart.phi(q)
+    phi[3, 0], phi[7, 5], phi[11] = 9.0, np.nan, chart.phi(beyond_domain(chart, 12, 1.5)[-1])
+    solutions = chart.solve(phi)
+    assert solutions.statuses[3] == oc.InverseStatus.OUT_OF_REACH
+    assert solutions.statuses[7] == oc.InverseStatus.BAD_INPUT
+    assert solutions.statuses[11] in BEYOND
+    good = np.setdiff1d(np.arange(40), [3, 7, 11])
+    assert solutions.found.nonzero()[0].tolist() == good.tolist()
+    np.testing.assert_allclose(solutions.q[good], q[good], atol=1e-7)
+    assert np.isnan(solutions.q[7]).all()
+    assert np.isfinite(np.delete(solutions.q, 7, axis=0)).all()
+    assert solutions.error[3] == pytest.approx(
+        np.abs((phi[3] - chart.phi(solutions.q[3])) / (chart.phi_sizes + 1e-5 * np.abs(phi[3]))).max()
+    )
+
+
+def test_few_rows_and_many_have_the_same_solutions(iiwa_fit: Fit) -> None:
+    """Few rows are solved one by one, in another way."""
+    chart = iiwa_fit.chart
+    q = sample_uniform(chart.problem.domain, 30, 7)
+    starts = q + np.random.default_rng(0).uniform(-0.3, 0.3, q.shape)
+    together = chart.solve(chart.phi(q), starts)
+    for k in range(30):
+        alone = chart.solve(chart.phi(q[k]), starts[k])
+        np.testing.assert_allclose(alone.q[0], together.q[k], atol=1e-9)
+        assert alone.status[0] == together.status[k]
+
+
+def test_a_solution_lies_near_its_start(arm: oc.Chart) -> None:
+    """With a start, the search follows the solution out of the domain; without one, it stays inside if it can."""
+    q = beyond_domain(arm, 400, 1.6)
+    inside = arm.problem.domain.contains(q)
+    solutions = arm.solve(arm.phi(q), q + 1e-3)
+    near = np.abs(solutions.q - q).max(axis=1) < 1e-6
+    assert near.mean() > 0.97  # the others lie at a fold
+    assert (solutions.found == inside)[near].all()
+    assert arm.solve(arm.phi(q)).found.sum() >= inside.sum()
+
+
+def test_what_is_found_lies_inside_and_solves(arm: oc.Chart) -> None:
+    wide = arm.phi(beyond_domain(arm, 1000, 1.5))
+    solutions = arm.solve(wide)
+    assert 100 < solutions.found.sum() < 1000
+    q, found = solutions.q, solutions.found
+    assert oc.contains(arm.problem.domain, q[found]).all()
+    assert not oc.contains(arm.problem.domain, q[np.isin(solutions.status, BEYOND)]).any()
+    np.testing.assert_allclose(arm.phi(q[found]), wide[found], atol=1e-8)
+
+
+def test_corners_of_the_domain_are_found_inside(arm: oc.Chart) -> None:
+    """Rounding does not push solutions on the border out of the domain."""
+    domain = arm.problem.domain
+    corners = domain.centre + domain.half_width * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
+    assert arm.solve(arm.phi(corners)).found.all()
+
+
+def test_joint_limits_and_the_border_of_the_domain_are_told_apart() -> None:
+    robot = problems.get("iiwa").robot
+    task = oc.Task.position(robot, "xyz")
+    centre = np.where(np.isfinite(robot.upper), robot.upper - 0.3, 0.0)
+    chart = oc.fit(oc.Problem(robot, task, domain=oc.Box(centre, 0.25)), oc.Polynomial(2), samples=500).chart
+    q = np.vstack([centre + 0.2, centre + 0.28, centre + 0.35, centre - 0.35])
+    statuses = chart.solve(chart.phi(q), q).statuses
+    assert [status.name for status in statuses] == ["FOUND", "OUTSIDE_DOMAIN", "LIMIT", "OUTSIDE_DOMAIN"]
+
+
+def test_a_singular_solution_is_named() -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    task = oc.Task.custom(robot, "square", lambda q: q[0] ** 2)
+    chart = oc.fit(oc.Problem(robot, task, domain=oc.Box([0.5, 0.0], 0.6)), oc.Polynomial(1)).chart
+    phi = chart.phi([[0.0, 0.1], [0.5, 0.1]])
+    solutions = chart.solve(phi, [[0.0, 0.1], [0.4, 0.1]])
+    assert solutions.statuses == (oc.InverseStatus.SINGULAR, FOUND)
+    with pytest.raises(InverseError, match="singular at the solution of row 0"):
+        solutions.require()
+
+
+def test_require_names_the_rows(arm: oc.Chart) -> None:
+    phi = np.vstack([arm.phi(arm.problem.domain.centre), [9.0, 0.0, 0.0], arm.phi(beyond_domain(arm, 30, 3.0)[29])])
+    solutions = arm.solve(phi)
+    with pytest.raises(InverseError, match=r"rows \[1\]: relative error is"):
+        solutions.require()
+    assert arm.solve(phi[:1]).require().found.all()
+
+
+def test_inside_gives_the_nearest_coordinates_that_keep_the_task(arm: oc.Chart) -> None:
+    """No point of a fine net of self-motions inside the domain is nearer, and rows without such points say so."""
+    domain = arm.problem.domain
+    phi = arm.phi(beyond_domain(arm, 60, 1.25))
+    solutions = arm.solve(phi, inside=True)
+    assert {FOUND, NEAREST} <= set(solutions.statuses)
+    kept = np.isin(solutions.status, (FOUND, NEAREST))
+    assert domain.contains(solutions.q).all()
+    np.testing.assert_allclose(arm.task(solutions.q[kept]), phi[kept, :2], atol=1e-8)
+    np.testing.assert_allclose(solutions.distance, np.abs(arm.xi(solutions.q) - phi[:, 2:])[:, 0], atol=1e-9)
+    for k in np.flatnonzero(solutions.status != FOUND):
+        inner = self_motion(arm, phi[k, :2])
+        if solutions.status[k] == NEAREST:
+            least = np.abs(arm.xi(inner) - phi[k, 2]).min() if len(inner) else np.inf
+            assert solutions.distance[k] <= least + 1e-7  # Ipopt stays a little off the border
+        else:
+            assert len(inner) == 0
+
+
+def self_motion(arm: oc.Chart, x: np.ndarray) -> np.ndarray:
+    """Joint positions of the planar arm inside the domain with the tip at x, in closed form for 4,001 last joints."""
+    domain = arm.problem.domain
+    wrist_angle = np.linspace(*(domain.centre[2] + domain.half_width[2] * np.array([-1, 1])), 4001)
+    reach = np.hypot(1 + np.cos(wrist_angle), np.sin(wrist_angle))  # of links 2 and 3 as one
+    bend = np.arctan2(np.sin(wrist_angle), 1 + np.cos(wrist_angle))
+    cosine = (x @ x - 1 - reach**2) / (2 * reach)
+    found = []
+    for sign in (-1, 1):
+        with np.errstate(invalid="ignore"):
+            elbow = sign * np.arccos(cosine)
+        shoulder = np.arctan2(x[1], x[0]) - np.arctan2(reach * np.sin(elbow), 1 + reach * np.cos(elbow))
+        found.append(np.stack([shoulder, elbow - bend, wrist_angle], axis=1))
+    q = np.concatenate(found)
+    q = q[np.isfinite(q).all(axis=1)]
+    return q[domain.contains(q)]
+
+
+def test_inside_keeps_clear_of_singular_positions() -> None:
+    """The part of a box that is clear counts as inside, and no other."""
+    chart = clear()
+    box = oc.Box(chart.problem.domain.centre, 1.2 * chart.problem.domain.half_width)
+    solutions = chart.solve(chart.phi(sample_uniform(box, 150, 1)), inside=True)
+    kept = np.isin(solutions.status, (FOUND, NEAREST))
+    assert (solutions.status == NEAREST).sum() > 5
+    assert chart.problem.domain.contains(solutions.q[kept]).all()
+
+
+def test_all_solutions_of_a_folded_chart_are_found() -> None:
+    """x = cos q1 + cos(q1 + q2) and xi linear: the solutions of one equation in one unknown, counted on a net."""
+    robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[1.0, 1.0])
+    problem = oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Box([0.5, 0.5], 1.0))
+    chart = oc.fit(problem, oc.Linear()).chart
+    g = chart.jacobian(problem.domain.centre)[1]
+    along = np.array([-g[1], g[0]])
+    for q in sample_uniform(problem.domain, 20, 4):
+        line = q + np.linspace(-4, 4, 80_001)[:, None] * along  # all q with the same xi
+        line = line[problem.domain.contains(line)]
+        crossings = np.count_nonzero(np.diff(np.sign(chart.task(line)[:, 0] - chart.task(q)[0] + 1e-13)))
+        found = chart.solutions(chart.phi(q))
+        assert len(found) == crossings
+        np.testing.assert_allclose(chart.phi(found), np.tile(chart.phi(q), (len(found), 1)), atol=1e-9)
+
+
+def test_grown_charts_solve_with_their_own_inverse() -> None:
+    chart = circle()
+    phi = np.vstack([chart.phi([1.0, 0.2]), [9.0, 9.0]])
+    solutions = chart.solve(phi, [1.0, 0.1])
+    assert solutions.statuses == (FOUND, oc.InverseStatus.OUT_OF_REACH)
+    np.testing.assert_allclose(solutions.q[0], [1.0, 0.2], atol=1e-7)
+    with pytest.raises(NoExpressionError, match="inside"):
+        chart.solve(phi, inside=True)
+
+
+def test_bad_arguments_are_refused(arm: oc.Chart) -> None:
+    phi = arm.phi(arm.problem.domain.centre)
+    with pytest.raises(ShapeError, match="phi has shape"):
+        arm.solve(np.zeros((4, 2)))
+    with pytest.raises(ShapeError, match="q_start has shape"):
+        arm.solve(np.tile(phi, (3, 1)), np.zeros((2, 3)))
+    with pytest.raises(InvalidValueError, match="tolerance"):
+        arm.solve(phi, tolerance=-1.0)
+    with pytest.raises(InvalidValueError, match="phi"):
+        arm.solve("centre")
+    with pytest.raises(InvalidValueError, match="finite"):
+        arm.inverse([np.nan, 0.0, 0.0])
+    assert arm.solve([np.inf, 0.0, 0.0]).statuses == (oc.InverseStatus.BAD_INPUT,)
+
+
+def test_no_rows_have_no_solutions(arm: oc.Chart) -> None:
+    solutions = arm.solve(np.empty((0, 3)))
+    assert (solutions.q.shape, len(solutions), solutions.found.all()) == ((0, 3), 0, True)
+    assert repr(solutions) == "Solutions: no rows"
+
+
+def test_solutions_show_counts_and_are_read_only(arm: oc.Chart) -> None:
+    solutions = arm.solve(np.vstack([arm.phi(arm.problem.domain.centre), [9.0, 0.0, 0.0]]))
+    assert repr(solutions).startswith("Solutions: 1 FOUND, 1 OUT_OF_REACH\n")
+    with pytest.raises(ValueError, match="read-only"):
+        solutions.q[0] = 0
+
+
+def test_inverses_of_singular_and_undefined_matrices() -> None:
+    A = np.array([np.diag([2.0, 4.0]), np.diag([2.0, 0.0]), np.full((2, 2), np.nan)])
+    found, singular = inverses(A)
+    np.testing.assert_allclose(found[:2], [np.diag([0.5, 0.25]), np.diag([0.5, 0.0])], atol=1e-15)
+    assert np.isnan(found[2]).any()
+    assert singular.tolist() == [False, True, False]
