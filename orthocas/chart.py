@@ -248,9 +248,10 @@ class Chart(Shown):
             if len(starts) not in (1, len(targets)):
                 raise ShapeError("q_start", starts.shape, targets.shape)
             starts = np.broadcast_to(starts, targets.shape)
-        if inside and isinstance(self.coordinates, InvertibleMap):
-            raise NoExpressionError("`inside` needs coordinates with an expression, expected a fitted chart")
-        return self._inverse.solve(targets, starts, float(tolerance), bool(inside))
+        require_kind("inside", inside, bool)
+        if inside:
+            self._require_expression("inside=True")
+        return self._inverse.solve(targets, starts, float(tolerance), inside)
 
     def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
         """All q inside the domain with phi(q) = phi that a search from 1,026 starts finds.
@@ -264,6 +265,9 @@ class Chart(Shown):
         Returns:
             Different solutions, the one nearest to the centre of the domain first, (k, n).
 
+        Raises:
+            NoExpressionError: if the coordinates are grown.
+
         Example:
             >>> import numpy as np
             >>> import orthocas as oc
@@ -274,6 +278,7 @@ class Chart(Shown):
             2
         """
         require_at_least("tolerance", tolerance, 0)
+        self._require_expression("a search for all solutions")
         return self._inverse.all_inside(as_point("phi", phi, self.n), float(tolerance))
 
     def function(self, name: str) -> ca.Function:
@@ -354,6 +359,11 @@ class Chart(Shown):
         except SingularTaskError:
             J_x = self.problem.task.batched_jacobian(points)[0].reshape(-1, self.m, self.n)
             return np.concatenate([J_x, self.coordinates.jacobian(points)], axis=1)
+
+    def _require_expression(self, what: str) -> None:
+        """Raise NoExpressionError if the coordinates are grown."""
+        if isinstance(self.coordinates, InvertibleMap):
+            raise NoExpressionError(f"{what} needs coordinates with a CasADi expression; received grown coordinates")
 
     def _rows(self, name: str, value: ArrayLike) -> Array:
         """One point or a set, as `as_point_set` takes them, but finite or not, (N, n)."""
