@@ -35,7 +35,7 @@ from orthocas.fitting.loss import Weights
 from orthocas.fitting.loss import register as register_loss_term
 from orthocas.fitting.symbolic_loss import loss
 from orthocas.grow import grow
-from orthocas.inverting import InverseStatus, Solutions
+from orthocas.inverting import InverseStatus, Solutions, Tracker, TrackerStatus
 from orthocas.involutivity import Involutivity, involutivity, lie_bracket
 from orthocas.metrics import Metric
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
@@ -77,6 +77,8 @@ __all__ = [
     "Solutions",
     "Task",
     "Torus",
+    "Tracker",
+    "TrackerStatus",
     "Weights",
     "certified_box",
     "certify",

@@ -29,13 +29,24 @@ from orthocas.coordinates.map import CoordinateMap, InvertibleMap
 from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError, SingularTaskError
 from orthocas.files.chart_file import fingerprint, read_chart, write_chart
 from orthocas.growing import GrownCoordinates
-from orthocas.inverting import FewRows, Inverse, Nearest, Newton, OwnInverse, PhiMap, PointFunctions, Solutions
+from orthocas.inverting import (
+    FewRows,
+    Inverse,
+    Nearest,
+    Newton,
+    OwnInverse,
+    PhiMap,
+    PointFunctions,
+    Solutions,
+    Tracker,
+    inverse_function,
+)
 from orthocas.judging.pointwise import PointQuality, point_quality
 from orthocas.problem import Problem, task_jacobians, task_sizes
 from orthocas.showing import Shown, listed
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
-FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
+FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "inverse")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -281,11 +292,28 @@ class Chart(Shown):
         self._require_expression("a search for all solutions")
         return self._inverse.all_inside(as_point("phi", phi, self.n), float(tolerance))
 
+    def tracker(self, q0: ArrayLike, largest_step: ArrayLike | None = None) -> Tracker:
+        """A tracker that follows a stream of phi from q0; see `Tracker`.
+
+        Args:
+            q0: a joint position inside the domain, (n,).
+            largest_step: largest change of each joint in a call, (n,) or one number [rad] or [m]; default: a tenth of
+                the half-widths of the domain.
+
+        Raises:
+            NoExpressionError: if the coordinates are grown.
+            InvalidValueError: if q0 lies outside the domain, or J is singular there.
+        """
+        self._require_expression("a tracker")
+        return Tracker(self._point_functions, self.problem.domain, q0, largest_step)
+
     def function(self, name: str) -> ca.Function:
-        """The CasADi function behind a method: xi, phi, jacobian, task, task_jacobian or second_derivative.
+        """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.
 
         The input q is a column (n, 1). second_derivative takes q, v, w (n, 1) and returns d^2 phi(q)[v, w] =
-        (d/ds) J(q + s v) w, (n, 1). For v = dq this is dJ/dt w.
+        (d/ds) J(q + s v) w, (n, 1). For v = dq this is dJ/dt w. inverse takes phi and q_start (n, 1), and returns q
+        (n, 1) with phi(q) = phi, or NaN where Newton's method finds none. Its derivatives are those of the implicit
+        function theorem, of any order; so it can be part of an optimal control problem.
 
         Raises:
             UnknownNameError: if there is no such function.
@@ -294,6 +322,8 @@ class Chart(Shown):
         require_known("chart function", name, FUNCTIONS)
         if name == "task":
             return self.problem.task.function
+        if name == "inverse":
+            return self._inverse_function
         return self.problem.task.jacobian_function if name == "task_jacobian" else self._functions[name]
 
     def _expression(self, name: str, q: Any) -> Any:
@@ -348,9 +378,16 @@ class Chart(Shown):
         phi_map = PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes)
         if isinstance(self.coordinates, InvertibleMap):
             return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map, self.m))
-        phi = self.function("phi")
-        local = FewRows(phi_map, PointFunctions.of(phi, self.function("jacobian")), Newton(phi_map))
-        return Inverse(self.problem, phi_map, local, Nearest(self.problem, phi, phi_map))
+        local = FewRows(phi_map, self._point_functions, Newton(phi_map))
+        return Inverse(self.problem, phi_map, local, Nearest(self.problem, self.function("phi"), phi_map))
+
+    @cached_property
+    def _inverse_function(self) -> ca.Function:
+        return inverse_function(self.function("phi"), self.phi_sizes)
+
+    @cached_property
+    def _point_functions(self) -> PointFunctions:
+        return PointFunctions.of(self.function("phi"), self.function("jacobian"), self.phi_sizes)
 
     def _jacobian_or_nan(self, points: Array) -> Array:
         """J at points (N, n), with NaN where the task has no finite Jacobian."""

@@ -1,5 +1,8 @@
 """The inverse map: batches with a status for each row, starts, the domain, trackers, derivatives, and compiled C."""
 
+from itertools import pairwise
+
+import casadi as ca
 import numpy as np
 import pytest
 from public_objects import circle, clear
@@ -235,3 +238,137 @@ def test_inverses_of_singular_and_undefined_matrices() -> None:
     np.testing.assert_allclose(found[:2], [np.diag([0.5, 0.25]), np.diag([0.5, 0.0])], atol=1e-15)
     assert np.isnan(found[2]).any()
     assert singular.tolist() == [False, True, False]
+
+
+def circle_of_the_tool(chart: oc.Chart, count: int = 500) -> np.ndarray:
+    """Values of phi for a circle of the tool while one coordinate moves to and fro."""
+    angle = np.linspace(0, 2 * np.pi, count)
+    path: np.ndarray = np.tile(chart.phi(chart.problem.domain.centre), (count, 1))
+    path[:, 0] += 0.05 * np.sin(angle)
+    path[:, 1] += 0.05 * (1 - np.cos(angle))
+    path[:, chart.m] += 0.1 * np.sin(angle)
+    return path
+
+
+def test_a_tracker_follows_a_stream_and_comes_back(iiwa_fit: Fit) -> None:
+    chart = iiwa_fit.chart
+    path, start = circle_of_the_tool(chart), chart.problem.domain.centre
+    tracker = chart.tracker(start)
+    q = []
+    for phi in path:
+        q.append(tracker.step(phi))
+        assert tracker.status == oc.TrackerStatus.OK
+    np.testing.assert_allclose(chart.phi(np.array(q)), path, atol=1e-9)
+    np.testing.assert_allclose(q[-1], start, atol=1e-9)
+    np.testing.assert_allclose(tracker.q, q[-1], atol=0)
+
+
+def test_a_tracker_keeps_the_last_position_where_it_must_not_go(arm: oc.Chart) -> None:
+    """It says why, and goes on from there when the stream comes back."""
+    domain = arm.problem.domain
+    start, known = domain.centre, arm.phi(domain.centre)
+    tracker = arm.tracker(start, largest_step=0.2)
+    edge = start + 0.99 * domain.half_width * [1, 0, 0]
+    at_edge = arm.tracker(edge)
+    cases = {
+        "OUTSIDE_DOMAIN": (at_edge, edge, arm.phi(edge + np.array([0.01, 0, 0]))),
+        "JUMP": (tracker, start, arm.phi(start + np.array([0.21, 0.0, 0.0]))),
+        "LOST": (tracker, start, known + np.array([9.0, 0.0, 0.0])),
+        "BAD_INPUT": (tracker, start, known * np.nan),
+    }
+    for name, (follower, last, phi) in cases.items():
+        np.testing.assert_array_equal(follower.step(phi), last)
+        assert follower.status.name == name
+    q = tracker.step(arm.phi(start + 0.01))
+    assert tracker.status == oc.TrackerStatus.OK
+    np.testing.assert_allclose(q, start + 0.01, atol=1e-9)
+    tracker.reset(edge)
+    np.testing.assert_array_equal(tracker.q, edge)
+
+
+def test_a_tracker_stops_at_a_singular_position_and_clear_of_it() -> None:
+    """J of a square task is singular at 0; and a clear box counts as the domain."""
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    task = oc.Task.custom(robot, "square", lambda q: q[0] ** 2)
+    chart = oc.fit(oc.Problem(robot, task, domain=oc.Box([0.3, 0.0], 0.5)), oc.Polynomial(1)).chart
+    tracker = chart.tracker([0.05, 0.0], largest_step=1.0)
+    xi = chart.xi([0.0, 0.0])[0]
+    tracker.step([0.0, xi])
+    assert tracker.status in (oc.TrackerStatus.SINGULAR, oc.TrackerStatus.LOST)
+    bounded = clear()
+    q = bounded.problem.domain.centre.copy()
+    follower, last = bounded.tracker(q), q
+    for _ in range(200):  # straighten the arm
+        q = q - [0.0, 0.01, 0.01]
+        last = follower.step(bounded.phi(q))
+        if follower.status != oc.TrackerStatus.OK:
+            break
+    assert follower.status == oc.TrackerStatus.OUTSIDE_DOMAIN
+    assert bounded.problem.domain.contains(last)
+    assert not bounded.problem.domain.contains(q)
+
+
+def test_trackers_are_made_for_fitted_charts_and_points_inside(arm: oc.Chart) -> None:
+    centre = arm.problem.domain.centre
+    with pytest.raises(InvalidValueError, match="q is .*, expected a point of the domain"):
+        arm.tracker(centre + 9)
+    with pytest.raises(InvalidValueError, match="largest_step"):
+        arm.tracker(centre, largest_step=0.0)
+    with pytest.raises(NoExpressionError, match="tracker"):
+        circle().tracker([1.0, 0.0])
+    tracker = arm.tracker(centre)
+    for wrong in (np.zeros(2), 0.5, [[0.0, 0.0, 0.0]]):
+        with pytest.raises(ShapeError, match="phi has shape"):
+            tracker.step(wrong)
+
+
+def test_inverse_function_has_first_and_second_derivatives(arm: oc.Chart) -> None:
+    """J^-1 for the first; differences of it for the second; the start does not matter."""
+    n, inverse = arm.n, arm.function("inverse")
+    q = arm.problem.domain.centre + 0.2
+    phi, start, weights = arm.phi(q), arm.problem.domain.centre, np.arange(1.0, n + 1)
+    np.testing.assert_allclose(inverse(phi, start).full()[:, 0], q, atol=1e-10)
+    p, s = ca.MX.sym("p", n), ca.MX.sym("s", n)
+    value = inverse(p, s)
+    first = ca.Function("first", [p, s], [ca.jacobian(value, p), ca.jacobian(value, s)])
+    second = ca.Function("second", [p, s], [ca.hessian(ca.dot(weights, value), p)[0]])
+    by_phi, by_start = (part.full() for part in first(phi, start))
+    np.testing.assert_allclose(by_phi, np.linalg.inv(arm.jacobian(q)), atol=1e-12)
+    assert not by_start.any()
+
+    def gradient(at: np.ndarray) -> np.ndarray:
+        return weights @ np.linalg.inv(arm.jacobian(arm.inverse(at, q)))
+
+    step = 1e-5
+    differences = np.array([(gradient(phi + step * e) - gradient(phi - step * e)) / (2 * step) for e in np.eye(n)])
+    np.testing.assert_allclose(second(phi, start).full(), differences, atol=1e-6)
+
+
+def test_inverse_function_is_nan_where_it_finds_nothing(arm: oc.Chart, capfd: pytest.CaptureFixture[str]) -> None:
+    inverse, centre = arm.function("inverse"), arm.problem.domain.centre
+    assert np.isnan(inverse(arm.phi(centre) + np.array([9.0, 0.0, 0.0]), centre).full()).all()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_inverse_and_phi_give_the_same_optimum(arm: oc.Chart) -> None:
+    """The shortest joint path while the tool moves on a line: over xi with the inverse, and over q with phi."""
+    start, knots = arm.problem.domain.centre, 6
+    line = arm.task(start) + np.linspace(0, 1, knots)[:, None] * [0.05, -0.1]
+    by_inverse, over_q = ca.Opti(), ca.Opti()
+    xi = by_inverse.variable(knots)
+    inverse, guess = arm.function("inverse"), ca.DM(start)
+    q = [inverse(ca.vertcat(line[k], xi[k]), guess) for k in range(knots)]
+    by_inverse.minimize(sum(ca.sumsqr(b - a) for a, b in pairwise(q)))
+    by_inverse.subject_to(xi[0] == arm.xi(start)[0])
+    by_inverse.set_initial(xi, arm.xi(start)[0])
+    Q = over_q.variable(3, knots)
+    over_q.minimize(ca.sumsqr(Q[:, 1:] - Q[:, :-1]))
+    for k in range(1, knots):
+        over_q.subject_to(arm.task(Q[:, k]) == line[k])
+    over_q.subject_to(Q[:, 0] == start)
+    over_q.set_initial(Q, np.tile(start[:, None], knots))
+    lengths = []
+    for problem in (by_inverse, over_q):
+        problem.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes"})
+        lengths.append(problem.solve().value(problem.f))
+    assert lengths[0] == pytest.approx(lengths[1], rel=1e-7)
