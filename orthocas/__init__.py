@@ -36,6 +36,7 @@ from orthocas.fitting.loss import Weights
 from orthocas.fitting.loss import register as register_loss_term
 from orthocas.fitting.symbolic_loss import loss
 from orthocas.grow import grow
+from orthocas.inverting import InverseStatus, Solutions, Tracker, TrackerStatus
 from orthocas.involutivity import Involutivity, involutivity, lie_bracket
 from orthocas.metrics import Metric
 from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
@@ -66,6 +67,7 @@ __all__ = [
     "Fourier",
     "Given",
     "GrownChart",
+    "InverseStatus",
     "Involutivity",
     "Linear",
     "Metric",
@@ -73,8 +75,11 @@ __all__ = [
     "Problem",
     "Report",
     "Robot",
+    "Solutions",
     "Task",
     "Torus",
+    "Tracker",
+    "TrackerStatus",
     "Weights",
     "certified_box",
     "certify",

@@ -16,7 +16,7 @@ from orthocas.checks import Array, Indices
 MAX_ITERATIONS = 50
 _PATIENCE = 8  # iterations after which the error must have halved
 GOAL = 1e-12  #: error at which the iteration stops
-_ROUNDING = 1e-5  # of phi: 1e-9 of it are 45 units in the last place
+ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
 _KEEP = 0.1  # J is evaluated again if a step leaves more of the error
 _DECREASE = 1e-4  # of the error, relative to the part of the step taken
 _HALVINGS, _SOLVED = 10, 1e-10  # of a step; below this error only rounding stops the decrease
@@ -34,7 +34,7 @@ class PhiMap:
 
     def scale(self, targets: Array) -> Array:
         """Scale of errors (N, n): the sizes of the components, and more where rounding of phi exceeds them."""
-        scale: Array = self.sizes + _ROUNDING * np.abs(targets)
+        scale: Array = self.sizes + ROUNDING * np.abs(targets)
         return scale
 
     def residual(self, targets: Array, q: Array) -> Array:
@@ -182,7 +182,8 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
     try:
         found = np.asarray(np.linalg.inv(matrices), dtype=float)
     except np.linalg.LinAlgError:  # it does not say which
-        singular = np.asarray(np.linalg.slogdet(matrices)[0] == 0)
+        with np.errstate(invalid="ignore"):
+            singular = np.asarray(np.linalg.slogdet(matrices)[0] == 0)
         found = np.empty_like(matrices)
         found[~singular] = np.linalg.inv(matrices[~singular])
         found[singular] = np.linalg.pinv(matrices[singular])
