@@ -14,7 +14,8 @@ import numpy as np
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 
-_CHUNKS = (1, 64, 512)  # samples in one call: the smallest number that holds the set, or the largest
+_CHUNKS = {1: 1, 256: 64}  # largest set: samples in one call
+_LARGEST = 512  # samples in one call, of larger sets
 _THREADED = 512  # from this chunk size on, starting threads pays off
 
 
@@ -54,7 +55,7 @@ class Batched:
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate N samples."""
-        chunk = next((size for size in _CHUNKS if size >= len(arguments[0])), _CHUNKS[-1])
+        chunk = next((size for most, size in _CHUNKS.items() if most >= len(arguments[0])), _LARGEST)
         if chunk not in self._mapped:
             how = ("thread", THREADS) if chunk >= _THREADED and THREADS > 1 else ()
             self._mapped[chunk] = self.function.map(chunk, *how)
