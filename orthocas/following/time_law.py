@@ -19,6 +19,7 @@ from orthocas.errors import SolveError
 _DEGREE = 3
 _PIECES = 60  # of the spline
 _CHECKED = 300  # places at which the limits are kept; time is stretched if they are not in between
+_TURNS = 0.01  # share of its largest slope that a joint counts with where the path turns back
 _FINE = 6000  # steps of the integration of time
 _LEAST = 1e-9  # smallest z inside the path, relative to its largest value
 
@@ -70,14 +71,15 @@ def fastest(first: Array, second: Array, velocity: Array, acceleration: Array) -
     s, knots = checked_places(), _knots()
     values = BSpline.design_matrix(s, knots, _DEGREE).tocoo()
     slopes = _derivative(s, knots)
-    rows, bounds = [values], [((velocity / np.maximum(np.abs(first), 1e-12)) ** 2).min(axis=1)]
+    moves = np.maximum(np.abs(first), _TURNS * np.abs(first).max(axis=0) + 1e-12)
+    rows, bounds = [values], [((velocity / moves) ** 2).min(axis=1)]
     for i in range(first.shape[1]):
         if not (np.abs(first[:, i]).max() < 1e-12 and np.abs(second[:, i]).max() < 1e-12):
             forces = values.multiply(second[:, i : i + 1]) + slopes.multiply(first[:, i : i + 1] / 2)
             rows += [forces, -forces]
             bounds += [np.full(len(s), acceleration[i])] * 2
     limits, matrix = np.concatenate(bounds), vstack(rows).tocsr()
-    scale = float(limits[: len(s)].max())
+    scale = float(limits[: len(s)].min())
     size = len(knots) - _DEGREE - 1
     ends = [(0.0, 0.0), *[(0.0, None)] * (size - 2), (0.0, 0.0)]
     gain = -np.asarray(values.sum(axis=0)).ravel()
