@@ -21,7 +21,7 @@ if _knows_parent():
 if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
-from orthocas import control, errors, parametrisations, problems, simulation, solvers
+from orthocas import control, errors, following, obstacles, parametrisations, problems, simulation, solvers
 from orthocas.certificates import Certificate
 from orthocas.certifying import certified_box, certify, check_certificate
 from orthocas.chart import Chart, GrownChart, load
@@ -35,6 +35,7 @@ from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.loss import Weights
 from orthocas.fitting.loss import register as register_loss_term
 from orthocas.fitting.symbolic_loss import loss
+from orthocas.following.follow import follow
 from orthocas.grow import grow
 from orthocas.inverting import InverseStatus, Solutions, Tracker, TrackerStatus
 from orthocas.involutivity import Involutivity, involutivity, lie_bracket
@@ -95,6 +96,8 @@ __all__ = [
     "evaluate",
     "export",
     "fit",
+    "follow",
+    "following",
     "generate_c",
     "grow",
     "involutivity",
@@ -102,6 +105,7 @@ __all__ = [
     "lie_bracket",
     "load",
     "loss",
+    "obstacles",
     "parametrisations",
     "plotting",
     "problems",

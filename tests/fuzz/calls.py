@@ -11,7 +11,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from public_objects import circle, clear, fitted, impedance, planar, steps, trajectory
+from public_objects import circle, clear, fitted, impedance, joint_motion, link_distances, planar, steps, trajectory
 
 import orthocas as oc
 from fuzz.child import Finding, run, verdict
@@ -342,6 +342,31 @@ def _methods() -> dict[str, Call]:
         "tracker.step": (chart.tracker(q).step, {"phi": phi}),
         "tracker.reset": (chart.tracker(q).reset, {"q": q}),
         "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
+        "follow": (
+            oc.follow,
+            {
+                "chart": clear(),
+                "tool_path": clear().task([q, q + 0.05, q]),
+                "xi": "hold",
+                "q_start": q,
+                "period": 0.05,
+                "velocity_limits": 1.0,
+                "acceleration_limits": 2.0,
+                "obstacles": [oc.obstacles.Sphere([9.0, 0, 0], 0.1)],
+                "link_radius": 0.1,
+                "clearance": 0.01,
+            },
+        ),
+        "follow by objective": (
+            oc.follow,
+            {"chart": chart, "tool_path": chart.task([q, q + 0.05]), "xi": "objective", "velocity_limits": 1.0},
+        ),
+        "motion.save_csv": (joint_motion().save_csv, {"path": "motion.csv"}),
+        "Sphere": (oc.obstacles.Sphere, {"centre": q, "radius": 0.1}),
+        "Capsule": (oc.obstacles.Capsule, {"start": q, "end": -q, "radius": 0.1}),
+        "Plane": (oc.obstacles.Plane, {"normal": q, "point": q}),
+        "LinkDistances": (oc.obstacles.LinkDistances, {"robot": robot, "obstacles": [], "radius": 0.1}),
+        "distances": (link_distances(), {"q": q}),
         "chart.xi_range": (chart.xi_range, {"q": q}),
         "chart.self_motion": (chart.self_motion, {"q": q, "samples": 20}),
         "curve of self_motion": (clear().self_motion, {"q": clear().problem.domain.centre, "step": 0.1}),
