@@ -23,6 +23,7 @@ SCRIPTS = (
     "lengths",
     "closed_loop",
     "control_tick",
+    "supervised_tick",
     "default_gains",
     "safety",
     "operational_space",

@@ -24,7 +24,9 @@ import pytest
 import scaling
 import starts
 import suggested_domains
+import supervised_tick
 from PIL import Image
+from programs import needs_c
 
 import orthocas as oc
 from orthocas.reproduce.registry import FIGURES
@@ -185,6 +187,15 @@ def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[st
     assert found["iiwa_domination"] < 0.02
     assert found["planar_3r_xy_domination"] < 0.02
     assert capsys.readouterr().out.count("\n") == 4
+
+
+@needs_c
+@pytest.mark.slow
+def test_the_flange_moves_alike_in_single_precision(capsys: pytest.CaptureFixture[str]) -> None:
+    found = supervised_tick.main(quick=True)
+    assert found["flange"] < 1e-5
+    assert 1e-8 < found["proof"] < 1e-4
+    assert len(re.findall(r"\| (?:double|float) \|", capsys.readouterr().out)) == 2
 
 
 @pytest.mark.slow

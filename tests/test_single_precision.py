@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +146,24 @@ def test_there_is_no_double_in_it(generated: GeneratedC, library: CompiledLibrar
     assert {name.split("@")[0] for name in unknown} <= {"sinf", "cosf", "sincosf", "sqrtf", "powf", "cbrtf"} | {
         *("fmaxf", "fminf", "floorf", "expf", "sinhf", "coshf", "memset", "memcpy", "__stack_chk_fail"),
     }
+
+
+@pytest.mark.slow
+def test_a_processor_in_single_precision_emulates_nothing(generated: GeneratedC, tmp_path: Path) -> None:
+    """For a Cortex-M4F, in assembly: none of the functions of the ARM ABI that emulate double precision."""
+    pytest.importorskip("ziglang")
+    (tmp_path / "double").mkdir()
+    double = tmp_path / "double" / "arm.c"
+    double.write_text((generated.folder / "arm.c").read_text().replace("float", "double"))
+    (tmp_path / "double" / "arm.h").write_text((generated.folder / "arm.h").read_text().replace("float", "double"))
+    emulated = []
+    for source in (generated.folder / "arm.c", double):
+        flags = ("-target", "thumb-linux-musleabihf", "-mcpu=cortex_m4+vfp4d16sp", "-std=c99", "-O1", "-S")
+        cache = ("env", f"ZIG_GLOBAL_CACHE_DIR={tmp_path}", f"ZIG_LOCAL_CACHE_DIR={tmp_path}")
+        output_of(*cache, sys.executable, "-m", "ziglang", "cc", *flags, source, "-o", tmp_path / "arm.s")
+        emulated.append(set(re.findall(rb"__aeabi_d\w+|__aeabi_\w+2d", (tmp_path / "arm.s").read_bytes())))
+    assert emulated[0] == set()
+    assert b"__aeabi_dmul" in emulated[1]
 
 
 def test_bounds_belong_to_the_domain(library: CompiledLibrary, law: Controller) -> None:
