@@ -448,6 +448,21 @@ def test_matched_stiffness_is_exact_where_the_inertia_is_constant_and_diagonal()
     np.testing.assert_allclose(matched_posture_stiffness(problem, 5.0), [75.0, 50.0])
     with pytest.raises(InvalidValueError, match="frequency"):
         matched_stiffness(chart, 0.0)
+    with pytest.raises(InvalidValueError, match="fastest"):
+        matched_stiffness(chart, 5.0, 0.0)
+    slower = matched_stiffness(chart, 5.0, 3.0) / matched_stiffness(chart, 5.0)  # 3 rad/s, not 5
+    np.testing.assert_allclose(slower, (3 / 5) ** 2, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_default_gains_of_a_pose_bear_5_ms_of_delay_although_the_flange_has_hardly_any_inertia() -> None:
+    """Joint 7 moves 3e-4 kg m^2. Springs that ignore delay give it modes beyond 23 Hz, which 5 ms make unstable."""
+    arm = oc.problems.get("iiwa")
+    problem = oc.Problem(arm.robot, oc.Task.named(arm.robot, "pose", arm.domain.centre), "euclidean", arm.domain)
+    chart = oc.fit(problem, oc.Polynomial(2), weights=(1000, 30, 150, 1)).chart
+    others = sample_uniform(arm.domain, 1000, 7)
+    assert PDPlus.on_chart(chart).modes(others).delays.min() > 5e-3
+    assert PDPlus(chart, matched_stiffness(chart, fastest=np.inf)).modes(others).delays.min() < 3e-3
 
 
 @pytest.mark.parametrize(("coupling", "damping"), [("coupled", "square_root"), ("decoupled", "double_diagonal")])
@@ -510,7 +525,7 @@ def test_default_gains_hold_an_arm_whose_masses_are_off() -> None:
 
 
 def _inertias(chart: oc.Chart) -> Array:
-    points = sample_uniform(chart.problem.domain, 256, 0)
+    points = sample_uniform(chart.problem.domain, 512, 0)
     J, M = chart.jacobian(points), chart.problem.robot.mass_matrix(points)
     half = np.linalg.inv(J)
     return np.asarray(half.transpose(0, 2, 1) @ M @ half)
