@@ -1,6 +1,7 @@
 /* Rows of the inverse map in one call. Compile with -DN=joints, next to a generated library named arm.
  *
- * For each row: q, phi there, and |J| |J^-1| of J with rows divided by the sizes, or -1 where nothing was found. */
+ * For each row: q and, unless `condition` is NULL, phi there, and |J| |J^-1| of J with rows divided by the sizes, or -1
+ * where nothing was found. */
 #include "arm.h"
 
 #include <math.h>
@@ -52,11 +53,12 @@ void arm_inverse_rows(long rows, const double *phi, const double *q_start, const
   double jacobian[N * N];
   long k;
   int i, j;
-  for (k = 0; k < rows; ++k, phi += N, q_start += N, q += N, found += N) {
-    arm_status status = arm_inverse(phi, q_start, q);
+  for (k = 0; k < rows; ++k) {
+    arm_status status = arm_inverse(phi + k * N, q_start + k * N, q + k * N);
+    if (condition == NULL) continue;
     condition[k] = -1.0;
     if (status != ARM_OK && status != ARM_OUTSIDE_DOMAIN) continue;
-    status = arm_chart(q, found, jacobian);
+    status = arm_chart(q + k * N, found + k * N, jacobian);
     for (i = 0; i < N; ++i)
       for (j = 0; j < N; ++j) jacobian[i * N + j] /= sizes[i];
     if (status == ARM_OK || status == ARM_OUTSIDE_DOMAIN) condition[k] = condition_of(jacobian);
