@@ -24,6 +24,7 @@ SCRIPTS = (
     "closed_loop",
     "control_tick",
     "supervised_tick",
+    "inverse",
     "default_gains",
     "safety",
     "operational_space",

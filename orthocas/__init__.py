@@ -25,7 +25,7 @@ from orthocas import control, errors, following, obstacles, parametrisations, pr
 from orthocas.certificates import Certificate
 from orthocas.certifying import certified_box, certify, check_certificate
 from orthocas.chart import Chart, GrownChart, load
-from orthocas.codegen import generate_c
+from orthocas.codegen import compile_inverse, generate_c
 from orthocas.comparing.compare import compare
 from orthocas.comparing.report import Comparison
 from orthocas.distil import distil
@@ -87,6 +87,7 @@ __all__ = [
     "check",
     "check_certificate",
     "compare",
+    "compile_inverse",
     "contains",
     "control",
     "cyclic_joints",

@@ -1,7 +1,7 @@
 """Charts phi(q) = [h(q); xi(q)]: task and extra coordinates together, with Jacobian and inverse map."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self, TypeVar, overload
@@ -32,6 +32,7 @@ from orthocas.growing import GrownCoordinates
 from orthocas.inverting import (
     FewRows,
     Inverse,
+    LocalSolver,
     Nearest,
     Newton,
     OwnInverse,
@@ -293,7 +294,13 @@ class Chart(Shown):
         return q[0] if single else q
 
     def solve(
-        self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9, inside: bool = False
+        self,
+        phi: ArrayLike,
+        q_start: ArrayLike | None = None,
+        *,
+        tolerance: float = 1e-9,
+        inside: bool = False,
+        local: LocalSolver | None = None,
     ) -> Solutions:
         """Solve phi(q) = phi for q, with a status for each row: a row that fails does not disturb the others.
 
@@ -309,6 +316,7 @@ class Chart(Shown):
             inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
                 other starts, get the q inside with the same x and the nearest xi that Ipopt finds (10 ms a row),
                 status NEAREST, or OUT_OF_REACH if none has that x. Not for grown coordinates.
+            local: another solver of phi(q) = phi near given starts; `orthocas.compile_inverse` has one.
 
         Returns:
             `Solutions` with q (N, n), status, iterations, error and distance (N,); N = 1 for one phi.
@@ -330,9 +338,12 @@ class Chart(Shown):
                 raise ShapeError("q_start", starts.shape, targets.shape)
             starts = np.broadcast_to(starts, targets.shape)
         require_kind("inside", inside, bool)
+        if local is not None and not callable(local):
+            raise InvalidValueError("local", repr(local)[:80], "a function of targets and starts")
         if inside:
             self._require_expression("inside=True")
-        return self._inverse.solve(targets, starts, float(tolerance), inside)
+        inverse = self._inverse if local is None else replace(self._inverse, local=local)
+        return inverse.solve(targets, starts, float(tolerance), inside)
 
     def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
         """All q inside the domain with phi(q) = phi that a search from 1,026 starts finds.
@@ -451,8 +462,13 @@ class Chart(Shown):
         return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
 
     @cached_property
+    def phi_map(self) -> PhiMap:
+        """phi and J for solvers of phi(q) = phi."""
+        return PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes)
+
+    @cached_property
     def _inverse(self) -> Inverse:
-        phi_map = PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes)
+        phi_map = self.phi_map
         if isinstance(self.coordinates, InvertibleMap):
             return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map, self.m))
         local = FewRows(phi_map, self._point_functions, Newton(phi_map))

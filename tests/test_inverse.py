@@ -1,16 +1,19 @@
 """The inverse map: batches with a status for each row, starts, the domain, trackers, derivatives, and compiled C."""
 
+import pickle
 from itertools import pairwise
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
+from programs import needs_c
 from public_objects import circle, clear
 
 import orthocas as oc
 from orthocas import problems
 from orthocas.domains import sample_uniform
-from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
+from orthocas.errors import CompileError, InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
 from orthocas.inverting.newton import inverses
 
@@ -372,3 +375,56 @@ def test_inverse_and_phi_give_the_same_optimum(arm: oc.Chart) -> None:
         problem.solver("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes"})
         lengths.append(problem.solve().value(problem.f))
     assert lengths[0] == pytest.approx(lengths[1], rel=1e-7)
+
+
+@needs_c
+def test_compiled_c_gives_the_same_solutions(iiwa_fit: Fit, tmp_path: Path) -> None:
+    """Of all kinds: found, outside, out of reach and without numbers, with starts and without."""
+    chart = iiwa_fit.chart
+    compiled = oc.compile_inverse(chart, tmp_path / "cache")
+    q = beyond_domain(chart, 600, 1.15)
+    phi = chart.phi(q)
+    phi[5, 0], phi[9, 2] = 9.0, np.nan
+    for start, most in ((None, 0), (q + 0.05, 0), (chart.problem.domain.centre, 6)):  # the last one is far away
+        mine, theirs = chart.solve(phi, start), compiled.solve(phi, start)
+        assert {0, 2, 5, 6} <= set(mine.statuses)
+        same = theirs.status == mine.status
+        assert np.count_nonzero(~same) <= most
+        np.testing.assert_allclose(theirs.q[same], mine.q[same], atol=1e-9)
+        assert theirs.error[theirs.found].max() <= 1e-9
+
+
+@needs_c
+def test_a_library_is_compiled_once(arm: oc.Chart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = oc.compile_inverse(arm)
+    (library,) = (tmp_path / "orthocas").iterdir()
+    written = library.stat().st_mtime_ns
+    again = oc.compile_inverse(arm)
+    assert (again.library, library.stat().st_mtime_ns) == (first.library, written)
+    assert oc.compile_inverse(clear()).library != library
+    copy = pickle.loads(pickle.dumps(first))
+    phi = arm.phi(arm.problem.domain.centre)
+    np.testing.assert_array_equal(copy.solve(phi).q, first.solve(phi).q)
+
+
+@needs_c
+def test_singular_solutions_of_compiled_c_are_named(tmp_path: Path) -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    task = oc.Task.custom(robot, "square", lambda q: q[0] ** 2)
+    chart = oc.fit(oc.Problem(robot, task, domain=oc.Box([0.5, 0.0], 0.6)), oc.Polynomial(1)).chart
+    phi = chart.phi([[0.0, 0.1], [0.5, 0.1]])
+    solutions = oc.compile_inverse(chart, tmp_path).solve(phi, [[0.0, 0.1], [0.4, 0.1]])
+    assert solutions.statuses == (oc.InverseStatus.SINGULAR, FOUND)
+
+
+@needs_c
+def test_a_damaged_library_and_grown_charts_are_refused(arm: oc.Chart, tmp_path: Path) -> None:
+    compiled = oc.compile_inverse(arm, tmp_path)
+    compiled.library.write_bytes(b"damaged")
+    with pytest.raises(CompileError, match="delete it"):
+        oc.compile_inverse(arm, tmp_path).solve(arm.phi(arm.problem.domain.centre))
+    with pytest.raises(NoExpressionError):
+        oc.compile_inverse(circle(), tmp_path)
+    with pytest.raises(InvalidValueError, match="local"):
+        arm.solve(arm.phi(arm.problem.domain.centre), local=3)  # type: ignore[arg-type]

@@ -12,16 +12,18 @@
 from orthocas.inverting.implicit import inverse_function
 from orthocas.inverting.inverse import Inverse
 from orthocas.inverting.nearest import Nearest
-from orthocas.inverting.newton import Newton, PhiMap
+from orthocas.inverting.newton import Attempt, LocalSolver, Newton, PhiMap
 from orthocas.inverting.own_inverse import OwnInverse
 from orthocas.inverting.point import FewRows, PointFunctions
 from orthocas.inverting.solutions import InverseStatus, Solutions
 from orthocas.inverting.tracker import Tracker, TrackerStatus
 
 __all__ = [
+    "Attempt",
     "FewRows",
     "Inverse",
     "InverseStatus",
+    "LocalSolver",
     "Nearest",
     "Newton",
     "OwnInverse",

@@ -338,9 +338,9 @@ def _methods() -> dict[str, Call]:
         "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "tolerance": 1e-9}),
         "chart.solve": (chart.solve, {"phi": phi, "q_start": q, "tolerance": 1e-9, "inside": True}),
         "chart.solutions": (chart.solutions, {"phi": phi, "tolerance": 1e-9}),
-        "chart.tracker": (chart.tracker, {"q0": q, "largest_step": 0.1}),
-        "tracker.step": (chart.tracker(q).step, {"phi": phi}),
-        "tracker.reset": (chart.tracker(q).reset, {"q": q}),
+        "chart.tracker": (chart.tracker, {"q0": planar().domain.centre, "largest_step": 0.1}),
+        "tracker.step": (chart.tracker(planar().domain.centre).step, {"phi": phi}),
+        "tracker.reset": (chart.tracker(planar().domain.centre).reset, {"q": q}),
         "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
         "follow": (
             oc.follow,
