@@ -10,6 +10,7 @@ from orthocas.cli.compare import compare
 from orthocas.cli.entry import INTERRUPTED
 from orthocas.cli.evaluate import evaluate
 from orthocas.cli.fit import fit
+from orthocas.cli.follow import follow
 from orthocas.cli.info import info
 from orthocas.cli.reproduce import reproduce
 from orthocas.cli.simulate import simulate
@@ -30,6 +31,7 @@ app.command()(info)
 app.command()(compare)
 app.command()(reproduce)
 app.command()(simulate)
+app.command()(follow)
 app.command()(codegen)
 
 
