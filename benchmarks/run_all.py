@@ -25,6 +25,7 @@ SCRIPTS = (
     "control_tick",
     "default_gains",
     "safety",
+    "following",
     "operational_space",
     "metric_loss",
     "against_torch",
