@@ -27,6 +27,7 @@ SCRIPTS = (
     "inverse",
     "default_gains",
     "safety",
+    "following",
     "operational_space",
     "redundancy_peers",
     "metric_loss",

@@ -11,6 +11,7 @@ from orthocas.cli.entry import INTERRUPTED
 from orthocas.cli.evaluate import evaluate
 from orthocas.cli.export import export
 from orthocas.cli.fit import fit
+from orthocas.cli.follow import follow
 from orthocas.cli.info import info
 from orthocas.cli.reproduce import reproduce
 from orthocas.cli.simulate import simulate
@@ -31,6 +32,7 @@ app.command()(info)
 app.command()(compare)
 app.command()(reproduce)
 app.command()(simulate)
+app.command()(follow)
 app.command()(codegen)
 app.command()(export)
 
