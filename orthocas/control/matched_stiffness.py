@@ -1,8 +1,8 @@
 """Stiffness from a frequency, because the scales and inertias of coordinates differ by orders of magnitude."""
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize
 
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind
@@ -58,7 +58,7 @@ def _matched(mobilities: Array, frequency: float) -> Array:
     W = mobilities[np.isfinite(mobilities).all(axis=(1, 2))]
     W = W[np.linalg.eigvalsh(W)[:, 0] > 0]
     start = -np.log(np.median(np.diagonal(W, axis1=1, axis2=2), axis=0))  # the solution where W is diagonal
-    return np.asarray(omega**2 * np.exp(minimize(_spread, start, (W,), method="BFGS", jac=True).x))
+    return np.asarray(omega**2 * np.exp(scipy.optimize.minimize(_spread, start, (W,), method="BFGS", jac=True).x))
 
 
 def _spread(log_stiffness: Array, W: Array) -> tuple[float, Array]:
