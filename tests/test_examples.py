@@ -21,6 +21,7 @@ import metric_loss
 import numpy as np
 import paper_network
 import pytest
+import quality_and_time
 import scaling
 import starts
 import suggested_domains
@@ -51,6 +52,12 @@ def test_fold_benchmark_finds_none() -> None:
     *_, searched, uniform, heavy, count = (float(word) for word in line.strip("| ").split("|")[1:])
     assert count == 0
     assert searched <= min(uniform, heavy)
+
+
+def test_quality_and_time_are_drawn_for_two_degrees(tmp_path: Path) -> None:
+    low, high = quality_and_time.main(tmp_path, quick=True)
+    assert high.task < low.task
+    assert (tmp_path / "front_seconds.png").stat().st_size > 10_000
 
 
 def test_certificate_benchmark_proves_its_box() -> None:
