@@ -9,6 +9,7 @@ SCRIPTS = (
     "command",
     "fits",
     "folds",
+    "quality_and_time",
     "clear_boxes",
     "certificates",
     "suggested_domains",

@@ -23,6 +23,7 @@ import metric_loss
 import numpy as np
 import paper_network
 import pytest
+import quality_and_time
 import scaling
 import starts
 import suggested_domains
@@ -75,6 +76,12 @@ def test_path_past_a_post(tmp_path: Path) -> None:
     assert found["objective: joints away from their start at the end [rad]"] < 1e-9
     with Image.open(tmp_path / "follow_path.png") as picture:
         assert picture.size[0] > 1000
+
+
+def test_quality_and_time_are_drawn_for_two_degrees(tmp_path: Path) -> None:
+    low, high = quality_and_time.main(tmp_path, quick=True)
+    assert high.task < low.task
+    assert (tmp_path / "front_seconds.png").stat().st_size > 10_000
 
 
 def test_certificate_benchmark_proves_its_box() -> None:
