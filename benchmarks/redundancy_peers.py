@@ -2,8 +2,8 @@
 
 Every method follows a stream of tool positions (`position`) or poses (`pose`) at 100 Hz, one joint position per tick:
 
-- chart: cubic coordinates; the inverse map from the last joint position, and where it fails or leaves the domain,
-  the arm holds still;
+- chart: the tracker of cubic coordinates, which holds still where there is no q inside the domain; for targets,
+  `solve(inside=True)`;
 - SEW chart (pose): the task and the stereographic SEW angle as coordinates, not orthogonal;
 - pink, mink: a frame task and a posture task of a given cost, joint limits, DAQP, one step per tick;
 - ssik (pose): the tracker, which holds an angle of its own (a swivel, or a joint);
@@ -37,7 +37,7 @@ from default_gains import problem_of, robot_file
 import orthocas as oc
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
-from orthocas.errors import InverseError, RobotError
+from orthocas.errors import RobotError
 from orthocas.simulation import MuJoCoPlant
 
 ARMS, TASKS = ("iiwa", "panda", "xarm7"), ("position", "pose")
@@ -122,26 +122,26 @@ class Arm:
 
 
 class OnChart:
-    """The inverse map of a chart from the last joint position."""
+    """The tracker of a chart. It holds still where there is no q inside the domain."""
 
     def __init__(self, chart: oc.Chart) -> None:
         self.chart = chart
 
     def start(self, q: Array) -> None:
         """Begin at q."""
-        self.q = q
+        self.tracker = self.chart.tracker(q, largest_step=np.inf)
 
     def command(self, target: Target) -> Array:
         """phi."""
         return np.concatenate([target.x, self.chart.xi(target.posture)])
 
     def tick(self, command: Array) -> Array:
-        """Hold still where there is no q inside the domain."""
-        with suppress(InverseError):
-            q = self.chart.inverse(command, self.q)
-            if oc.contains(self.chart.problem.domain, q):
-                self.q = q
-        return self.q
+        """Follow."""
+        return self.tracker.step(command)
+
+    def solution(self, command: Array) -> Array:
+        """With the wanted x, and xi as near as possible."""
+        return self.chart.solve(command, inside=True).q[0]
 
 
 class Pink:
@@ -334,6 +334,7 @@ def moved_by_ssik(method: SSIK, arm: Arm) -> tuple[float, float, float]:
 
 def found(method: Method, arm: Arm, points: Array) -> float:
     """Share of targets, those of joint positions (N, n), that are reached from home within the joint limits."""
+    at_once = isinstance(method, OnChart | SSIK)
     if isinstance(method, Pink | Mink):
         method.period = UNHURRIED  # limits of velocity stop nothing here
     close, count = np.where(np.arange(arm.chart.m) < 3, CLOSE, CLOSE_TURN), 0
@@ -341,9 +342,9 @@ def found(method: Method, arm: Arm, points: Array) -> float:
         target = arm.target(q, posture=arm.home)
         method.start(arm.home)
         command = method.command(target)
-        steps = 1 if isinstance(method, OnChart | SSIK) else STEPS
+        steps = 1 if at_once else STEPS
         for _ in range(steps):
-            reached = method.solution(command) if isinstance(method, SSIK) else method.tick(command)
+            reached = method.solution(command) if at_once else method.tick(command)
             if (np.abs(arm.error(reached, target.placement)) < close).all():
                 count += bool(inside_limits(arm, reached[None])[0])
                 break

@@ -2,6 +2,7 @@
 
 import csv
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from orthocas.following.costs import Costs
 from orthocas.following.joint_curve import JointCurve
 from orthocas.following.newton import Newton
 from orthocas.following.plan import Plan
+from orthocas.following.walk import walk
 from orthocas.obstacles import LinkDistances, Sphere
 
 START = np.array([0.6, 0.8, 0.8])
@@ -81,6 +83,24 @@ def test_rates_are_finite_differences_of_positions() -> None:
     ddq = (found.q[2:] - 2 * found.q[1:-1] + found.q[:-2]) / h**2
     assert np.abs(ddq - found.ddq[1:-1])[5:-5].max() < 1e-2 * np.abs(found.ddq).max()  # jerk times h, at its largest
     np.testing.assert_allclose(found.q[0] + np.trapezoid(found.dq, dx=h, axis=0), found.q[-1], atol=1e-5)
+
+
+def test_limits_are_kept_in_corners() -> None:
+    """A zigzag of straight lines, at periods that miss the corners and at one that sees them."""
+    chart = planar()
+    lines = [
+        chart.task(START) + np.array([x, y])
+        for k, x in enumerate((0.0, -0.1, -0.2))
+        for y in ((0, 0.1)[:: 1 - k % 2 * 2])
+    ]
+    path = np.vstack([np.linspace(a, b, 20, endpoint=False) for a, b in pairwise(lines)])
+    seconds = []
+    for period in (0.05, 0.001):
+        found = oc.follow(chart, path, velocity_limits=1.0, acceleration_limits=3.0, period=period)
+        assert np.abs(found.dq).max() <= 1.0
+        assert np.abs(found.ddq).max() <= 3.0
+        seconds.append(found.duration)
+    assert seconds[0] == pytest.approx(seconds[1], rel=0.05)
 
 
 def test_limits_are_kept_and_used() -> None:
@@ -154,6 +174,40 @@ def test_objective_keeps_away_from_borders() -> None:
     np.testing.assert_allclose(chosen.q[-1], chosen.q[0], atol=1e-9)
     assert chosen.margins.border > held.margins.border + 0.1
     np.testing.assert_allclose(chart.task(chosen.q), chosen.x, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("offset", [[0.4, -0.5, 0.4], [-0.5, 0.5, -0.3]])
+def test_objective_finds_a_way_where_holding_leaves_the_domain(offset: list[float]) -> None:
+    chart, path, q = planar(), loop(planar(), 0.4), START + np.array(offset)
+    with pytest.raises(PathError, match="it leaves the domain"):
+        oc.follow(chart, path, "hold", q_start=q, velocity_limits=1.0)
+    found = oc.follow(chart, path, "objective", q_start=q, velocity_limits=1.0)
+    assert found.margins.border > 0.2
+    assert chart.problem.domain.contains(found.q).all()
+
+
+def test_walk_stays_on_the_path_and_inside() -> None:
+    chart, limits, x = planar(), _limits(planar()), loop(planar(), 0.3)
+    q = walk(chart, Costs(limits), x, START + np.array([0.4, -0.5, 0.4]))
+    assert np.abs(chart.task(q)[1:] - x[1:]).max() < 1e-3
+    assert chart.problem.domain.contains(q).all()
+
+
+@pytest.mark.parametrize("bound", [None, 0.2])
+def test_costs_have_the_gradients_of_finite_differences(bound: float | None) -> None:
+    known = planar().problem
+    problem = oc.Problem(known.robot, known.task, domain=oc.Box(START, 0.7), least_singular_value=bound)
+    chart = oc.fit(problem, oc.Linear()).chart
+    distances = LinkDistances(known.robot, [Sphere([0.5, 1.2, 0.0], 0.2)], 0.1)
+    costs = Costs(Limits(chart, np.ones(3), np.ones(3), distances, 0.01))
+    q = START + np.random.default_rng(8).uniform(-0.8, 0.8, (30, 3))  # also outside
+    residuals, gradients = costs(q)
+    assert (residuals[:, -3:] > 1).any()  # near the ball
+    for i in range(3):
+        step = 1e-7 * np.eye(3)[i]
+        expected = (costs(q + step)[0] - costs(q - step)[0]) / 2e-7
+        np.testing.assert_allclose(gradients[:, :, i], expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -55,6 +55,7 @@ def calls_of_chart(chart: oc.Chart) -> list[Call]:
     q = points_of(chart)
     phi = chart.phi(q)
     fitted_calls: list[Call] = [
+        lambda k: chart.xi_range(q[k % 2]).high,
         lambda k: np.asarray(chart.function("phi")(q[k % 6])),
         lambda k: np.asarray(chart.function("jacobian")(q[k % 6])),
         lambda k: np.append(chart.quality(q[k % 6]).leak_deg, chart.quality(q[k % 6]).conditioning),

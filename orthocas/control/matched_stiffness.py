@@ -1,8 +1,8 @@
 """Stiffness from a frequency, because the scales and inertias of coordinates differ by orders of magnitude."""
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize
 
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_number, require_kind
@@ -67,7 +67,8 @@ def _matched(mobilities: Array, frequency: float, fastest: float) -> Array:
     W = W[np.linalg.eigvalsh(W)[:, 0] > 0]
     start = -np.log(np.median(np.diagonal(W, axis1=1, axis2=2), axis=0))  # the solution where W is diagonal
     bound = 2 * np.log(fastest / omega)
-    return np.asarray(omega**2 * np.exp(minimize(_spread, start, (W, bound), method="BFGS", jac=True).x))
+    found = scipy.optimize.minimize(_spread, start, (W, bound), method="BFGS", jac=True)
+    return np.asarray(omega**2 * np.exp(found.x))
 
 
 def _spread(log_stiffness: Array, W: Array, bound: float) -> tuple[float, Array]:

@@ -170,10 +170,9 @@ class BasisObjective:
     def _halves(self) -> list[Array]:
         """G of the coefficients of each coordinate at every second sample, (N / 2, n, K_j), in single precision."""
         names = [row.tobytes().hex() for row in self.kept]
-        if not set(names) <= set(self._expanded):
-            half = self._gradients.dense(self.G.astype(np.float32), self.N, _STRIDE)
-            for name, row in zip(names, self.kept, strict=True):
-                self._expanded[name] = half if row.all() else np.ascontiguousarray(half[:, :, row])
+        for name, row in zip(names, self.kept, strict=True):
+            if name not in self._expanded:
+                self._expanded[name] = self._gradients.dense_part(self.G, self.N, row, _STRIDE, np.float32)
         return [self._expanded[name] for name in names]
 
     def _by_joint(self, theta: Array) -> Array:

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
@@ -74,7 +74,7 @@ def aligned(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordin
         for J in (coordinates.jacobian(samples.points)[:, :fitted], chart.coordinates.jacobian(samples.points))
     )
     parallel = np.einsum("sin,sjn->ij", ours, theirs[:, :fitted]) / len(samples)
-    theirs_in_order, order = linear_sum_assignment(-np.abs(parallel.T))
+    theirs_in_order, order = scipy.optimize.linear_sum_assignment(-np.abs(parallel.T))
     signs = np.sign(parallel.T[theirs_in_order, order])
     back = np.empty(fitted)
     back[order] = signs

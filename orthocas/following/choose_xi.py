@@ -22,8 +22,9 @@ from orthocas.following.plan import Plan
 if TYPE_CHECKING:
     pass
 
-_PLACES = 160  # on the path
-_PIECES = 20  # of the spline
+_LEAST, _MOST = 20, 60  # pieces of the spline
+_DENSITY = 10  # pieces on a path as long as x moves over the domain
+_PLACES = 8  # where costs count, on every piece
 _SPEED, _BEND = 2e-2, 1e-4  # weights of the squares of xi' and xi''
 _ITERATIONS = 40
 _GAIN = 1e-3  # relative decrease of the cost that ends the iterations
@@ -53,11 +54,12 @@ class XiChoice:
 
     def __init__(self, plan: Plan, costs: Costs, newton: Newton) -> None:
         self.plan, self.costs, self.newton, self.chart = plan, costs, newton, newton.chart
-        self.s = np.linspace(0.0, 1.0, _PLACES)
-        self.nodes = np.linspace(0.0, 1.0, _PIECES + 1)
-        unit = np.eye(_PIECES + 1)
+        pieces = _pieces(plan, self.chart.phi_sizes[: self.chart.m])
+        self.s = np.linspace(0.0, 1.0, _PLACES * pieces + 1)
+        self.nodes = np.linspace(0.0, 1.0, pieces + 1)
+        unit = np.eye(pieces + 1)
         if plan.closed:
-            unit = np.vstack([unit[:_PIECES, :_PIECES], unit[:1, :_PIECES]])
+            unit = np.vstack([unit[:pieces, :pieces], unit[:1, :pieces]])
         self._unit = unit
         basis = self._spline(unit)
         self._basis = basis(self.s)
@@ -120,3 +122,9 @@ class XiChoice:
         change = -np.linalg.solve(scaled, gradient).reshape(state.values.shape)
         new = self._state(state.values + change, state.q)
         return new if new is not None and new.cost < state.cost else None
+
+
+def _pieces(plan: Plan, sizes: Array) -> int:
+    """Pieces of the spline: more on longer paths."""
+    length = np.linalg.norm(np.diff(plan.waypoints / sizes, axis=0), axis=1).sum()
+    return int(np.clip(np.ceil(_DENSITY * length), _LEAST, _MOST))

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_float_array, as_number, as_point, require_kind
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, SolveError
 from orthocas.following.checks import Limits
 from orthocas.following.choose_xi import XiChoice
 from orthocas.following.costs import Costs
@@ -24,6 +24,8 @@ from orthocas.obstacles.shapes import Obstacle
 HOLD = "hold"
 OBJECTIVE = "objective"
 _TO_FULL_SPEED = 0.5  # [s] that a joint takes to its velocity limit with the default acceleration limits
+_STRETCHES, _MARGIN = 20, 1.001  # how often time is stretched, and a little more than needed
+_INSTANTS = 2001  # at which the limits are kept besides
 _MOST_STAMPS = 1_000_000
 
 
@@ -44,7 +46,8 @@ def follow(
 
     The path is a cubic spline through the waypoints, periodic if it ends where it begins. At every time stamp, q has
     the x and xi of the splines to 1e-10. The speed along the path is the fastest smooth profile that keeps the
-    limits of velocity and acceleration at 300 places; then time is stretched until all time stamps keep them.
+    limits of velocity and acceleration in 300 parts of the path; then time is stretched until 2,000 instants
+    and all time stamps keep them.
 
     Args:
         chart: a fitted chart.
@@ -154,32 +157,35 @@ def _of_joints(chart: Chart, name: str, value: ArrayLike) -> Array:
 
 
 def _on_stamps(plan: Plan, curve: JointCurve, law: TimeLaw, limits: Limits, period: float) -> JointMotion:
-    """The motion at multiples of the period, slower until all of them keep the limits."""
-    for _ in range(2):
+    """The motion at multiples of the period, slower until these and other instants keep the limits."""
+    law = _slowed(law, limits, *_motion(curve, law, np.linspace(0.0, law.duration, _INSTANTS))[2:])
+    for _ in range(_STRETCHES):
         stamps = max(4, int(np.ceil(law.duration / period - 1e-9)))
         if stamps > _MOST_STAMPS:
             raise InvalidValueError("period", period, f"at most {_MOST_STAMPS} time stamps in {law.duration:.3g} s")
         law = law.stretched(stamps * period)
         times = period * np.arange(stamps + 1, dtype=float)
-        s, speed, rate = law.at(times)
-        q, first, second = curve.at(s)
-        dq: Array = first * speed[:, None]
-        ddq: Array = second * speed[:, None] ** 2 + first * rate[:, None]
-        used = max((np.abs(dq) / limits.velocity).max(), np.sqrt((np.abs(ddq) / limits.acceleration).max()))
-        if used <= 1:
+        s, q, dq, ddq = _motion(curve, law, times)
+        slower = _slowed(law, limits, dq, ddq)
+        if slower is law:
             break
-        law = law.stretched(law.duration * float(used) * (1 + 1e-9))
-    chart = limits.chart
-    return JointMotion(
-        chart.labels,
-        chart.problem.robot.joint_names,
-        times,
-        q,
-        dq,
-        ddq,
-        plan.x(s),
-        plan.xi(s),
-        s,
-        plan.closed,
-        limits.margins(q, dq, ddq),
-    )
+        law = slower
+    else:
+        raise SolveError("no speed along the path keeps the limits at all time stamps")
+    x, xi = plan.x(s), plan.xi(s)
+    names = limits.chart.labels, limits.chart.problem.robot.joint_names
+    return JointMotion(*names, times, q, dq, ddq, x, xi, s, plan.closed, limits.margins(q, dq, ddq))
+
+
+def _motion(curve: JointCurve, law: TimeLaw, times: Array) -> tuple[Array, Array, Array, Array]:
+    """s (N,), and q, dq, ddq (N, n) at times (N,)."""
+    s, speed, rate = law.at(times)
+    q, first, second = curve.at(s)
+    dq, ddq = first * speed[:, None], second * speed[:, None] ** 2 + first * rate[:, None]
+    return s, q, np.asarray(dq, dtype=float), np.asarray(ddq, dtype=float)
+
+
+def _slowed(law: TimeLaw, limits: Limits, dq: Array, ddq: Array) -> TimeLaw:
+    """The law, or a slower one if velocities or accelerations (N, n) exceed their limits."""
+    used = max((np.abs(dq) / limits.velocity).max(), np.sqrt((np.abs(ddq) / limits.acceleration).max()))
+    return law if used <= 1 else law.stretched(law.duration * float(used) * _MARGIN)

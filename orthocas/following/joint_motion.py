@@ -85,8 +85,7 @@ class JointMotion(Shown):
             PathFileError: if the folder is missing or not writable, or there is another file, or a symbolic link.
         """
         target = as_path("path", path)
-        require_writable(target, PathFileError)
-        require_replaceable(target, _is_ours(target), force, PathFileError)
+        require_place(target, force)
         with published(target.parent) as drafts:
             (drafts / target.name).write_text(self._text(), encoding="utf-8", newline="")
 
@@ -99,6 +98,16 @@ class JointMotion(Shown):
         table = np.column_stack([self.times, self.q, self.dq, self.ddq, self.x, self.xi])
         writer.writerows([repr(float(value)) for value in row] for row in table)
         return text.getvalue()
+
+
+def require_place(path: Path, force: bool) -> None:
+    """Check, before long work, that `JointMotion.save_csv` can write there.
+
+    Raises:
+        PathFileError: if the folder is missing or not writable, or there is a file of others, or a symbolic link.
+    """
+    require_writable(path, PathFileError)
+    require_replaceable(path, _is_ours(path), force, PathFileError)
 
 
 def _is_ours(path: Path) -> bool:

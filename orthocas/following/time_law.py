@@ -13,12 +13,12 @@ from scipy.interpolate import BSpline
 from scipy.optimize import linprog
 from scipy.sparse import coo_array, vstack
 
-from orthocas.checks import Array
+from orthocas.checks import Array, Indices
 from orthocas.errors import SolveError
 
 _DEGREE = 3
 _PIECES = 60  # of the spline
-_CHECKED = 300  # places at which the limits are kept; time is stretched if they are not in between
+_BINS, _PLACES = 300, 8  # parts of the path, and places of each; limits count where a joint turns most within a part
 _TURNS = 0.01  # share of its largest slope that a joint counts with where the path turns back
 _FINE = 6000  # steps of the integration of time
 _LEAST = 1e-9  # smallest z inside the path, relative to its largest value
@@ -52,8 +52,8 @@ class TimeLaw:
 
 
 def checked_places() -> Array:
-    """The parameters s at which `fastest` wants q' and q''."""
-    return np.linspace(0.0, 1.0, _CHECKED)
+    """The parameters s at which `fastest` wants q' and q'', (P,)."""
+    return np.linspace(0.0, 1.0, _BINS * _PLACES)
 
 
 def fastest(first: Array, second: Array, velocity: Array, acceleration: Array) -> TimeLaw:
@@ -68,21 +68,23 @@ def fastest(first: Array, second: Array, velocity: Array, acceleration: Array) -
     Raises:
         SolveError: if the linear program fails.
     """
-    s, knots = checked_places(), _knots()
-    values = BSpline.design_matrix(s, knots, _DEGREE).tocoo()
-    slopes = _derivative(s, knots)
+    knots = _knots()
     moves = np.maximum(np.abs(first), _TURNS * np.abs(first).max(axis=0) + 1e-12)
-    rows, bounds = [values], [((velocity / moves) ** 2).min(axis=1)]
+    speeds = ((velocity / moves) ** 2).min(axis=1)
+    slowest = _worst(-speeds)
+    rows, bounds = [_basis(slowest, knots)[0]], [speeds[slowest]]
     for i in range(first.shape[1]):
-        if not (np.abs(first[:, i]).max() < 1e-12 and np.abs(second[:, i]).max() < 1e-12):
-            forces = values.multiply(second[:, i : i + 1]) + slopes.multiply(first[:, i : i + 1] / 2)
+        if np.abs(first[:, i]).max() > 1e-12:
+            k = _worst(np.abs(second[:, i]))
+            values, slopes = _basis(k, knots)
+            forces = values.multiply(second[k, i : i + 1]) + slopes.multiply(first[k, i : i + 1] / 2)
             rows += [forces, -forces]
-            bounds += [np.full(len(s), acceleration[i])] * 2
+            bounds += [np.full(_BINS, acceleration[i])] * 2
     limits, matrix = np.concatenate(bounds), vstack(rows).tocsr()
-    scale = float(limits[: len(s)].min())
+    scale = float(limits[:_BINS].min())
     size = len(knots) - _DEGREE - 1
     ends = [(0.0, 0.0), *[(0.0, None)] * (size - 2), (0.0, 0.0)]
-    gain = -np.asarray(values.sum(axis=0)).ravel()
+    gain = -np.asarray(rows[0].sum(axis=0)).ravel()
     found = linprog(gain, matrix, limits / scale, bounds=ends, method="highs")
     if found.x is None or found.x.max() <= 0:
         raise SolveError(f"the speed profile of a path was not found: {found.message}")
@@ -105,8 +107,14 @@ def _knots() -> Array:
     return np.concatenate([np.zeros(_DEGREE), inner, np.ones(_DEGREE)])
 
 
-def _derivative(s: Array, knots: Array) -> coo_array:
-    """Derivatives of the basis at places (P,), (P, size)."""
-    size = len(knots) - _DEGREE - 1
-    basis = BSpline(knots, np.eye(size), _DEGREE).derivative()
-    return coo_array(np.asarray(basis(s)))
+def _worst(values: Array) -> Indices:
+    """The place with the largest value (P,) in each part of the path, (_BINS,)."""
+    parts = values.reshape(_BINS, _PLACES)
+    return np.asarray(np.arange(_BINS) * _PLACES + parts.argmax(axis=1), dtype=np.int64)
+
+
+def _basis(k: Indices, knots: Array) -> tuple[coo_array, coo_array]:
+    """Values and derivatives of the basis at places k (P,), (P, size) each."""
+    basis = BSpline(knots, np.eye(len(knots) - _DEGREE - 1), _DEGREE)
+    s = checked_places()[k]
+    return coo_array(np.asarray(basis(s))), coo_array(np.asarray(basis.derivative()(s)))

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_simpson
 
 from orthocas.checks import Array, as_float_array, as_path, frozen_indices, require_known, require_shape, require_text
 from orthocas.control.status import FROM_THE_LAW, ControlStatus
@@ -81,7 +81,7 @@ class Trajectory(Shown):
         It is 0 for impedance control and PD+ (coupled) while the reference is at rest, in continuous time with the true
         model and without friction, pushes, noise, or commands that were clipped or replaced by the fallback.
         """
-        lost = cumulative_simpson(self.dissipated_power, x=self.times, initial=0.0)
+        lost = scipy.integrate.cumulative_simpson(self.dissipated_power, x=self.times, initial=0.0)
         return np.asarray(self.storage - self.storage[0] + lost)
 
     @property
