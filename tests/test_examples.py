@@ -17,6 +17,7 @@ import front
 import gallery
 import growing_queries
 import iiwa_demo
+import inverse
 import involutivity
 import ipopt_front
 import metric_loss
@@ -225,6 +226,15 @@ def test_the_flange_moves_alike_in_single_precision(capsys: pytest.CaptureFixtur
     assert found["flange"] < 1e-5
     assert 1e-8 < found["proof"] < 1e-4
     assert len(re.findall(r"\| (?:double|float) \|", capsys.readouterr().out)) == 2
+
+
+@pytest.mark.slow
+@needs_c
+def test_benchmark_of_the_inverse_finds_every_row(capsys: pytest.CaptureFixture[str]) -> None:
+    found = inverse.main(quick=True)
+    assert {found[f"{solver}, none found"] for solver in ("NumPy", "compiled C")} == {1.0}
+    assert {value for name, value in found.items() if name.endswith("wrong")} == {0}
+    assert len(re.findall(r"\| (?:NumPy|compiled C) \|", capsys.readouterr().out)) == 8
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.casadi_tools.threads import in_threads
 from orthocas.checks import Array, Indices
 
 MAX_ITERATIONS = 50
@@ -20,6 +21,7 @@ ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
 _KEEP = 0.1  # J is evaluated again if a step leaves more of the error
 _DECREASE = 1e-4  # of the error, relative to the part of the step taken
 _HALVINGS, _SOLVED = 10, 1e-10  # of a step; below this error only rounding stops the decrease
+_PIECE = 2048  # matrices that a thread inverts at once
 _SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
 SUSPICIOUS = 1e6  #: |J| |J^-1| above which singular values are computed
 
@@ -139,7 +141,8 @@ class _Run:
 
         A row whose J is from an earlier point waits for a new one instead.
         """
-        steps = np.matmul(self._inverse[rows], self.residual[rows, :, None])[:, :, 0]
+        inverse = self._inverse if len(rows) == len(self._inverse) else self._inverse[rows]  # copies take time
+        steps = np.matmul(inverse, self.residual[rows, :, None])[:, :, 0]
         goes_on = np.zeros(len(rows), dtype=bool)
         left = np.flatnonzero(np.isfinite(steps).all(axis=1))
         for halvings in range(_HALVINGS + 1):
@@ -180,7 +183,12 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
     """
     singular: NDArray[np.bool_] = np.zeros(len(matrices), dtype=bool)
     try:
-        found = np.asarray(np.linalg.inv(matrices), dtype=float)
+        found = np.empty_like(matrices)
+        pieces = [slice(first, first + _PIECE) for first in range(0, len(matrices), _PIECE)]
+        for piece, inverse in zip(
+            pieces, in_threads(lambda piece: np.linalg.inv(matrices[piece]), pieces), strict=True
+        ):
+            found[piece] = inverse
     except np.linalg.LinAlgError:  # it does not say which
         with np.errstate(invalid="ignore"):
             singular = np.asarray(np.linalg.slogdet(matrices)[0] == 0)
