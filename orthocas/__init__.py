@@ -1,57 +1,67 @@
 """orthocas: joint-space coordinates that a redundant robot's task does not disturb, with CasADi."""
 
+import os as _os
+import sys as _sys
 from importlib import import_module as _import_module
 from pathlib import Path as _Path
+from types import ModuleType as _ModuleType
 from typing import TYPE_CHECKING
 
 from orthocas.cli.entry import is_command_line as _is_command_line
 from orthocas.cli.entry import leave_on_ctrl_c as _leave_on_ctrl_c
+from orthocas.version import VERSION as _VERSION
 
 if _is_command_line():
-    _leave_on_ctrl_c()  # the imports below take a second
+    _leave_on_ctrl_c()  # what a command imports takes half a second
 
-from orthocas.comparing.workers import end_early_with_parent as _end_early_with_parent
-from orthocas.comparing.workers import knows_parent as _knows_parent
-
-if _knows_parent():
-    _end_early_with_parent()
+if "ORTHOCAS_PARENT" in _os.environ:  # a process that shares work of another one, see `orthocas.comparing.workers`
+    _import_module("orthocas.comparing.workers").end_early_with_parent()
 
 # In a checkout, problems/ and solvers/ lie beside this folder, not inside it. Looking one level up keeps
 # `orthocas.problems` importable there, whether or not an installed copy exists; a wheel does not run this line.
 if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
-from orthocas import control, errors, following, obstacles, parametrisations, problems, simulation, solvers
-from orthocas.certificates import Certificate
-from orthocas.certifying import certified_box, certify, check_certificate
-from orthocas.chart import Chart, GrownChart, load
-from orthocas.codegen import generate_c
-from orthocas.comparing.compare import compare
-from orthocas.comparing.report import Comparison
-from orthocas.distil import distil
-from orthocas.domains import Box, Torus, contains, default_box
-from orthocas.fitting.fit import Fit, fit
-from orthocas.fitting.loss import Weights
-from orthocas.fitting.loss import register as register_loss_term
-from orthocas.fitting.symbolic_loss import loss
-from orthocas.following.follow import follow
-from orthocas.grow import grow
-from orthocas.involutivity import Involutivity, involutivity, lie_bracket
-from orthocas.metrics import Metric
-from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
-from orthocas.parametrisations import register as register_parametrisation
-from orthocas.postures.clear_box import ClearBox
-from orthocas.postures.suggest import suggest_domain
-from orthocas.problem import Problem, check
-from orthocas.quality import Report, evaluate
-from orthocas.robots import Robot
-from orthocas.simulation import simulate
-from orthocas.singularities import jumps, singular_points
-from orthocas.tasks import Task
-from orthocas.version import VERSION as _VERSION
-
 if TYPE_CHECKING:
-    from orthocas import plotting
+    from orthocas import (
+        control,
+        errors,
+        following,
+        obstacles,
+        parametrisations,
+        plotting,
+        problems,
+        simulation,
+        solvers,
+    )
+    from orthocas.certificates import Certificate
+    from orthocas.certifying import certified_box, certify, check_certificate
+    from orthocas.chart import Chart, GrownChart, load
+    from orthocas.codegen import compile_inverse, generate_c
+    from orthocas.comparing.compare import compare
+    from orthocas.comparing.report import Comparison
+    from orthocas.distil import distil
+    from orthocas.domains import Box, Torus, contains, default_box
+    from orthocas.exporting import export
+    from orthocas.fitting.fit import Fit, fit
+    from orthocas.fitting.loss import Weights
+    from orthocas.fitting.loss import register as register_loss_term
+    from orthocas.fitting.symbolic_loss import loss
+    from orthocas.following.follow import follow
+    from orthocas.grow import grow
+    from orthocas.inverting import InverseStatus, Solutions, Tracker, TrackerStatus
+    from orthocas.involutivity import Involutivity, involutivity, lie_bracket
+    from orthocas.metrics import Metric
+    from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
+    from orthocas.parametrisations import register as register_parametrisation
+    from orthocas.postures.clear_box import ClearBox
+    from orthocas.postures.suggest import suggest_domain
+    from orthocas.problem import Problem, check
+    from orthocas.quality import Report, evaluate
+    from orthocas.robots import Robot
+    from orthocas.simulation import simulate
+    from orthocas.singularities import jumps, singular_points
+    from orthocas.tasks import Task
 
 __version__ = _VERSION
 __all__ = [
@@ -66,6 +76,7 @@ __all__ = [
     "Fourier",
     "Given",
     "GrownChart",
+    "InverseStatus",
     "Involutivity",
     "Linear",
     "Metric",
@@ -73,14 +84,18 @@ __all__ = [
     "Problem",
     "Report",
     "Robot",
+    "Solutions",
     "Task",
     "Torus",
+    "Tracker",
+    "TrackerStatus",
     "Weights",
     "certified_box",
     "certify",
     "check",
     "check_certificate",
     "compare",
+    "compile_inverse",
     "contains",
     "control",
     "cyclic_joints",
@@ -88,6 +103,7 @@ __all__ = [
     "distil",
     "errors",
     "evaluate",
+    "export",
     "fit",
     "follow",
     "following",
@@ -111,12 +127,63 @@ __all__ = [
     "suggest_domain",
 ]
 
+# Everything is imported on first use: all of it takes half a second, and few programs need all.
+_HOMES = {
+    "orthocas.certificates": ["Certificate"],
+    "orthocas.certifying": ["certified_box", "certify", "check_certificate"],
+    "orthocas.chart": ["Chart", "GrownChart", "load"],
+    "orthocas.codegen": ["compile_inverse", "generate_c"],
+    "orthocas.comparing.compare": ["compare"],
+    "orthocas.comparing.report": ["Comparison"],
+    "orthocas.distil": ["distil"],
+    "orthocas.domains": ["Box", "Torus", "contains", "default_box"],
+    "orthocas.exporting": ["export"],
+    "orthocas.fitting.fit": ["Fit", "fit"],
+    "orthocas.fitting.loss": ["Weights", "register as register_loss_term"],
+    "orthocas.fitting.symbolic_loss": ["loss"],
+    "orthocas.following.follow": ["follow"],
+    "orthocas.grow": ["grow"],
+    "orthocas.inverting": ["InverseStatus", "Solutions", "Tracker", "TrackerStatus"],
+    "orthocas.involutivity": ["Involutivity", "involutivity", "lie_bracket"],
+    "orthocas.metrics": ["Metric"],
+    "orthocas.parametrisations": [
+        *("MLP", "SEW", "Fourier", "Given", "Linear", "Polynomial", "cyclic_joints"),
+        "register as register_parametrisation",
+    ],
+    "orthocas.postures.clear_box": ["ClearBox"],
+    "orthocas.postures.suggest": ["suggest_domain"],
+    "orthocas.problem": ["Problem", "check"],
+    "orthocas.quality": ["Report", "evaluate"],
+    "orthocas.robots": ["Robot"],
+    "orthocas.simulation": ["simulate"],
+    "orthocas.singularities": ["jumps", "singular_points"],
+    "orthocas.tasks": ["Task"],
+}
+_PLACES = {name.split()[-1]: (home, name.split()[0]) for home, names in _HOMES.items() for name in names}
+
+
+class _Package(_ModuleType):
+    """This package. `orthocas.grow`, `distil` and `involutivity` stay the functions of modules of the same names."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _PLACES and isinstance(value, _ModuleType)):  # Python sets modules that are imported
+            super().__setattr__(name, value)
+
+
+_sys.modules[__name__].__class__ = _Package
+
 
 def __getattr__(name: str) -> object:
-    """Import `plotting` on first use: it needs matplotlib, which takes half a second to import."""
-    if name == "plotting":
-        return _import_module("orthocas.plotting")
-    raise AttributeError(f"module 'orthocas' has no attribute '{name}'")
+    """A public name, imported on first use."""
+    if name in _PLACES:
+        home, own_name = _PLACES[name]
+        found = getattr(_import_module(home), own_name)
+    elif name in __all__:
+        found = _import_module(f"orthocas.{name}")
+    else:
+        raise AttributeError(f"module 'orthocas' has no attribute '{name}'")
+    globals()[name] = found
+    return found
 
 
 def __dir__() -> list[str]:

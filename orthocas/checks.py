@@ -128,9 +128,8 @@ def as_path(name: str, value: Any) -> Path:
 
 def require_finite(name: str, array: Array) -> None:
     """Raise InvalidValueError, with the index of the first bad entry, unless all entries are finite."""
-    bad = np.argwhere(~np.isfinite(array))
-    if bad.size:
-        place = tuple(int(i) for i in bad[0])
+    if not np.isfinite(array).all():
+        place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise InvalidValueError(f"{name}{list(place) if place else ''}", array[place], "a finite number")
 
 

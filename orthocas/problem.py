@@ -198,15 +198,16 @@ def task_sizes(problem: Problem) -> Array:
     return np.where(np.isfinite(sizes) & (sizes > 0), sizes, 1.0)
 
 
-def task_jacobians(problem: Problem, points: Array) -> Array:
-    """J_x at points (N, n), as an array (N, m, n).
+def task_jacobians(problem: Problem, points: Array, results: Array | None = None) -> Array:
+    """J_x at points (N, n), as an array (N, m, n): a new one, or `results`.
 
     Raises:
         SingularTaskError: if J_x is not finite at a point (for example polar coordinates at the origin).
     """
-    J = problem.task.batched_jacobian(points)[0].reshape(-1, problem.m, problem.n)
-    finite = np.isfinite(J).all(axis=(1, 2))
-    if not finite.all():
-        at = np.round(points[np.flatnonzero(~finite)[0]], 4).tolist()
+    J = np.empty((len(points), problem.m, problem.n)) if results is None else results
+    problem.task.batched_jacobian.into(J, points)
+    if not np.isfinite(J).all():
+        bad = ~np.isfinite(J).all(axis=(1, 2))
+        at = np.round(points[np.flatnonzero(bad)[0]], 4).tolist()
         raise SingularTaskError(f"the Jacobian of task '{problem.task.name}' is not finite at q = {at}")
     return J

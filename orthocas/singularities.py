@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
@@ -123,7 +123,7 @@ def _distinct(points: Array) -> Array:
     """One point from each group of equal points, sorted."""
     kept: list[int] = []
     if len(points):
-        groups = cKDTree(points).query_ball_point(points, _SAME)
+        groups = scipy.spatial.cKDTree(points).query_ball_point(points, _SAME)
         kept = sorted({min(group) for group in groups})
     chosen = points[kept]
     return np.asarray(chosen[np.lexsort(np.round(chosen, 4).T[::-1])])

@@ -7,7 +7,8 @@ from typing import Any, Self
 import casadi as ca
 from numpy.typing import ArrayLike
 
-from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import dense_function
+from orthocas.casadi_tools.blocks import BlockedFunction
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.user_expression import expression_of
 from orthocas.checks import require_kind, require_text
@@ -232,14 +233,14 @@ class Task(Shown):
         return dense_function("centred_jacobian", [q, centre], [ca.jacobian(x, q)], ["q", "centre"])
 
     @cached_property
-    def batched(self) -> Batched:
+    def batched(self) -> BlockedFunction:
         """Evaluates h at many points."""
-        return Batched(self.function)
+        return BlockedFunction(self.function)
 
     @cached_property
-    def batched_jacobian(self) -> Batched:
+    def batched_jacobian(self) -> BlockedFunction:
         """Evaluates J_x at many points."""
-        return Batched(self.jacobian_function)
+        return BlockedFunction(self.jacobian_function)
 
     @classmethod
     def _turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None) -> Self:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+import scipy
 
 from orthocas.checks import Array, require_at_least, require_count
 from orthocas.errors import InvalidValueError
@@ -102,6 +102,6 @@ class _Run:
 def _solved(H: Array, gradient: Array) -> Array:
     """H^-1 gradient: by Cholesky, or by LU where rounding in single precision has left H indefinite."""
     try:
-        return np.asarray(cho_solve(cho_factor(H), gradient), dtype=float)
+        return np.asarray(scipy.linalg.cho_solve(scipy.linalg.cho_factor(H), gradient), dtype=float)
     except np.linalg.LinAlgError:
         return np.asarray(np.linalg.solve(H, gradient), dtype=float)

@@ -231,6 +231,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "distances of links": link_distances,
     "self-motion": lambda: fitted().chart.self_motion(planar().domain.centre, samples=30),
     "self-motion curve": lambda: cyclic().self_motion(cyclic().problem.domain.centre),
+    "solutions": lambda: fitted().chart.solve([[1.6, 0.1, 0.1], [9.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]),
+    "tracker": lambda: fitted().chart.tracker(planar().domain.centre),
     "involutivity": lambda: oc.involutivity(planar(), 100),
     "singular point": lambda: oc.singular_points(problems.get("planar_2r"))[0],
     "jump": lambda: oc.jumps(circle())[0],
@@ -297,6 +299,13 @@ def _of_chart(chart: oc.Chart) -> Iterator[Any]:
     yield chart.inverse(phi[known], q[known] + 1e-3)
     if not isinstance(chart, oc.GrownChart):
         yield from (np.asarray(chart.function(name)(q[0])) for name in ("xi", "phi", "jacobian"))
+
+
+@_numbers.register
+def _of_tracker(tracker: oc.Tracker) -> Iterator[Any]:
+    q = tracker.q
+    yield from (q, tracker.step(fitted().chart.phi(q) + 1e-3), tracker.status, tracker.largest_step)
+    tracker.reset(q)
 
 
 @_numbers.register

@@ -29,7 +29,7 @@ from orthocas.certifying.monomials import monomials
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.certifying.volume import conditioning_bound
 from orthocas.checks import Array
-from orthocas.cli.commands import app
+from orthocas.cli.commands import app_for
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.errors import CertifyError, ChartFileError, Interrupted, InvalidValueError
 from orthocas.minimising.watch import Progress
@@ -432,7 +432,7 @@ def test_graphs_with_whole_powers_are_bounded() -> None:
 
 
 def command(*words: Any) -> Any:
-    return CliRunner().invoke(app, [str(word) for word in words])
+    return CliRunner().invoke(app_for(list(map(str, words))), [str(word) for word in words])
 
 
 def test_the_command_certifies_checks_and_shows(tmp_path: Path) -> None:

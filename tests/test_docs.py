@@ -70,6 +70,17 @@ def test_python_blocks_of_the_page_on_domains_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_python_blocks_of_the_page_on_the_inverse_run(tmp_path: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "inverse.md").read_text(), flags=re.DOTALL)
+    printed = python("\n".join(blocks), tmp_path).splitlines()
+    assert printed[0].startswith("Solutions: ")
+    assert printed[0].endswith(" OUT_OF_REACH")
+    assert printed[3:7] == ["True", "True True", "True", "LOST True"]
+    over_xi, over_q = printed[7].split()
+    assert over_xi == over_q
+
+
+@pytest.mark.slow
 def test_python_blocks_of_the_page_on_paths_run(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "paths.md").read_text(), flags=re.DOTALL)
     printed = python("\n".join(blocks), tmp_path)

@@ -23,10 +23,13 @@ import metric_loss
 import numpy as np
 import paper_network
 import pytest
+import quality_and_time
 import scaling
 import starts
 import suggested_domains
+import supervised_tick
 from PIL import Image
+from programs import needs_c
 
 import orthocas as oc
 from orthocas.reproduce.registry import FIGURES
@@ -73,6 +76,12 @@ def test_path_past_a_post(tmp_path: Path) -> None:
     assert found["objective: joints away from their start at the end [rad]"] < 1e-9
     with Image.open(tmp_path / "follow_path.png") as picture:
         assert picture.size[0] > 1000
+
+
+def test_quality_and_time_are_drawn_for_two_degrees(tmp_path: Path) -> None:
+    low, high = quality_and_time.main(tmp_path, quick=True)
+    assert high.task < low.task
+    assert (tmp_path / "front_seconds.png").stat().st_size > 10_000
 
 
 def test_certificate_benchmark_proves_its_box() -> None:
@@ -207,6 +216,15 @@ def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[st
     assert found["iiwa_domination"] < 0.02
     assert found["planar_3r_xy_domination"] < 0.02
     assert capsys.readouterr().out.count("\n") == 4
+
+
+@needs_c
+@pytest.mark.slow
+def test_the_flange_moves_alike_in_single_precision(capsys: pytest.CaptureFixture[str]) -> None:
+    found = supervised_tick.main(quick=True)
+    assert found["flange"] < 1e-5
+    assert 1e-8 < found["proof"] < 1e-4
+    assert len(re.findall(r"\| (?:double|float) \|", capsys.readouterr().out)) == 2
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """What the loss leaves free is chosen the same way every time: offset, scale, order and sign of coordinates."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,3 +80,14 @@ def test_coordinates_vanish_at_the_centre_and_have_mean_gradients_of_length_one(
     np.testing.assert_allclose(chart.xi(planar_x.domain.centre), 0, atol=1e-12)
     lengths = np.linalg.norm(chart.coordinates.jacobian(sample_problem(planar_x, 4000, 9).points), axis=2).mean(axis=0)
     np.testing.assert_allclose(lengths, 1, rtol=0.15)  # the fit took the mean over 200 samples
+
+
+def test_a_coordinate_that_folds_at_the_centre_keeps_its_values(planar_x: oc.Problem) -> None:
+    found, centre = oc.fit(planar_x, oc.Polynomial(2), samples=200).chart.coordinates, planar_x.domain.centre
+    points = sample_problem(planar_x, 20, 1).points
+    units = (replace(found, theta=theta) for theta in np.eye(found.theta.size).reshape(-1, *found.theta.shape))
+    folded = [c for c in units if not c.jacobian(centre[None]).any() and np.ptp(c.xi(points), axis=0).any()]
+    assert folded  # squares of a joint
+    for coordinates in folded:
+        again = in_gauge(coordinates, centre).xi(points)
+        np.testing.assert_allclose(np.sort(np.abs(again)), np.sort(np.abs(coordinates.xi(points))), atol=1e-12)

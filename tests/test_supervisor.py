@@ -383,9 +383,7 @@ def test_settings_in_c_are_those_of_python(generated: GeneratedC, law: Controlle
 def test_a_million_hostile_ticks_stay_bounded_with_the_right_status(generated: GeneratedC, tmp_path: Path) -> None:
     """Under the address and undefined-behaviour sanitizers; the program itself checks commands, states and statuses."""
     flags = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    program = built(
-        generated, "supervised_ticks.c", tmp_path, "-DTICKS=1000000L", "-DLIMIT=120.0", "-DSINGULAR=0", *flags
-    )
+    program = built(generated, "supervised_ticks.c", tmp_path, "-DTICKS=1000000L", "-DLIMIT=120.0", *flags)
     done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{done.returncode}: {done.stderr}"
     counts = [int(word) for word in done.stdout.split()]

@@ -64,6 +64,7 @@ def calls_of_chart(chart: oc.Chart) -> list[Call]:
         lambda k: chart.phi(q[k % 6]),
         lambda k: chart.jacobian(q[: 1 + k % 6]),
         lambda k: chart.inverse(phi[k % 6], q[k % 6] + 0.02),
+        lambda k: chart.solve(phi[k % 6 :]).q,
         lambda k: chart.problem.robot.mass_matrix(q[k % 6]),
         *([] if isinstance(chart, oc.GrownChart) else fitted_calls),
     ]

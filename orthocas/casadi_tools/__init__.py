@@ -3,6 +3,8 @@
 Which evaluator to use:
 
 - `batch.Batched` maps any SX or MX function of one sample over a set of samples. Use it by default.
+- `blocks.BlockedFunction` does the same for an SX function of q that often meets thousands of joint positions, in
+  threads. `blocks.fill` is its loop, for functions of other kinds.
 - `columns.ColumnFunction` evaluates a large SX function on columns of 256 samples. It serves the loss
   and the gradients of basis functions.
 - `blas_graph.NumpyGraph` evaluates an MX graph of dense products at BLAS speed, derivatives included. It serves

@@ -14,9 +14,8 @@ import numpy as np
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 
-_CHUNKS = {1: 1, 256: 64}  # largest set: samples in one call
-_LARGEST = 512  # samples in one call, of larger sets
-_THREADED = 512  # from this chunk size on, starting threads pays off
+_CHUNKS = (1, 8, 64)  # samples in one call: the smallest number that holds the set, or the largest
+_LARGE = 512  # samples in one call of sets of at least so many, where starting threads pays off
 
 
 def _threads() -> int:
@@ -55,9 +54,10 @@ class Batched:
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate N samples."""
-        chunk = next((size for most, size in _CHUNKS.items() if most >= len(arguments[0])), _LARGEST)
+        N = len(arguments[0])
+        chunk = _LARGE if N >= _LARGE else next((size for size in _CHUNKS if size >= N), _CHUNKS[-1])
         if chunk not in self._mapped:
-            how = ("thread", THREADS) if chunk >= _THREADED and THREADS > 1 else ()
+            how = ("thread", THREADS) if chunk == _LARGE and THREADS > 1 else ()
             self._mapped[chunk] = self.function.map(chunk, *how)
         return evaluate_columns(self._mapped[chunk], chunk, *arguments)
 

@@ -4,7 +4,7 @@ CasADi multiplies dense matrices with a triple loop, and differentiation drops a
 builds the whole graph, derivatives included, and the products are replaced at the end.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from threading import local
 from typing import Any
 
@@ -112,6 +112,22 @@ class NumpyGraph:
         with deferred():
             evaluate()
         return results
+
+    def on_one_block(self) -> Callable[[Array], Array]:
+        """A function of this graph's one input with its own memory. It returns the same array at every call."""
+        buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
+        buffer, evaluate = self.function.buffer()
+        values, result = (np.empty(size[::-1]) for size in (self.function.size_in(0), self.function.size_out(0)))
+        buffer.set_arg(0, values.data)
+
+        def run(block: Array) -> Array:
+            values[...] = block.T
+            buffer.set_res(0, result.data)  # also keeps the buffer alive, which `evaluate` does not
+            with deferred():
+                evaluate()
+            return result.T
+
+        return run
 
     def _rewritten(self, inputs: Sequence[ca.MX], outputs: list[ca.MX]) -> list[ca.MX]:
         """Cut the graph at its expensive nodes, and join the pieces with NumPy's nodes in between."""

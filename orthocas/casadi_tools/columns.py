@@ -71,14 +71,19 @@ class ColumnFunction:
             results = list(pool.map(lambda run, part: _of_blocks(run, *part), runs, split))
         return [np.concatenate(outputs) for outputs in zip(*results, strict=True)]
 
-    def on_one_block(self) -> Callable[..., list[Array]]:
-        """A function of contiguous inputs (entries, c) with its own scratch memory. It returns (entries, c)."""
+    def on_one_block(self, reused: bool = False) -> Callable[..., list[Array]]:
+        """A function of contiguous inputs (entries, c) with its own scratch memory. It returns (entries, c).
+
+        Args:
+            reused: return the same arrays at every call. Large ones need time to allocate.
+        """
         buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
         buffer, evaluate = self._on_block.buffer()
         shapes = [(self._function.numel_out(i), COLUMNS) for i in range(self._function.n_out())]
+        own = [np.empty(shape) for shape in shapes] if reused else None
 
         def run(*arguments: Array) -> list[Array]:
-            results = [np.empty(shape) for shape in shapes]
+            results = own or [np.empty(shape) for shape in shapes]
             for i, array in enumerate(arguments):
                 buffer.set_arg(i, array.data)
             for i, array in enumerate(results):

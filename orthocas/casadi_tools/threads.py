@@ -4,13 +4,14 @@ BLAS divides a product among threads, and rounds differently for every number of
 and the work is cut into pieces of a fixed size, whose results come back in their order.
 """
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from threading import Lock
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from orthocas.casadi_tools.batch import THREADS
 
@@ -33,13 +34,17 @@ class _BlasHold:
 
     def __init__(self) -> None:
         self._lock, self._count = Lock(), 0
-        self._limits: threadpool_limits | None = None
+        self._libraries: ThreadpoolController | None = None
+        self._modules = 0  # when the libraries were searched, which takes 1 ms
+        self._limits: Any = None
 
     def begin(self) -> None:
         """One more wants it."""
         with self._lock:
             if not self._count:
-                self._limits = threadpool_limits(1, user_api="blas")
+                if self._libraries is None or self._modules != len(sys.modules):  # which may have brought some
+                    self._libraries, self._modules = ThreadpoolController(), len(sys.modules)
+                self._limits = self._libraries.limit(limits=1, user_api="blas")
             self._count += 1
 
     def end(self) -> None:

@@ -1,6 +1,7 @@
 """Certificates: what was proved of a chart, with all that is needed to check it again."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -76,6 +77,24 @@ class Certificate(Shown):
         facts["boxes"] = f"{self.regular.proved_count} proved, {self.boxes} judged, {self.seconds:.3g} s"
         facts["method"] = f"{self.method}, chart {self.fingerprint[:12]}"
         return facts
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        one = self.injective
+        return {
+            "proved": self.proved,
+            "share": self.share,
+            "bound": self.bound,
+            "conditioning": self.conditioning,
+            "boxes": self.boxes,
+            "parts": self.regular.proved_count,
+            "unproved": self.regular.open_count,
+            "seconds": self.seconds,
+            "one_to_one_half_width": None if one is None else ((one.high - one.low) / 2).tolist(),
+            "fold": [list(point) for point in self.fold],
+            "method": self.method,
+            "fingerprint": self.fingerprint,
+        }
 
     def _verdict(self) -> str:
         if self.fold:

@@ -11,8 +11,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import sparse
 
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.certifying.graph import TaylorGraph
@@ -146,7 +146,7 @@ def _one_derivative(terms: Array, place: dict[Monomial, int], joint: int, D: Arr
             rows.append(k)
             columns.append(place[(*term[:joint], int(b), *term[joint + 1 :])])
             values.append(D[term[joint], b])
-    return sparse.csr_array((values, (rows, columns)), shape=(len(terms),) * 2)
+    return scipy.sparse.csr_array((values, (rows, columns)), shape=(len(terms),) * 2)
 
 
 @cache

@@ -7,7 +7,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -18,7 +18,7 @@ from orthocas.chart import Chart
 from orthocas.checks import require_count
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
 from orthocas.cli.progress import terminal_monitor
-from orthocas.comparing.workers import begin_worker, starting_workers, worker_pool
+from orthocas.comparing.workers import begin_worker, starting_workers, worker_pool, workers_killed_on_error
 from orthocas.errors import Interrupted
 from orthocas.files.archive import require_free
 from orthocas.files.chart_file import CHART
@@ -83,25 +83,6 @@ def certify(
     raise typer.Exit(0 if found.proved else _NOT_PROVED)
 
 
-def as_dict(certificate: Certificate) -> dict[str, Any]:
-    """Plain data for JSON."""
-    one = certificate.injective
-    return {
-        "proved": certificate.proved,
-        "share": certificate.share,
-        "bound": certificate.bound,
-        "conditioning": certificate.conditioning,
-        "boxes": certificate.boxes,
-        "parts": certificate.regular.proved_count,
-        "unproved": certificate.regular.open_count,
-        "seconds": certificate.seconds,
-        "one_to_one_half_width": None if one is None else ((one.high - one.low) / 2).tolist(),
-        "fold": [list(point) for point in certificate.fold],
-        "method": certificate.method,
-        "fingerprint": certificate.fingerprint,
-    }
-
-
 @contextmanager
 def _executor(workers: int, scheduler: str | None) -> Iterator[Executor | None]:
     """What shares the work: processes, a Dask scheduler, or nothing."""
@@ -109,7 +90,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor | None]:
         with scheduler_executor(scheduler) as executor:
             yield executor
     elif workers > 1:
-        with worker_pool(workers, begin_worker, os.getpid()) as executor:
+        with worker_pool(workers, begin_worker, os.getpid()) as executor, workers_killed_on_error():
             with starting_workers():
                 for _ in range(workers):  # each call starts a process
                     executor.submit(os.getpid)
@@ -128,7 +109,7 @@ def _unfinished(chart: Chart, bound: float | None) -> Certificate | None:
 
 def _report(certificate: Certificate, target: Path, json: bool) -> None:
     if json:
-        print_json({"chart": str(target), **as_dict(certificate)})
+        print_json({"chart": str(target), **certificate.as_dict()})
     else:
         print_rows({**certificate.facts(), "chart": str(target)})
 
@@ -136,7 +117,7 @@ def _report(certificate: Certificate, target: Path, json: bool) -> None:
 def _report_check(certificate: Certificate | None, holds: bool, seconds: float, json: bool) -> None:
     assert certificate is not None
     if json:
-        print_json({"holds": holds, **as_dict(certificate), "seconds": seconds})
+        print_json({"holds": holds, **certificate.as_dict(), "seconds": seconds})
     else:
         verdict = "holds" if holds else "does NOT hold"
         print_rows({"check": f"the certificate {verdict}, {seconds:.3g} s", **certificate.facts()})

@@ -1,38 +1,47 @@
 """Collects the commands, and turns errors into one line and exit code 2."""
 
-import numpy as np
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
 import typer
 
 from orthocas.casadi_tools.interrupts import ended_in_order, remembered
-from orthocas.cli.certify import certify
-from orthocas.cli.codegen import codegen
-from orthocas.cli.compare import compare
 from orthocas.cli.entry import INTERRUPTED
-from orthocas.cli.evaluate import evaluate
-from orthocas.cli.fit import fit
-from orthocas.cli.follow import follow
-from orthocas.cli.info import info
-from orthocas.cli.reproduce import reproduce
-from orthocas.cli.simulate import simulate
 from orthocas.errors import OrthocasError, one_line
 
-app = typer.Typer(
-    name="orthocas",
-    help="Joint-space coordinates that a redundant robot's task does not disturb.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
-app.command()(fit)
-app.command()(evaluate)
-app.command()(certify)
-app.command()(info)
-app.command()(compare)
-app.command()(reproduce)
-app.command()(simulate)
-app.command()(follow)
-app.command()(codegen)
+COMMANDS = {
+    "fit": "Fit extra coordinates to a problem and save the chart.",
+    "evaluate": "Measure the quality of a chart on held-out samples of its domain.",
+    "certify": "Prove that a chart does not fold anywhere on its domain, and keep the proof in its file.",
+    "info": "Show a chart file, a named problem, or a robot file.",
+    "compare": "Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts.",
+    "reproduce": "Redraw figures of the paper and print the numbers they show.",
+    "simulate": "Run a controller in a chart's coordinates; write the run, pictures, an animation and a report.",
+    "follow": "Follow a tool path; write joint positions, velocities and accelerations on time stamps.",
+    "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",
+    "export": "Write task, xi, phi and Jacobian of a chart as one Python module that needs the library only.",
+}  #: names of the commands, modules of this package, and the first lines of their help
+
+
+def app_for(words: Sequence[str]) -> typer.Typer:
+    """The command line with the commands that `words` name. Of others it knows the help: their imports take time."""
+    app = typer.Typer(
+        name="orthocas",
+        help="Joint-space coordinates that a redundant robot's task does not disturb.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+    for name, summary in COMMANDS.items():
+        command = getattr(import_module(f"orthocas.cli.{name}"), name) if name in words else _idle
+        app.command(name, help=None if name in words else summary)(command)
+    return app
+
+
+def _idle() -> None:
+    """Stands for a command that is not called."""
 
 
 def _complain(text: str) -> None:
@@ -45,7 +54,7 @@ def run() -> int:
     """Run the command line; bad input gives one line on standard error and exit code 2, a signal its own code."""
     with ended_in_order(), remembered() as pressed:
         try:
-            code = app(standalone_mode=False) or 0
+            code = app_for(sys.argv[1:])(standalone_mode=False) or 0
         except KeyboardInterrupt:
             code = INTERRUPTED
         except Exception as error:
@@ -61,7 +70,8 @@ def _message(error: Exception) -> str:
         return error.format_message()
     if isinstance(error, OrthocasError):
         return str(error)
-    if isinstance(error, OSError | MemoryError | np.linalg.LinAlgError):  # from libraries: also one line, no traceback
+    from_library = isinstance(error, OSError | MemoryError) or type(error).__name__ == "LinAlgError"
+    if from_library:  # also one line, no traceback
         return f"{type(error).__name__}: {error}"
     raise error
 

@@ -21,9 +21,9 @@ from orthocas.cli.problem_argument import (
     ToolText,
     build_problem,
     parse_numbers,
-    suggested,
 )
 from orthocas.cli.progress import terminal_monitor
+from orthocas.cli.suggested_problem import suggested
 from orthocas.errors import Interrupted, InvalidValueError
 from orthocas.files.archive import require_free
 from orthocas.files.chart_file import CHART

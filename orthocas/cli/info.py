@@ -5,7 +5,6 @@ from typing import Any
 
 from orthocas import problems
 from orthocas.chart import Chart
-from orthocas.cli.certify import as_dict
 from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.cli.problem_argument import (
     Locks,
@@ -46,7 +45,7 @@ def info(
             "parameters": chart.coordinates.size,
             **_reach(chart),
             "notes": dict(chart.notes),
-            **({"certificate": as_dict(chart.certificate)} if chart.certificate else {}),
+            **({"certificate": chart.certificate.as_dict()} if chart.certificate else {}),
         }
     if json:
         print_json(data)

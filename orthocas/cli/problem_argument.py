@@ -11,13 +11,7 @@ from orthocas import problems
 from orthocas.checks import Array
 from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, UnknownNameError
-from orthocas.metrics import Metric
-from orthocas.minimising.watch import Monitor
-from orthocas.parametrisations import Parametrisation
-from orthocas.postures.probe import Bounds
 from orthocas.postures.regular_box import regular_box
-from orthocas.postures.suggest import suggest_domain
-from orthocas.postures.suggestion import DomainSuggestion
 from orthocas.problem import Problem
 from orthocas.robots import Robot
 from orthocas.tasks import Task
@@ -110,53 +104,13 @@ def build_problem(name: str, options: ProblemOptions) -> Problem:
     if not options.given():
         return base
     options.require_no_robot(f"the named problem '{name}'")
-    centre, half_width = _centre(base.robot, options), _half_width(options)
+    centre, half_width = chosen_centre(base.robot, options), _half_width(options)
     domain = base.domain
     if centre is not None or half_width is not None:
         domain = default_box(base.robot, base.domain.centre if centre is None else centre, half_width)
     task = base.task if options.task is None else Task.named(base.robot, options.task)
     metric = base.metric if options.metric is None else options.metric
     return Problem(base.robot, task, metric, domain, name, options.least_singular_value)
-
-
-def suggested(
-    name: str,
-    options: ProblemOptions,
-    parametrisation: Parametrisation | None,
-    bounds: Bounds,
-    seed: int,
-    monitor: Monitor,
-) -> tuple[Problem, DomainSuggestion]:
-    """Build the problem of `--domain auto`, and the suggestion that its domain comes from.
-
-    Raises:
-        UnknownNameError: if `name` is neither a named problem nor a robot file.
-        OrthocasError: if anything does not fit together.
-    """
-    if options.half_width is not None:
-        raise InvalidValueError("--half-width", options.half_width, "none with --domain auto, which finds it")
-    if options.least_singular_value is not None:
-        given = options.least_singular_value
-        raise InvalidValueError("--least-singular-value", given, "none with --domain auto, which stays clear by itself")
-    base = None if is_robot_file(name) else build_problem(name, options)
-    robot = build_robot(name, options) if base is None else base.robot
-    task = Task.named(robot, options.task or "position") if base is None else base.task
-    metric: Metric | str = (options.metric or "euclidean") if base is None else base.metric
-    home: Array | str | None = _centre(robot, options) if base is None else base.domain.centre
-    if options.home is not None:
-        home = options.home
-    found = suggest_domain(
-        robot,
-        task,
-        home,
-        metric,
-        leak_deg=bounds.leak_deg,
-        conditioning=bounds.conditioning,
-        parametrisation=parametrisation,
-        seed=seed,
-        monitor=monitor,
-    )
-    return Problem(robot, task, metric, found.domain, Path(name).stem if base is None else base.name), found
 
 
 def parse_numbers(option: str, text: str) -> Array:
@@ -171,14 +125,14 @@ def parse_numbers(option: str, text: str) -> Array:
 def _from_file(name: str, options: ProblemOptions) -> Problem:
     robot = build_robot(name, options)
     task = Task.named(robot, "position" if options.task is None else options.task)
-    centre = _centre(robot, options)
+    centre = chosen_centre(robot, options)
     centre = regular_box(robot, task).centre if centre is None else centre
     domain = default_box(robot, centre, _half_width(options))
     metric = "euclidean" if options.metric is None else options.metric
     return Problem(robot, task, metric, domain, Path(name).stem, options.least_singular_value)
 
 
-def _centre(robot: Robot, options: ProblemOptions) -> Array | None:
+def chosen_centre(robot: Robot, options: ProblemOptions) -> Array | None:
     """The centre that --centre or --home gives; None without either."""
     if options.home is None:
         return None if options.centre is None else parse_numbers("--centre", options.centre)

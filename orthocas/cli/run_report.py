@@ -20,6 +20,10 @@ _REASONS = {
     ControlStatus.OUTSIDE_DOMAIN: "the arm left the domain",
     ControlStatus.SINGULAR: "the coordinates became singular",
     ControlStatus.NOT_FINITE: "the controller received an input that was not finite",
+    ControlStatus.BAD_INPUT: "a measurement or a reference could not be used",
+    ControlStatus.TOO_FAST: "a joint exceeded its limit of velocity",
+    ControlStatus.LATE: "a tick came too late",
+    ControlStatus.OK: "the arm was not well inside the domain",  # where a supervised law begins
 }
 
 
@@ -38,6 +42,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
     inside = np.asarray(contains(chart.problem.domain, seen.q))
     judged = plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
     largest = np.abs(seen.command).max(axis=0)
+    lasting = {status.name: seconds for status, seconds in seen.seconds_in_status.items()}
     report = {
         "controller": controller.name,
         "coupling": controller.settings.get("coupling"),
@@ -51,8 +56,10 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
         "fallback": {
             "share": len(bad) / len(seen.times),
             "since": None if first is None else float(seen.times[first]),
-            "reason": None if first is None else _REASONS[ControlStatus(int(seen.status[first]))],
+            "reason": None if first is None else _REASONS[_cause(seen, first)],
         },
+        "seconds_in_status": lasting,
+        "catches": [{"time": time, "cause": cause.name} for time, cause in seen.catches],
         "saturated_share": float(seen.saturated.mean()),
         "share_inside_domain": float(inside.mean()),
         "command": seen.kind,
@@ -88,6 +95,8 @@ def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
     rows["command"] = f"at most {command:.4g} {unit}, {joint}"
     if report["saturated_share"]:
         rows["limit"] = f"reached for {report['saturated_share']:.1%} of the run"
+    if report["catches"]:
+        rows["statuses"] = ", ".join(f"{name} {time:.3g} s" for name, time in report["seconds_in_status"].items())
     if energy := report["energy"]:
         rows["energy"] = (
             f"V at most {_text(energy['storage_largest'])} J, at the end {_text(energy['storage_end'])} J; "
@@ -102,11 +111,23 @@ def fallback_text(report: dict[str, Any]) -> str | None:
     fallback = report["fallback"]
     if fallback["since"] is None:
         return None
+    if report["catches"]:
+        times = "once" if len(report["catches"]) == 1 else f"{len(report['catches'])} times"
+        return (
+            f"at t = {fallback['since']:.4g} s {fallback['reason']}: the catcher took over, {times} in all, "
+            f"and commanded for {fallback['share']:.1%} of the run"
+        )
     what = "the gravity torque" if report["command"] == "torque" else "zero velocity"
     return (
         f"at t = {fallback['since']:.4g} s {fallback['reason']}: the controller commanded only {what} "
         f"for {fallback['share']:.1%} of the run"
     )
+
+
+def _cause(seen: Trajectory, k: int) -> ControlStatus:
+    """Why the law did not command at an instant."""
+    status = ControlStatus(int(seen.status[k]))
+    return status if status in _REASONS else ControlStatus(int(seen.cause[k]))
 
 
 def _angles(chart: Chart, seen: Trajectory) -> dict[str, Any] | None:

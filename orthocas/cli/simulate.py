@@ -30,7 +30,7 @@ from orthocas.cli.output import AsJson, Force, note, number, print_json, print_r
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.cli.progress import terminal_monitor
 from orthocas.cli.run_report import fallback_text, run_report, run_rows
-from orthocas.control import Controller, Reference, posture_reference
+from orthocas.control import Controller, Reference, Safety, posture_reference
 from orthocas.errors import ArchiveError, Interrupted, InvalidValueError
 from orthocas.files.atomic import output_folder, published, require_replaceable_files, require_writable
 from orthocas.files.json import to_json
@@ -71,6 +71,10 @@ def simulate(
     plant: Annotated[
         str, typer.Option("--plant", help="Simulator: cvodes, or mujoco (needs --rate and the extra [sim]).")
     ] = CVODES,
+    supervised: Annotated[
+        bool,
+        typer.Option("--supervised", help="Run the supervised law of the generated C (needs --rate and a C compiler)."),
+    ] = False,
     mass_factor: Annotated[
         float | None,
         typer.Option("--mass-factor", parser=number, help="True masses divided by those of the controller's model."),
@@ -97,7 +101,7 @@ def simulate(
     words = (stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction)
     options = ControllerOptions(*words, damping, damping_stiffness, second)
     require_options(controller, options)
-    _require_plant(plant, rate)
+    _require_plant(plant, rate, supervised)
     _require_folder(out, animation, force)
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         loaded = Chart.load(chart)
@@ -109,6 +113,7 @@ def simulate(
         "plant": _plant(plant, loaded.problem.robot, mass_factor),
         "friction": None if friction is None else Friction(*_pair("--friction", friction)),
         "noise": _noise(law, noise, seed, rate),
+        "safety": Safety.of(law) if supervised else None,
     }
     begin = time.perf_counter()
     with terminal_monitor() as monitor:
@@ -142,11 +147,13 @@ def _require_folder(out: Path, animation: str, force: bool) -> None:
     require_replaceable_files(out, names, force)
 
 
-def _require_plant(plant: str, rate: float | None) -> None:
-    """Raise UnknownNameError for other plants, and InvalidValueError for MuJoCo without a sampled controller."""
+def _require_plant(plant: str, rate: float | None, supervised: bool) -> None:
+    """Raise UnknownNameError for other plants, and InvalidValueError where a sampled controller is missing."""
     require_known("plant", plant, (CVODES, MUJOCO))
     if plant == MUJOCO and rate is None:
         raise InvalidValueError("--plant", plant, "--rate as well, because MuJoCo runs with a sampled controller")
+    if supervised and rate is None:
+        raise InvalidValueError("--supervised", "given", "--rate as well, because a supervised law runs tick by tick")
 
 
 def _plant(plant: str, model: Robot, mass_factor: float | None) -> Robot | MuJoCo | None:

@@ -7,8 +7,8 @@ from typing import Self
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.cached import cached_property
@@ -102,7 +102,7 @@ class Reference(Shown):
         if len(t) < 2 or t[0] != 0 or np.diff(t).min() <= 0:
             raise InvalidValueError("times", t.tolist(), "at least two increasing times that begin with 0")
         rest = [(order, np.zeros(len(names))) for order in (1, 2)]
-        spline = make_interp_spline(t, values, _DEGREE, bc_type=(rest, rest))
+        spline = scipy.interpolate.make_interp_spline(t, values, _DEGREE, bc_type=(rest, rest))
         taylor = [spline(t[:-1], order) / factorial(order) for order in reversed(range(_DEGREE + 1))]
         coefficients = np.stack(taylor, axis=2).reshape(len(t) - 1, -1)
         spacing = min(_GRID, float(np.diff(t).min()) / 4)

@@ -6,16 +6,20 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.batch import Batched, dense_function, evaluate_columns
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.blas_graph import NumpyGraph
+from orthocas.casadi_tools.blocks import MANY, fill
 from orthocas.casadi_tools.cached import cached_property
+from orthocas.casadi_tools.columns import COLUMNS
 from orthocas.casadi_tools.scalar_code import scalar_code
+from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.checks import Array, frozen_array, require_shape
+from orthocas.coordinates.blocks import Maker, block_functions
 from orthocas.coordinates.point_functions import point_functions
 from orthocas.parametrisations import Family, JointSpace, Parametrisation
 from orthocas.parametrisations.family import Expression, GradedParametrisation
 
-_COLUMNS = 256  # samples side by side in graphs of matrices
+_FEW = 8  # joint positions below which networks are evaluated one by one
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,16 +91,20 @@ class Coordinates:
 
     def xi(self, points: Array) -> Array:
         """Coordinates (N, r) at points (N, n)."""
-        if self.as_matrices:
-            return evaluate_columns(self._column_graphs["xi"].function, _COLUMNS, points)[0]
-        return self._batched["xi"](points)[0]
+        return self.into("xi", np.empty((len(points), self.r)), points)
 
     def jacobian(self, points: Array) -> Array:
         """J_xi (N, r, n) at points (N, n)."""
-        if self.as_matrices:
-            flat = evaluate_columns(self._column_graphs["jacobian"].function, _COLUMNS, points)[0]
-            return flat.reshape(len(points), self.r, self.space.n)
-        return self._batched["jacobian"](points)[0].reshape(len(points), self.r, self.space.n)
+        return self.into("jacobian", np.empty((len(points), self.r, self.space.n)), points)
+
+    def into(self, name: str, results: Array, points: Array) -> Array:
+        """Write xi or the Jacobian at points (N, n) to `results`, which may be part of a larger array; return it."""
+        if len(points) < (_FEW if self.as_matrices else MANY):
+            results[...] = self._batched[name](points)[0].reshape(results.shape)
+        else:
+            with one_blas_thread():
+                fill(results, points, self._on_blocks[name])
+        return results
 
     @cached_property
     def functions(self) -> dict[str, ca.Function]:
@@ -123,12 +131,20 @@ class Coordinates:
 
     @cached_property
     def _batched(self) -> dict[str, Batched]:
-        return {name: Batched(scalar_code(self.functions[name])) for name in ("xi", "jacobian")}
+        fast = (lambda graph: graph) if self.as_matrices else scalar_code
+        return {name: Batched(fast(self.functions[name])) for name in ("xi", "jacobian")}
+
+    @cached_property
+    def _on_blocks(self) -> dict[str, Maker]:
+        """What makes functions of many joint positions side by side."""
+        if not self.as_matrices:
+            return block_functions(self)
+        return {name: graph.on_one_block for name, graph in self._column_graphs.items()}
 
     @cached_property
     def _column_graphs(self) -> dict[str, NumpyGraph]:
         """Functions xi and vec(J_xi^T) of many joint positions side by side, where dense products are fast."""
-        q = ca.MX.sym("q", self.space.n, _COLUMNS)
+        q = ca.MX.sym("q", self.space.n, COLUMNS)
         J_xi = ca.vertcat(*self._gradients(q))
         return {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}
 

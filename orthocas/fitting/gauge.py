@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
@@ -48,9 +48,10 @@ def in_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
     the positive direction. Idle joints stay last.
     """
     g = coordinates.jacobian(centre[None, :])[0, : len(coordinates.offset)]
-    moved = (g**2 @ np.arange(g.shape[1])) / (g**2).sum(axis=1)
+    size = (g**2).sum(axis=1)
+    moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)  # g = 0: a fold at the centre
     largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]
-    return _rearranged(coordinates, np.argsort(moved, kind="stable"), np.sign(largest))
+    return _rearranged(coordinates, np.argsort(moved, kind="stable"), np.where(largest < 0, -1.0, 1.0))
 
 
 def aligned(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordinates:
@@ -73,7 +74,7 @@ def aligned(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordin
         for J in (coordinates.jacobian(samples.points)[:, :fitted], chart.coordinates.jacobian(samples.points))
     )
     parallel = np.einsum("sin,sjn->ij", ours, theirs[:, :fitted]) / len(samples)
-    theirs_in_order, order = linear_sum_assignment(-np.abs(parallel.T))
+    theirs_in_order, order = scipy.optimize.linear_sum_assignment(-np.abs(parallel.T))
     signs = np.sign(parallel.T[theirs_in_order, order])
     back = np.empty(fitted)
     back[order] = signs

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial import cKDTree
+import scipy
 
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
@@ -84,19 +84,19 @@ class CircleLeaf:
         return np.asarray(self.curve[-1] - self.curve[0])
 
     @cached_property
-    def _spline(self) -> CubicSpline:
+    def _spline(self) -> Any:
         """A spline of the curve without its drift, periodic in the arc length."""
         share = np.linspace(0.0, 1.0, len(self.curve))[:, None]
         periodic = self.curve - share * self._drift
         periodic[-1] = periodic[0]
-        return CubicSpline(share[:, 0] * self.length[0], periodic, bc_type="periodic")
+        return scipy.interpolate.CubicSpline(share[:, 0] * self.length[0], periodic, bc_type="periodic")
 
     def _at(self, along: Array) -> Array:
         return np.asarray(self._spline(along) + along[:, None] / self.length[0] * self._drift)
 
     @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self._embedded(self.curve[:-1]))
+    def _tree(self) -> Any:
+        return scipy.spatial.cKDTree(self._embedded(self.curve[:-1]))
 
     def _embedded(self, points: Array) -> Array:
         """Angles as points on circles, so that whole turns do not matter."""

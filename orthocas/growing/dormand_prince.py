@@ -9,8 +9,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.integrate import DOP853
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.cached import cached_property
@@ -83,13 +83,13 @@ class BatchedFlow:
         """One step: y, step size, p -> new y and its estimated error in units of the tolerance."""
         k = self.field.size1_in(0)
         y, step, p = ca.SX.sym("y", k), ca.SX.sym("step"), ca.SX.sym("p", self.field.size1_in(1))
-        slopes: list[Any] = []
+        method, slopes = scipy.integrate.DOP853, list[Any]()
         for i in range(_STAGES):
-            slopes.append(self.field(y + step * _combined(DOP853.A[i, :i], slopes), p) if i else self.field(y, p))
-        moved = y + step * _combined(DOP853.B, slopes)
+            slopes.append(self.field(y + step * _combined(method.A[i, :i], slopes), p) if i else self.field(y, p))
+        moved = y + step * _combined(method.B, slopes)
         scale = ca.DM(self.scale)
-        fifth = ca.sumsqr(_combined(DOP853.E5[:_STAGES], slopes) / scale)
-        third = ca.sumsqr(_combined(DOP853.E3[:_STAGES], slopes) / scale)
+        fifth = ca.sumsqr(_combined(method.E5[:_STAGES], slopes) / scale)
+        third = ca.sumsqr(_combined(method.E3[:_STAGES], slopes) / scale)
         error = step * fifth / ca.sqrt(fifth + 0.01 * third + 1e-300)
         return dense_function("step", [y, step, p], [moved, error])
 

@@ -1,8 +1,8 @@
 """Harmonic map of a disk-shaped mesh onto the unit disk."""
 
-import igl
 import numpy as np
 
+import orthocas.growing.libigl as igl
 from orthocas.checks import Array, Indices, require_finite, require_shape
 from orthocas.errors import FoldedMapError, InvalidValueError
 from orthocas.growing.level_surface import TriangleMesh, require_disk

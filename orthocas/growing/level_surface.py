@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import skimage
 from numpy.typing import ArrayLike, NDArray
-from skimage.measure import marching_cubes
 
 from orthocas.checks import Array, Indices, frozen_array, require_count, require_finite, require_shape
 from orthocas.errors import InvalidValueError
@@ -160,7 +160,7 @@ def _sampled_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[
 def _march(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, Indices, Mask, Array]:
     """Marching cubes: vertices (V, 3), faces (F, 3), free axes (V, 3), and the ends of their grid edges (2, V, 3)."""
     _push_from_zero(gap)
-    index, faces, _, _ = marching_cubes(gap, 0.0, gradient_direction="descent")
+    index, faces, _, _ = skimage.measure.marching_cubes(gap, 0.0, gradient_direction="descent")
     corners = np.stack([np.floor(index), np.ceil(index)]).astype(int)
     ends = np.stack([axis[corners[:, :, i]] for i, axis in enumerate(axes)], axis=2)
     points = ends[0] + (index - corners[0]) * (ends[1] - ends[0])

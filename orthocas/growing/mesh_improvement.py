@@ -4,10 +4,10 @@ The flips are ours, because libigl has only intrinsic flips, whose new edges nee
 trimesh has no flips.
 """
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
+import orthocas.growing.libigl as igl
 from orthocas.checks import Array, Indices
 from orthocas.growing.triangle_mesh import edge_keys, half_edges
 

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import igl
 import numpy as np
 from numpy.typing import ArrayLike
 
+import orthocas.growing.libigl as igl
 from orthocas.checks import Array, Indices, frozen_array, frozen_indices, require_finite, require_shape
 from orthocas.errors import InvalidValueError
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from orthocas.checks import Array, Indices
 from orthocas.errors import SingularTaskError
@@ -137,7 +137,7 @@ class LevelCurve:
 
         s = 0.0
         if self._margin(q, t, signs) > 0:
-            s = max(0.0, brentq(margin, 0.0, h, xtol=_ROUNDING) - 2 * _ROUNDING)
+            s = max(0.0, scipy.optimize.brentq(margin, 0.0, h, xtol=_ROUNDING) - 2 * _ROUNDING)
         point, onward = self._stepped(q, t, s, target) or (q, t)
         values = self.walls.values(point)
         if signs is not None and signs(point, onward) < values.min():
@@ -159,7 +159,7 @@ class LevelCurve:
             point, _ = self._stepped(q, t, s, target) or (q, t)
             return float(self.walls.gap(point, start) @ t_start)
 
-        return self._stepped(q, t, brentq(ahead, 0.0, h, xtol=_ROUNDING), target) or (q, t)
+        return self._stepped(q, t, scipy.optimize.brentq(ahead, 0.0, h, xtol=_ROUNDING), target) or (q, t)
 
 
 def _of_task(chart: "Chart") -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:

@@ -77,14 +77,21 @@ class ClosedLoop:
 
 
 @dataclass(frozen=True, eq=False)
+class Held:
+    """What a sampled controller said at the start of each of N ticks."""
+
+    commands: Array  #: (N, n), held until the end of the tick
+    status: Array  #: (N,)
+    cause: Array  #: (N,) why the catcher of a supervised law took over last
+
+
+@dataclass(frozen=True, eq=False)
 class Piece:
     """A part of a run: N instants, each at the end of a time step."""
 
     times: Array  #: (N,) [s]
     states: Array  #: (N, s)
-    held: tuple[Array, Array] | None = (
-        None  #: sampled controllers: commands (N, n) held until each instant, and their status (N,)
-    )
+    held: Held | None = None  #: of sampled controllers, in the tick that ends at each instant
 
 
 def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:

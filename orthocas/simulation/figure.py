@@ -1,6 +1,6 @@
 """Figure of a run: controlled quantities with their references, joints, commands and storage over time."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ def units_of(problem: Problem) -> dict[str, str]:
 
 
 def trajectory_figure(trajectory: Trajectory, units: Mapping[str, str] | None = None) -> Figure:
-    """Draw controlled quantities on the left; joints, commands and storage on the right. Red marks the fallback.
+    """Draw controlled quantities on the left; joints, commands and storage on the right. Red: not the law.
 
     Args:
         trajectory: the run.
@@ -114,10 +114,17 @@ def _title(trajectory: Trajectory) -> str:
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
         text += f": {trajectory.outcome.value}, run ended early"
-    reasons = {ControlStatus(int(status)) for status in np.unique(trajectory.status)} - {*FROM_THE_LAW}
-    if reasons:
-        text += "\nred: fallback, " + ", ".join(reason.name.lower().replace("_", " ") for reason in sorted(reasons))
+    lasting = trajectory.seconds_in_status
+    cut, red = ([status for status in lasting if (status in FROM_THE_LAW) == kind] for kind in (True, False))
+    if red:
+        text += f"\nred: {'catcher' if trajectory.catches else 'fallback'}, {_durations(lasting, red)}"
+    if cut := [status for status in cut if status is not ControlStatus.OK]:
+        text += f"\n{_durations(lasting, cut)}"
     return text
+
+
+def _durations(lasting: Mapping[ControlStatus, float], chosen: Sequence[ControlStatus]) -> str:
+    return ", ".join(f"{status.words} {lasting[status]:.3g} s" for status in chosen)
 
 
 def _in_mathematics(label: str) -> str:

@@ -1,11 +1,10 @@
 """Closed loops with MuJoCo as plant: a sampled controller whose command is held between ticks."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.simulation.closed_loop import ClosedLoop, Piece
@@ -13,14 +12,20 @@ from orthocas.simulation.disturbances import Noise
 from orthocas.simulation.loads import Loads
 from orthocas.simulation.mujoco_plant import MuJoCoPlant
 from orthocas.simulation.mujoco_scene import MuJoCo
-
-_TICKS = 50  # ticks between two looks at Ctrl-C
+from orthocas.simulation.sampled import pieces
+from orthocas.simulation.supervised import SupervisedLaw
 
 
 def run_physics(
-    loop: ClosedLoop, reference: Reference, start: Array, rate: float, noise: Noise, scene: MuJoCo
+    loop: ClosedLoop,
+    reference: Reference,
+    start: Array,
+    rate: float,
+    noise: Noise,
+    scene: MuJoCo,
+    supervised: SupervisedLaw | None = None,
 ) -> Iterator[Piece]:
-    """Yield pieces of 50 ticks, with the commands that were held.
+    """Yield pieces of 50 ticks, with the commands that were held: those of the law, or of the supervised law.
 
     Raises:
         SimulationError: if MuJoCo gives up.
@@ -39,19 +44,17 @@ def run_physics(
     times = np.arange(ticks) / rate
     wanted, errors = np.hstack(reference.sample(times)), noise.sample(ticks, loop.n)
     shares = loop.loads.shares(times, 1 / rate)
-    law = _law(loop, len(reference.labels))
-    for first in range(0, ticks, _TICKS):
-        held = range(first, min(first + _TICKS, ticks))
-        rows = []
-        with deferred():
-            for k in held:
-                command, status = (
-                    part.full().ravel() for part in law(np.concatenate([plant.q, plant.dq]) + errors[k], wanted[k])
-                )
-                plant.step(command, 1 / rate, _push(plant, loop.loads, shares[k]))
-                rows.append(np.concatenate([plant.q, plant.dq, command, status]))
-        states, commands, known = np.split(np.array(rows), [2 * loop.n, 3 * loop.n], axis=1)
-        yield Piece(times[held] + 1 / rate, states, (commands, known[:, 0]))
+    law = _law(loop, len(reference.labels)) if supervised is None else supervised.tick
+    if supervised is not None:
+        supervised.start(start[: loop.n] + errors[0, : loop.n])
+
+    def tick(k: int) -> Array:
+        q, dq = np.split(np.concatenate([plant.q, plant.dq]) + errors[k], 2)
+        sent = law(q, dq, wanted[k])
+        plant.step(sent[: loop.n], 1 / rate, _push(plant, loop.loads, shares[k]))
+        return np.concatenate([plant.q, plant.dq, sent])
+
+    yield from pieces(tick, times, 1 / rate, 2 * loop.n)
 
 
 def _push(plant: MuJoCoPlant, loads: Loads, shares: Array) -> Array | None:
@@ -67,11 +70,9 @@ def _push(plant: MuJoCoPlant, loads: Loads, shares: Array) -> Array | None:
     return torque
 
 
-def _law(loop: ClosedLoop, k: int) -> ca.Function:
-    """State as measured, reference with derivatives (3 k, 1) -> command, status."""
+def _law(loop: ClosedLoop, k: int) -> Callable[[Array, Array, Array], Array]:
+    """q and dq as measured, reference with derivatives (3 k,) -> [command; status; no cause]."""
     state, reference = ca.MX.sym("state", 2 * loop.n), ca.MX.sym("reference", 3 * k)
-    return ca.Function(
-        "law",
-        [state, reference],
-        [*loop.commanded(state, (reference[:k], reference[k : 2 * k], reference[2 * k :]))],
-    )
+    sent = ca.vertcat(*loop.commanded(state, (reference[:k], reference[k : 2 * k], reference[2 * k :])), 0)
+    law = ca.Function("law", [state, reference], [sent])
+    return lambda q, dq, wanted: np.asarray(law(np.concatenate([q, dq]), wanted).full().ravel())

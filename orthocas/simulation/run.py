@@ -1,6 +1,6 @@
 """`simulate`: runs a controller, a reference and a robot in closed loop."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -10,15 +10,18 @@ from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array, as_number, as_point
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
+from orthocas.control.safety import Safety
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
 from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.simulation.closed_loop import ClosedLoop, Piece
 from orthocas.simulation.continuous import integrate
 from orthocas.simulation.disturbances import Friction, Noise, Push, Stops
 from orthocas.simulation.loads import Loads
+from orthocas.simulation.mujoco_scene import MuJoCo
 from orthocas.simulation.physics import run_physics
 from orthocas.simulation.run_checks import Plant, plant_of, require_fitting, require_kinds
 from orthocas.simulation.sampled import run_ticks
+from orthocas.simulation.supervised import SupervisedLaw, run_supervised
 from orthocas.simulation.trajectory import Outcome, Trajectory
 
 TOLERANCE = 1e-8  #: relative and absolute, of CVODES
@@ -37,6 +40,8 @@ def simulate(
     friction: Friction | None = None,
     stops: Stops | None = None,
     noise: Noise | None = None,
+    safety: Safety | None = None,
+    resume_after: float = 1.0,
     must_be_reachable: bool = True,
     tolerance: float = TOLERANCE,
     monitor: Monitor = silent,
@@ -61,6 +66,10 @@ def simulate(
         friction: friction in the joints.
         stops: joint stops for CVODES; default none. For torque controllers only. MuJoCo has its own.
         noise: noise on the measurements of a sampled controller.
+        safety: run the supervised law of the generated C with these settings, for example
+            `oc.control.Safety.of(controller)`, in place of the law alone. Needs a law on a chart, a `control_rate` and
+            a C compiler. The run begins as on the robot, with NAME_start; its `status` and `cause` tell what happened.
+        resume_after: with `safety`, time from a catch until the law is asked for again [s]; infinite: never.
         must_be_reachable: whether to raise an error, before the run, if the reference leaves the domain.
         tolerance: relative and absolute tolerance of CVODES.
         monitor: called with progress.
@@ -71,6 +80,7 @@ def simulate(
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.
         MissingExtraError: if MuJoCo is the plant and not installed.
+        CompileError: if a supervised law needs a C compiler and there is none.
         ShapeError, InvalidValueError, UnknownNameError: for arguments of the wrong shape, value or type.
         Interrupted: after Ctrl-C; its `result` is the trajectory up to there, with outcome INTERRUPTED.
 
@@ -96,7 +106,7 @@ def simulate(
     ):
         if not 0 < as_number(name, value) < np.inf:
             raise InvalidValueError(name, value, "a finite number > 0")
-    require_fitting(loop, reference, friction, noise, control_rate, scene is not None)
+    require_fitting(loop, reference, friction, noise, control_rate, scene is not None, safety)
     start = _start_state(loop, q_start, dq_start)
     if must_be_reachable:
         controller.require_reachable(reference, start[: loop.n])
@@ -105,8 +115,8 @@ def simulate(
     if control_rate is None:
         running = integrate(loop, reference, start, step, tolerance)
     else:
-        ticks = partial(run_physics, scene=scene) if scene else partial(run_ticks, tolerance=tolerance)
-        running = ticks(loop, reference, start, control_rate, noise or Noise())
+        law = None if safety is None else SupervisedLaw(controller, safety, resume_after, 1 / control_rate)
+        running = _ticks(scene, tolerance, law)(loop, reference, start, control_rate, noise or Noise())
     try:
         for piece in running:
             pieces.append(piece)
@@ -122,6 +132,15 @@ def simulate(
     if run.outcome is Outcome.INTERRUPTED:
         raise Interrupted(run)
     return run
+
+
+def _ticks(scene: MuJoCo | None, tolerance: float, law: SupervisedLaw | None) -> Callable[..., Iterator[Piece]]:
+    """What runs a sampled controller: MuJoCo or CVODES, with the law alone or the supervised one."""
+    if scene is not None:
+        return partial(run_physics, scene=scene, supervised=law)
+    if law is not None:
+        return partial(run_supervised, tolerance=tolerance, law=law)
+    return partial(run_ticks, tolerance=tolerance)
 
 
 def _progress(name: str, time: float, duration: float) -> Progress:
@@ -152,9 +171,10 @@ def _trajectory(
     arguments = [q, dq, *wanted, *(np.tile(gain, (len(times), 1)) for gain in controller.gains.values())]
     command, status = Batched(controller.function)(*arguments)
     held = [piece.held for piece in pieces if piece.held is not None]
+    cause = np.zeros(len(times))
     if held:  # noisy measurements: use the commands that were sent, and the last one also for the end
-        command = np.vstack([*(sent for sent, _ in held), held[-1][0][-1:]])
-        status = np.concatenate([*(known for _, known in held), held[-1][1][-1:]])[:, None]
+        command = _with_last([part.commands for part in held])
+        status, cause = _with_last([part.status for part in held]), _with_last([part.cause for part in held])
     unknown = [np.full((len(times), 1), np.nan)] * 2
     storage, power = unknown if controller.energy is None else Batched(controller.energy)(*arguments)
     return Trajectory(
@@ -167,11 +187,17 @@ def _trajectory(
         q=q,
         dq=dq if loop.torque else command,
         command=command,
-        status=status[:, 0].astype(int),
+        status=status.ravel().astype(int),
         value=Batched(controller.measured)(q)[0],
         reference=wanted[0],
         reference_velocity=wanted[1],
         reference_acceleration=wanted[2],
         storage=storage[:, 0],
         dissipated_power=power[:, 0],
+        cause=cause.astype(int),
     )
+
+
+def _with_last(parts: Sequence[Array]) -> Array:
+    """The rows of all parts, and the last one once more."""
+    return np.concatenate([*parts, parts[-1][-1:]])

@@ -6,6 +6,7 @@ from typing import Literal
 from orthocas.checks import as_number, require_kind
 from orthocas.control.controller import Controller, require_controller
 from orthocas.control.reference import Reference
+from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
 from orthocas.robots import Robot
 from orthocas.simulation.closed_loop import ClosedLoop
@@ -54,6 +55,7 @@ def require_fitting(
     noise: Noise | None,
     control_rate: float | None,
     in_mujoco: bool,
+    safety: Safety | None,
 ) -> None:
     """Raise InvalidValueError for arguments that would be ignored, or fail later with a less clear message."""
     controller = loop.controller
@@ -83,6 +85,8 @@ def require_fitting(
         raise InvalidValueError(
             "noise", noise, "no noise without control_rate, because white noise needs control ticks"
         )
+    if safety is not None and control_rate is None:
+        raise InvalidValueError("control_rate", None, "a number, because a supervised law runs tick by tick")
     if in_mujoco:
         _require_for_mujoco(loop, control_rate)
 

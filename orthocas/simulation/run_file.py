@@ -10,14 +10,16 @@ from orthocas.files.npy import Stored, from_npy
 from orthocas.files.zips import unpacking
 
 
-def read_run_file(path: Path, version: int, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, Stored]]:
-    """Header and the named arrays of a run; other entries of the file are left alone.
+def read_run_file(
+    path: Path, version: int, names: Sequence[str], later: Sequence[str] = ()
+) -> tuple[dict[str, Any], dict[str, Stored]]:
+    """Header and the named arrays of a run, and the later ones if the file has them; other entries are left alone.
 
     Raises:
         TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
     """
     with unpacking(path, "trajectory", TrajectoryFileError) as zipped:
-        entries = ["header", *names]
+        entries = ["header", *names, *(name for name in later if f"{name}.npy" in zipped.sizes)]
         zipped.require_room([f"{name}.npy" for name in entries])
         try:
             stored = {name: from_npy(zipped.read(f"{name}.npy")) for name in entries}

@@ -1,6 +1,6 @@
 """Closed loops with a sampled controller: the command is held between ticks while CVODES integrates the plant."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import casadi as ca
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
-from orthocas.simulation.closed_loop import ClosedLoop, Piece, cvodes_options, run_compiled
+from orthocas.simulation.closed_loop import ClosedLoop, Held, Piece, cvodes_options, run_compiled
 from orthocas.simulation.disturbances import Noise
 
 _TICKS = 50  # ticks per integrator call
@@ -43,7 +43,31 @@ def run_ticks(
         outputs = run_compiled(run, ca.DM(state), *map(ca.DM, inputs))
         states, commands, status = (np.asarray(out).T[:count] for out in outputs)
         state = states[-1]
-        yield Piece(times[first : first + count] + 1 / rate, states, (commands, status[:, 0]))
+        yield Piece(times[first : first + count] + 1 / rate, states, Held(commands, status[:, 0], 0 * status[:, 0]))
+
+
+def pieces(tick: Callable[[int], Array], times: Array, period: float, size: int) -> Iterator[Piece]:
+    """Yield pieces of 50 ticks for a plant that is driven tick by tick.
+
+    Args:
+        tick: number of the tick -> [state at its end (size,); command (n,); status; cause].
+        times: starts of the ticks (N,) [s].
+        period: their length [s].
+        size: of a state.
+    """
+    for first in range(0, len(times), _TICKS):
+        held = range(first, min(first + _TICKS, len(times)))
+        with deferred():
+            rows = np.array([tick(k) for k in held])
+        states, commands, known = np.split(rows, [size, rows.shape[1] - 2], axis=1)
+        yield Piece(times[held] + period, states, Held(commands, known[:, 0], known[:, 1]))
+
+
+def held_plant(loop: ClosedLoop, length: float, tolerance: float) -> ca.Function:
+    """x0, p = [command; load] -> xf, the state after a tick in which command and load are constant."""
+    x, u, w = (ca.SX.sym(*of) for of in (("x", loop.plant_rate.size1_in(0)), ("u", loop.n), ("load", loop.loads.size)))
+    ode = {"x": x, "p": ca.vertcat(u, w), "ode": loop.plant_rate(x, u, w)}
+    return ca.integrator("plant", "cvodes", ode, 0.0, length, cvodes_options(tolerance, loop.stiff))
 
 
 def _filled(rows: Array) -> Array:
@@ -54,15 +78,7 @@ def _filled(rows: Array) -> Array:
 def _tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Function:
     """state, reference with derivatives (3 k, 1), noise, load -> state after the tick, command, status."""
     size = loop.plant_rate.size1_in(0)
-    x, u, w = ca.SX.sym("x", size), ca.SX.sym("u", loop.n), ca.SX.sym("load", loop.loads.size)
-    plant = ca.integrator(
-        "plant",
-        "cvodes",
-        {"x": x, "p": ca.vertcat(u, w), "ode": loop.plant_rate(x, u, w)},
-        0.0,
-        length,
-        cvodes_options(tolerance, loop.stiff),
-    )
+    plant = held_plant(loop, length, tolerance)
     state, reference = ca.MX.sym("state", size), ca.MX.sym("reference", 3 * k)
     noise, load = ca.MX.sym("noise", size), ca.MX.sym("load", loop.loads.size)
     command, status = loop.commanded(state + noise, (reference[:k], reference[k : 2 * k], reference[2 * k :]))

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.integrate import cumulative_simpson
 
 from orthocas.checks import Array, as_float_array, as_path, frozen_indices, require_known, require_shape, require_text
 from orthocas.control.status import FROM_THE_LAW, ControlStatus
@@ -33,8 +33,11 @@ _ARRAYS = {  #: array fields and their units
     "reference_acceleration": "value / s^2",
     "storage": "J",
     "dissipated_power": "W",
+    "cause": "orthocas.control.ControlStatus",
 }
-_SINGLE = ("times", "status", "storage", "dissipated_power")  #: one number at each instant
+_LATER = ("cause",)  #: arrays that older files do not have
+_REQUIRED = tuple(name for name in _ARRAYS if name not in _LATER)
+_SINGLE = ("times", "status", "storage", "dissipated_power", "cause")  #: one number at each instant
 _OF_JOINTS = ("q", "dq", "command")  #: one number for every joint; the others for every label
 
 
@@ -69,6 +72,7 @@ class Trajectory(Shown):
     reference_acceleration: Array  #: (N, k)
     storage: Array  #: (N,) V [J]; NaN for velocity controllers
     dissipated_power: Array  #: (N,) dissipated by the controller's damping [W]; NaN for velocity controllers
+    cause: Array  #: (N,) why the catcher of a supervised law took over last, `ControlStatus`; OK if it never did
 
     @property
     def energy_balance(self) -> Array:
@@ -77,7 +81,7 @@ class Trajectory(Shown):
         It is 0 for impedance control and PD+ (coupled) while the reference is at rest, in continuous time with the true
         model and without friction, pushes, noise, or commands that were clipped or replaced by the fallback.
         """
-        lost = cumulative_simpson(self.dissipated_power, x=self.times, initial=0.0)
+        lost = scipy.integrate.cumulative_simpson(self.dissipated_power, x=self.times, initial=0.0)
         return np.asarray(self.storage - self.storage[0] + lost)
 
     @property
@@ -89,6 +93,19 @@ class Trajectory(Shown):
     def saturated(self) -> NDArray[np.bool_]:
         """Where the limit cut the command of the law, (N,)."""
         return np.asarray(self.status == ControlStatus.SATURATED)
+
+    @property
+    def seconds_in_status(self) -> dict[ControlStatus, float]:
+        """How long each status lasted that occurred [s]; a status holds until the next instant."""
+        lasting = np.diff(self.times)
+        return {ControlStatus(int(s)): float(lasting[self.status[:-1] == s].sum()) for s in np.unique(self.status)}
+
+    @property
+    def catches(self) -> tuple[tuple[float, ControlStatus], ...]:
+        """When the catcher of a supervised law took over [s], and why; OK: the run began too near the border."""
+        caught = self.status == ControlStatus.CAUGHT
+        first = np.flatnonzero(caught & ~np.concatenate([[False], caught[:-1]]))
+        return tuple((float(self.times[i]), ControlStatus(int(self.cause[i]))) for i in first)
 
     @property
     def storage_rise(self) -> float:
@@ -112,6 +129,8 @@ class Trajectory(Shown):
             "fallback": f"at {bad} instants" if bad else "never",
             "limit reached": f"at {cut} instants" if cut else "never",
         }
+        if self.catches:
+            facts["caught"] = listed(f"at {time:.4g} s ({cause.words})" for time, cause in self.catches)
         return facts if np.isnan(self.storage).any() else facts | {"storage rise": f"{self.storage_rise:.3g} J"}
 
     def save(self, path: str | Path, force: bool = False) -> None:
@@ -125,7 +144,7 @@ class Trajectory(Shown):
         """
         target = as_path("path", path)
         require_writable(target, TrajectoryFileError)
-        require_replaceable(target, is_numpy_archive(target, ("header", *_ARRAYS)), force, TrajectoryFileError)
+        require_replaceable(target, is_numpy_archive(target, ("header", *_REQUIRED)), force, TrajectoryFileError)
         header = {
             "version": _VERSION,
             "controller": self.controller,
@@ -147,7 +166,7 @@ class Trajectory(Shown):
             TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
         """
         path = as_path("path", path)
-        header, arrays = read_run_file(path, _VERSION, tuple(_ARRAYS))
+        header, arrays = read_run_file(path, _VERSION, _REQUIRED, _LATER)
         try:
             names: dict[str, Any] = {name: tuple(part(header, name, list)) for name in ("labels", "joint_names")}
             _require_names(names)
@@ -182,7 +201,9 @@ def _checked_arrays(arrays: Mapping[str, Any], n: int, k: int) -> dict[str, Any]
         checked[name] = as_float_array(name, array)
         width = () if name in _SINGLE else (n,) if name in _OF_JOINTS else (k,)
         require_shape(name, checked[name].shape, (N, *width))
-    checked["status"] = frozen_indices("status", checked["status"], (N,), len(ControlStatus))
+    checked.setdefault("cause", np.zeros(N))
+    for name in ("status", "cause"):
+        checked[name] = frozen_indices(name, checked[name], (N,), len(ControlStatus))
     if N == 0 or not np.isfinite(checked["times"]).all() or (np.diff(checked["times"]) <= 0).any():
         raise InvalidValueError("times", "empty or not increasing", "increasing instants, at least one")
     return checked

@@ -276,6 +276,7 @@ def _functions() -> dict[str, Call]:
         ),
         "evaluate": (oc.evaluate, {"chart": chart, "samples": 50, "seed": 1}),
         "evaluate points": (oc.evaluate, {"chart": chart, "samples": None, "seed": None, "points": [q, q]}),
+        "export": (oc.export, {"chart": chart, "to": "numpy", "path": "module.py", "force": False}),
         "generate_c": (oc.generate_c, {"chart": chart, "out": "c", "controller": impedance(), "name": "arm"}),
         "generate_c with settings": (
             oc.generate_c,
@@ -335,6 +336,11 @@ def _methods() -> dict[str, Call]:
         "chart.quality": (chart.quality, {"q": q}),
         "grown.quality": (grown.quality, {"q": [q[:2], q[:2]]}),
         "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "tolerance": 1e-9}),
+        "chart.solve": (chart.solve, {"phi": phi, "q_start": q, "tolerance": 1e-9, "inside": True}),
+        "chart.solutions": (chart.solutions, {"phi": phi, "tolerance": 1e-9}),
+        "chart.tracker": (chart.tracker, {"q0": planar().domain.centre, "largest_step": 0.1}),
+        "tracker.step": (chart.tracker(planar().domain.centre).step, {"phi": phi}),
+        "tracker.reset": (chart.tracker(planar().domain.centre).reset, {"q": q}),
         "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
         "follow": (
             oc.follow,
@@ -461,6 +467,11 @@ def _control() -> dict[str, Call]:
             oc.simulate,
             {"controller": law, "reference": reference, "q_start": centre, "control_rate": 50.0, "dq_start": centre * 0}
             | {"noise": None, "plant": None},
+        ),
+        "simulate supervised": (
+            oc.simulate,
+            {"controller": law, "reference": reference, "q_start": centre, "control_rate": 50.0, "resume_after": 1.0}
+            | {"safety": control.Safety.of(law)},
         ),
         "coupling_index": (
             simulation.coupling_index,

@@ -70,6 +70,7 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--controller": _LAWS,
     "--plant": ("mujoco", "cvodes", "MuJoCo", ""),
     "--steps": _FILES,
+    "--to": ("numpy", "torch", "jax", "", "tensorflow"),
     "--name": ("arm", "int", "1arm", "a b", "math", "é", "x" * 200, "main"),
 }
 _PROBLEM_OPTIONS = ("--tip", "--lock", "--tool")
@@ -115,6 +116,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},
         (*_LAW_OPTIONS, *_RUN_OPTIONS),
     ),
+    "export": (_FILES, {"--to": "numpy", "--out": "module.py"}, ()),
     "follow": (
         _FILES,
         {"--out": "q.csv", "--velocity-limit": "1", "--period": "0.05"},

@@ -62,6 +62,12 @@ COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is
     "reproduce": ("reproduce", "fig20", "--quick", "--out", "out"),
     "loop": ("-c", _LOOP),
 }
+_PYTHON_BEGINS = (  # what Python says of Ctrl-C before it reads a line of ours
+    "Fatal Python error: init_",
+    "Could not import runpy module",
+    "Error processing line 1 of",
+    "Exception ignored in: <function _get_module_lock",
+)
 _MEASURED = ("seconds", "control_tick_us", "history")  # keys of what differs from run to run
 
 
@@ -113,12 +119,14 @@ def _stopped(folder: Path, name: str, number: int, moment: float, alone: bool, w
     if process.returncode == 0 and (what := _difference(numbers(folder, out), wanted)):
         return f"exit code 0 with {what}"
     said = None if name == "loop" else _complaint(process.returncode, number, late, err)
-    drafts = [] if number == signal.SIGKILL else _drafts(folder)
+    drafts = [] if number == signal.SIGKILL else [name for name in _drafts(folder) if f"-{process.pid}-" in name]
     return said or (f"drafts {drafts} are left" if drafts else torn(folder))
 
 
 def _complaint(code: int, number: int, late: float, err: str) -> str | None:
-    """What is wrong with exit code or words; before and after our handlers the signal itself ends the process."""
+    """What is wrong with exit code or words; before and after our handlers the signal, or Python, ends the process."""
+    if err.startswith(_PYTHON_BEGINS):
+        return None
     codes = {0, -number, 128 + number}
     if code not in codes:
         return f"exit code {code}, expected one of {codes}: {err[-300:]}"

@@ -1,0 +1,26 @@
+"""`orthocas export`: a chart as a module of NumPy, PyTorch or JAX."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from orthocas import exporting
+from orthocas.chart import Chart
+from orthocas.cli.output import AsJson, Force, print_json, print_rows
+
+
+def export(
+    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    to: Annotated[str, typer.Option("--to", help=f"Library: {', '.join(exporting.LIBRARIES)}.")],
+    out: Annotated[Path, typer.Option("--out", help="The module to write, NAME.py.")],
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Write task, xi, phi and Jacobian of a chart as one Python module that needs the library only."""
+    loaded = Chart.load(chart)
+    module = exporting.export(loaded, to, out, force)
+    if json:
+        print_json({"module": str(module), "library": to, "joints": loaded.n, "labels": list(loaded.labels)})
+    else:
+        print_rows({"module": f"{module}, with {to} alone", "functions": "task, xi, phi, jacobian"})

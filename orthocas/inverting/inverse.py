@@ -1,0 +1,169 @@
+"""The inverse map q(x, xi) of a chart for many targets: starts, restarts, and a status for each row (ours)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.checks import Array, Indices
+from orthocas.domains import borders
+from orthocas.inverting.nearest import Nearest
+from orthocas.inverting.newton import Attempt, LocalSolver, PhiMap, largest
+from orthocas.inverting.solutions import InverseStatus, Solutions
+from orthocas.inverting.starts import Starts
+from orthocas.problem import Problem
+
+_ROWS = 16_384  # solved at once
+_RESTARTS = 8  # from points of the table, where neither the rough inverse nor the centre leads to a solution inside
+_TASK_STARTS = 3  # for the nearest coordinates, after the best q so far
+_MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, InverseStatus.OUT_OF_REACH)
+_MANY = 1024  # starts of the search for all solutions
+_SAME = 1e-6  # of the half-widths: distance up to which two solutions count as one
+_SNAP = 1e-9  # of the half-widths: solutions so close to the border are moved onto it
+_SLACK = 1e-9  # of the half-widths: joint limits are decimal numbers, see `require_within_limits`
+
+
+@dataclass(eq=False)
+class Found:
+    """The best points so far."""
+
+    q: Array  #: (N, n), finite
+    residual: Array  #: (phi - phi(q)) / scale, (N, n)
+    iterations: Indices  #: (N,)
+    status: Indices  #: (N,)
+
+    def improve(self, rows: Indices, other: "Found") -> None:
+        """Take over what another search found in some rows, where it is better."""
+        better = other.status < self.status[rows]
+        same = other.status == self.status[rows]
+        better |= same & (other.status == InverseStatus.OUT_OF_REACH) & (other.error < self.error[rows])
+        into = rows[better]
+        for name in ("q", "residual", "iterations", "status"):
+            getattr(self, name)[into] = getattr(other, name)[better]
+
+    @property
+    def error(self) -> Array:
+        """Largest entries of the residuals, (N,)."""
+        return largest(self.residual)
+
+    @property
+    def missing(self) -> Indices:
+        """Rows without a solution inside the domain."""
+        return np.flatnonzero(self.status != InverseStatus.FOUND)
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """Solves phi(q) = phi, and tells for each row how the search ended."""
+
+    problem: Problem
+    phi_map: PhiMap
+    local: LocalSolver
+    nearest: Nearest | None = None  #: for solutions inside the domain only
+
+    def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
+        """Solutions for targets (N, n), from starts (N, n) or our own. Rows that are not finite fail."""
+        good = np.isfinite(targets).all(axis=1)
+        if starts is not None:
+            good &= np.isfinite(starts).all(axis=1)
+        q = np.full(targets.shape, np.nan)
+        error, distance = np.full((2, len(q)), np.nan)
+        status, iterations = np.full(len(q), int(InverseStatus.BAD_INPUT)), np.zeros(len(q), dtype=np.int64)
+        for rows in np.array_split(np.flatnonzero(good), -(-int(good.sum()) // _ROWS) or 1):
+            if rows.size:
+                found = self._searched(targets[rows], None if starts is None else starts[rows], tolerance, inside)
+                q[rows], status[rows], iterations[rows] = found.q, found.status, found.iterations
+                error[rows], distance[rows] = found.error, self._distance(targets[rows], found.residual)
+                kept = found.status == InverseStatus.NEAREST
+                error[rows[kept]] = largest(found.residual[kept, : self.problem.m])
+        return Solutions(q, status, iterations, error, distance, tolerance)
+
+    def all_inside(self, target: Array, tolerance: float) -> Array:
+        """Different solutions for one target (n,) inside the domain, that nearest to the centre first, (k, n)."""
+        domain = self.problem.domain
+        starts = np.vstack([self.starts.guess(target[None]), domain.centre[None], self.starts.spread(_MANY, target)])
+        found = self._attempt(np.broadcast_to(target, starts.shape), starts, tolerance)
+        q = found.q[found.status == InverseStatus.FOUND]
+        different: list[Array] = []
+        for row in q[np.argsort(np.linalg.norm((q - domain.centre) / domain.half_width, axis=1))]:
+            if all(np.abs((row - other) / domain.half_width).max() > _SAME for other in different):
+                different.append(row)
+        return np.array(different).reshape(-1, len(target))
+
+    def _searched(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
+        """What the search finds from given starts, or from the rough inverse and, where that fails, from others."""
+        best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance)
+        rows = best.missing
+        if inside or starts is None:
+            for start in self._other_starts(targets[rows]):
+                left = best.status[rows] != InverseStatus.FOUND
+                if not left.any():
+                    break
+                best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
+        if inside and self.nearest is not None:
+            self._move_inside(self.nearest, targets, best, tolerance)
+        return best
+
+    def _move_inside(self, nearest: Nearest, targets: Array, best: Found, tolerance: float) -> None:
+        """Replace what is missing by the nearest coordinates inside the domain."""
+        rows = np.flatnonzero(np.isin(best.status, _MOVED))
+        starts = self.starts.nearest(targets[rows], _TASK_STARTS, self.problem.m) if rows.size else ()
+        for start in (best.q[rows], *starts):
+            left = best.status[rows] != InverseStatus.NEAREST
+            into = rows[left]
+            if not into.size:
+                break
+            best.q[into] = nearest.search(targets[into], start[left])
+            best.residual[into] = self.phi_map.residual(targets[into], best.q[into])
+            kept = nearest.keeps_task(targets[into], best.q[into], tolerance)
+            best.status[into] = np.where(kept, InverseStatus.NEAREST, InverseStatus.OUT_OF_REACH)
+
+    def _other_starts(self, targets: Array) -> Iterator[Array]:
+        """The centre of the domain, and points of the table near the targets, (N, n) each."""
+        if len(targets):
+            yield np.broadcast_to(self.problem.domain.centre, targets.shape)
+            yield from self.starts.nearest(targets, _RESTARTS, self.problem.n)
+
+    def _attempt(self, targets: Array, starts: Array, tolerance: float) -> Found:
+        """One search from starts (N, n), judged."""
+        attempt = self._snapped(targets, self.local(targets, starts), tolerance)
+        solved = largest(attempt.residual) <= tolerance
+        status = np.full(len(targets), int(InverseStatus.OUT_OF_REACH))
+        status[solved] = self._status(attempt.q[solved])
+        doubtful = np.flatnonzero(solved & attempt.suspicious)
+        if doubtful.size:
+            status[doubtful[self.phi_map.is_singular(attempt.q[doubtful])]] = InverseStatus.SINGULAR
+        return Found(attempt.q, attempt.residual, attempt.iterations, status)
+
+    def _status(self, q: Array) -> Indices:
+        """Where solutions (N, n) lie."""
+        robot, domain = self.problem.robot, self.problem.domain
+        slack = _SLACK * domain.half_width
+        allowed = ((q >= robot.lower - slack) & (q <= robot.upper + slack)).all(axis=1)
+        beyond = np.where(allowed, InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT)
+        return np.where(domain.contains(q), InverseStatus.FOUND, beyond).astype(np.int64)
+
+    def _snapped(self, targets: Array, attempt: Attempt, tolerance: float) -> Attempt:
+        """The same points, but on the border where they are solutions that miss it by rounding."""
+        low, high = borders(self.problem.domain)
+        moved = np.clip(attempt.q, low, high)
+        off = np.abs(moved - attempt.q)
+        rows = np.flatnonzero((off > 0).any(axis=1) & (off <= _SNAP * self.problem.domain.half_width).all(axis=1))
+        if not rows.size:
+            return attempt
+        residual = self.phi_map.residual(targets[rows], moved[rows])
+        good = largest(residual) <= tolerance
+        attempt.q[rows[good]], attempt.residual[rows[good]] = moved[rows[good]], residual[good]
+        return attempt
+
+    def _distance(self, targets: Array, residual: Array) -> Array:
+        """|xi(q) - xi|, (N,): infinite where xi(q) is undefined."""
+        difference = (residual * self.phi_map.scale(targets))[:, self.problem.m :]
+        distance = np.sqrt((difference**2).sum(axis=1))
+        return np.where(np.isfinite(distance), distance, np.inf)
+
+    @cached_property
+    def starts(self) -> Starts:
+        """Starts for this chart."""
+        return Starts(self.phi_map, self.problem.domain)

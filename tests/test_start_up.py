@@ -1,0 +1,86 @@
+"""What is imported when: little at first, and nothing twice under two names."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import orthocas as oc
+from orthocas.cli.commands import COMMANDS, app_for
+from orthocas.comparing import workers
+
+INIT = Path(oc.__file__)
+HEAVY = {"casadi", "numpy", "pinocchio", "scipy", "matplotlib", "trimesh", "igl", "skimage", "rich", "PIL", "mujoco"}
+
+
+def modules_after(code: str) -> set[str]:
+    """Modules that a new interpreter has after some code."""
+    told = subprocess.run(
+        [sys.executable, "-c", f"{code}\nimport sys; print(*sys.modules)"], capture_output=True, text=True, check=True
+    )
+    return set(told.stdout.splitlines()[-1].split())
+
+
+def test_the_package_itself_imports_nothing_heavy() -> None:
+    assert not HEAVY & modules_after("import orthocas")
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = "import sys; sys.argv = ['orthocas', '--help']\nfrom orthocas.cli.commands import run\nrun()"
+    loaded = modules_after(code)
+    assert "orthocas.cli.commands" in loaded
+    assert not HEAVY & loaded
+
+
+@pytest.mark.parametrize("module", ["orthocas.chart", "orthocas.fitting.fit", "orthocas.cli.info", "orthocas.control"])
+def test_parts_of_scipy_and_pictures_wait_until_they_are_needed(module: str) -> None:
+    late = {"scipy.interpolate", "scipy.optimize", "scipy.spatial", "scipy.special", "scipy.sparse", "scipy.linalg"}
+    late |= {"igl", "matplotlib", "trimesh", "rich", "PIL", "mujoco", "distributed"}
+    assert not late & modules_after(f"import {module}")
+
+
+def test_names_in_the_package_agree() -> None:
+    """What type checkers read, what is imported on first use, and the public names."""
+    body = ast.parse(INIT.read_text()).body
+    (typed,) = [node for node in body if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"]
+    places = {
+        alias.asname or alias.name: (node.module, alias.name)
+        for node in typed.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    modules = {name for name, (home, _) in places.items() if home == "orthocas"}
+    assert {name: place for name, place in places.items() if name not in modules} == oc._PLACES
+    assert set(oc.__all__) == set(places)
+    assert oc.__all__ == sorted(oc.__all__, key=lambda name: (not name.isupper(), not name[0].isupper(), name))
+    for name, (home, own_name) in oc._PLACES.items():
+        assert getattr(oc, name) is getattr(sys.modules[home], own_name)
+
+
+def test_functions_stay_functions_beside_modules_of_their_names() -> None:
+    code = (
+        "import orthocas.grow, orthocas.involutivity\nimport orthocas as oc\nfrom orthocas import distil\n"
+        "import orthocas.distil\nassert all(map(callable, (oc.grow, oc.involutivity, distil, oc.distil)))"
+    )
+    assert "orthocas.distil" in modules_after(code)
+
+
+def test_unknown_names_are_errors() -> None:
+    with pytest.raises(AttributeError, match="module 'orthocas' has no attribute 'nothing'"):
+        oc.nothing  # noqa: B018
+    assert set(oc.__all__) < set(dir(oc))
+
+
+def test_help_tells_the_first_lines_of_all_commands() -> None:
+    commands = {command.name: command for command in app_for(list(COMMANDS)).registered_commands}
+    assert list(commands) == list(COMMANDS)
+    for name, command in commands.items():
+        assert command.callback is not None
+        assert (command.callback.__doc__ or "").splitlines()[0] == COMMANDS[name]
+        assert sys.modules[f"orthocas.cli.{name}"] is not None
+
+
+def test_workers_are_known_by_the_same_variable() -> None:
+    assert f'"{workers._PARENT}" in _os.environ' in INIT.read_text()
