@@ -35,14 +35,15 @@ if TYPE_CHECKING:
         solvers,
     )
     from orthocas.certificates import Certificate
-    from orthocas.certifying import certified_box, certify, check_certificate
+    from orthocas.certifying.certify import certified_box, certify
+    from orthocas.certifying.check import check_certificate
     from orthocas.chart import Chart, GrownChart, load
     from orthocas.codegen import compile_inverse, generate_c
     from orthocas.comparing.compare import compare
     from orthocas.comparing.report import Comparison
     from orthocas.distil import distil
     from orthocas.domains import Box, Torus, contains, default_box
-    from orthocas.exporting import export
+    from orthocas.exporting.export import export
     from orthocas.fitting.fit import Fit, fit
     from orthocas.fitting.loss import Weights
     from orthocas.fitting.loss import register as register_loss_term
@@ -130,14 +131,15 @@ __all__ = [
 # Everything is imported on first use: all of it takes half a second, and few programs need all.
 _HOMES = {
     "orthocas.certificates": ["Certificate"],
-    "orthocas.certifying": ["certified_box", "certify", "check_certificate"],
+    "orthocas.certifying.certify": ["certified_box", "certify"],
+    "orthocas.certifying.check": ["check_certificate"],
     "orthocas.chart": ["Chart", "GrownChart", "load"],
     "orthocas.codegen": ["compile_inverse", "generate_c"],
     "orthocas.comparing.compare": ["compare"],
     "orthocas.comparing.report": ["Comparison"],
     "orthocas.distil": ["distil"],
     "orthocas.domains": ["Box", "Torus", "contains", "default_box"],
-    "orthocas.exporting": ["export"],
+    "orthocas.exporting.export": ["export"],
     "orthocas.fitting.fit": ["Fit", "fit"],
     "orthocas.fitting.loss": ["Weights", "register as register_loss_term"],
     "orthocas.fitting.symbolic_loss": ["loss"],

@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_point_set, require_count, require_kind, require_memory
@@ -242,9 +242,15 @@ def _worst_point(judged: Judged, worst: WorstPoints | None) -> Array:
 def _idle_coordinates(chart: Chart, judged: Judged) -> dict[int, str]:
     """Coordinates that are functions of one idle joint alone, with the names of these joints."""
     first = samples_at(chart.problem, sample_uniform(chart.problem.domain, _TELLING, 0))
-    shares = np.abs(judged.jacobian) / np.linalg.norm(judged.jacobian, axis=2, keepdims=True)
     found: dict[int, str] = {}
     for joint in idle_joints(chart.problem, first):
-        others = np.delete(shares, joint, axis=2).max(axis=(0, 2))
-        found |= {int(j): chart.problem.robot.joint_names[joint] for j in np.flatnonzero(others <= _ALONE)}
+        likely = _functions_of(joint, judged.jacobian[:_TELLING])
+        sure = likely[_functions_of(joint, judged.jacobian[:, likely])]
+        found |= {int(j): chart.problem.robot.joint_names[joint] for j in sure}
     return found
+
+
+def _functions_of(joint: int, J: Array) -> NDArray[np.int_]:
+    """Coordinates whose gradients, rows of J (N, r, n), have entries for one joint only."""
+    others = np.abs(np.delete(J, joint, axis=2)).max(axis=2, initial=0.0) <= _ALONE * np.linalg.norm(J, axis=2)
+    return np.flatnonzero(others.all(axis=0))

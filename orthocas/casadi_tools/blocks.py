@@ -77,20 +77,22 @@ class BlockedFunction:
 
     def into(self, results: Array, points: Array) -> Array:
         """Write the values to `results`, which may be part of a larger array, and return it."""
-        if len(points) < MANY:
-            results[...] = self._few(points)[0]
+        if len(points) < MANY or self._by_rows is None:
+            results[...] = self._few(points)[0].reshape(results.shape)
         else:
-            fill(results, points, self.on_one_block)
+            fill(results, points, self._on_one_block)
         return results
 
-    def on_one_block(self) -> BlockFunction:
+    def _on_one_block(self) -> BlockFunction:
         """The function for `fill`."""
+        assert self._by_rows is not None
         run = self._by_rows.on_one_block(reused=True)
         return lambda columns: run(columns)[0]
 
     @cached_property
-    def _by_rows(self) -> ColumnFunction:
-        """The function with its entries row by row."""
+    def _by_rows(self) -> ColumnFunction | None:
+        """The function with its entries row by row; None if it has an operation that columns do not support."""
         q = ca.SX.sym("q", self._function.size_in(0)[0])
         entries = ca.vec(ca.densify(self._function(q)).T)
-        return ColumnFunction(ca.Function(self._function.name(), [q], [entries]))
+        columns = ColumnFunction(ca.Function(self._function.name(), [q], [entries]))
+        return columns if columns.supported else None

@@ -18,6 +18,7 @@ from orthocas.casadi_tools.batch import THREADS
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.tape import Tape, replay, to_tape
 from orthocas.checks import Array
+from orthocas.errors import OrthocasError
 
 COLUMNS = 256  #: samples in a block
 
@@ -104,6 +105,14 @@ class ColumnFunction:
             for i in range(self._function.n_out())
         ]
         return ca.Function(f"{self._function.name()}_columns", inputs, outputs)
+
+    @property
+    def supported(self) -> bool:
+        """Whether tapes know all operations of the function."""
+        try:
+            return bool(self.tape)
+        except OrthocasError:
+            return False
 
     @cached_property
     def tape(self) -> Tape:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.blocks import BlockedFunction, BlockFunction
+from orthocas.casadi_tools.blocks import BlockFunction
 from orthocas.casadi_tools.columns import COLUMNS, ColumnFunction
 from orthocas.checks import Array
 from orthocas.parametrisations.family import SelfDerivativeFamily
@@ -17,15 +17,14 @@ if TYPE_CHECKING:
 Maker = Callable[[], BlockFunction]
 
 
-def block_functions(coordinates: "Coordinates") -> dict[str, Maker]:
-    """What makes xi and the Jacobian on blocks: functions of q (n, c) that return (r, c), or J_xi row by row (r n, c).
+def block_function(coordinates: "Coordinates", name: str) -> Maker:
+    """What makes xi or the Jacobian of a self-derivative family on blocks, once for each thread.
 
-    Each thread needs its own.
+    They are functions of q (n, c) that return (r, c), or J_xi row by row, (r n, c).
     """
-    family = coordinates.family if len(coordinates.offset) else None
-    if isinstance(family, SelfDerivativeFamily):
-        return {"xi": _values(coordinates, family), "jacobian": _slopes(coordinates, family)}
-    return {name: BlockedFunction(coordinates.functions[name]).on_one_block for name in ("xi", "jacobian")}
+    family = coordinates.family
+    assert isinstance(family, SelfDerivativeFamily)
+    return (_values if name == "xi" else _slopes)(coordinates, family)
 
 
 def _values(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:

@@ -6,18 +6,18 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.casadi_tools.batch import dense_function
 from orthocas.casadi_tools.blas_graph import NumpyGraph
-from orthocas.casadi_tools.blocks import MANY, fill
-from orthocas.casadi_tools.cached import cached_property
+from orthocas.casadi_tools.blocks import MANY, BlockedFunction, fill
+from orthocas.casadi_tools.cached import BuiltOnUse, cached_property
 from orthocas.casadi_tools.columns import COLUMNS
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.checks import Array, frozen_array, require_shape
-from orthocas.coordinates.blocks import Maker, block_functions
+from orthocas.coordinates.blocks import Maker, block_function
 from orthocas.coordinates.point_functions import point_functions
 from orthocas.parametrisations import Family, JointSpace, Parametrisation
-from orthocas.parametrisations.family import Expression, GradedParametrisation
+from orthocas.parametrisations.family import Expression, GradedParametrisation, SelfDerivativeFamily
 
 _FEW = 8  # joint positions below which networks are evaluated one by one
 
@@ -99,8 +99,8 @@ class Coordinates:
 
     def into(self, name: str, results: Array, points: Array) -> Array:
         """Write xi or the Jacobian at points (N, n) to `results`, which may be part of a larger array; return it."""
-        if len(points) < (_FEW if self.as_matrices else MANY):
-            results[...] = self._batched[name](points)[0].reshape(results.shape)
+        if not self._has_blocks or len(points) < (_FEW if self.as_matrices else MANY):
+            self._point_by_point[name].into(results, points)
         else:
             with one_blas_thread():
                 fill(results, points, self._on_blocks[name])
@@ -130,16 +130,21 @@ class Coordinates:
         }
 
     @cached_property
-    def _batched(self) -> dict[str, Batched]:
+    def _point_by_point(self) -> BuiltOnUse[BlockedFunction]:
         fast = (lambda graph: graph) if self.as_matrices else scalar_code
-        return {name: Batched(fast(self.functions[name])) for name in ("xi", "jacobian")}
+        return BuiltOnUse(lambda name: BlockedFunction(fast(self.functions[name])))
+
+    @property
+    def _has_blocks(self) -> bool:
+        """Whether products of matrices make the family fast on blocks of joint positions."""
+        return self.as_matrices or (len(self.offset) > 0 and isinstance(self.family, SelfDerivativeFamily))
 
     @cached_property
-    def _on_blocks(self) -> dict[str, Maker]:
+    def _on_blocks(self) -> BuiltOnUse[Maker]:
         """What makes functions of many joint positions side by side."""
-        if not self.as_matrices:
-            return block_functions(self)
-        return {name: graph.on_one_block for name, graph in self._column_graphs.items()}
+        if self.as_matrices:
+            return BuiltOnUse(lambda name: self._column_graphs[name].on_one_block)
+        return BuiltOnUse(lambda name: block_function(self, name))
 
     @cached_property
     def _column_graphs(self) -> dict[str, NumpyGraph]:

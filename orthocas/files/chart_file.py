@@ -23,7 +23,15 @@ from orthocas.files.json import part
 from orthocas.files.npy import Stored, to_npy
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.metrics import Metric
-from orthocas.parametrisations import JointSpace, parametrisation_from_data, parametrisation_to_data
+from orthocas.parametrisations import (
+    MLP,
+    Fourier,
+    JointSpace,
+    Linear,
+    Polynomial,
+    parametrisation_from_data,
+    parametrisation_to_data,
+)
 from orthocas.postures.clear_box import CLEAR_BOX, ClearBox
 from orthocas.problem import Problem
 from orthocas.robots import KinematicTree, Robot
@@ -32,6 +40,8 @@ from orthocas.tasks import Task
 CHART = Kind("chart", 1, ChartFileError)
 Notes = Mapping[str, str | float]
 _PROBES = 8  # points of the domain where a chart that is read is evaluated
+_MODERATE = 1e50  # products of a few such numbers do not overflow
+_BOUNDED = (Polynomial, Fourier, Linear, MLP)  # finite wherever their parameters are
 _LEAF = "leaf_"  # prefix of the names of arrays that belong to a base leaf
 
 
@@ -147,11 +157,19 @@ def _require_finite(problem: Problem, coordinates: CoordinateMap) -> None:
     """
     q = sample_uniform(problem.domain, _PROBES, 0)
     values = {"the task": problem.task.batched(q)[0], "the Jacobian of the task": problem.task.batched_jacobian(q)[0]}
-    if isinstance(coordinates, Coordinates):  # grown ones may be NaN where their flow does not reach the leaf
+    if isinstance(coordinates, Coordinates) and not _surely_finite(coordinates):  # grown ones may be NaN
         values |= {"xi": coordinates.xi(q), "the Jacobian of xi": coordinates.jacobian(q)}
     for what, numbers in values.items():
         if not np.isfinite(numbers.reshape(_PROBES, -1)).all(axis=1).any():
             raise InvalidValueError(what, f"not finite at any of {_PROBES} points of the domain", "finite numbers")
+
+
+def _surely_finite(coordinates: Coordinates) -> bool:
+    """Whether coordinates are finite on their domain because all their numbers are moderate. That is quick to tell."""
+    sizes = [np.abs(values) for values in (coordinates.theta, coordinates.offset, coordinates.scale)]
+    widths = coordinates.space.half_width
+    moderate = all((size < _MODERATE).all() for size in (*sizes, widths, 1 / widths))
+    return moderate and isinstance(coordinates.parametrisation, _BOUNDED)
 
 
 def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:

@@ -2,18 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.casadi_tools.threads import in_threads
 from orthocas.checks import Array
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.fitting.loss import pairs
 from orthocas.problem import Problem, task_jacobians
 from orthocas.samples import Samples, samples_at
 
-_CHUNK = 5000
+_CHUNK = 40_000  # joint positions evaluated at once
+_PIECE = 2500  # of these, judged by a thread at once
 _LONGEST = 1e100  # squares of longer gradients overflow: they have no value
 
 
@@ -34,8 +36,10 @@ class Judged:
     @classmethod
     def at(cls, problem: Problem, coordinates: CoordinateMap, points: Array) -> Self:
         """Judge coordinates at joint positions (N, n)."""
-        starts = range(0, max(len(points), 1), _CHUNK)
-        parts = [_judged(problem, coordinates, points[start : start + _CHUNK]) for start in starts]
+        parts: list[tuple[Any, ...]] = []
+        for start in range(0, max(len(points), 1), _CHUNK):
+            sampled = _Sampled.at(problem, coordinates, points[start : start + _CHUNK])
+            parts += in_threads(sampled.judged, range(0, max(len(sampled.points), 1), _PIECE))
         return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def of_coordinates(self, chosen: Sequence[int]) -> Self:
@@ -52,17 +56,40 @@ class Judged:
         return type(self)(**({part.name: getattr(self, part.name) for part in fields(self)} | shortened))
 
 
-def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> tuple[Array, ...]:
-    """The fields of `Judged` for one chunk."""
-    samples = samples_at(problem, points)
-    kept = np.ones(len(points), dtype=bool)
-    if len(samples) < len(points):
-        kept = np.asarray((task_jacobians(problem, points) != 0).any(axis=2).all(axis=1))
-    J = coordinates.jacobian(samples.points)
-    lengths = np.linalg.norm(J, axis=2)
-    alive = (lengths.min(axis=1) > 0) & (lengths.max(axis=1) < _LONGEST)  # false for NaN, as grown coordinates have it
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """What CasADi evaluates at joint positions. The rest is NumPy, which threads share."""
+
+    points: Array  #: (N, n)
+    samples: Samples  #: at those positions where no task gradient vanishes
+    jacobian: Array  #: J_xi there
+    kept: NDArray[np.bool_]  #: which positions these are, (N,)
+
+    @classmethod
+    def at(cls, problem: Problem, coordinates: CoordinateMap, points: Array) -> Self:
+        """Evaluate at points (N, n)."""
+        samples = samples_at(problem, points)
+        kept = np.ones(len(points), dtype=bool)
+        if len(samples) < len(points):
+            kept = np.asarray((task_jacobians(problem, points) != 0).any(axis=2).all(axis=1))
+        return cls(points, samples, coordinates.jacobian(samples.points), kept)
+
+    def judged(self, start: int) -> tuple[Any, ...]:
+        """The fields of `Judged` for one piece of the positions."""
+        kept = self.kept[start : start + _PIECE].copy()
+        first = int(np.count_nonzero(self.kept[:start]))
+        part = slice(first, first + int(np.count_nonzero(kept)))
+        return _judged(self.samples[part], self.jacobian[part], kept)
+
+
+def _judged(samples: Samples, J: Array, kept: NDArray[np.bool_]) -> tuple[Any, ...]:
+    """The fields of `Judged` for samples with coordinate gradients J (N, r, n). `kept` tells which positions remain."""
+    lengths = _lengths(J)
+    measured = (lengths > 0) & (lengths < _LONGEST)  # false for NaN, as grown coordinates have it
+    alive: NDArray[np.bool_] = np.asarray(measured.all(axis=1))
     kept[kept] = alive
-    samples, J, lengths = samples[alive], J[alive], lengths[alive]
+    if not alive.all():
+        samples, J, lengths = samples[alive], J[alive], lengths[alive]
     raised = samples.raised(J)
     first, second = (np.array([pair[k] for pair in pairs(J.shape[1])], dtype=int) for k in (0, 1))
     products = np.einsum("spn,spn->sp", raised[:, first], J[:, second])
@@ -73,12 +100,20 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> tupl
         samples.points,
         J,
         samples.unit_task_gradients @ (J / lengths[:, :, None]).transpose(0, 2, 1),
-        products / (np.linalg.norm(raised, axis=2)[:, first] * lengths[:, second]),
+        products / (_lengths(raised)[:, first] * lengths[:, second]),
         leak_sines,
         products / (metric_lengths[:, first] * metric_lengths[:, second]),
         conditioning,
         signs,
     )
+
+
+def _lengths(vectors: Array) -> Array:
+    """Euclidean norms of vectors (N, k, n), (N, k)."""
+    squares: Array = np.einsum("skn,skn->sk", vectors, vectors)
+    if squares.size and not (squares.max() < _LONGEST and squares.min() > 1 / _LONGEST):  # or with NaN
+        return np.asarray(np.linalg.norm(vectors, axis=2))
+    return np.asarray(np.sqrt(squares))
 
 
 def in_the_metric(samples: Samples, J: Array) -> tuple[Array, Array, Array]:
@@ -87,7 +122,7 @@ def in_the_metric(samples: Samples, J: Array) -> tuple[Array, Array, Array]:
     lengths = _metric_lengths(J, raised)[:, :, None]
     along = samples.task_basis @ (J / lengths).transpose(0, 2, 1)  # (N, m, r)
     return (
-        np.linalg.norm(along, axis=1),
+        np.sqrt((along**2).sum(axis=1)),
         _smallest_singular_values(J / lengths, raised / lengths, along),
         np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1))),
     )

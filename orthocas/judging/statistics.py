@@ -1,14 +1,31 @@
 """Statistics of angles and leaks in reports."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
 
+from orthocas.casadi_tools.threads import in_threads
 from orthocas.checks import Array
 from orthocas.judging.gradients import Judged
 
-_BIN_EDGES = np.linspace(-0.05, 180.05, 1802)  # 90 degrees lies in the middle of its bin
+_BIN = 0.1  # [deg]; 90 degrees lies in the middle of its bin
+_PIECE = 2**16  # angles that a thread takes at once
+
+
+def _degrees(inverse: Callable[[Array], Array], values: Array, most: int) -> tuple[Array, Array]:
+    """Angles of all values [deg] in one row, and their counts in bins around 0.0, 0.1, ..., `most` degrees."""
+    flat = values.ravel()
+    angles = np.empty_like(flat)
+    bins, ends = round(most / _BIN) + 1, (-_BIN / 2, most + _BIN / 2)
+
+    def one_piece(start: int) -> Array:
+        part = slice(start, start + _PIECE)
+        angles[part] = np.degrees(inverse(flat[part]))
+        return np.histogram(angles[part], bins, ends)[0].astype(float)
+
+    return angles, sum(in_threads(one_piece, range(0, len(flat), _PIECE)), np.zeros(bins))
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +40,7 @@ class AngleStatistics:
     @classmethod
     def of_cosines(cls, cosines: Array) -> Self:
         """Statistics of the angles arccos(cosines), in degrees."""
-        angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).ravel()
-        counts = np.histogram(angles, _BIN_EDGES)[0].astype(float)
+        angles, counts = _degrees(np.arccos, np.clip(cosines, -1.0, 1.0), 180)
         if angles.size == 0:
             return cls(np.nan, np.nan, np.nan, counts)
         return cls(float(angles.mean()), float(angles.std()), float(np.abs(angles - 90).max()), counts)
@@ -55,8 +71,8 @@ class LeakStatistics:
     @classmethod
     def of_sines(cls, sines: Array) -> Self:
         """Statistics of the leaks arcsin(sines), in degrees, for sines (N, r)."""
-        leaks = np.degrees(np.arcsin(np.clip(sines, 0.0, 1.0)))
-        counts = np.histogram(leaks, _BIN_EDGES[:902])[0].astype(float)
+        flat, counts = _degrees(np.arcsin, np.clip(sines, 0.0, 1.0), 90)
+        leaks = flat.reshape(sines.shape)
         if leaks.size == 0:
             return cls(np.nan, np.nan, np.nan, (), counts)
         squares = (leaks**2).mean(axis=0)

@@ -49,9 +49,10 @@ class ProductFamily(BasisFamily):
         tables = np.zeros((n, self.outputs, 1 + self.width))
         for i in range(n):
             D = self.one_joint_derivatives(i)
+            parts = [np.flatnonzero(row).tolist() for row in D]
             for k, term in enumerate(self.terms):
-                for b in np.flatnonzero(D[term[i]]):
-                    tables[i, :, places[(*term[:i], int(b), *term[i + 1 :])]] += D[term[i], b] * C[:, k]
+                for b in parts[term[i]]:
+                    tables[i, :, places[(*term[:i], b, *term[i + 1 :])]] += D[term[i], b] * C[:, k]
         return tables
 
 
