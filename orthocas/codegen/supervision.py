@@ -6,11 +6,13 @@ from dataclasses import fields
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.codegen.numbers import numbers
 from orthocas.control import Controller
 from orthocas.control.safety import Safety
 from orthocas.control.turns import without_turns
 from orthocas.domains import borders
+from orthocas.postures.clear_box import ClearBox
 
 
 def supervision_kernels(controller: Controller) -> list[ca.Function]:
@@ -22,10 +24,18 @@ def supervision_kernels(controller: Controller) -> list[ca.Function]:
     error = reference - measured
     if controller.chart is not None and controller.labels == controller.chart.labels:
         error = without_turns(controller.chart, error)
-    return [
+    found = [
         ca.Function("fallback", inputs, fallback.call(inputs)),
         ca.Function("deviation", [q, reference], [ca.densify(measured), ca.densify(error)]),
     ]
+    clear = _clear_box(controller)
+    return found if clear is None else [*found, scalar_code(ca.Function("gram", [q], [clear.gram(q)]))]
+
+
+def _clear_box(controller: Controller) -> ClearBox | None:
+    """The domain of the law, if its border depends on the singular values of the task."""
+    domain = controller.problem.domain
+    return domain if controller.chart is not None and isinstance(domain, ClearBox) else None
 
 
 def supervision_values(controller: Controller, safety: Safety) -> dict[str, str]:
@@ -43,10 +53,27 @@ def supervision_values(controller: Controller, safety: Safety) -> dict[str, str]
         "turning": _flags(endless),
         "safety_fields": "\n".join(_field(name, value) for name, value in _numbers(safety).items()),
         "safety_values": ",\n".join(f"  {_literal(value)}" for value in _numbers(safety).values()),
+        **_clearance_values(controller),
         "fallback_arguments": "\n".join(f"  arg[{1 + i}] = gains->{gain};" for i, gain in enumerate(controller.gains)),
     }
 
 
+def _clearance_values(controller: Controller) -> dict[str, str]:
+    """The bound on the singular value of the task as a part of the border."""
+    clear = _clear_box(controller)
+    if clear is None:
+        return {"nearest": "1.0", "clearance_too": " in half-widths", "clear_border": ""}
+    return {
+        "nearest": "clearance_ahead(q, dq, time)",
+        "clearance_too": " in half-widths, or the clearance",
+        "clear_border": _CLEAR_BORDER,
+        "clear_bound": repr(clear.least_singular_value),
+        "clear_span": repr(float(clear.singular_values(clear.centre)) - clear.least_singular_value),
+    }
+
+
+_CLEAR_BORDER = """ The bound on the relative singular value of the task is a part of the border; its
+ * distance counts in shares of that from the centre."""
 _TORQUE = """It compensates gravity, damps with the mass matrix,
  * holds the arm with a spring that gives way under too much force."""
 _VELOCITY = """It stops the arm and holds it."""

@@ -77,7 +77,7 @@ def _state_type(n: int, k: int, precision: Precision) -> type[ctypes.Structure]:
     joints, quantities = precision.c_type * n, precision.c_type * k
     names = ("q", "dq", "command", "law", "anchor", "safe")
     layout = [
-        *((name, ctypes.c_int) for name in ("mode", "cause", "asked", "bad_ticks", "stale_ticks")),
+        *((name, ctypes.c_int) for name in ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks")),
         *((name, precision.c_type) for name in ("weight", "brake")),
         *((name, joints) for name in names),
         *((name, quantities) for name in ("offset", "integral", "value", "velocity", "acceleration")),

@@ -26,7 +26,8 @@ _ZONE = 0.05  # [rad] or [m], at most this share of the range of a joint
 class Safety:
     """Settings of the supervised law; `Safety.of(controller)` gives the default ones.
 
-    Margins are distances to the border in half-widths of the domain. Lists hold one number per joint (n,), or per
+    Margins are distances to the border in half-widths of the domain. On a `ClearBox`, the bound on the relative singular
+    value s is a border too, at the distance (s - bound) / (s at the centre - bound). Lists hold one number per joint (n,), or per
     controlled quantity (k,) where that is said.
     """
 
