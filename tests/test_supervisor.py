@@ -459,3 +459,22 @@ def test_a_start_without_a_measurement_waits_for_the_first_one(supervisor: Super
     for _ in range(50):
         _, status = supervisor.step(outside, np.zeros(3), at_rest(chart, domain.centre), TICK)
     assert status is ControlStatus.CAUGHT
+
+
+def test_velocity_laws_carry_no_settings_of_torques(chart: oc.Chart, tmp_path: Path) -> None:
+    law = Kinematic.on_chart(chart)
+    generated = oc.generate_c(chart, tmp_path, law, "arm")
+    header = (tmp_path / "arm.h").read_text()
+    for name in ("brake_stiffness", "brake_yield", "stop_zone", "stop_damping"):
+        assert name not in header
+    library, q = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3), chart.problem.domain.centre
+    commands = []
+    for safety in (None, Safety.of(law), Safety.of(law, return_speed=0.1, damping=1.0)):
+        supervisor = Supervisor(library, law, safety)
+        supervisor.take_over(q, np.zeros(3))
+        for k in range(60):  # the catcher after speeds beyond the limit
+            command, _ = supervisor.step(q + 1e-4 * k, np.full(3, 20.0 * (k == 30)), at_rest(chart, q), TICK)
+        assert supervisor.mode == 1  # the catcher
+        commands.append(command)
+    np.testing.assert_array_equal(commands[0], commands[1])
+    assert np.abs(commands[2] - commands[0]).max() > 1e-4
