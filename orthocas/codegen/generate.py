@@ -134,7 +134,7 @@ def _stack_bytes(kernels: Kernels, n: int, k: int, size: int) -> int:
     compose = kernels.array_bytes("dynamics", size) + size * n * (n + 5)
     supervised = size * (9 * n + 8 * k) if k else 0
     locals_ = round(_LOCALS * max(1.0, n / 7) ** 2)  # compilers keep matrices in local variables
-    clear = kernels.array_bytes("pivots", size) if "pivots" in kernels.work else 0  # called by the others
+    clear = sum(kernels.array_bytes(name, size) for name in ("pivots", "gram") if name in kernels.work)  # inside others
     work = max(kernels.array_bytes(name, size) for name in kernels.work)
     return max(inverse, compose, work) + supervised + clear + locals_
 

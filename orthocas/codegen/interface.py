@@ -70,6 +70,7 @@ def template_values(
             values[f"{kernel}_{word}"] = str(max(1, size))
     if controller is not None and safety is not None:
         values |= _control_values(controller) | supervision_values(controller, safety)
+        values["clearance_c"] = filled("clearance.c", values) if "clear_span" in values else ""
         values["compose"] = filled(f"compose_{controller.command}.c", values)
     values |= _clear_values(domain, values)
     for template in ("control.h", "control.c", "check_control.c", "control.md", "supervisor.h", "supervisor.c"):

@@ -1,16 +1,16 @@
 """Calls the supervised law of a compiled library from Python, for simulations and tests."""
 
 import ctypes
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_point, require_shape
+from orthocas.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 from orthocas.codegen.library import CompiledLibrary, gain_numbers
 from orthocas.codegen.precision import Precision
 from orthocas.control import Controller, ControlStatus, Safety
+from orthocas.control.controller import require_controller
 
 _POINTER = ctypes.c_void_p
 
@@ -25,10 +25,16 @@ class Supervisor:
     """
 
     def __init__(self, library: CompiledLibrary, controller: Controller, safety: Safety | None = None) -> None:
+        require_kind("library", library, CompiledLibrary)
+        require_controller(controller)
         self._n, self._k, self._library = library.n, len(controller.labels), library
         self._functions = {name: library.function(name) for name in ("start", "take_over", "resume", "step")}
         self._functions["step"].argtypes = [*[_POINTER] * 6, library.precision.c_type, _POINTER]
-        self._safety = library.address("default_safety") if safety is None else _packed(safety, library.precision)
+        if safety is None:
+            self._safety = library.address("default_safety")
+        else:
+            require_kind("safety", safety, Safety)
+            self._safety = _packed(safety.in_c(controller.command), library.precision)
         self._state = _state_type(self._n, self._k, library.precision)()
         self._command = library.numbers(np.zeros(self._n))
         self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
@@ -49,12 +55,12 @@ class Supervisor:
 
     def step(self, q: Array, dq: Array, reference: Array, period: float = 1e-3) -> tuple[Array, ControlStatus]:
         """Command (n,) and status of one control period. The reference is [value, velocity, acceleration], (3 k,)."""
-        inputs = [self._library.numbers(part) for part in (q, dq, reference, self.gains)]
-        sizes = {"q": self._n, "dq": self._n, "reference": 3 * self._k}
-        for (name, size), part in zip(sizes.items(), inputs, strict=False):  # C would read beyond the end
-            require_shape(name, part.shape, (size,))
+        given = {"q": (q, self._n), "dq": (dq, self._n), "reference": (reference, 3 * self._k)}
+        inputs = [self._numbers(name, *value) for name, value in given.items()]
+        inputs.append(self._library.numbers(self.gains))
+        time = as_number("period", period)
         status = self._functions["step"](
-            self._here, self._safety, *map(_pointer, inputs), float(period), _pointer(self._command)
+            self._here, self._safety, *map(_pointer, inputs), time, _pointer(self._command)
         )
         return self._command.copy(), ControlStatus(status)
 
@@ -64,6 +70,12 @@ class Supervisor:
             raise AttributeError(name)
         value = getattr(self._state, name)
         return np.array(value) if isinstance(value, ctypes.Array) else value
+
+    def _numbers(self, name: str, values: ArrayLike, size: int) -> Array:
+        """Numbers of the library's type, which may be NaN or infinite."""
+        array = as_float_array(name, values)
+        require_shape(name, array.shape, (size,))  # C would read beyond the end
+        return self._library.numbers(array)
 
     def _point(self, name: str, values: ArrayLike) -> Array:
         return self._library.numbers(as_point(name, values, self._n))
@@ -77,7 +89,7 @@ def _state_type(n: int, k: int, precision: Precision) -> type[ctypes.Structure]:
     joints, quantities = precision.c_type * n, precision.c_type * k
     names = ("q", "dq", "command", "law", "anchor", "safe")
     layout = [
-        *((name, ctypes.c_int) for name in ("mode", "cause", "asked", "bad_ticks", "stale_ticks")),
+        *((name, ctypes.c_int) for name in ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks")),
         *((name, precision.c_type) for name in ("weight", "brake")),
         *((name, joints) for name in names),
         *((name, quantities) for name in ("offset", "integral", "value", "velocity", "acceleration")),
@@ -85,9 +97,8 @@ def _state_type(n: int, k: int, precision: Precision) -> type[ctypes.Structure]:
     return type("State", (ctypes.Structure,), {"_fields_": layout})
 
 
-def _packed(safety: Safety, precision: Precision) -> Any:
+def _packed(values: dict[str, Any], precision: Precision) -> Any:
     """The settings as the C struct."""
-    values = {field.name: getattr(safety, field.name) for field in fields(Safety)}
     layout = [(name, _kind(value, precision)) for name, value in values.items()]
     struct = type("Safety", (ctypes.Structure,), {"_fields_": layout})()
     for name, value in values.items():

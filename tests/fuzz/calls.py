@@ -17,6 +17,8 @@ import orthocas as oc
 from fuzz.child import Finding, run, verdict
 from fuzz.words import NAMES, NUMBERS, Rng, pick
 from orthocas import control, parametrisations, plotting, problems, simulation, solvers
+from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
+from orthocas.errors import CompileError
 
 Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments that it takes
 
@@ -152,7 +154,7 @@ def _objects() -> dict[str, Any]:
 @cache
 def good_calls() -> dict[str, Call]:
     """What can be called, with arguments that work and take little time."""
-    return {**_makers(), **_functions(), **_methods(), **_control(), **_physics()}
+    return {**_makers(), **_functions(), **_methods(), **_control(), **_physics(), **_supervised()}
 
 
 def _physics() -> dict[str, Call]:
@@ -169,6 +171,26 @@ def _physics() -> dict[str, Call]:
         "plant.reset": (lambda **given: _plant(robot).reset(**given), {"q": q, "dq": q}),
         "plant.push": (lambda **given: _plant(robot).push(**given), {"force": q, "link": 1, "point": q}),
         "plant.step": (lambda **given: _plant(robot).step(**given), {"torque": q, "seconds": 0.01, "loads": q}),
+    }
+
+
+def _supervised() -> dict[str, Call]:
+    """The supervised law of a compiled library, if there is a compiler."""
+    law = impedance()
+    with TemporaryDirectory() as folder:
+        try:
+            path = compile_shared(oc.generate_c(law.chart, folder, law, "arm"), Path(folder), ("-O0",))
+        except CompileError:
+            return {}
+        library = CompiledLibrary(path, "arm", 3)
+        library.check()  # it is loaded before its file goes
+    q, reference = law.problem.domain.centre, np.zeros(9)
+    supervisor = Supervisor(library, law)
+    return {
+        "supervisor": (Supervisor, {"library": library, "controller": law, "safety": control.Safety.of(law)}),
+        "supervisor.start": (supervisor.start, {"q": q, "command": q}),
+        "supervisor.take_over": (supervisor.take_over, {"q": q, "command": q}),
+        "supervisor.step": (supervisor.step, {"q": q, "dq": q, "reference": reference, "period": 1e-3}),
     }
 
 
