@@ -21,8 +21,8 @@ from orthocas.following.checks import Limits
 from orthocas.following.choose_xi import XiChoice
 from orthocas.following.costs import Costs
 from orthocas.following.joint_curve import JointCurve
-from orthocas.following.newton import Newton
 from orthocas.following.plan import Plan
+from orthocas.following.solver import Solver
 from orthocas.following.walk import walk
 from orthocas.obstacles import LinkDistances, Sphere
 
@@ -213,9 +213,9 @@ def test_objective_is_that_of_ipopt() -> None:
     chart, limits = planar(), _limits(planar())
     other = START + np.array([0.3, -0.4, 0.3])
     plan = Plan.held(chart, chart.task(other) + loop(chart, 0.1) - loop(chart, 0.1)[0], chart.xi(other))
-    curve = JointCurve.along(newton := Newton(chart), plan.phi, other)
+    curve = JointCurve.along(solver := Solver(chart), plan.phi, other)
     assert isinstance(curve, JointCurve)
-    choice = XiChoice(plan, Costs(limits), newton)
+    choice = XiChoice(plan, Costs(limits), solver)
     values = choice.best(curve.q(choice.s)).xi(choice.nodes[:-1])
     expected = by_ipopt(choice, limits, curve.q(choice.s))
     np.testing.assert_allclose(values, expected, atol=0.02)

@@ -16,8 +16,8 @@ from scipy.interpolate import CubicSpline
 
 from orthocas.checks import Array
 from orthocas.following.costs import Costs
-from orthocas.following.newton import ROUGH, Newton
 from orthocas.following.plan import Plan
+from orthocas.following.solver import Solver
 
 if TYPE_CHECKING:
     pass
@@ -49,11 +49,11 @@ class XiChoice:
     Args:
         plan: the tool path.
         costs: of joint positions.
-        newton: solves for them.
+        solver: solves for them.
     """
 
-    def __init__(self, plan: Plan, costs: Costs, newton: Newton) -> None:
-        self.plan, self.costs, self.newton, self.chart = plan, costs, newton, newton.chart
+    def __init__(self, plan: Plan, costs: Costs, solver: Solver) -> None:
+        self.plan, self.costs, self.solver, self.chart = plan, costs, solver, solver.chart
         pieces = _pieces(plan, self.chart.phi_sizes[: self.chart.m])
         self.s = np.linspace(0.0, 1.0, _PLACES * pieces + 1)
         self.nodes = np.linspace(0.0, 1.0, pieces + 1)
@@ -97,7 +97,7 @@ class XiChoice:
     def _state(self, values: Array, near: Array) -> _State | None:
         """The state of values (K, r), with joint positions near others; None where Newton's method fails."""
         goals = np.hstack([self.plan.x(self.s), self._basis @ values])
-        q = self.newton.solve(near, goals, ROUGH)
+        q = self.solver.solve(near, goals)
         if not np.isfinite(q).all():
             return None
         smooth = float(np.einsum("kr,kl,lr->", values, self._smooth, values))
@@ -107,7 +107,7 @@ class XiChoice:
     def _model(self, state: _State) -> tuple[Array, Array]:
         """Gauss-Newton Hessian (K r, K r) and half the gradient (K r,) of the cost."""
         r, m, B = self.chart.r, self.chart.m, self._basis
-        G = state.gradients @ np.linalg.inv(self.newton.phi_and_jacobian(state.q)[1])[:, :, m:] / np.sqrt(len(B))
+        G = state.gradients @ np.linalg.inv(self.solver.jacobian(state.q))[:, :, m:] / np.sqrt(len(B))
         squares = np.einsum("pka,pkb->pab", G, G)
         hessian = np.einsum("pi,pj,pab->iajb", B, B, squares, optimize=True)
         hessian += np.einsum("ij,ab->iajb", self._smooth, np.eye(r))

@@ -14,8 +14,8 @@ from orthocas.following.choose_xi import XiChoice
 from orthocas.following.costs import Costs
 from orthocas.following.joint_curve import JointCurve, Lost
 from orthocas.following.joint_motion import JointMotion
-from orthocas.following.newton import Newton
 from orthocas.following.plan import Plan
+from orthocas.following.solver import Solver
 from orthocas.following.time_law import TimeLaw, checked_places, fastest
 from orthocas.following.walk import walk
 from orthocas.obstacles.link_distances import LinkDistances
@@ -93,10 +93,10 @@ def follow(
     if not 1e-5 <= stamp <= 10:
         raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
     plan = _plan(chart, tool_path, xi, start)
-    newton = Newton(chart)
-    curve = JointCurve.along(newton, plan.phi, start)
+    solver = Solver(chart)
+    curve = JointCurve.along(solver, plan.phi, start)
     if isinstance(xi, str) and xi == OBJECTIVE:
-        plan, curve = _chosen(newton, plan, curve, limits, start)
+        plan, curve = _chosen(solver, plan, curve, limits, start)
     if isinstance(curve, Lost):
         limits.require_kept(plan, curve.s, curve.q)
         raise limits.lost(plan, curve)
@@ -117,14 +117,14 @@ def _plan(chart: Chart, tool_path: Any, xi: Any, start: Array) -> Plan:
 
 
 def _chosen(
-    newton: Newton, plan: Plan, held: JointCurve | Lost, limits: Limits, start: Array
+    solver: Solver, plan: Plan, held: JointCurve | Lost, limits: Limits, start: Array
 ) -> tuple[Plan, JointCurve | Lost]:
     """The path with coordinates by objective, from those that are held, or from a walk where that is not possible."""
     costs = Costs(limits)
-    choice = XiChoice(plan, costs, newton)
-    q = walk(newton.chart, costs, plan.x(choice.s), start) if isinstance(held, Lost) else held.q(choice.s)
+    choice = XiChoice(plan, costs, solver)
+    q = walk(solver.chart, costs, plan.x(choice.s), start) if isinstance(held, Lost) else held.q(choice.s)
     chosen = choice.best(q)
-    return chosen, JointCurve.along(newton, chosen.phi, q[0])
+    return chosen, JointCurve.along(solver, chosen.phi, q[0])
 
 
 def _limits(

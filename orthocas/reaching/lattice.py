@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from orthocas.checks import Array, Indices
+from orthocas.inverting.newton import Newton, largest
 from orthocas.reaching.intervals import XiRange
 
 if TYPE_CHECKING:
     from orthocas.chart import Chart
 
-_ITERATIONS = 12
 _TOLERANCE = 1e-10  # of phi, relative to `Chart.phi_sizes`
 _FARTHEST = 3.0  # distance of a point from its neighbour, in lengths of the predicted step
-_SINGULAR = 1e12  # condition number of J
 _MOST = 4  # times as many points as wanted, at most
 
 
@@ -63,34 +62,10 @@ def _neighbours(
 
 def _solved(chart: "Chart", starts: Array, targets: Array, sign: float) -> tuple[Array, Indices]:
     """Newton's method from all starts (N, n), and the rows where it found a point of the domain on the same sheet."""
-    q, sizes = starts.copy(), chart.phi_sizes
-    first = np.zeros(len(q))
-    for k in range(_ITERATIONS):
-        change = _newton_step(chart, q, targets)
-        if k == 0:
-            first = np.linalg.norm(change, axis=1)
-        q = q + change
-        if np.linalg.norm(change, axis=1).max() < 1e-13:
-            break
-    error = np.abs((chart.phi(q) - targets) / sizes).max(axis=1)
-    near = np.linalg.norm(q - starts, axis=1) <= _FARTHEST * first + 1e-9
-    rows = np.flatnonzero((error < _TOLERANCE) & near & chart.problem.domain.contains(q))
-    same = np.sign(np.linalg.det(_jacobian(chart, q[rows]))) == sign
-    return q, np.asarray(rows[same], dtype=np.int64)
-
-
-def _newton_step(chart: "Chart", q: Array, targets: Array) -> Array:
-    """J^-1 (target - phi), at most half a radian long; zero where J is singular or not finite."""
-    J, error = _jacobian(chart, q), targets - chart.phi(q)
-    rows = np.flatnonzero(np.isfinite(J).all(axis=(1, 2)) & np.isfinite(error).all(axis=1))
-    rows = rows[np.linalg.cond(J[rows]) < _SINGULAR]
-    change = np.zeros_like(q)
-    change[rows] = np.linalg.solve(J[rows], error[rows][..., None])[..., 0]
-    length = np.linalg.norm(change, axis=1, keepdims=True)
-    return np.asarray(change * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300)))
-
-
-def _jacobian(chart: "Chart", q: Array) -> Array:
-    """J at points (N, n), also where it is not finite."""
-    J_x = chart.problem.task.batched_jacobian(q)[0].reshape(-1, chart.m, chart.n)
-    return np.concatenate([J_x, chart.coordinates.jacobian(q)], axis=1)
+    phi_map = chart.phi_map
+    found = Newton(phi_map)(targets, starts)
+    step = np.linalg.solve(phi_map.jacobian(starts), (targets - phi_map.phi(starts))[..., None])[..., 0]
+    near = np.linalg.norm(found.q - starts, axis=1) <= _FARTHEST * np.linalg.norm(step, axis=1) + 1e-9
+    rows = np.flatnonzero((largest(found.residual) < _TOLERANCE) & near & chart.problem.domain.contains(found.q))
+    same = np.sign(np.linalg.det(phi_map.jacobian(found.q[rows]))) == sign
+    return found.q, np.asarray(rows[same], dtype=np.int64)
