@@ -3,12 +3,14 @@
 Three arms with cubic coordinates on boxes of about +-0.6 rad or the paper's. The robot in MuJoCo has other masses
 than the law's model, or carries 1 kg that the law does not know, at the tip. Five starts in the inner 60 % of each box:
 hold still for 1.5 s, then a step of 40 mm in x and one in the first extra coordinate, 1.5 s each, through the low pass
-of the paper; smaller ones, or in the other direction, where these leave the domain.
+of the paper; smaller ones, or in the other direction, where these leave the domain. The last table is the supervised
+law, which holds still, without and with integral action, on position tasks.
 """
 
 import argparse
 from collections import deque
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib.metadata import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,11 +19,13 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.codegen import Supervisor
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
-from orthocas.control import ControlStatus, PDPlus, Reference
+from orthocas.control import ControlStatus, PDPlus, Reference, Safety
 from orthocas.control.matched_stiffness import mobility
 from orthocas.domains import sample_uniform
 from orthocas.errors import UnreachableReferenceError
+from orthocas.problems.iiwa import urdf_path
 from orthocas.simulation import MuJoCoPlant
 
 CASES = (  # robot, task, metric
@@ -35,7 +39,11 @@ ROBOTS = {  # of the package example-robot-data: file, tip, locked joints, centr
         (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4),
         (0.6, 0.6, 0.6, 0.6, 0.8, 0.6, 1.2),
     ),
-    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef", None, (0.0, 0.0177, 0.0, 0.9119, 0.0, 0.7243, 0.0), 0.6),
+    "xarm7": (
+        *("xarm_description/urdf/xarm7.urdf", "link_eef", {}),
+        (0.0, 0.0177, 0.0, 0.9119, 0.0, 0.7243, 0.0),
+        (0.6, 0.6, 0.6, 0.6, 0.8, 0.6, 1.2),
+    ),
 }
 PLANTS = {
     "-20 %": lambda robot: robot.with_scaled_masses(0.8),
@@ -44,18 +52,30 @@ PLANTS = {
 }
 RATE = 1000.0  # [Hz]
 DELAY = 5  # ticks from the measurement to the torque
+INTEGRAL, LONG = 3.0, 2.0  # rate of the integral action [1/s], for the last table [s]
 HOLD, STEP, XI = 1.5, 0.04, 0.15  # [s], [m], [1]
+
+
+@contextmanager
+def robot_file(name: str) -> Iterator[tuple[Path, str, dict[str, float]]]:
+    """URDF file of an arm, its tip and its locked joints."""
+    if name in problems.names():
+        with urdf_path() as path:
+            yield path, "link_ee", {}
+        return
+    file, tip, locked = ROBOTS[name][:3]
+    yield (
+        next(Path(str(f.locate())).resolve() for f in files("example-robot-data") or [] if str(f).endswith(file)),
+        tip,
+        locked,
+    )
 
 
 def problem_of(name: str, task: str, metric: str) -> oc.Problem:
     """An arm with its box."""
-    if name in problems.names():
-        known = problems.get(name)
-        robot, box = known.robot, known.domain
-    else:
-        file, tip, locked, centre, half_width = ROBOTS[name]
-        path = next(Path(str(f.locate())).resolve() for f in files("example-robot-data") or [] if str(f).endswith(file))
-        robot, box = oc.Robot.from_file(path, tip, locked), oc.Box(centre, half_width)
+    with robot_file(name) as (path, tip, locked):
+        robot = oc.Robot.from_file(path, tip, locked)
+    box = problems.get(name).domain if name in problems.names() else oc.Box(*ROBOTS[name][3:])
     return oc.Problem(robot, oc.Task.named(robot, task, box.centre), metric, box, name)
 
 
@@ -80,15 +100,53 @@ def modes_row(label: str, law: PDPlus) -> str:
 def sag_row(label: str, law: PDPlus, starts: int) -> str:
     """Largest distances from the reference at rest and in motion [mm], and ticks in which the law had to give up."""
     words = [label]
-    with TemporaryDirectory() as folder:
-        generated = oc.generate_c(law.chart, folder, law, "law")
-        library = CompiledLibrary(compile_shared(generated, Path(folder)), "law", law.problem.n)
+    with compiled(law) as library:
         for make in PLANTS.values():
             plant = MuJoCoPlant(make(law.problem.robot))
             found = np.array([followed(law, library, plant, start) for start in starts_of(law.problem, starts)])
             held, moving, lost = found[:, 0].max(), found[:, 1].max(), int((found[:, 2] > 0).sum())
             words.append(f"{1e3 * held:.1f}, {1e3 * moving:.1f}" + (f", {lost} left" if lost else ""))
     return f"| {' | '.join(words)} |"
+
+
+def integral_row(label: str, law: PDPlus, starts: int) -> str:
+    """Distance from the reference after holding for 2 s without and with integral action [mm], and catches."""
+    words = [label]
+    with compiled(law) as library:
+        for make in PLANTS.values():
+            plant, ends = MuJoCoPlant(make(law.problem.robot)), []
+            for rate in (0.0, INTEGRAL):
+                supervisor = Supervisor(library, law, Safety.of(law, integral_rate=rate))
+                found = [held(law, supervisor, plant, start) for start in starts_of(law.problem, starts)]
+                caught = sum(np.isinf(found))
+                ends.append(f"{1e3 * max(np.compress(np.isfinite(found), found), default=np.nan):.2f}")
+                ends[-1] += f" ({caught} caught)" if caught else ""
+            words.append(" -> ".join(ends))
+    return f"| {' | '.join(words)} |"
+
+
+def held(law: PDPlus, supervisor: Supervisor, plant: MuJoCoPlant, q: np.ndarray) -> float:
+    """Distance of the tip from where it is to stay, 2 s after the supervised law began [m]; infinite if caught."""
+    m = min(3, law.chart.m)
+    plant.reset(q)
+    supervisor.start(q)
+    late = deque([law.problem.robot.gravity(q)] * DELAY)
+    reference = np.concatenate([law.chart.phi(q), np.zeros(2 * law.chart.n)])
+    for _ in range(round(LONG * RATE)):
+        command, status = supervisor.step(plant.q, plant.dq, reference, 1 / RATE)
+        if status is ControlStatus.CAUGHT:
+            return np.inf
+        late.append(command)
+        plant.step(late.popleft(), 1 / RATE)
+    return float(np.linalg.norm(law.chart.phi(plant.q)[:m] - reference[:m]))
+
+
+@contextmanager
+def compiled(law: PDPlus) -> Iterator[CompiledLibrary]:
+    """The law in C."""
+    with TemporaryDirectory() as folder:
+        generated = oc.generate_c(law.chart, folder, law, "law")
+        yield CompiledLibrary(compile_shared(generated, Path(folder)), "law", law.problem.n)
 
 
 def starts_of(problem: oc.Problem, count: int) -> np.ndarray:
@@ -130,13 +188,15 @@ def followed(law: PDPlus, library: CompiledLibrary, plant: MuJoCoPlant, q: np.nd
 
 
 def main(quick: bool = False) -> list[str]:
-    """Print both tables; `quick` takes one arm and one start."""
+    """Print the tables; `quick` takes one arm and one start."""
     laws = {f"{', '.join(case)}": PDPlus.on_chart(chart_of(*case)) for case in (CASES[:1] if quick else CASES)}
     rows = [modes_row(label, law) for label, law in laws.items()]
     print("\n".join(rows), flush=True)
-    for label, law in laws.items():
-        rows.append(sag_row(label, law, 1 if quick else 5))
-        print(rows[-1], flush=True)
+    for row in (sag_row, integral_row):
+        for label, law in laws.items():
+            if row is sag_row or "pose" not in label:
+                rows.append(row(label, law, 1 if quick else 5))
+                print(rows[-1], flush=True)
     return rows
 
 

@@ -1,8 +1,8 @@
-"""Laws in xi against the textbook's operational space controller, in MuJoCo at 1 kHz: three tables (10 min).
+"""Laws in xi against the textbook's operational space controller, in MuJoCo at 1 kHz: four tables (15 min).
 
 The arm is the 7-DoF arm with cubic coordinates, A = M and default gains; `--robot panda` takes another one. Circles and
-steps of 0.1 m need A = I: with A = M, the light wrist would turn beyond its part of the box. The peer has 4 Hz and the
-damping ratio 0.7 in all directions of task and posture. The laws in xi have modes around 4 Hz and the same damping
+steps of 0.1 m need A = I: with A = M, the light wrist would turn beyond its part of the box. The peer has 6 Hz and the
+damping ratio 0.7 in all directions of task and posture. The laws in xi have modes around 6 Hz and the same damping
 ratio. All laws hold the same postures: those of the peer come from the chart's inverse map.
 """
 
@@ -10,7 +10,7 @@ import argparse
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,8 +20,9 @@ from textbook_law import TextbookLaw
 
 import orthocas as oc
 from orthocas.checks import Array
+from orthocas.codegen import Supervisor
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
-from orthocas.control import ControlStatus, Impedance, PDPlus, Reference, posture_reference
+from orthocas.control import ControlStatus, Impedance, PDPlus, Reference, Safety, posture_reference
 from orthocas.control.matched_stiffness import SPRING_FREQUENCY
 from orthocas.control.status import FROM_THE_LAW
 from orthocas.errors import SimulationError, UnreachableReferenceError
@@ -36,6 +37,8 @@ PUSH = 20.0  # [N]
 RADIUS, PERIOD = 0.1, 2.0  # of the circle [m], [s]
 BITS, CUTOFF = 14, 100.0  # of the encoders; of the low pass behind the differences [Hz]
 COULOMB = (1.0, 1.0, 1.0, 1.0, 0.3, 0.3, 0.3)  # [N m]
+INTEGRAL = 3.0  # rate of the integral action [1/s]
+KNOWN, SLOW = 0.8, 0.02  # share of the friction that a law compensates; speed at which half of that is reached [rad/s]
 GIVEN_UP = 100  # ticks without the law, after which a run ends
 
 
@@ -45,6 +48,10 @@ class Motion:
 
     phi: Array  #: (N, 3, n), with two derivatives
     posture: Array  #: (N, 2, n), with one derivative
+
+    def at_end(self) -> "Motion":
+        """The last tick alone."""
+        return Motion(self.phi[-1:], self.posture[-1:])
 
 
 @dataclass(frozen=True)
@@ -102,7 +109,7 @@ class Encoders:
 
 @contextmanager
 def laws_on(chart: oc.Chart) -> Iterator[list[Law]]:
-    """The laws of the tables, compiled. The last one, a textbook law without a posture, is only for circles."""
+    """The laws of the tables, compiled: four for all, a textbook law without posture for circles, two for friction."""
     ours: dict[str, PDPlus | Impedance] = {
         "PD+ coupled": PDPlus.on_chart(chart),
         "PD+ decoupled": PDPlus.on_chart(chart, coupling="decoupled"),
@@ -116,6 +123,11 @@ def laws_on(chart: oc.Chart) -> Iterator[list[Law]]:
             laws.append(in_coordinates(name, law, library))
         for name, posture in (("textbook", True), ("textbook, posture only damped", False)):
             laws.append(textbook(name, TextbookLaw(library, chart.m, SPRING_FREQUENCY, 0.7, posture)))
+        law = PDPlus.on_chart(chart, inputs="extra_torque")
+        generated = oc.generate_c(chart, Path(folder) / "friction", law, "friction")
+        library = CompiledLibrary(compile_shared(generated, generated.folder), "friction", chart.n)
+        laws.append(integrating("PD+ coupled with integral action on x", law, library))
+        laws.append(compensating("PD+ coupled with 80 % of the friction compensated", law, library))
         yield laws
 
 
@@ -131,6 +143,30 @@ def in_coordinates(name: str, law: PDPlus | Impedance, library: CompiledLibrary)
         return float(law.stiffness[m:] @ e[m:] ** 2 / 2)
 
     return Law(name, command, hidden)
+
+
+def integrating(name: str, law: PDPlus, library: CompiledLibrary) -> Law:
+    """A supervised law with integral action on x. On xi as well, joints that stick would break loose one by one."""
+    rates = np.repeat([INTEGRAL, 0.0], [law.chart.m, law.chart.r])
+    supervisor = Supervisor(library, law, Safety.of(law, integral_rate=rates))
+
+    def command(q: Array, dq: Array, motion: Motion, k: int) -> tuple[Array, int]:
+        if k == 0:
+            supervisor.start(q)
+        return supervisor.step(q, dq, motion.phi[k].ravel(), TICK)
+
+    return Law(name, command, lambda q, motion: np.nan)
+
+
+def compensating(name: str, law: PDPlus, library: CompiledLibrary) -> Law:
+    """A law whose extra torque is most of the friction of the wanted motion."""
+    gains, n = gain_numbers(law), law.problem.n
+
+    def command(q: Array, dq: Array, motion: Motion, k: int) -> tuple[Array, int]:
+        gains[-n:] = KNOWN * np.array(COULOMB) * np.tanh(motion.posture[k, 1] / SLOW)
+        return library.control(q, dq, motion.phi[k], gains)
+
+    return Law(name, command, lambda q, motion: np.nan)
 
 
 def textbook(name: str, law: TextbookLaw) -> Law:
@@ -332,6 +368,23 @@ def imperfect(chart: oc.Chart, laws: list[Law], starts: Array, loops: dict[str, 
     return rows
 
 
+def against_friction(chart: oc.Chart, laws: list[Law], starts: Array) -> list[str]:
+    """The fourth table: what integral action and compensation do against Coulomb friction."""
+    rows = ["| Coulomb friction | x moves: largest, at the end | xi moves |", "| --- | --- | --- |"]
+    groups = ((chart.labels[: chart.m], STEP), (chart.labels[chart.m :], None))
+    moves = [[(q, step_of(chart, q, label, size)) for q in starts for label in labels] for labels, size in groups]
+    for law in laws:
+        words = []
+        for part in moves:
+            runs = [(motion, followed(law, chart.problem.robot, q, motion, Loop(coulomb=1.0))) for q, motion in part]
+            ends = [flange_error(chart, replace(run, q=run.q[-1:]), motion.at_end()) for motion, run in runs]
+            words.append(f"{max(flange_error(chart, run, motion) for motion, run in runs):.2f}, {max(ends):.2f}")
+            words[-1] += ", left" * any(run.status for _, run in runs)
+        rows.append(f"| {law.name} | {' | '.join(words)} |")
+        print("\n".join(rows[-1:] if len(rows) > 3 else rows), flush=True)
+    return rows
+
+
 def outcome(law: Law, chart: oc.Chart, moves: Moves, loop: Loop) -> str:
     """Errors of the flange, and what went wrong how often."""
     errors, bad = [], []
@@ -352,10 +405,11 @@ def main(quick: bool = False, robot: str = "iiwa") -> list[str]:
         starts = starts_of(chart.problem, 2 if quick else 5)
         with laws_on(chart) as laws:
             if metric == "inertia":
-                rows += against_textbook(chart, laws[:-1], starts)
-                rows += imperfect(chart, laws[:-1], starts[:3], loops)
+                rows += against_textbook(chart, laws[:4], starts)
+                rows += imperfect(chart, laws[:4], starts[:3], loops)
+                rows += against_friction(chart, [laws[0], *laws[5:], laws[3]], starts[:1] if quick else starts[:3])
             else:
-                rows += returning(chart, laws, starts, 3 if quick else 50)
+                rows += returning(chart, laws[:5], starts, 3 if quick else 50)
     return rows
 
 

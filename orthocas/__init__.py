@@ -23,12 +23,22 @@ if not (_Path(__file__).parent / "problems").is_dir():
     __path__.append(str(_Path(__file__).parent.parent))
 
 if TYPE_CHECKING:
-    from orthocas import control, errors, parametrisations, plotting, problems, simulation, solvers
+    from orthocas import (
+        control,
+        errors,
+        following,
+        obstacles,
+        parametrisations,
+        plotting,
+        problems,
+        simulation,
+        solvers,
+    )
     from orthocas.certificates import Certificate
     from orthocas.certifying.certify import certified_box, certify
     from orthocas.certifying.check import check_certificate
     from orthocas.chart import Chart, GrownChart, load
-    from orthocas.codegen import generate_c
+    from orthocas.codegen import compile_inverse, generate_c
     from orthocas.comparing.compare import compare
     from orthocas.comparing.report import Comparison
     from orthocas.distil import distil
@@ -38,7 +48,9 @@ if TYPE_CHECKING:
     from orthocas.fitting.loss import Weights
     from orthocas.fitting.loss import register as register_loss_term
     from orthocas.fitting.symbolic_loss import loss
+    from orthocas.following.follow import follow
     from orthocas.grow import grow
+    from orthocas.inverting import InverseStatus, Solutions, Tracker, TrackerStatus
     from orthocas.involutivity import Involutivity, involutivity, lie_bracket
     from orthocas.metrics import Metric
     from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
@@ -65,6 +77,7 @@ __all__ = [
     "Fourier",
     "Given",
     "GrownChart",
+    "InverseStatus",
     "Involutivity",
     "Linear",
     "Metric",
@@ -72,14 +85,18 @@ __all__ = [
     "Problem",
     "Report",
     "Robot",
+    "Solutions",
     "Task",
     "Torus",
+    "Tracker",
+    "TrackerStatus",
     "Weights",
     "certified_box",
     "certify",
     "check",
     "check_certificate",
     "compare",
+    "compile_inverse",
     "contains",
     "control",
     "cyclic_joints",
@@ -89,6 +106,8 @@ __all__ = [
     "evaluate",
     "export",
     "fit",
+    "follow",
+    "following",
     "generate_c",
     "grow",
     "involutivity",
@@ -96,6 +115,7 @@ __all__ = [
     "lie_bracket",
     "load",
     "loss",
+    "obstacles",
     "parametrisations",
     "plotting",
     "problems",
@@ -114,7 +134,7 @@ _HOMES = {
     "orthocas.certifying.certify": ["certified_box", "certify"],
     "orthocas.certifying.check": ["check_certificate"],
     "orthocas.chart": ["Chart", "GrownChart", "load"],
-    "orthocas.codegen": ["generate_c"],
+    "orthocas.codegen": ["compile_inverse", "generate_c"],
     "orthocas.comparing.compare": ["compare"],
     "orthocas.comparing.report": ["Comparison"],
     "orthocas.distil": ["distil"],
@@ -123,7 +143,9 @@ _HOMES = {
     "orthocas.fitting.fit": ["Fit", "fit"],
     "orthocas.fitting.loss": ["Weights", "register as register_loss_term"],
     "orthocas.fitting.symbolic_loss": ["loss"],
+    "orthocas.following.follow": ["follow"],
     "orthocas.grow": ["grow"],
+    "orthocas.inverting": ["InverseStatus", "Solutions", "Tracker", "TrackerStatus"],
     "orthocas.involutivity": ["Involutivity", "involutivity", "lie_bracket"],
     "orthocas.metrics": ["Metric"],
     "orthocas.parametrisations": [

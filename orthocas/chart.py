@@ -1,7 +1,7 @@
 """Charts phi(q) = [h(q); xi(q)]: task and extra coordinates together, with Jacobian and inverse map."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self, TypeVar, overload
@@ -17,6 +17,7 @@ from orthocas.checks import (
     Array,
     as_float_array,
     as_path,
+    as_point,
     as_point_set,
     require_at_least,
     require_kind,
@@ -25,10 +26,22 @@ from orthocas.checks import (
 )
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap, InvertibleMap
-from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
+from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError, SingularTaskError
 from orthocas.files.chart_file import fingerprint, read_chart, write_chart
 from orthocas.growing import GrownCoordinates
-from orthocas.inverting import FewRows, Inverse, Newton, OwnInverse, PhiMap, PointFunctions, Solutions
+from orthocas.inverting import (
+    FewRows,
+    Inverse,
+    LocalSolver,
+    Nearest,
+    Newton,
+    OwnInverse,
+    PhiMap,
+    PointFunctions,
+    Solutions,
+    Tracker,
+    inverse_function,
+)
 from orthocas.judging.pointwise import PointQuality, point_quality
 from orthocas.problem import Problem, task_jacobians, task_sizes
 from orthocas.reaching.intervals import XiRange, xi_range
@@ -36,7 +49,7 @@ from orthocas.reaching.self_motion import SelfMotion, self_motion
 from orthocas.showing import Shown, listed
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
-FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian")
+FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "inverse")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -280,7 +293,15 @@ class Chart(Shown):
         q = self.solve(targets, q_start, tolerance=tolerance).require(inside=False).q
         return q[0] if single else q
 
-    def solve(self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
+    def solve(
+        self,
+        phi: ArrayLike,
+        q_start: ArrayLike | None = None,
+        *,
+        tolerance: float = 1e-9,
+        inside: bool = False,
+        local: LocalSolver | None = None,
+    ) -> Solutions:
         """Solve phi(q) = phi for q, with a status for each row: a row that fails does not disturb the others.
 
         Newton's method works on all rows at once. With `q_start`, it searches from there only, and q is the solution
@@ -292,12 +313,17 @@ class Chart(Shown):
             phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
             q_start: initial guess (n,), or (N, n) with one guess per row of phi.
             tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
+            inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
+                other starts, get the q inside with the same x and the nearest xi that Ipopt finds (10 ms a row),
+                status NEAREST, or OUT_OF_REACH if none has that x. Not for grown coordinates.
+            local: another solver of phi(q) = phi near given starts; `orthocas.compile_inverse` has one.
 
         Returns:
             `Solutions` with q (N, n), status, iterations, error and distance (N,); N = 1 for one phi.
 
         Raises:
             ShapeError: if a row has another number of entries, or q_start another number of rows.
+            NoExpressionError: if `inside` is asked of grown coordinates.
 
         Source:
             ours: docs/inverse.md.
@@ -311,13 +337,64 @@ class Chart(Shown):
             if len(starts) not in (1, len(targets)):
                 raise ShapeError("q_start", starts.shape, targets.shape)
             starts = np.broadcast_to(starts, targets.shape)
-        return self._inverse.solve(targets, starts, float(tolerance))
+        require_kind("inside", inside, bool)
+        if local is not None and not callable(local):
+            raise InvalidValueError("local", repr(local)[:80], "a function of targets and starts")
+        if inside:
+            self._require_expression("inside=True")
+        inverse = self._inverse if local is None else replace(self._inverse, local=local)
+        return inverse.solve(targets, starts, float(tolerance), inside)
+
+    def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
+        """All q inside the domain with phi(q) = phi that a search from 1,026 starts finds.
+
+        A chart that does not fold has one at most. The search is no proof: it may miss solutions near folds.
+
+        Args:
+            phi: target values, (n,).
+            tolerance: as in `solve`.
+
+        Returns:
+            Different solutions, the one nearest to the centre of the domain first, (k, n).
+
+        Raises:
+            NoExpressionError: if the coordinates are grown.
+
+        Example:
+            >>> import numpy as np
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[1.0, 1.0])
+            >>> problem = oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Box([0.5, 0.5], 1.0))
+            >>> chart = oc.fit(problem, oc.Linear()).chart  # it folds
+            >>> len(chart.solutions(chart.phi([0.4, 0.3])))
+            2
+        """
+        require_at_least("tolerance", tolerance, 0)
+        self._require_expression("a search for all solutions")
+        return self._inverse.all_inside(as_point("phi", phi, self.n), float(tolerance))
+
+    def tracker(self, q0: ArrayLike, largest_step: ArrayLike | None = None) -> Tracker:
+        """A tracker that follows a stream of phi from q0; see `Tracker`.
+
+        Args:
+            q0: a joint position inside the domain, (n,).
+            largest_step: largest change of each joint in a call, (n,) or one number [rad] or [m]; default: a tenth of
+                the half-widths of the domain.
+
+        Raises:
+            NoExpressionError: if the coordinates are grown.
+            InvalidValueError: if q0 lies outside the domain, or J is singular there.
+        """
+        self._require_expression("a tracker")
+        return Tracker(self._point_functions, self.problem.domain, q0, largest_step)
 
     def function(self, name: str) -> ca.Function:
-        """The CasADi function behind a method: xi, phi, jacobian, task, task_jacobian or second_derivative.
+        """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.
 
         The input q is a column (n, 1). second_derivative takes q, v, w (n, 1) and returns d^2 phi(q)[v, w] =
-        (d/ds) J(q + s v) w, (n, 1). For v = dq this is dJ/dt w.
+        (d/ds) J(q + s v) w, (n, 1). For v = dq this is dJ/dt w. inverse takes phi and q_start (n, 1), and returns q
+        (n, 1) with phi(q) = phi, or NaN where Newton's method finds none. Its derivatives are those of the implicit
+        function theorem, of any order; so it can be part of an optimal control problem.
 
         Raises:
             UnknownNameError: if there is no such function.
@@ -326,6 +403,8 @@ class Chart(Shown):
         require_known("chart function", name, FUNCTIONS)
         if name == "task":
             return self.problem.task.function
+        if name == "inverse":
+            return self._inverse_function
         return self.problem.task.jacobian_function if name == "task_jacobian" else self._functions[name]
 
     def _expression(self, name: str, q: Any) -> Any:
@@ -383,12 +462,25 @@ class Chart(Shown):
         return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
 
     @cached_property
+    def phi_map(self) -> PhiMap:
+        """phi and J for solvers of phi(q) = phi."""
+        return PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes)
+
+    @cached_property
     def _inverse(self) -> Inverse:
-        phi_map = PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes)
+        phi_map = self.phi_map
         if isinstance(self.coordinates, InvertibleMap):
             return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map, self.m))
-        points = PointFunctions.of(self.function("phi"), self.function("jacobian"))
-        return Inverse(self.problem, phi_map, FewRows(phi_map, points, Newton(phi_map)))
+        local = FewRows(phi_map, self._point_functions, Newton(phi_map))
+        return Inverse(self.problem, phi_map, local, Nearest(self.problem, self.function("phi"), phi_map))
+
+    @cached_property
+    def _inverse_function(self) -> ca.Function:
+        return inverse_function(self.function("phi"), self.phi_sizes)
+
+    @cached_property
+    def _point_functions(self) -> PointFunctions:
+        return PointFunctions.of(self.function("phi"), self.function("jacobian"), self.phi_sizes)
 
     def _jacobian_or_nan(self, points: Array) -> Array:
         """J at points (N, n), with NaN where the task has no finite Jacobian."""
@@ -397,6 +489,11 @@ class Chart(Shown):
         except SingularTaskError:
             J_x = self.problem.task.batched_jacobian(points)[0].reshape(-1, self.m, self.n)
             return np.concatenate([J_x, self.coordinates.jacobian(points)], axis=1)
+
+    def _require_expression(self, what: str) -> None:
+        """Raise NoExpressionError if the coordinates are grown."""
+        if isinstance(self.coordinates, InvertibleMap):
+            raise NoExpressionError(f"{what} needs coordinates with a CasADi expression; received grown coordinates")
 
     def _rows(self, name: str, value: ArrayLike) -> Array:
         """One point or a set, as `as_point_set` takes them, but finite or not, (N, n)."""

@@ -187,6 +187,14 @@ class UnreachableReferenceError(OrthocasError, ValueError):
     """A reference leaves what the robot can reach inside the domain."""
 
 
+class PathError(OrthocasError, ValueError):
+    """A tool path cannot be followed: it leaves the reach, a limit, or the space between obstacles."""
+
+
+class PathFileError(ArchiveError):
+    """A file of a tool path or of joint positions cannot be read or written."""
+
+
 class GrowError(OrthocasError, ValueError):
     """Coordinates cannot be grown with the given arguments."""
 

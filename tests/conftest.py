@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from charts import with_metric
 from programs import Run
 
 import orthocas as oc
@@ -92,6 +93,14 @@ def planar_fit(planar_x: oc.Problem) -> Fit:
 def planar_chart(planar_x: oc.Problem) -> oc.Chart:
     """Task x, A = M, orthogonal to 0.2 degrees, with gradients of even lengths: for controllers."""
     return oc.fit(planar_x, oc.Polynomial(degree=8), weights=(1000, 30, 150, 0.1)).chart
+
+
+@pytest.fixture(scope="session")
+def arm_chart() -> oc.Chart:
+    """The 7-DoF arm with A = M, roughly fitted: laws have to be right for any regular chart."""
+    problem = oc.problems.get("iiwa")
+    inertial = with_metric(problem, "inertia")
+    return oc.fit(inertial, oc.Polynomial(2)).chart
 
 
 @pytest.fixture(scope="session")

@@ -144,6 +144,16 @@ def certificate() -> oc.Certificate:
     return oc.certify(fitted().chart)
 
 
+@cache
+def joint_motion() -> oc.following.JointMotion:
+    x = fitted().chart.task(planar().domain.centre)
+    return oc.follow(fitted().chart, [x, x + 0.05, x], velocity_limits=1.0, period=0.05)
+
+
+def link_distances() -> oc.obstacles.LinkDistances:
+    return oc.obstacles.LinkDistances(planar().robot, [oc.obstacles.Sphere([0.5, 0.0, 0.5], 0.1)], 0.05)
+
+
 def run_time_model() -> control.RunTimeModel:
     return control.RunTimeModel(payload=1.0, wrench=np.zeros(6), extra_torque=0.1)
 
@@ -213,8 +223,16 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "quality of points": lambda: fitted().chart.quality(points_of(fitted().chart)),
     "range of coordinates": lambda: fitted().chart.xi_range(planar().domain.centre),
     "interval": lambda: fitted().chart.xi_range(planar().domain.centre)["xi1"],
+    "joint motion": joint_motion,
+    "margins": lambda: joint_motion().margins,
+    "sphere": lambda: oc.obstacles.Sphere([0.5, 0.0, 0.5], 0.1),
+    "capsule": lambda: oc.obstacles.Capsule([0.5, 0.0, 0.0], [0.5, 0.0, 1.0], 0.1),
+    "plane": lambda: oc.obstacles.Plane([0.0, 0.0, 1.0], [0.0, 0.0, -0.1]),
+    "distances of links": link_distances,
     "self-motion": lambda: fitted().chart.self_motion(planar().domain.centre, samples=30),
     "self-motion curve": lambda: cyclic().self_motion(cyclic().problem.domain.centre),
+    "solutions": lambda: fitted().chart.solve([[1.6, 0.1, 0.1], [9.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]),
+    "tracker": lambda: fitted().chart.tracker(planar().domain.centre),
     "involutivity": lambda: oc.involutivity(planar(), 100),
     "singular point": lambda: oc.singular_points(problems.get("planar_2r"))[0],
     "jump": lambda: oc.jumps(circle())[0],
@@ -284,6 +302,13 @@ def _of_chart(chart: oc.Chart) -> Iterator[Any]:
 
 
 @_numbers.register
+def _of_tracker(tracker: oc.Tracker) -> Iterator[Any]:
+    q = tracker.q
+    yield from (q, tracker.step(fitted().chart.phi(q) + 1e-3), tracker.status, tracker.largest_step)
+    tracker.reset(q)
+
+
+@_numbers.register
 def _of_robot(robot: oc.Robot) -> Iterator[Any]:
     q = np.linspace(-1, 1, 2 * robot.n).reshape(2, robot.n)
     yield from (robot.joint_names, robot.mass_matrix(q), robot.bias(q, q), robot.tip_position(q), robot.upper)
@@ -304,6 +329,11 @@ def _of_problem(problem: oc.Problem) -> Iterator[Any]:
 @_numbers.register
 def _of_domain(domain: oc.Box | oc.Torus) -> Iterator[Any]:
     yield from (domain.name, sample_uniform(domain, 5, 0))
+
+
+@_numbers.register
+def _of_distances(distances: oc.obstacles.LinkDistances) -> Iterator[Any]:
+    yield from (distances.pairs, distances(np.linspace(-1, 1, 6).reshape(2, 3)))
 
 
 @_numbers.register

@@ -1,4 +1,4 @@
-"""Control laws against formulas written out with NumPy and Pinocchio's matrices, and what they do in bad states."""
+"""Control laws against formulas written out with NumPy and Pinocchio's matrices."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from charts import linear_on_the_torus, with_metric
-from scipy.linalg import block_diag, eigvalsh, sqrtm
+from charts import with_metric
+from laws import torque
+from scipy.linalg import block_diag, sqrtm
 
 import orthocas as oc
-from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array
 from orthocas.control import (
     ControlStatus,
@@ -20,30 +20,16 @@ from orthocas.control import (
     PDPlus,
     Projector,
     Reference,
-    matched_posture_stiffness,
-    matched_stiffness,
 )
 from orthocas.control.controller import Controller
-from orthocas.control.status import FROM_THE_LAW
 from orthocas.domains import sample_uniform
 from orthocas.errors import (
-    InvalidValueError,
     NoExpressionError,
-    ShapeError,
-    UnknownNameError,
     UnreachableReferenceError,
 )
 from orthocas.problems.iiwa import urdf_path
 
 RNG = np.random.default_rng(21)
-
-
-@pytest.fixture(scope="module")
-def arm_chart() -> oc.Chart:
-    """The 7-DoF arm with A = M, roughly fitted: laws have to be right for any regular chart."""
-    problem = oc.problems.get("iiwa")
-    inertial = with_metric(problem, "inertia")
-    return oc.fit(inertial, oc.Polynomial(2)).chart
 
 
 @dataclass
@@ -77,12 +63,6 @@ class State:
 def model() -> pin.Model:
     with urdf_path() as path:
         return pin.buildModelFromUrdf(str(path))
-
-
-def torque(controller: Controller, *state: Array, **gains: Any) -> tuple[Array, int]:
-    values = {**controller.gains, **gains}
-    command, status = controller.function(*state, *values.values())
-    return command.full().ravel(), int(status)
 
 
 def called(controller: Controller, s: State) -> Array:
@@ -248,147 +228,6 @@ def test_pseudo_inverse_control_moves_the_tool_and_nothing_else() -> None:
     np.testing.assert_allclose(J @ found, rate[:3], rtol=1e-10)
 
 
-@pytest.fixture(scope="module")
-def laws(planar_chart: oc.Chart) -> list[Controller]:
-    problem = planar_chart.problem
-    limit = 30.0
-    return [
-        Impedance(planar_chart, 50.0, limit=limit),
-        PDPlus(planar_chart, 50.0, coupling="decoupled", limit=limit),
-        Kinematic(planar_chart, 1.0, limit=limit),
-        Projector(problem, 50.0, 10.0, limit=limit),
-        KinematicProjector(problem, 1.0, 1.0, limit=limit),
-    ]
-
-
-class TestGuard:
-    """Bad states give a status and a finite, bounded command."""
-
-    @staticmethod
-    def run(law: Controller, q: Any, dq: Any = 0.0, reference: Any = 0.0) -> tuple[Array, int]:
-        n, k = law.problem.n, len(law.labels)
-        value = np.broadcast_to(reference, (k,))
-        return torque(law, np.broadcast_to(q, (n,)), np.broadcast_to(dq, (n,)), value, np.zeros(k), np.zeros(k))
-
-    def test_outside_the_domain_is_gravity_or_rest(self, laws: list[Controller], planar_x: oc.Problem) -> None:
-        q = planar_x.domain.centre + 1.01 * planar_x.domain.half_width
-        gravity = np.clip(planar_x.robot.gravity(q), -30, 30)
-        for law in laws[:3]:
-            command, status = self.run(law, q, 1.0)
-            assert status == ControlStatus.OUTSIDE_DOMAIN
-            np.testing.assert_allclose(command, gravity if law.command == "torque" else 0.0, atol=1e-12)
-        for law in laws[3:]:
-            assert self.run(law, q, 1.0)[1] in FROM_THE_LAW  # projectors have no domain
-
-    def test_singular_task_is_told(self, laws: list[Controller]) -> None:
-        for law in laws[3:]:
-            command, status = self.run(law, [0.0, 0.0, 0.0], 1.0)  # stretched along x: dx/dq = 0
-            assert status == ControlStatus.SINGULAR
-            assert np.isfinite(command).all()
-
-    def test_singular_chart_is_told(self) -> None:
-        chart = linear_on_the_torus()
-        for law in (Impedance(chart, 50.0), PDPlus(chart, 50.0), Kinematic(chart)):
-            command, status = self.run(law, [0.0, 0.0, 0.0], 1.0)
-            assert status == ControlStatus.SINGULAR
-            want = chart.problem.robot.gravity(np.zeros(3)) if law.command == "torque" else np.zeros(3)
-            np.testing.assert_allclose(command, want, atol=1e-12)
-
-    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
-    def test_not_finite_input_is_told_wherever_it_comes(self, laws: list[Controller], bad: float) -> None:
-        for law in laws:
-            centre, n = law.problem.domain.centre, law.problem.n
-            for q, dq, reference in (([0, bad, 0], 0.0, 0.0), (centre, [bad, 0, 0], 0.0), (centre, 0.0, bad)):
-                command, status = self.run(law, q, dq, reference)
-                assert status == ControlStatus.NOT_FINITE
-                assert np.isfinite(command).all()
-                assert np.abs(command).max() <= 30
-            gains = {name: np.full(len(value), bad) for name, value in law.gains.items() if name != "limit"}
-            k = len(law.labels)
-            command, status = torque(law, centre, np.zeros(n), *np.zeros((3, k)), **gains)
-            assert status == ControlStatus.NOT_FINITE
-
-    def test_random_states_of_any_size_give_finite_bounded_commands(self, laws: list[Controller]) -> None:
-        count = 2000
-        for law in laws:
-            n, k = law.problem.n, len(law.labels)
-            scale = 10.0 ** RNG.uniform(-3, 120, (count, 1))
-            arrays = [RNG.normal(size=(count, size)) * scale for size in (n, n, k, k, k)]
-            arrays[0][::2] = sample_uniform(law.problem.domain, count // 2, 4)
-            command, status = Batched(law.function)(*arrays, *(np.tile(g, (count, 1)) for g in law.gains.values()))
-            assert np.isfinite(command).all()
-            assert np.abs(command).max() <= 30
-            assert set(np.unique(status)) <= {s.value for s in ControlStatus}
-            assert len(np.unique(status)) >= 2
-
-    @pytest.mark.parametrize("bad", [np.nan, -5.0, 0.0])
-    def test_limit_that_is_none_stops_the_robot(self, laws: list[Controller], bad: float) -> None:
-        for law in laws:
-            n, k = law.problem.n, len(law.labels)
-            command, status = torque(
-                law,
-                law.problem.domain.centre,
-                *np.zeros((1, n)),
-                np.full(k, 5.0),
-                *np.zeros((2, k)),
-                limit=np.full(n, bad),
-            )
-            assert status == ControlStatus.NOT_FINITE
-            np.testing.assert_array_equal(command, 0.0)
-
-    def test_limit_cuts_the_command(self, planar_chart: oc.Chart) -> None:
-        q, far = planar_chart.problem.domain.centre, np.full(3, 10.0)
-        free, ok = torque(Impedance(planar_chart, 50.0), q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))
-        law = Impedance(planar_chart, 50.0, limit=[5, 6, 7])
-        cut, status = torque(law, q, *np.zeros((1, 3)), far, *np.zeros((2, 3)))
-        np.testing.assert_allclose(cut, np.clip(free, [-5, -6, -7], [5, 6, 7]))
-        assert np.abs(free).max() > 7
-        assert (ok, status) == (ControlStatus.OK, ControlStatus.SATURATED)
-
-    @pytest.mark.parametrize("limit", [0.3, [0.2, 1.0, 0.4]])
-    def test_limit_of_velocities_keeps_their_direction(self, planar_chart: oc.Chart, limit: Any) -> None:
-        problem, wanted = planar_chart.problem, np.array([0.5, -0.3, 0.2])
-        q = problem.domain.centre
-        for law, of in ((Kinematic, planar_chart), (KinematicProjector, problem)):
-            k = len(law(of).labels)
-            rate = np.resize(wanted, k)
-            free, _ = torque(law(of), q, np.zeros(3), np.zeros(k), rate, np.zeros(k))
-            cut, status = torque(law(of, limit=limit), q, np.zeros(3), np.zeros(k), rate, np.zeros(k))
-            share = (np.broadcast_to(limit, 3) / np.abs(free)).min()
-            assert share < 1
-            np.testing.assert_allclose(cut, share * free, rtol=1e-12)
-            assert status == ControlStatus.SATURATED
-
-    def test_fallback_is_gravity_or_rest(self, laws: list[Controller]) -> None:
-        for law in laws:
-            q = law.problem.domain.centre
-            command = law.fallback(q, *law.gains.values()).full().ravel()
-            want = law.problem.robot.gravity(q) if law.command == "torque" else 0 * q
-            np.testing.assert_allclose(command, want, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "words"),
-    [
-        (lambda c: Impedance(c, 0.0), InvalidValueError, r"stiffness\[0\] is 0.0, expected positive"),
-        (lambda c: Impedance(c, [1, 2]), ShapeError, r"stiffness has shape \(2,\), expected \(3,\)"),
-        (lambda c: PDPlus(c, [1, np.nan, 1]), InvalidValueError, r"stiffness\[1\] is nan"),
-        (lambda c: PDPlus(c, 1.0, -0.1), InvalidValueError, r"damping_ratio\[0\] is -0.1"),
-        (lambda c: PDPlus(c, 1.0, coupling="loose"), UnknownNameError, "unknown coupling 'loose'"),
-        (lambda c: PDPlus(c, 1.0, damping="none"), UnknownNameError, "unknown damping 'none'"),
-        (lambda c: PDPlus(c, 1.0, limit=-1.0), InvalidValueError, r"limit\[0\] is -1.0"),
-        (lambda c: PDPlus(c, "stiff"), InvalidValueError, "stiffness is 'stiff'"),
-        (lambda c: Kinematic(c, -1.0), InvalidValueError, r"feedback\[0\] is -1.0"),
-        (lambda c: Projector(c.problem, 1.0, 0.0), InvalidValueError, r"posture_stiffness\[0\] is 0.0"),
-        (lambda c: Projector(c.problem, [1, 1], 1.0), ShapeError, r"stiffness has shape \(2,\)"),
-        (lambda c: KinematicProjector(c.problem, 0.0, [1, 1]), ShapeError, "posture_feedback"),
-    ],
-)
-def test_bad_gains_are_refused(planar_chart: oc.Chart, make: Any, error: type[Exception], words: str) -> None:
-    with pytest.raises(error, match=words):
-        make(planar_chart)
-
-
 def test_grown_charts_are_refused_with_a_way_out(planar_x: oc.Problem) -> None:
     grown = oc.grow(planar_x, leaf="linear")
     for law in (lambda: Impedance(grown, 1.0), lambda: Kinematic(grown)):
@@ -416,101 +255,3 @@ def test_posture_beyond_joint_limits_is_reported() -> None:
     reference = Reference.steps(law.labels, start, [(1.0, {name: 3.0})], 3.0)
     with pytest.raises(UnreachableReferenceError, match=rf"joint '{name}' at 2\.\d+ at t = 1\.\d+ s, expected within"):
         law.require_reachable(reference, problem.domain.centre)
-
-
-def test_matched_stiffness_has_its_modes_around_the_frequency(planar_chart: oc.Chart, arm_chart: oc.Chart) -> None:
-    """The geometric mean of the generalised eigenvalues of (K, M_phi) is omega^2, and no other K has less spread."""
-    for chart in (planar_chart, arm_chart):
-        inertias = _inertias(chart)
-        K = matched_stiffness(chart, 3.0)
-        logs = np.array([np.log(eigvalsh(np.diag(K), inertia) / 9.0) for inertia in inertias])
-        assert abs(logs.mean()) < 1e-5
-        least = (logs**2).sum(axis=1).mean()
-        rng = np.random.default_rng(3)
-        for factors in np.exp(0.05 * rng.normal(size=(10, chart.n))):
-            others = [np.log(eigvalsh(np.diag(K * factors), inertia) / 9.0) for inertia in inertias]
-            assert (np.square(others)).sum(axis=1).mean() > least
-
-
-def test_matched_stiffness_is_exact_where_the_inertia_is_constant_and_diagonal() -> None:
-    """Two sliding joints at right angles: x and xi move 3 kg and 2 kg, whatever the posture."""
-    model = pin.Model()
-    body = pin.SE3.Identity()
-    outer = model.addJoint(0, pin.JointModelPX(), body, "px")
-    inner = model.addJoint(outer, pin.JointModelPY(), body, "py")
-    for joint, mass in ((outer, 1.0), (inner, 2.0)):
-        model.appendBodyToJoint(joint, pin.Inertia(mass, np.zeros(3), np.eye(3)), body)
-    model.addFrame(pin.Frame("tip", inner, 0, body, pin.FrameType.OP_FRAME))
-    robot = oc.Robot.from_model(model, "tip")
-    problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box(np.zeros(2), 1.0))
-    chart = oc.fit(problem, oc.Linear()).chart
-    np.testing.assert_allclose(matched_stiffness(chart, 5.0), [75.0, 50.0 / chart.jacobian(np.zeros(2))[1, 1] ** 2])
-    np.testing.assert_allclose(matched_posture_stiffness(problem, 5.0), [75.0, 50.0])
-    with pytest.raises(InvalidValueError, match="frequency"):
-        matched_stiffness(chart, 0.0)
-
-
-@pytest.mark.parametrize(("coupling", "damping"), [("coupled", "square_root"), ("decoupled", "double_diagonal")])
-def test_modes_are_those_of_the_simulated_dynamics(arm_chart: oc.Chart, coupling: Any, damping: Any) -> None:
-    """Stiffness and damping of the loop, from finite differences of the robot's acceleration under the law at rest."""
-    law = Impedance(arm_chart, matched_stiffness(arm_chart), 0.4, coupling, damping)
-    q, n = arm_chart.problem.domain.centre, arm_chart.n
-    phi, zero = arm_chart.phi(q), np.zeros(n)
-
-    def acceleration(state: Array) -> Array:
-        tau, _ = torque(law, state[:n], state[n:], phi, zero, zero)
-        return arm_chart.problem.robot.forward_dynamics(state[:n], state[n:], tau)
-
-    state, h = np.concatenate([q, zero]), 1e-5
-    columns = [(acceleration(state + h * unit) - acceleration(state - h * unit)) / (2 * h) for unit in np.eye(2 * n)]
-    slopes = np.array(columns).T
-    modes = law.modes(q)
-    np.testing.assert_allclose(
-        np.sort(np.sqrt(np.linalg.eigvals(-slopes[:, :n]).real)) / (2 * np.pi), modes.frequencies, 1e-5
-    )
-    rates = 2 * modes.damping_ratios * 2 * np.pi * modes.frequencies
-    assert rates.sum() == pytest.approx(-np.trace(slopes[:, n:]), rel=1e-6)
-    if damping == "double_diagonal" and coupling == "coupled":
-        np.testing.assert_allclose(modes.damping_ratios, 0.4, rtol=1e-6)
-
-
-def test_a_mode_is_unstable_beyond_its_delay(planar_chart: oc.Chart) -> None:
-    """A root of s^2 + (2 zeta omega s + omega^2) e^(-sT) crosses the imaginary axis at the longest delay T."""
-    modes = PDPlus(planar_chart, matched_stiffness(planar_chart), 0.7).modes(planar_chart.problem.domain.centre)
-    for frequency, ratio, delay in zip(modes.frequencies, modes.damping_ratios, modes.delays, strict=True):
-        omega = 2 * np.pi * frequency
-
-        def largest_real_part(T: float, omega: float = omega, ratio: float = ratio) -> float:
-            s = 1j * omega * 1.5
-            for _ in range(50):  # Newton
-                late = np.exp(-s * T)
-                value = s**2 + (2 * ratio * omega * s + omega**2) * late
-                slope = 2 * s + (2 * ratio * omega - T * (2 * ratio * omega * s + omega**2)) * late
-                s -= value / slope
-            return float(s.real)
-
-        assert largest_real_part(0.98 * delay) < 0 < largest_real_part(1.02 * delay)
-
-
-def test_default_gains_hold_an_arm_whose_masses_are_off() -> None:
-    """Static solution of J^T K e = 0.2 g on the plant with 1.2 times the mass: sag up to 20 mm, inside the domain."""
-    problem = oc.problems.get("iiwa")
-    chart = oc.fit(problem, oc.Polynomial(3), weights=(1000, 30, 150, 1)).chart
-    law, plant = PDPlus.on_chart(chart), problem.robot.with_scaled_masses(1.2)
-    rng = np.random.default_rng(5)
-    for start in problem.domain.centre + 0.6 * problem.domain.half_width * rng.uniform(-1, 1, (5, 7)):
-        q = start
-        for _ in range(30):
-            wrong = plant.gravity(q) - problem.robot.gravity(q)
-            e = -np.linalg.solve(chart.jacobian(q).T, wrong) / law.stiffness
-            q = chart.inverse(chart.phi(start) + e, q)
-        assert oc.contains(problem.domain, q)
-        sag = np.linalg.norm(problem.robot.tip_position(q) - problem.robot.tip_position(start))
-        assert 1e-3 < sag < 0.02
-
-
-def _inertias(chart: oc.Chart) -> Array:
-    points = sample_uniform(chart.problem.domain, 256, 0)
-    J, M = chart.jacobian(points), chart.problem.robot.mass_matrix(points)
-    half = np.linalg.inv(J)
-    return np.asarray(half.transpose(0, 2, 1) @ M @ half)

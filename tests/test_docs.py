@@ -81,6 +81,28 @@ def test_python_blocks_of_the_page_on_batches_run(run: Run, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
+def test_python_blocks_of_the_page_on_the_inverse_run(tmp_path: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "inverse.md").read_text(), flags=re.DOTALL)
+    printed = python("\n".join(blocks), tmp_path).splitlines()
+    assert printed[0].startswith("Solutions: ")
+    assert printed[0].endswith(" OUT_OF_REACH")
+    assert printed[3:7] == ["True", "True True", "True", "LOST True"]
+    over_xi, over_q = printed[7].split()
+    assert over_xi == over_q
+
+
+@pytest.mark.slow
+def test_python_blocks_of_the_page_on_paths_run(tmp_path: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "paths.md").read_text(), flags=re.DOTALL)
+    printed = python("\n".join(blocks), tmp_path)
+    assert printed.startswith("Interval: xi1 in [")
+    assert "SelfMotionCurve: curve of length" in printed
+    assert "obstacle 0 are" in printed
+    assert "closed path" in printed
+    assert (tmp_path / "q.csv").read_text().startswith("time_s,q1,q2,q3,d_q1")
+
+
+@pytest.mark.slow
 @needs_c
 @needs_cmake
 @pytest.mark.usefixtures("checkout")

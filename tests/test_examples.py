@@ -12,20 +12,26 @@ import distillation
 import domain_size
 import fits
 import folds
+import follow_path
+import following
 import front
 import gallery
 import growing_queries
 import iiwa_demo
+import inverse
 import involutivity
 import ipopt_front
 import metric_loss
 import numpy as np
 import paper_network
 import pytest
+import quality_and_time
 import scaling
 import starts
 import suggested_domains
+import supervised_tick
 from PIL import Image
+from programs import needs_c
 
 import orthocas as oc
 from orthocas.reproduce.registry import FIGURES
@@ -52,6 +58,32 @@ def test_fold_benchmark_finds_none() -> None:
     *_, searched, uniform, heavy, count = (float(word) for word in line.strip("| ").split("|")[1:])
     assert count == 0
     assert searched <= min(uniform, heavy)
+
+
+@pytest.mark.slow
+def test_benchmark_of_paths_keeps_limits_and_closes() -> None:
+    rows = following.main(quick=True)
+    assert len(rows) == 6
+    for line in rows[:3]:
+        cells = [cell.strip() for cell in line.strip("| ").split("|")]
+        assert all(float(share.strip(" %")) <= 100 for share in cells[4].split(","))
+        assert float(cells[-1]) < 1e-9
+
+
+@pytest.mark.slow
+def test_path_past_a_post(tmp_path: Path) -> None:
+    found = follow_path.main(tmp_path, quick=True)
+    assert found["hold: distance from the post [m]"] < 0
+    assert found["objective: distance from the post [m]"] > follow_path.CLEARANCE
+    assert found["objective: joints away from their start at the end [rad]"] < 1e-9
+    with Image.open(tmp_path / "follow_path.png") as picture:
+        assert picture.size[0] > 1000
+
+
+def test_quality_and_time_are_drawn_for_two_degrees(tmp_path: Path) -> None:
+    low, high = quality_and_time.main(tmp_path, quick=True)
+    assert high.task < low.task
+    assert (tmp_path / "front_seconds.png").stat().st_size > 10_000
 
 
 def test_certificate_benchmark_proves_its_box() -> None:
@@ -186,6 +218,24 @@ def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[st
     assert found["iiwa_domination"] < 0.02
     assert found["planar_3r_xy_domination"] < 0.02
     assert capsys.readouterr().out.count("\n") == 4
+
+
+@needs_c
+@pytest.mark.slow
+def test_the_flange_moves_alike_in_single_precision(capsys: pytest.CaptureFixture[str]) -> None:
+    found = supervised_tick.main(quick=True)
+    assert found["flange"] < 1e-5
+    assert 1e-8 < found["proof"] < 1e-4
+    assert len(re.findall(r"\| (?:double|float) \|", capsys.readouterr().out)) == 2
+
+
+@pytest.mark.slow
+@needs_c
+def test_benchmark_of_the_inverse_finds_every_row(capsys: pytest.CaptureFixture[str]) -> None:
+    found = inverse.main(quick=True)
+    assert {found[f"{solver}, none found"] for solver in ("NumPy", "compiled C")} == {1.0}
+    assert {value for name, value in found.items() if name.endswith("wrong")} == {0}
+    assert len(re.findall(r"\| (?:NumPy|compiled C) \|", capsys.readouterr().out)) == 8
 
 
 @pytest.mark.slow

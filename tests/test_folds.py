@@ -10,13 +10,16 @@ from orthocas.domains import sample_heavily
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fold_search import FoldSearch
-from orthocas.fitting.loss import LEAST_CONDITIONING, Weights
-from orthocas.fitting.mirror import find_mirror
+from orthocas.fitting.loss import LEAST_CONDITIONING, Loss, Sizes, Weights
+from orthocas.fitting.loss.residuals import sample_loss
+from orthocas.fitting.mirror import Mirror, find_mirror
 from orthocas.judging.gradients import Judged
+from orthocas.parametrisations import JointSpace
 from orthocas.samples import sample_problem
 from orthocas.worst_points import worst_points
 
 ACTIVE = list(range(6))
+SPACE = JointSpace(np.zeros(2), np.ones(2), (False, False), ("a", "b"))
 SIGNS = (-1, 1, -1, 1, -1, 1)  # joints that turn about the arm's plane turn round in the mirror
 
 
@@ -42,13 +45,38 @@ def test_a_planar_arm_out_of_line_has_no_mirror(planar_xy: oc.Problem) -> None:
     assert find_mirror(planar_xy, [0, 1, 2]) is None
 
 
-def test_fitted_coordinates_are_even_or_odd_in_the_mirror(iiwa_fit: Fit) -> None:
+def test_fitted_coordinates_keep_their_size_or_change_places_in_the_mirror(iiwa_fit: Fit) -> None:
+    """xi(S q) = T xi(q) with a signed permutation T. Two odd components and an even one give the trace -1."""
     chart = iiwa_fit.chart
     u = np.random.default_rng(1).uniform(-0.7, 0.7, (50, 7))
-    here, there = (chart.xi(chart.problem.domain.centre + side) for side in (u, np.array([*SIGNS, 1]) * u))
-    signs = np.sign(np.einsum("sj,sj->j", here, there))
-    np.testing.assert_allclose(there, signs * here, atol=1e-9)
-    assert sorted(signs[:3]) == [-1, -1, 1]
+    here, there = (chart.xi(chart.problem.domain.centre + side)[:, :3] for side in (u, np.array([*SIGNS, 1]) * u))
+    T = np.linalg.lstsq(here, there, rcond=None)[0].T
+    np.testing.assert_allclose(there, here @ T.T, atol=1e-6)  # a linear relation, up to the scales of coordinates
+    assert (np.abs(T) > 1e-6).sum() == 3
+    assert np.linalg.det(T) == pytest.approx(1, abs=1e-6)
+    assert np.trace(T) == pytest.approx(-1, abs=1e-6)
+
+
+def test_coordinates_that_change_places_come_from_components_and_back() -> None:
+    theta = np.arange(6.0)
+    mirror = Mirror(SPACE, np.ones(2), np.array([-1.0, -1.0, 1.0]), exchanged=((1, 2),))
+    C = mirror.coordinates(theta).reshape(3, 2)
+    np.testing.assert_allclose(C, [[0, 1], [6 / 2**0.5, 8 / 2**0.5], [2 / 2**0.5, 2 / 2**0.5]])
+    np.testing.assert_allclose(mirror.components(C.ravel()), theta, atol=1e-15)
+
+
+def test_choices_are_parities_alone_or_pairs_of_an_odd_and_an_even_component() -> None:
+    mirror = Mirror(SPACE, np.ones(2), np.array([-1.0, -1.0, 1.0]))
+    assert [choice.exchanged for choice in mirror.choices()] == [(), ((0, 2),), ((1, 2),)]
+
+
+def test_the_loss_of_components_is_that_of_the_coordinates_made_of_them() -> None:
+    sizes, rng = Sizes(n=4, m=1, r=3, identity_metric=True), np.random.default_rng(2)
+    coordinates, components = (Loss.of(sizes, Weights().by_name, pairs) for pairs in ((), ((0, 2),)))
+    J = rng.normal(size=(3, 4))
+    turned = np.array([(J[0] + J[2]) / 2**0.5, J[1], (J[2] - J[0]) / 2**0.5])
+    data = [rng.normal(size=symbol.shape) for symbol in coordinates.symbols()]
+    assert float(sample_loss(components)(J, *data)) == pytest.approx(float(sample_loss(coordinates)(turned, *data)))
 
 
 def test_no_fold_is_left_where_other_samples_look_for_one(iiwa_fit: Fit) -> None:

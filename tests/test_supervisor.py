@@ -383,12 +383,98 @@ def test_settings_in_c_are_those_of_python(generated: GeneratedC, law: Controlle
 def test_a_million_hostile_ticks_stay_bounded_with_the_right_status(generated: GeneratedC, tmp_path: Path) -> None:
     """Under the address and undefined-behaviour sanitizers; the program itself checks commands, states and statuses."""
     flags = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    program = built(
-        generated, "supervised_ticks.c", tmp_path, "-DTICKS=1000000L", "-DLIMIT=120.0", "-DSINGULAR=0", *flags
-    )
+    program = built(generated, "supervised_ticks.c", tmp_path, "-DTICKS=1000000L", "-DLIMIT=120.0", *flags)
     done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{done.returncode}: {done.stderr}"
     counts = [int(word) for word in done.stdout.split()]
     assert sum(counts) == 1_000_000
     for status in ("OK", "SATURATED", "NEAR_BORDER", "CAUGHT", "RETURNING", "BAD_INPUT"):
         assert counts[ControlStatus[status]] > 100, (status, counts)
+
+
+@pytest.mark.slow
+def test_the_bound_on_singular_values_is_a_border_with_a_zone_before_it(tmp_path: Path) -> None:
+    """Led slowly towards a straight arm: damped, caught before the bound, brought back; torques change smoothly."""
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [3.0, 3.0, 3.0])
+    box = oc.Box([0.6, 0.8, 0.8], [0.8, 1.2, 1.2])
+    problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=box, least_singular_value=0.2)
+    clear = problem.domain
+    assert isinstance(clear, oc.ClearBox)
+    chart = oc.fit(problem, oc.Polynomial(3)).chart
+    law = PDPlus.on_chart(chart)
+    generated = oc.generate_c(chart, tmp_path, law, "arm")
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3)
+    supervisor = Supervisor(library, law, Safety.of(law, command_rate=np.inf))
+    arm, straight = Arm(robot, box.centre), np.array([0.6, 0.0, 0.1])
+    supervisor.start(box.centre)
+    run(supervisor, arm, at_rest(chart, box.centre), 0.5)
+    statuses, commands, sizes = [], [], []
+    for k in range(4000):
+        wanted = box.centre + k / 4000 * (straight - box.centre)
+        command, status = supervisor.step(arm.q, arm.dq, moving(chart, wanted, (straight - box.centre) / 4.0), TICK)
+        arm.move(command)
+        statuses.append(status)
+        commands.append(command)
+        sizes.append(clear.singular_values(arm.q))
+    first = [statuses.index(status) for status in (ControlStatus.NEAR_BORDER, ControlStatus.CAUGHT)]
+    assert [set(part) for part in np.split(np.array(statuses), first)] == [
+        {ControlStatus.OK},
+        {ControlStatus.NEAR_BORDER},
+        {ControlStatus.CAUGHT},
+    ]
+    assert first[1] - first[0] > 10
+    span = clear.singular_values(box.centre) - 0.2
+    assert sizes[first[0]] == pytest.approx(0.2 + 0.06 * span, abs=0.01 * span)
+    assert min(sizes[: first[1] + 1]) > 0.2
+    changes = np.abs(np.diff(commands, axis=0)).max(axis=1)
+    assert max(changes[k - 1] for k in first) < 0.5  # [N m] where the status changes
+    assert changes[first[0] - 100 :].max() < 2.0  # the law hands over in the 30 ticks of fade_out
+    assert np.abs(arm.dq).max() < 1e-3
+    supervisor.resume()
+    statuses, _, _ = run(supervisor, arm, at_rest(chart, box.centre), 4.0)
+    assert statuses[0] is ControlStatus.RETURNING
+    assert statuses[-1] is ControlStatus.OK
+
+
+def test_margins_at_run_time_decide_where_the_law_starts(
+    library: CompiledLibrary, law: Controller, chart: oc.Chart
+) -> None:
+    domain = chart.problem.domain
+    q = domain.centre + 0.8 * domain.half_width
+    for margin, wanted in ((0.1, 0), (0.3, 1)):
+        supervisor = Supervisor(library, law, Safety.of(law, return_margin=margin))
+        supervisor.start(q)
+        supervisor.step(q, np.zeros(3), at_rest(chart, q), TICK)
+        assert supervisor.mode == wanted  # the law, the catcher
+        np.testing.assert_allclose(np.abs(supervisor.safe - domain.centre) <= (1 - margin) * domain.half_width, True)
+    assert np.abs(supervisor.safe - domain.centre).max() < np.abs(q - domain.centre).max()
+
+
+def test_a_start_without_a_measurement_waits_for_the_first_one(supervisor: Supervisor, chart: oc.Chart) -> None:
+    """Where the arm is decides whether the law may begin, not where an unreadable sensor was taken to be."""
+    domain = chart.problem.domain
+    outside, nowhere = domain.centre + 1.3 * domain.half_width, np.full(3, np.nan)
+    supervisor.start(domain.centre)
+    supervisor.step(nowhere, np.zeros(3), np.zeros(9), TICK)
+    for _ in range(50):
+        _, status = supervisor.step(outside, np.zeros(3), at_rest(chart, domain.centre), TICK)
+    assert status is ControlStatus.CAUGHT
+
+
+def test_velocity_laws_carry_no_settings_of_torques(chart: oc.Chart, tmp_path: Path) -> None:
+    law = Kinematic.on_chart(chart)
+    generated = oc.generate_c(chart, tmp_path, law, "arm")
+    header = (tmp_path / "arm.h").read_text()
+    for name in ("brake_stiffness", "brake_yield", "stop_zone", "stop_damping"):
+        assert name not in header
+    library, q = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3), chart.problem.domain.centre
+    commands = []
+    for safety in (None, Safety.of(law), Safety.of(law, return_speed=0.1, damping=1.0)):
+        supervisor = Supervisor(library, law, safety)
+        supervisor.take_over(q, np.zeros(3))
+        for k in range(60):  # the catcher after speeds beyond the limit
+            command, _ = supervisor.step(q + 1e-4 * k, np.full(3, 20.0 * (k == 30)), at_rest(chart, q), TICK)
+        assert supervisor.mode == 1  # the catcher
+        commands.append(command)
+    np.testing.assert_array_equal(commands[0], commands[1])
+    assert np.abs(commands[2] - commands[0]).max() > 1e-4

@@ -6,11 +6,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+from programs import needs_c
 from public_objects import (
     circle,
     disk,
@@ -29,8 +31,9 @@ from orthocas.casadi_tools.batch import Batched
 from orthocas.casadi_tools.blas_graph import NumpyGraph
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
+from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import Controller
-from orthocas.simulation import simulate
+from orthocas.simulation import MuJoCoPlant, simulate
 
 THREADS = 8
 Call = Callable[[int], Any]  #: the k-th call of a series
@@ -55,6 +58,7 @@ def calls_of_chart(chart: oc.Chart) -> list[Call]:
     q = points_of(chart)
     phi = chart.phi(q)
     fitted_calls: list[Call] = [
+        lambda k: chart.xi_range(q[k % 2]).high,
         lambda k: np.asarray(chart.function("phi")(q[k % 6])),
         lambda k: np.asarray(chart.function("jacobian")(q[k % 6])),
         lambda k: np.append(chart.quality(q[k % 6]).leak_deg, chart.quality(q[k % 6]).conditioning),
@@ -63,6 +67,7 @@ def calls_of_chart(chart: oc.Chart) -> list[Call]:
         lambda k: chart.phi(q[k % 6]),
         lambda k: chart.jacobian(q[: 1 + k % 6]),
         lambda k: chart.inverse(phi[k % 6], q[k % 6] + 0.02),
+        lambda k: chart.solve(phi[k % 6 :]).q,
         lambda k: chart.problem.robot.mass_matrix(q[k % 6]),
         *([] if isinstance(chart, oc.GrownChart) else fitted_calls),
     ]
@@ -108,6 +113,33 @@ def test_simulations_share_a_law() -> None:
     for k, run in enumerate(runs):
         for found, wanted in zip(numbers(run), sampled if k % 2 else expected, strict=True):
             np.testing.assert_array_equal(found, wanted)
+
+
+@needs_c
+def test_supervised_arms_in_mujoco_share_a_library(tmp_path: Path) -> None:
+    """Library, law and robot are shared; every run has its own state and plant."""
+    law = impedance()
+    generated = oc.generate_c(law.chart, tmp_path, law, "arm")
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", law.problem.n)
+    start = law.problem.domain.centre
+
+    def arm(k: int) -> Array:
+        q = start + 0.02 * (k % 4)
+        supervisor, plant = Supervisor(library, law), MuJoCoPlant(law.problem.robot)
+        supervisor.start(q)
+        plant.reset(q)
+        reference = np.concatenate([law.chart.phi(start), np.zeros(2 * len(law.labels))])
+        path = []
+        for _ in range(100):
+            command, _ = supervisor.step(plant.q, plant.dq, reference)
+            plant.step(command, 1e-3)
+            path.append(np.concatenate([plant.q, command]))
+        return np.array(path)
+
+    alone = [arm(k) for k in range(4)]
+    assert np.abs(alone[1] - alone[0]).max() > 1e-3
+    for k, found in enumerate(in_threads(arm, 16)):
+        np.testing.assert_array_equal(found, alone[k % 4])
 
 
 def test_graphs_with_nodes_in_python_keep_memory_apart() -> None:

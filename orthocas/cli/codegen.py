@@ -52,6 +52,9 @@ def codegen(
     check: Annotated[
         bool, typer.Option("--check", help="Compile the C and compare it with Python on 1000 states.")
     ] = False,
+    single_precision: Annotated[
+        bool, typer.Option("--float", help="Numbers are float instead of double, for processors in single precision.")
+    ] = False,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -73,7 +76,7 @@ def codegen(
         loaded = Chart.load(chart)
         loaded.function("xi")  # raises for grown charts
         law = None if controller == _NONE else build_controller(controller, loaded, options, limit)
-        generated = generate_c(loaded, out, law, name, force)
+        generated = generate_c(loaded, out, law, name, force, single_precision=single_precision)
         remarks = [] if law is None else law.remarks()
     proof = check_c(generated, loaded, law) if check else None
     report = _report(generated, proof)

@@ -18,6 +18,7 @@ COMMANDS = {
     "compare": "Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts.",
     "reproduce": "Redraw figures of the paper and print the numbers they show.",
     "simulate": "Run a controller in a chart's coordinates; write the run, pictures, an animation and a report.",
+    "follow": "Follow a tool path; write joint positions, velocities and accelerations on time stamps.",
     "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",
     "export": "Write task, xi, phi and Jacobian of a chart as one Python module that needs the library only.",
 }  #: names of the commands, modules of this package, and the first lines of their help

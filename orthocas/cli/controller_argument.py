@@ -17,7 +17,7 @@ _CHOICES = ("coupling", "damping", "model", "gravity", "inputs", "second")  # op
 
 Stiffness = Annotated[
     str | None,
-    typer.Option("--stiffness", help='"100", or "100,50,..." per quantity; default: modes around 4 Hz.'),
+    typer.Option("--stiffness", help='"100", or "100,50,..." per quantity; default: modes around 6 Hz.'),
 ]
 DampingRatio = Annotated[
     str | None, typer.Option("--damping-ratio", help='"0.7", or "0.7,1,..." per quantity; default: 0.7.')
@@ -47,7 +47,7 @@ PostureStiffness = Annotated[
     str | None,
     typer.Option(
         "--posture-stiffness",
-        help="Stiffness of the springs in the second task; for projector. Default: modes around 4 Hz.",
+        help="Stiffness of the springs in the second task; for projector. Default: modes around 6 Hz.",
     ),
 ]
 SecondName = Annotated[

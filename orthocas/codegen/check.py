@@ -5,13 +5,14 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.numbers import numbers
+from orthocas.codegen.precision import Precision
 from orthocas.control import Controller
 
 
-def check_values(chart: Chart, controller: Controller | None, q: Array) -> dict[str, str]:
+def check_values(chart: Chart, controller: Controller | None, q: Array, precision: Precision) -> dict[str, str]:
     """Values of the placeholders: a state, and what every function gives there."""
     n, robot = chart.n, chart.problem.robot
-    dq = np.round(np.linspace(0.1, -0.2, n), 3)
+    dq = precision.rounded(np.round(np.linspace(0.1, -0.2, n), 3))
     values = {
         "check_q": q,
         "check_dq": dq,
@@ -22,7 +23,8 @@ def check_values(chart: Chart, controller: Controller | None, q: Array) -> dict[
         "check_bias": robot.bias(q, dq),
     }
     if controller is not None:
-        reference = controller.measured(q).full().ravel() + 0.001, *np.full((2, len(controller.labels)), 0.01)
+        value = controller.measured(q).full().ravel() + 0.001
+        reference = [precision.rounded(part) for part in (value, *np.full((2, len(value)), 0.01))]
         command, _ = controller.function(q, dq, *reference, *controller.gains.values())
         values["check_command"] = command.full().ravel()
     words = {name: numbers(value) for name, value in values.items()}

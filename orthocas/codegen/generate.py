@@ -14,6 +14,7 @@ from orthocas.checks import as_path, require_kind, require_shape
 from orthocas.codegen.generated import GeneratedC
 from orthocas.codegen.interface import filled, template_values
 from orthocas.codegen.kernels import Kernels, generate_kernels
+from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
 from orthocas.codegen.supervision import supervision_kernels
 from orthocas.control import Controller, Safety
 from orthocas.control.controller import require_controller
@@ -39,6 +40,7 @@ def generate_c(
     name: str | None = None,
     force: bool = False,
     safety: Safety | None = None,
+    single_precision: bool = False,
 ) -> GeneratedC:
     """Write C99 for a chart, the robot's dynamics, the inverse map, and a controller.
 
@@ -53,6 +55,8 @@ def generate_c(
         name: a C identifier; default from the names of problem and controller.
         force: also replace files of the same names that were not generated.
         safety: settings of the supervised law; default `Safety.of(controller)`.
+        single_precision: whether numbers are `float` instead of `double`, for processors that compute in single
+            precision only.
 
     Raises:
         NoExpressionError: if the chart is grown; `orthocas.distil` turns it into a chart with a closed expression.
@@ -77,21 +81,23 @@ def generate_c(
         safety = _matching_safety(controller, safety)
     name = _name(chart, controller) if name is None else name
     _require_matching(chart, controller, name)
-    kernels = generate_kernels(_functions(chart, controller), f"{name}_kernel")
-    stack_bytes = _stack_bytes(kernels, chart.n, 0 if controller is None else len(controller.labels))
-    values = template_values(chart, controller, safety, name, kernels, stack_bytes)
+    precision = SINGLE if single_precision else DOUBLE
+    kernels = generate_kernels(_functions(chart, controller, precision), f"{name}_kernel")
+    stack_bytes = _stack_bytes(kernels, chart.n, 0 if controller is None else len(controller.labels), precision.size)
+    values = template_values(chart, controller, safety, name, kernels, stack_bytes, precision)
     names = {"robot.h": f"{name}.h", "robot.c": f"{name}.c", "pkgconfig.pc": f"{name}.pc.in"}
     contents = {names.get(template, template): filled(template, values) for template in _TEMPLATES}
+    contents |= {file: precision.code(contents[file]) for file in (f"{name}.h", f"{name}.c")}
     folder = as_path("out", out)
     try:
         _require_free(folder, name, contents, force)
     except OSError as error:  # a name that is too long, for example
         raise ArchiveError(f"cannot write to {out}: {error.strerror}") from error
     _write(folder, contents)
-    return GeneratedC(folder, name, stack_bytes)
+    return GeneratedC(folder, name, stack_bytes, single_precision)
 
 
-def _functions(chart: Chart, controller: Controller | None) -> list[ca.Function]:
+def _functions(chart: Chart, controller: Controller | None, precision: Precision) -> list[ca.Function]:
     """The kernels, with matrices row by row. One kernel computes mass matrix, bias and gravity, which share much."""
     n, robot = chart.n, chart.problem.robot
     q, dq, v = (ca.MX.sym(name, n) for name in ("q", "dq", "v"))
@@ -104,7 +110,7 @@ def _functions(chart: Chart, controller: Controller | None) -> list[ca.Function]
     if isinstance(domain, ClearBox):
         found.append(scalar_code(ca.Function("pivots", [q], [domain.pivots(q)])))
     if controller is not None:
-        graph = controller.graph
+        graph = precision.graph(controller)
         inputs = graph.mx_in()
         found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller)]
     return found
@@ -122,14 +128,15 @@ def _matching_safety(controller: Controller, safety: Safety | None) -> Safety:
     return safety
 
 
-def _stack_bytes(kernels: Kernels, n: int, k: int) -> int:
+def _stack_bytes(kernels: Kernels, n: int, k: int, size: int) -> int:
     """Sum of the work arrays, those of the inverse map or a supervised law, and an allowance for other variables."""
-    inverse = kernels.array_bytes("chart") + 8 * n * (n + 6)
-    compose = kernels.array_bytes("dynamics") + 8 * n * (n + 5)
-    supervised = 8 * (9 * n + 8 * k) if k else 0
+    inverse = kernels.array_bytes("chart", size) + size * n * (n + 6)
+    compose = kernels.array_bytes("dynamics", size) + size * n * (n + 5)
+    supervised = size * (9 * n + 8 * k) if k else 0
     locals_ = round(_LOCALS * max(1.0, n / 7) ** 2)  # compilers keep matrices in local variables
-    clear = kernels.array_bytes("pivots") if "pivots" in kernels.work else 0  # called by the others
-    return max(inverse, compose, *map(kernels.array_bytes, kernels.work)) + supervised + clear + locals_
+    clear = sum(kernels.array_bytes(name, size) for name in ("pivots", "gram") if name in kernels.work)  # inside others
+    work = max(kernels.array_bytes(name, size) for name in kernels.work)
+    return max(inverse, compose, work) + supervised + clear + locals_
 
 
 def _require_matching(chart: Chart, controller: Controller | None, name: str) -> None:

@@ -11,3 +11,4 @@ class GeneratedC:
     folder: Path
     name: str  #: prefix of every C name, and of the files
     stack_bytes: int  #: largest stack use of a call
+    single_precision: bool = False  #: whether its numbers are `float`, not `double`

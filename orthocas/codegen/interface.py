@@ -13,6 +13,7 @@ from orthocas.codegen.check import check_values
 from orthocas.codegen.description import description_values
 from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.numbers import numbers
+from orthocas.codegen.precision import Precision, bounds_inside
 from orthocas.codegen.supervision import supervision_values
 from orthocas.codegen.words import words
 from orthocas.control import Controller, Safety
@@ -32,12 +33,14 @@ def template_values(
     name: str,
     kernels: Kernels,
     stack_bytes: int,
+    precision: Precision,
 ) -> dict[str, str]:
     """The values of all placeholders in the templates."""
     problem = chart.problem
     domain = problem.domain
     lower, upper = borders(domain)
-    somewhere = _somewhere(domain)
+    lowest, highest = bounds_inside(domain, precision)
+    somewhere = precision.rounded(_somewhere(domain))
     joints = words(problem.robot.joint_names)
     values = {
         "name": name,
@@ -46,19 +49,20 @@ def template_values(
         "version": VERSION,
         "casadi_version": ca.CasadiMeta.version(),
         **_sizes(chart),
+        **precision.words(),
         "joint_list": ", ".join(joints),
         **description_values(chart),
         "domain_lines": _domain_lines(joints, lower, upper) + _clear_line(domain),
         "certificate": _certificate(chart),
-        "domain_lower": numbers(lower),
-        "domain_upper": numbers(upper),
+        "domain_lower": numbers(lowest),
+        "domain_upper": numbers(highest),
         "domain_centre": numbers(domain.centre),
         "domain_reach": numbers(reach(domain)),
         "phi_sizes": numbers(chart.phi_sizes),
         "max_evaluations": str(_MAX_EVALUATIONS),
         "stack_bytes": str(stack_bytes),
         "check_q": numbers(somewhere),
-        **check_values(chart, controller, somewhere),
+        **check_values(chart, controller, somewhere, precision),
         "kernels": kernels.code,
     }
     for kernel, sizes in kernels.work.items():
@@ -66,6 +70,7 @@ def template_values(
             values[f"{kernel}_{word}"] = str(max(1, size))
     if controller is not None and safety is not None:
         values |= _control_values(controller) | supervision_values(controller, safety)
+        values["clearance_c"] = filled("clearance.c", values) if "clear_span" in values else ""
         values["compose"] = filled(f"compose_{controller.command}.c", values)
     values |= _clear_values(domain, values)
     for template in ("control.h", "control.c", "check_control.c", "control.md", "supervisor.h", "supervisor.c"):

@@ -20,10 +20,10 @@ class Kernels:
     code: str
     work: dict[str, tuple[int, int, int, int]]  #: lengths of arg, res, iw and w that a call needs, by function name
 
-    def array_bytes(self, name: str) -> int:
-        """Size of the work arrays that a call of a function needs, in bytes."""
+    def array_bytes(self, name: str, number_size: int) -> int:
+        """Size of the work arrays that a call of a function needs, with numbers of a size, in bytes."""
         arg, res, iw, w = self.work[name]
-        return 8 * (arg + res + w) + 4 * iw
+        return 8 * (arg + res) + number_size * w + 4 * iw
 
 
 def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:

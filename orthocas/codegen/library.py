@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, require_shape
 from orthocas.codegen.generated import GeneratedC
+from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
 from orthocas.control import Controller
 from orthocas.errors import CompileError
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
+NO_DOUBLE = ("-Wdouble-promotion", "-Wfloat-conversion")  #: for code in single precision
 
 
 def compilers() -> tuple[str, ...]:
@@ -42,7 +45,8 @@ def compile_shared(
     library = folder / f"lib{generated.name}.so"
     source = generated.folder / f"{generated.name}.c"
     compiler = compilers()[0] if compiler is None else compiler
-    command = [compiler, *STRICT, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
+    warnings = (*STRICT, *(NO_DOUBLE if generated.single_precision else ()))
+    command = [compiler, *warnings, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise CompileError(f"{' '.join(command)} failed: {done.stderr[:500]}")
@@ -56,49 +60,57 @@ class CompiledLibrary:
     path: Path
     name: str
     n: int
+    single_precision: bool = False
+
+    @property
+    def precision(self) -> Precision:
+        """The number type of the library."""
+        return SINGLE if self.single_precision else DOUBLE
 
     def chart(self, q: Array) -> tuple[Array, Array, int]:
         """phi (n,), J (n, n), status."""
-        phi, J = np.empty(self.n), np.empty((self.n, self.n))
+        phi, J = self._zeros(self.n), self._zeros(self.n, self.n)
         return phi, J, self._call("chart", [q], [phi, J])
 
     def check(self) -> float:
         """Largest relative difference that the library finds between itself and the numbers it was generated with."""
         run = self.function("check")
-        run.restype = ctypes.c_double
+        run.restype = self.precision.c_type
         return float(run())
 
     def curvature(self, q: Array, dq: Array, v: Array) -> tuple[Array, int]:
         """dJ/dt v (n,), status."""
-        curvature = np.empty(self.n)
+        curvature = self._zeros(self.n)
         return curvature, self._call("chart_curvature", [q, dq, v], [curvature])
 
     def inverse(self, phi: Array, q_start: Array) -> tuple[Array, int]:
         """q (n,), status."""
-        q = np.empty(self.n)
+        q = self._zeros(self.n)
         return q, self._call("inverse", [phi, q_start], [q])
 
     def dynamics(self, q: Array, dq: Array) -> tuple[Array, Array, Array, int]:
         """M (n, n), bias (n,), gravity (n,), status."""
-        M, bias, gravity = np.empty((self.n, self.n)), np.empty(self.n), np.empty(self.n)
+        M, bias, gravity = self._zeros(self.n, self.n), self._zeros(self.n), self._zeros(self.n)
         return M, bias, gravity, self._call("dynamics", [q, dq], [M, bias, gravity])
 
     def control(self, q: Array, dq: Array, reference: Array, gains: Array) -> tuple[Array, int]:
         """Command (n,), status. Reference (3 k,) and gains hold the numbers of the C structs in order."""
-        command = np.empty(self.n)
+        command = self._zeros(self.n)
         return command, self._call("control", [q, dq, reference, gains], [command])
 
     def low_pass(self, reference: Array, target: Array, omega: float, zeta: float, period: float) -> None:
         """Move a reference (3 k,) by one step of the low pass towards a target (k,)."""
-        run = self.function("reference_low_pass")
-        run.argtypes, run.restype = [ctypes.c_void_p] * 2 + [ctypes.c_double] * 3, None
-        run(reference.ctypes.data, target.ctypes.data, omega, zeta, period)
+        run, here, there = self.function("reference_low_pass"), self.numbers(reference), self.numbers(target)
+        run.argtypes, run.restype = [ctypes.c_void_p] * 2 + [self.precision.c_type] * 3, None
+        run(here.ctypes.data, there.ctypes.data, omega, zeta, period)
+        reference[:] = here
 
     def spline(self, start: Array, target: Array, duration: float, time: float) -> Array:
         """The reference (3 k,) at a time on the spline from a reference to rest at a target (k,)."""
-        run, reference = self.function("reference_spline"), np.empty(3 * len(target))
-        run.argtypes, run.restype = [ctypes.c_void_p] * 2 + [ctypes.c_double] * 2 + [ctypes.c_void_p], None
-        run(start.ctypes.data, target.ctypes.data, duration, time, reference.ctypes.data)
+        run, reference, number = self.function("reference_spline"), self._zeros(3 * len(target)), self.precision.c_type
+        run.argtypes, run.restype = [*[ctypes.c_void_p] * 2, number, number, ctypes.c_void_p], None
+        ends = [self.numbers(end) for end in (start, target)]
+        run(*(end.ctypes.data for end in ends), duration, time, reference.ctypes.data)
         return reference
 
     @property
@@ -120,7 +132,15 @@ class CompiledLibrary:
         return ctypes.addressof(ctypes.c_char.in_dll(self._c, f"{self.name}_{name}"))
 
     def _table(self, name: str, count: int) -> Array:
-        return np.array((ctypes.c_double * count).in_dll(self._c, f"{self.name}_{name}"))
+        return np.array((self.precision.c_type * count).in_dll(self._c, f"{self.name}_{name}"), dtype=float)
+
+    def numbers(self, values: ArrayLike) -> Array:
+        """Values as a C array of the library's number type."""
+        with np.errstate(over="ignore"):
+            return np.ascontiguousarray(values, dtype=self.precision.scalar)
+
+    def _zeros(self, *shape: int) -> Array:
+        return np.zeros(shape, dtype=self.precision.scalar)
 
     @cached_property
     def _c(self) -> ctypes.CDLL:
@@ -128,7 +148,7 @@ class CompiledLibrary:
 
     def _call(self, function: str, inputs: list[Array], outputs: list[Array]) -> int:
         run = getattr(self._c, f"{self.name}_{function}")
-        arrays = [np.ascontiguousarray(array, dtype=float) for array in inputs] + outputs
+        arrays = [self.numbers(array) for array in inputs] + outputs
         for array in arrays[:2]:  # q and dq, or q and an output; C would read beyond the end of a short array
             require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
         return int(run(*(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))

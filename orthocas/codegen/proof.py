@@ -1,6 +1,6 @@
 """`--check`: compares compiled C with the Python that it was generated from."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,16 +12,17 @@ from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind
 from orthocas.codegen.generated import GeneratedC
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
+from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, bounds_inside
+from orthocas.codegen.random_inputs import corner_cases, random_gains, spoiled
 from orthocas.control import Controller, ControlStatus
-from orthocas.control.status import LARGEST
-from orthocas.domains import borders, contains
+from orthocas.control.controller import squared_volume
+from orthocas.control.status import FROM_THE_LAW
+from orthocas.domains import Domain, contains
 from orthocas.errors import ProofError
 from orthocas.files.drafts import draft_folder
 
-TOLERANCE = 1e-10  #: largest accepted difference, relative to the largest entry of the result
 _REACH = 1.2  # random states lie in the domain enlarged by this factor
-_ROUNDING = 1e-12  # where one rounding of q changes the Python result by more than this, C may differ in proportion
-_BAD = (np.nan, np.inf, -np.inf, 1e200)
+_NEARBY = 0.01  # [half-widths] in single precision, a status may be that of a place so near
 
 
 @dataclass(frozen=True)
@@ -44,26 +45,36 @@ def check_c(
 
     Raises:
         CompileError: if there is no compiler, or compilation fails.
-        ProofError: if a result differs by more than 1e-10 of its largest entry, or a status differs. Near
-            singularities, where one rounding of q changes commands by more than 1e-12, the accepted difference is a
-            hundred times that change.
+        ProofError: if a result differs by more than 1e-10 of its largest entry (single precision: 1e-3), or a status
+            differs. Near singularities, where one rounding of q changes commands by more than 1e-12 (1e-5), the
+            accepted difference is a hundred times that change. In single precision, the accepted difference of
+            commands also grows with the inverse square of the volume of the gradients, relative to its median, and
+            their status may be that of a place within 0.01 half-widths.
     """
     require_kind("chart", chart, Chart)
-    n, domain, places = chart.n, chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, chart.n))
-    q = domain.centre + domain.half_width * np.vstack([_REACH * places, _corner_cases(n)])
+    n, precision = chart.n, SINGLE if generated.single_precision else DOUBLE
+    q = _positions(chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, n)), precision)
     differences: dict[str, float] = {}
     for compiler in compilers():
         with draft_folder() as folder:
             path = compile_shared(generated, folder, compiler=compiler)
-            found = _compared(CompiledLibrary(path, generated.name, n), chart, controller, q, seed)
+            library = CompiledLibrary(path, generated.name, n, generated.single_precision)
+            found = _compared(library, chart, controller, q, seed)
         for name, value in found.items():
-            if not value <= TOLERANCE:
+            if not value <= precision.tolerance:
                 raise ProofError(
                     f"C, compiled by {compiler}, differs from Python by {value:.3g} in {name}, "
-                    f"expected at most {TOLERANCE:g} relative"
+                    f"expected at most {precision.tolerance:g} relative"
                 )
             differences[name] = max(value, differences.get(name, 0.0))
     return Proof(len(q), tuple(Path(compiler).name for compiler in compilers()), differences)
+
+
+def _positions(domain: Domain, places: Array, precision: Precision) -> Array:
+    """Random positions in and around the domain, then the corner cases, which belong to it."""
+    corners = domain.centre + domain.half_width * corner_cases(places.shape[1])
+    around = domain.centre + domain.half_width * _REACH * places
+    return precision.rounded(np.vstack([around, np.clip(corners, *bounds_inside(domain, precision))]))
 
 
 def _compared(
@@ -71,11 +82,11 @@ def _compared(
 ) -> dict[str, float]:
     """Largest relative differences by function; the last positions are corner cases, taken at rest."""
     rng = np.random.default_rng(seed)
-    if not np.array_equal(library.domain, borders(chart.problem.domain)):
+    if not np.array_equal(library.domain, bounds_inside(chart.problem.domain, library.precision)):
         raise ProofError("the domain in C differs from the domain of the chart")
-    dq = rng.normal(size=q.shape)
-    dq[len(q) - len(_corner_cases(chart.n)) :] = 0
-    differences = _chart_and_dynamics(library, chart, *_spoiled(rng, q, dq))
+    dq = library.precision.rounded(rng.normal(size=q.shape))
+    dq[len(q) - len(corner_cases(chart.n)) :] = 0
+    differences = _chart_and_dynamics(library, chart, *spoiled(rng, q, dq))
     differences["curvature"] = _curvature(library, chart, q, dq, rng)
     differences["check"] = library.check()
     differences["inverse"] = _inverse(library, chart, q)
@@ -84,23 +95,10 @@ def _compared(
     return differences
 
 
-def _corner_cases(n: int) -> Array:
-    """Centre, two corners and centres of the faces of the box from -1 to 1, (3 + 2 n, n)."""
-    return np.vstack([np.zeros(n), np.full(n, -1), np.full(n, 1), -np.eye(n), np.eye(n)])
-
-
-def _spoiled(rng: np.random.Generator, *arrays: Array) -> list[Array]:
-    """Copies with a NaN, infinite or huge number in every twentieth row of one array; corner cases stay as they are."""
-    copies = [array.copy() for array in arrays]
-    for row in range(0, len(arrays[0]) - len(_corner_cases(arrays[0].shape[1])), 20):
-        array = copies[rng.integers(len(copies))]
-        array[row, rng.integers(array.shape[1])] = _BAD[rng.integers(len(_BAD))]
-    return copies
-
-
 def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Array) -> dict[str, float]:
     domain, robot = chart.problem.domain, chart.problem.robot
-    known, moving = _are_numbers(q), _are_numbers(q, dq)
+    largest = library.precision.largest
+    known, moving = _are_numbers(largest, q), _are_numbers(largest, q, dq)
     somewhere, speed = np.where(known[:, None], q, domain.centre), np.where(moving[:, None], dq, 0)
     inside = np.where(contains(domain, somewhere), ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN)
     wanted = {"phi": chart.phi(somewhere), "jacobian": chart.jacobian(somewhere)}
@@ -127,7 +125,7 @@ def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Ar
 
 def _curvature(library: CompiledLibrary, chart: Chart, q: Array, dq: Array, rng: np.random.Generator) -> float:
     """Largest relative difference of dJ/dt v where it has a value, with any v."""
-    v = rng.normal(size=q.shape)
+    v = library.precision.rounded(rng.normal(size=q.shape))
     wanted = Batched(chart.function("second_derivative"))(q, dq, v)[0]
     found = [library.curvature(*row) for row in zip(q, dq, v, strict=True)]
     good = np.asarray(np.isfinite(wanted).all(axis=1))
@@ -139,8 +137,8 @@ def _inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
     inner = q[: len(q) // 10]
     regular = [_is_regular(*pair) for pair in zip(chart.phi(inner), chart.jacobian(inner), strict=True)]
     inner = inner[np.array(regular, dtype=bool)]
-    targets = chart.phi(inner)
-    near = [_inverse_error(library, chart, *pair) for pair in zip(targets, inner + 0.01, strict=True)]
+    targets, starts = chart.phi(inner), library.precision.rounded(inner + 0.01)
+    near = [_inverse_error(library, chart, *pair) for pair in zip(targets, starts, strict=True)]
     far = [_inverse_error(library, chart, *pair) for pair in zip(targets + 1e3, inner, strict=True)]
     solved = np.isfinite(near).sum()
     if solved < 0.9 * len(inner):
@@ -161,80 +159,69 @@ def _inverse_error(library: CompiledLibrary, chart: Chart, target: Array, start:
     """Largest remaining error in phi. Infinite without a solution; status and output must then be as documented."""
     solution, status = library.inverse(target, start)
     if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
-        if (status == ControlStatus.OK) != contains(chart.problem.domain, solution):
+        if (status == ControlStatus.OK) != contains(chart.problem.domain, solution.astype(float)):
             raise ProofError(f"the status of inverse is {status} at q = {solution.tolist()}")
-        return float(np.abs(chart.phi(solution) - target).max())
+        return float(np.abs(chart.phi(solution.astype(float)) - target).max())
     if status != ControlStatus.SINGULAR or not np.array_equal(solution, start):
         raise ProofError(f"inverse returns {solution.tolist()} and status {status}, expected its start")
     return np.inf
 
 
 def _control(library: CompiledLibrary, controller: Controller, q: Array, dq: Array, rng: np.random.Generator) -> float:
-    k = len(controller.labels)
-    around = np.nan_to_num(Batched(controller.measured)(q)[0])
-    reference = (around + 0.1 * rng.normal(size=around.shape), *rng.normal(size=(2, len(q), k)))
-    q, dq, *parts = _spoiled(rng, q, dq, *reference)
-    gains = _random_gains(controller, len(q), rng)
-    law = Batched(controller.function)
-    command, status = law(q, dq, *parts, *gains)
-    moved, status_there = law(np.nextafter(q, np.inf), dq, *parts, *gains)
-    if not (status == ControlStatus.OK).any():
-        raise ProofError(f"{controller.name} is well defined at none of {len(q)} states, expected at least one")
-    numbers = gain_numbers(controller)
+    numbers = library.precision.rounded(gain_numbers(controller))
     if not np.array_equal(library.default_gains(len(numbers)), numbers):
         raise ProofError("the default gains in C differ from the gains of the controller")
-    references, all_gains = np.hstack(parts), np.hstack(gains)
-    found = [library.control(*row) for row in zip(q, dq, references, all_gains, strict=True)]
-    _require_status("control", [row[1] for row in found], status[:, 0], q)
-    change = np.where(status_there[:, 0] == status[:, 0], _differences(moved, command), 0).clip(_ROUNDING, 1)
-    sensitivity = change / _ROUNDING
-    return float((_differences(np.array([row[0] for row in found]), command) / sensitivity).max())
+    inputs = _law_inputs(library.precision, controller, q, dq, rng)
+    law = Batched(library.precision.graph(controller))
+    command, status = law(*inputs)
+    if not (status == ControlStatus.OK).any():
+        raise ProofError(f"{controller.name} is well defined at none of {len(q)} states, expected at least one")
+    rows = zip(*inputs[:2], np.hstack(inputs[2:5]), np.hstack(inputs[5:]), strict=True)
+    found, statuses = zip(*(library.control(*row) for row in rows), strict=True)
+    same = np.array(statuses) == status[:, 0]
+    if library.single_precision:
+        wanted = np.where(_is_near_another_status(controller, law, inputs), statuses, status[:, 0])
+    else:
+        wanted = status[:, 0]
+    _require_status("control", statuses, wanted, inputs[0])
+    relative = _differences(np.array(found), command) / _amplification(library.precision, controller, law, inputs)
+    return float(relative[same].max())
 
 
-def _random_gains(controller: Controller, rows: int, rng: np.random.Generator) -> list[Array]:
-    """Random gains around those of the controller, (rows, length) each; limits are finite or, at times, infinite."""
-    gains = []
-    for name, gain in controller.gains.items():
-        values = _RANDOM.get(name, _scaled)(gain, rows, rng)
-        if name == "limit":
-            values[::3] = np.inf  # states of a weak arm may all saturate, which would say little of the law
-            values[7::40, 0] = rng.choice([0.0, -1.0, np.nan, np.inf], size=len(values[7::40]))
-        gains.append(values)
-    return gains
+def _law_inputs(
+    precision: Precision, controller: Controller, q: Array, dq: Array, rng: np.random.Generator
+) -> list[Array]:
+    """Positions, velocities, references with two derivatives, and gains, some of them spoiled."""
+    around = np.nan_to_num(Batched(controller.measured)(q)[0])
+    reference = (around + 0.1 * rng.normal(size=around.shape), *rng.normal(size=(2, *around.shape)))
+    state = spoiled(rng, q, dq, *reference)
+    return [precision.rounded(values) for values in (*state, *random_gains(controller, len(q), rng))]
 
 
-def _scaled(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    return np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
+def _amplification(precision: Precision, controller: Controller, law: Batched, inputs: list[Array]) -> Array:
+    """How much more than the tolerance the command may differ at each state, (N,) >= 1."""
+    (command, status), (moved, status_there) = law(*inputs), law(precision.next_above(inputs[0]), *inputs[1:])
+    change = np.where(status_there == status, _differences(moved, command)[:, None], 0)[:, 0]
+    found: Array = change.clip(precision.sensitive, 1) / precision.sensitive
+    volume = squared_volume(controller.graph)
+    if precision is SINGLE and volume is not None:
+        squares = np.where(np.isin(status, FROM_THE_LAW), Batched(volume)(*inputs)[0], 1.0)[:, 0]
+        found /= squares.clip(precision.smallest_volume**2, 1)
+    return found
 
 
-def _shifted(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    return np.asarray(gain + rng.normal(size=(rows, len(gain))))
+def _is_near_another_status(controller: Controller, law: Batched, inputs: list[Array]) -> NDArray[np.bool_]:
+    """Whether the status of the law is another one at a place next to q along a joint, (N,)."""
+    q, others = inputs[0], inputs[1:]
+    step = np.diag(_NEARBY * controller.problem.domain.half_width)
+    here = law(*inputs)[1][:, 0]
+    near = [law(q + way, *others)[1][:, 0] != here for way in np.vstack([step, -step])]
+    return np.asarray(np.any(near, axis=0))
 
 
-def _payloads(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    """Payloads of up to 2 kg, within some 0.1 m of the tip, with positive definite inertias."""
-    mass, factors = rng.uniform(0, 2, (rows, 1)), 0.05 * rng.normal(size=(rows, 3, 3))
-    inertia = factors @ factors.transpose(0, 2, 1)
-    return np.hstack([mass, 0.1 * rng.normal(size=(rows, 3)), inertia[:, *np.triu_indices(3)]])
-
-
-def _symmetric(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    """The matrix (n * n,) times one factor and plus a diagonal, so that it stays symmetric positive definite."""
-    n = round(len(gain) ** 0.5)
-    diagonal = np.eye(n) * rng.uniform(0, 0.1, (rows, 1, n))
-    return np.asarray((gain.reshape(n, n) * rng.uniform(0.5, 1.5, (rows, 1, 1)) + diagonal).reshape(rows, -1))
-
-
-_RANDOM: Mapping[str, Callable[[Array, int, np.random.Generator], Array]] = {  # inputs that are not just positive
-    "payload": _payloads,
-    "mass_matrix": _symmetric,
-    **dict.fromkeys(("wrench", "extra_torque", "coriolis_torque", "gravity_torque"), _shifted),
-}
-
-
-def _are_numbers(*arrays: Array) -> NDArray[np.bool_]:
+def _are_numbers(largest: float, *arrays: Array) -> NDArray[np.bool_]:
     """Rows without NaN, infinities and numbers that the C code rejects."""
-    known: NDArray[np.bool_] = np.all([(np.abs(array) <= LARGEST).all(axis=1) for array in arrays], axis=0)
+    known: NDArray[np.bool_] = np.all([(np.abs(array) <= largest).all(axis=1) for array in arrays], axis=0)
     return known
 
 
@@ -243,7 +230,7 @@ def _zero_unless(good: NDArray[np.bool_], values: Array) -> Array:
     return np.where(good.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0)
 
 
-def _require_status(function: str, found: list[int], wanted: Array, q: Array) -> None:
+def _require_status(function: str, found: Sequence[int], wanted: Array, q: Array) -> None:
     unequal = np.flatnonzero(np.array(found) != wanted)
     if unequal.size:
         row = int(unequal[0])

@@ -1,16 +1,15 @@
 """The supervised law in generated C: its kernels, and the values of its templates."""
 
-from collections.abc import Mapping
-from dataclasses import fields
-
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.codegen.numbers import numbers
 from orthocas.control import Controller
 from orthocas.control.safety import Safety
 from orthocas.control.turns import without_turns
 from orthocas.domains import borders
+from orthocas.postures.clear_box import ClearBox
 
 
 def supervision_kernels(controller: Controller) -> list[ca.Function]:
@@ -22,10 +21,18 @@ def supervision_kernels(controller: Controller) -> list[ca.Function]:
     error = reference - measured
     if controller.chart is not None and controller.labels == controller.chart.labels:
         error = without_turns(controller.chart, error)
-    return [
+    found = [
         ca.Function("fallback", inputs, fallback.call(inputs)),
         ca.Function("deviation", [q, reference], [ca.densify(measured), ca.densify(error)]),
     ]
+    clear = _clear_box(controller)
+    return found if clear is None else [*found, scalar_code(ca.Function("gram", [q], [clear.gram(q)]))]
+
+
+def _clear_box(controller: Controller) -> ClearBox | None:
+    """The domain of the law, if its border depends on the singular values of the task."""
+    domain = controller.problem.domain
+    return domain if controller.chart is not None and isinstance(domain, ClearBox) else None
 
 
 def supervision_values(controller: Controller, safety: Safety) -> dict[str, str]:
@@ -35,57 +42,44 @@ def supervision_values(controller: Controller, safety: Safety) -> dict[str, str]
     lower, upper = borders(domain)
     bordered = np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None)
     endless = np.isinf(robot.lower) & np.isinf(robot.upper) & ~np.array(robot.tree.prismatic)
-    torque = controller.command == "torque"
+    torque, settings = controller.command == "torque", safety.in_c(controller.command)
     return {
         "catcher": _TORQUE if torque else _VELOCITY,
         "domain_half_width": numbers(domain.half_width),
         "bordered": _flags(bordered),
         "turning": _flags(endless),
-        "safety_fields": "\n".join(_field(name, value) for name, value in _numbers(safety).items()),
-        "safety_values": ",\n".join(f"  {_literal(value)}" for value in _numbers(safety).values()),
+        "safety_fields": "\n".join(_field(name, value) for name, value in settings.items()),
+        "safety_values": ",\n".join(f"  {_literal(value)}" for value in settings.values()),
+        **_clearance_values(controller),
         "fallback_arguments": "\n".join(f"  arg[{1 + i}] = gains->{gain};" for i, gain in enumerate(controller.gains)),
     }
 
 
+def _clearance_values(controller: Controller) -> dict[str, str]:
+    """The bound on the singular value of the task as a part of the border."""
+    clear = _clear_box(controller)
+    if clear is None:
+        return {"nearest": "1.0", "clearance_too": " in half-widths", "clear_border": ""}
+    return {
+        "nearest": "clearance_ahead(q, dq, time)",
+        "clearance_too": " in half-widths, or the clearance",
+        "clear_border": _CLEAR_BORDER,
+        "clear_bound": repr(clear.least_singular_value),
+        "clear_span": repr(float(clear.singular_values(clear.centre)) - clear.least_singular_value),
+    }
+
+
+_CLEAR_BORDER = """ The bound on the relative singular value of the task is a part of the border; its
+ * distance counts in shares of that from the centre."""
 _TORQUE = """It compensates gravity, damps with the mass matrix,
  * holds the arm with a spring that gives way under too much force."""
 _VELOCITY = """It stops the arm and holds it."""
-
-_MEANING: Mapping[str, str] = {
-    "command_rate": "largest change of the command per second",
-    "speed_limit": "joint speed at which the catcher takes over; 30 times as fast is a bad measurement",
-    "rest_speed": "joint speed below which the arm counts as slow",
-    "near_margin": "distance to the border, in half-widths, at which NEAR_BORDER and damping begin",
-    "catch_margin": "distance to the border at which the catcher takes over",
-    "return_margin": "distance to the border from which the law may take over again",
-    "fade_in": "time in which the law takes over [s]",
-    "fade_out": "time in which the law gives way to the catcher [s]",
-    "return_speed": "of the fastest joint on the way back",
-    "error_limit": "largest error that the law gets to see",
-    "offset_rate": "speed at which the reference goes from where the arm is to what is asked",
-    "integral_rate": "integral action: growth of the shift of the reference per error [1/s]; 0: none",
-    "integral_limit": "largest shift of the reference",
-    "hold_ticks": "ticks without a good measurement for which the last command is held",
-    "longest_period": "between two ticks; later ones call the catcher [s]",
-    "lower": "joint limits",
-    "upper": "joint limits",
-    "stop_zone": "where springs and dampers at the joint limits begin",
-    "stop_stiffness": "of these springs; velocity laws: largest speed per distance [1/s]",
-    "stop_damping": "against motion towards the limit",
-    "damping": "rate d of the catcher's damping -d M dq [1/s]; velocity laws: rate of the way to the anchor",
-    "brake_stiffness": "spring of the catcher: symmetric, row by row",
-    "brake_yield": "largest torque of that spring",
-}
-
-
-def _numbers(safety: Safety) -> dict[str, object]:
-    return {field.name: getattr(safety, field.name) for field in fields(safety)}
 
 
 def _field(name: str, value: object) -> str:
     size = f"[{value.size}]" if isinstance(value, np.ndarray) else ""
     kind = "int" if name == "hold_ticks" else "double"
-    return f"  {kind} {name}{size}; /* {_MEANING[name]} */"
+    return f"  {kind} {name}{size}; /* {Safety.meaning(name)} */"
 
 
 def _literal(value: object) -> str:

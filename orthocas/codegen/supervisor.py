@@ -1,15 +1,16 @@
 """Calls the supervised law of a compiled library from Python, for simulations and tests."""
 
 import ctypes
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_point, require_shape
+from orthocas.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 from orthocas.codegen.library import CompiledLibrary, gain_numbers
+from orthocas.codegen.precision import Precision
 from orthocas.control import Controller, ControlStatus, Safety
+from orthocas.control.controller import require_controller
 
 _POINTER = ctypes.c_void_p
 
@@ -24,23 +25,29 @@ class Supervisor:
     """
 
     def __init__(self, library: CompiledLibrary, controller: Controller, safety: Safety | None = None) -> None:
-        self._n, self._k = library.n, len(controller.labels)
+        require_kind("library", library, CompiledLibrary)
+        require_controller(controller)
+        self._n, self._k, self._library = library.n, len(controller.labels), library
         self._functions = {name: library.function(name) for name in ("start", "take_over", "resume", "step")}
-        self._functions["step"].argtypes = [*[_POINTER] * 6, ctypes.c_double, _POINTER]
-        self._safety = library.address("default_safety") if safety is None else _packed(safety)
-        self._state = _state_type(self._n, self._k)()
-        self._command = np.zeros(self._n)
+        self._functions["step"].argtypes = [*[_POINTER] * 6, library.precision.c_type, _POINTER]
+        if safety is None:
+            self._safety = library.address("default_safety")
+        else:
+            require_kind("safety", safety, Safety)
+            self._safety = _packed(safety.in_c(controller.command), library.precision)
+        self._state = _state_type(self._n, self._k, library.precision)()
+        self._command = library.numbers(np.zeros(self._n))
         self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
 
     def start(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
         """Begin at joint positions (n,), with the command (n,) that the robot executes now; default the fallback."""
-        given = None if command is None else _pointer(as_point("command", command, self._n))
-        self._functions["start"](self._here, _pointer(as_point("q", q, self._n)), given)
+        given = None if command is None else _pointer(self._point("command", command))
+        self._functions["start"](self._here, _pointer(self._point("q", q)), given)
 
     def take_over(self, q: ArrayLike, command: ArrayLike) -> None:
         """Take over from another controller while the arm moves."""
-        points = [_pointer(as_point(name, value, self._n)) for name, value in (("q", q), ("command", command))]
-        self._functions["take_over"](self._here, *points)
+        points = self._point("q", q), self._point("command", command)
+        self._functions["take_over"](self._here, *map(_pointer, points))
 
     def resume(self) -> None:
         """Ask for the law again."""
@@ -48,12 +55,12 @@ class Supervisor:
 
     def step(self, q: Array, dq: Array, reference: Array, period: float = 1e-3) -> tuple[Array, ControlStatus]:
         """Command (n,) and status of one control period. The reference is [value, velocity, acceleration], (3 k,)."""
-        inputs = [np.ascontiguousarray(part, dtype=float) for part in (q, dq, reference, self.gains)]
-        sizes = {"q": self._n, "dq": self._n, "reference": 3 * self._k}
-        for (name, size), part in zip(sizes.items(), inputs, strict=False):  # C would read beyond the end
-            require_shape(name, part.shape, (size,))
+        given = {"q": (q, self._n), "dq": (dq, self._n), "reference": (reference, 3 * self._k)}
+        inputs = [self._numbers(name, *value) for name, value in given.items()]
+        inputs.append(self._library.numbers(self.gains))
+        time = as_number("period", period)
         status = self._functions["step"](
-            self._here, self._safety, *map(_pointer, inputs), float(period), _pointer(self._command)
+            self._here, self._safety, *map(_pointer, inputs), time, _pointer(self._command)
         )
         return self._command.copy(), ControlStatus(status)
 
@@ -64,37 +71,45 @@ class Supervisor:
         value = getattr(self._state, name)
         return np.array(value) if isinstance(value, ctypes.Array) else value
 
+    def _numbers(self, name: str, values: ArrayLike, size: int) -> Array:
+        """Numbers of the library's type, which may be NaN or infinite."""
+        array = as_float_array(name, values)
+        require_shape(name, array.shape, (size,))  # C would read beyond the end
+        return self._library.numbers(array)
+
+    def _point(self, name: str, values: ArrayLike) -> Array:
+        return self._library.numbers(as_point(name, values, self._n))
+
     @property
     def _here(self) -> Any:
         return ctypes.byref(self._state)
 
 
-def _state_type(n: int, k: int) -> type[ctypes.Structure]:
-    joints, quantities = ctypes.c_double * n, ctypes.c_double * k
+def _state_type(n: int, k: int, precision: Precision) -> type[ctypes.Structure]:
+    joints, quantities = precision.c_type * n, precision.c_type * k
     names = ("q", "dq", "command", "law", "anchor", "safe")
     layout = [
-        *((name, ctypes.c_int) for name in ("mode", "cause", "asked", "bad_ticks", "stale_ticks")),
-        *((name, ctypes.c_double) for name in ("weight", "brake")),
+        *((name, ctypes.c_int) for name in ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks")),
+        *((name, precision.c_type) for name in ("weight", "brake")),
         *((name, joints) for name in names),
         *((name, quantities) for name in ("offset", "integral", "value", "velocity", "acceleration")),
     ]
     return type("State", (ctypes.Structure,), {"_fields_": layout})
 
 
-def _packed(safety: Safety) -> Any:
+def _packed(values: dict[str, Any], precision: Precision) -> Any:
     """The settings as the C struct."""
-    values = {field.name: getattr(safety, field.name) for field in fields(Safety)}
-    layout = [(name, _kind(value)) for name, value in values.items()]
+    layout = [(name, _kind(value, precision)) for name, value in values.items()]
     struct = type("Safety", (ctypes.Structure,), {"_fields_": layout})()
     for name, value in values.items():
         setattr(struct, name, tuple(value.tolist()) if isinstance(value, np.ndarray) else value)
     return ctypes.pointer(struct)
 
 
-def _kind(value: Any) -> Any:
+def _kind(value: Any, precision: Precision) -> Any:
     if isinstance(value, np.ndarray):
-        return ctypes.c_double * value.size
-    return ctypes.c_int if isinstance(value, int) else ctypes.c_double
+        return precision.c_type * value.size
+    return ctypes.c_int if isinstance(value, int) else precision.c_type
 
 
 def _pointer(array: Array) -> Any:

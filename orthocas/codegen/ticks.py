@@ -48,17 +48,20 @@ def control_tick(chart: Chart) -> float:
 
 
 def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int = 100_000) -> list[Ticks]:
-    """Measure compiled controllers of one robot, with their own gains, on 64 states inside the domain.
+    """Measure compiled controllers of one robot and number type, with their own gains, on 64 states inside the domain.
 
     Raises:
         CompileError: if there is no C compiler, or the timing program cannot be built or run.
     """
+    first = cases[0][1]
     with draft_folder() as folder:
         data, program = folder / "states", folder / "ticks"
-        np.concatenate([part.ravel() for law, _ in cases for part in (_states(law), gain_numbers(law))]).tofile(data)
+        numbers = np.concatenate([part.ravel() for law, _ in cases for part in (_states(law), gain_numbers(law))])
+        first.numbers(numbers).tofile(data)
         source = files("orthocas.codegen") / "templates" / "ticks.c"
         (folder / "ticks.c").write_text(source.read_text())
-        _run([compilers()[0], "-O2", str(folder / "ticks.c"), "-o", str(program), "-ldl"])
+        number = f"-DNUMBER={first.precision.c_name}"
+        _run([compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
         arguments = [str(program), str(data), str(calls), str(cases[0][0].problem.n)]
         for law, library in cases:
             sizes = (3 * len(law.labels), len(gain_numbers(law)))

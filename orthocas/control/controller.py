@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
-from orthocas.control.status import guard
+from orthocas.control.status import GUARD, SMALLEST_VOLUME, guard
 from orthocas.domains import Domain
 from orthocas.errors import InvalidValueError
 from orthocas.problem import Problem
@@ -157,8 +157,35 @@ def guarded_graph(
     """The graph of a controller: its law, protected by the guard of `orthocas.control.status`."""
     numbers = ca.vertcat(*(value for key, value in inputs.items() if key != "limit"))
     check = guard(domain, command.shape[0], numbers.shape[0], keep_direction)
-    safe, status = check(command, fallback, inputs["limit"], inputs["q"], numbers, volume)
+    smallest = ca.MX(SMALLEST_VOLUME**2)
+    safe, status = check(command, fallback, inputs["limit"], inputs["q"], numbers, volume, smallest)
     return named_function(name, inputs, {"command": safe, "status": status})
+
+
+def with_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:
+    """The same graph of a controller, with another smallest volume of the gradients, relative to the median."""
+    inputs, call = _guard_call(graph)
+    if call is None:
+        return graph
+    check = call.which_function()
+    outputs = check(*(call.dep(i) for i in range(check.n_in() - 1)), ca.MX(smallest**2))
+    return ca.Function(graph.name(), inputs, list(outputs), graph.name_in(), graph.name_out())
+
+
+def squared_volume(graph: ca.Function) -> ca.Function | None:
+    """Inputs of a controller -> squared volume of its gradients, relative to the median; None without a guard."""
+    inputs, call = _guard_call(graph)
+    if call is None:
+        return None
+    return ca.Function("squared_volume", inputs, [call.dep(call.which_function().n_in() - 2)])
+
+
+def _guard_call(graph: ca.Function) -> tuple[list[ca.MX], ca.MX | None]:
+    """Inputs of a graph, and the call of the guard that all its outputs come from, if it has one."""
+    inputs = graph.mx_in()
+    call = graph.call(inputs, True, False)[0].dep(0)
+    is_guarded = call.is_call() and call.which_function().name() == GUARD
+    return inputs, call if is_guarded else None
 
 
 def fallback_function(inputs: dict[str, ca.MX], command: ca.MX) -> ca.Function:

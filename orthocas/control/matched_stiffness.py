@@ -5,27 +5,33 @@ import scipy
 from numpy.typing import ArrayLike
 
 from orthocas.chart import Chart
-from orthocas.checks import Array, require_kind
+from orthocas.checks import Array, as_number, require_kind
 from orthocas.control.gains import positive_gains
 from orthocas.domains import sample_uniform
+from orthocas.errors import InvalidValueError
 from orthocas.problem import Problem
 from orthocas.robots.robot import Robot
 
-SPRING_FREQUENCY = 8 * np.pi  #: [rad/s], 4 Hz: holds arms whose masses are 20 % off within 20 mm (docs/control.md)
-_SAMPLES, _SEED = 256, 0
+SPRING_FREQUENCY = 12 * np.pi  #: [rad/s], 6 Hz: arms whose masses are 20 % off stay in their boxes (docs/control.md)
+FASTEST = 36 * np.pi  #: [rad/s], 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7
+_SAMPLES, _SEED = 512, 0
+_TOO_FAST = 3000.0  # weight of the squared logarithm by which a mode exceeds the fastest frequency
 
 
-def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY) -> Array:
-    """Stiffness of [x; xi], (n,), with which the closed loop has its modes around a frequency.
+def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY, fastest: float = FASTEST) -> Array:
+    """Stiffness of [x; xi], (n,), with which the closed loop has its modes around a frequency, and none too fast.
 
     At rest the loop is M_phi dde + D de + K e = 0 with M_phi = (J M^-1 J^T)^-1, so the squared frequencies lambda_i of
-    its modes are the eigenvalues of K^1/2 J M^-1 J^T K^1/2. K minimises the mean of sum_i log^2(lambda_i / omega^2)
-    over the domain. The geometric mean of all modes is then omega. Single modes lie on both sides of it, because M_phi
-    is not diagonal and varies; `modes` of a law tells where.
+    its modes are the eigenvalues of K^1/2 J M^-1 J^T K^1/2. K minimises the mean over the domain of
+    sum_i log^2(lambda_i / omega^2) + 3000 sum_i max(0, log(lambda_i / fastest^2))^2. As long as no mode comes near
+    `fastest`, the geometric mean of all modes is omega. Single modes lie on both sides of it, because M_phi is not
+    diagonal and varies; `modes` of a law tells where. Delays make fast modes unstable, so `fastest` takes stiffness
+    from the coordinates that move light wrists.
 
     Args:
         chart: a chart with a closed expression.
         frequency: omega > 0 of the springs [rad/s].
+        fastest: of all modes [rad/s], > 0; infinite: no bound. Single postures exceed it by some per cent.
 
     Source:
         ours, docs/derivations.md#stiffness
@@ -33,13 +39,13 @@ def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY) -> Arra
     require_kind("chart", chart, Chart)
     chart.function("xi")  # raises for grown charts
     points = _points(chart.problem)
-    return _matched(mobility(chart, points, chart.problem.robot), frequency)
+    return _matched(mobility(chart, points, chart.problem.robot), frequency, fastest)
 
 
-def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUENCY) -> Array:
+def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUENCY, fastest: float = FASTEST) -> Array:
     """Stiffness of springs in the joints, from the modes of (K_q, M) in the same way, (n,)."""
     require_kind("problem", problem, Problem)
-    return _matched(np.linalg.inv(problem.robot.mass_matrix(_points(problem))), frequency)
+    return _matched(np.linalg.inv(problem.robot.mass_matrix(_points(problem))), frequency, fastest)
 
 
 def mobility(chart: Chart, points: ArrayLike, robot: Robot) -> Array:
@@ -52,21 +58,28 @@ def _points(problem: Problem) -> Array:
     return sample_uniform(problem.domain, _SAMPLES, _SEED)
 
 
-def _matched(mobilities: Array, frequency: float) -> Array:
+def _matched(mobilities: Array, frequency: float, fastest: float) -> Array:
     """The stiffness for M_phi^-1 at several postures, (N, n, n); singular postures are left out."""
-    omega = positive_gains("frequency", frequency, 1)
+    omega = float(positive_gains("frequency", frequency, 1)[0])
+    if not as_number("fastest", fastest) > 0:
+        raise InvalidValueError("fastest", fastest, "a number > 0 or infinity")
     W = mobilities[np.isfinite(mobilities).all(axis=(1, 2))]
     W = W[np.linalg.eigvalsh(W)[:, 0] > 0]
     start = -np.log(np.median(np.diagonal(W, axis1=1, axis2=2), axis=0))  # the solution where W is diagonal
-    return np.asarray(omega**2 * np.exp(scipy.optimize.minimize(_spread, start, (W,), method="BFGS", jac=True).x))
+    bound = 2 * np.log(fastest / omega)
+    found = scipy.optimize.minimize(_spread, start, (W, bound), method="BFGS", jac=True)
+    return np.asarray(omega**2 * np.exp(found.x))
 
 
-def _spread(log_stiffness: Array, W: Array) -> tuple[float, Array]:
-    """Mean of sum_i log^2(lambda_i) for K = exp(log_stiffness), and its gradient.
+def _spread(log_stiffness: Array, W: Array, bound: float) -> tuple[float, Array]:
+    """Mean of sum_i log^2(lambda_i) + 3000 max(0, log(lambda_i) - bound)^2 for K = exp(log_stiffness); gradient.
 
     With unit eigenvectors v_i, d log(lambda_i) / d log(K_j) = v_ij^2.
     """
     root = np.exp(log_stiffness / 2)
     values, vectors = np.linalg.eigh(root[:, None] * W * root)
     logs = np.log(values.clip(np.finfo(float).tiny))
-    return float((logs**2).sum(axis=1).mean()), 2 * (vectors**2 @ logs[..., None])[..., 0].mean(axis=0)
+    excess = (logs - bound).clip(0)
+    slopes = 2 * (logs + _TOO_FAST * excess)
+    cost = (logs**2 + _TOO_FAST * excess**2).sum(axis=1).mean()
+    return float(cost), (vectors**2 @ slopes[..., None])[..., 0].mean(axis=0)

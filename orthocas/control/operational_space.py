@@ -134,7 +134,7 @@ class _OperationalSpace(Shown):
         Args:
             chart: the chart.
             limit: largest torque of each joint.
-            settings: arguments of the law; `stiffness` defaults to `matched_stiffness`, modes around 4 Hz. `model`
+            settings: arguments of the law; `stiffness` defaults to `matched_stiffness`, modes around 6 Hz. `model`
                 (own, given), `gravity` (law, robot) and `inputs` ("payload,wrench,extra_torque") are words.
         """
         stiffness, inputs = settings.pop("stiffness", None), settings.pop("inputs", "")

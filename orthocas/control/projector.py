@@ -128,7 +128,7 @@ class Projector(Shown):
 
     @classmethod
     def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """Build the law on the problem of a chart; by default with modes around 4 Hz.
+        """Build the law on the problem of a chart; by default with modes around 6 Hz.
 
         The setting `second` is "joints" (default) or "xi", the coordinates of the chart.
         """

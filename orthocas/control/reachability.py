@@ -9,6 +9,7 @@ from orthocas.control.reference import Reference
 from orthocas.domains import borders, contains
 from orthocas.errors import InvalidValueError, InverseError, UnreachableReferenceError
 from orthocas.postures.clear_box import ClearBox
+from orthocas.reaching.intervals import too_far
 
 
 def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
@@ -34,26 +35,13 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
         try:
             new = chart.inverse(value, q)
         except InverseError as error:
-            text = f"the reference cannot be reached {where}: {error}{_too_far(chart, q, targets[k])}"
+            text = f"the reference cannot be reached {where}: {error}{too_far(chart, q, targets[k, chart.m :])}"
             raise UnreachableReferenceError(text) from None
         if not contains(chart.problem.domain, new):
-            text = f"the reference leaves the domain {where}: {_outside(chart, new)}{_too_far(chart, q, targets[k])}"
-            raise UnreachableReferenceError(text)
+            reason = f"{_outside(chart, new)}{too_far(chart, q, targets[k, chart.m :])}"
+            raise UnreachableReferenceError(f"the reference leaves the domain {where}: {reason}")
         path[k] = q = new
     return path
-
-
-def _too_far(chart: Chart, q: Array, target: Array) -> str:
-    """The coordinate whose target lies farthest outside what it reaches from q (n,); empty if there is none."""
-    reach, wanted = chart.xi_range(q), target[chart.m :]
-    beyond = np.maximum(reach.low - wanted, wanted - reach.high)
-    k = int(np.argmax(beyond))
-    if beyond[k] <= 0:
-        return ""
-    interval = reach[k]
-    stop = interval.low_stop if wanted[k] < interval.low else interval.high_stop
-    told = f"at the last x it reaches [{interval.low:.4g}, {interval.high:.4g}], stopped by {stop}"
-    return f"; {interval.label} = {wanted[k]:.4g} is asked for, {told}"
 
 
 def _outside(chart: Chart, q: Array) -> str:

@@ -1,7 +1,7 @@
 """Settings of the supervised law in generated C: border, catcher, limits, bad input (ours)."""
 
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Annotated, Any, Self, get_args
 
 import casadi as ca
 import numpy as np
@@ -9,12 +9,13 @@ from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.checks import Array, as_float_array, as_number, require_count, require_shape
-from orthocas.control.controller import Controller, require_controller
+from orthocas.control.controller import Command, Controller, require_controller
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError
 
 _SAMPLES, _SEED = 256, 0
 _RATE = {"torque": 1000.0, "velocity": 20.0}  # [N m/s] as on many arms, 1 N m in a millisecond; [rad/s^2]
+_TORQUE_ONLY = ("stop_zone", "stop_damping", "brake_stiffness", "brake_yield")  # velocity laws do not use them
 _SPEED = 4 * np.pi  # [rad/s] or [m/s], of joints without a limit
 _CATCHER = 12.0  # [1/s] natural frequency and damping rate of the catcher
 _RETURN = 0.3  # [rad/s] or [m/s], on the way back
@@ -26,46 +27,57 @@ _ZONE = 0.05  # [rad] or [m], at most this share of the range of a joint
 class Safety:
     """Settings of the supervised law; `Safety.of(controller)` gives the default ones.
 
-    Margins are distances to the border in half-widths of the domain. Lists hold one number per joint (n,), or per
-    controlled quantity (k,) where that is said.
+    Margins are distances to the border in half-widths of the domain. On a `ClearBox`, the bound on the relative
+    singular value s is a border too, at the distance (s - bound) / (s at the centre - bound). Lists hold one number
+    per joint (n,), or per controlled quantity (k,) where that is said. The meanings are those of the generated header.
     """
 
-    command_rate: Array  #: largest change of the command [N m/s], [rad/s^2]
-    speed_limit: Array  #: joint speed at which the catcher takes over; 30 times as fast is a bad measurement [rad/s]
-    rest_speed: Array  #: joint speed below which the arm counts as slow [rad/s]
-    near_margin: float  #: where NEAR_BORDER and additional damping begin
-    catch_margin: float  #: where the catcher takes over, also if the arm would get there while the law fades out
-    return_margin: float  #: where the arm must be before the law takes over again
-    fade_in: float  #: time in which the law takes over [s]
-    fade_out: float  #: time in which the law gives way to the catcher [s]
-    return_speed: float  #: of the fastest joint on the way back [rad/s]
-    error_limit: Array  #: largest error that the law gets to see (k,)
-    offset_rate: Array  #: speed at which the reference goes from where the arm is to what is asked (k,) [1/s]
-    integral_rate: Array  #: integral action: growth of the shift of the reference per error (k,) [1/s]
-    integral_limit: Array  #: largest shift (k,)
-    hold_ticks: int  #: ticks without a good measurement for which the last command is held
-    longest_period: float  #: between two ticks; later ones call the catcher [s]
-    lower: Array  #: joint limits [rad] or [m]
-    upper: Array  #: joint limits [rad] or [m]
-    stop_zone: Array  #: where springs and dampers near the joint limits begin [rad] or [m]
-    stop_stiffness: Array  #: of these springs [N m/rad]; velocity laws: largest speed per distance [1/s]
-    stop_damping: Array  #: against motion towards the limit [N m s/rad]
-    damping: float  #: rate d of the catcher's damping -d M dq [1/s]; velocity laws: of the way to the anchor
-    brake_stiffness: Array  #: spring of the catcher, constant and symmetric, row by row (n * n) [N m/rad]
-    brake_yield: Array  #: largest torque of that spring; beyond it, the arm is let go slowly [N m]
+    command_rate: Annotated[Array, "largest change of the command [N m/s], [rad/s^2]"]
+    speed_limit: Annotated[Array, "joint speed at which the catcher takes over; 30 times that is a bad one [rad/s]"]
+    rest_speed: Annotated[Array, "joint speed below which the arm counts as slow [rad/s]"]
+    near_margin: Annotated[float, "distance to the border at which NEAR_BORDER and additional damping begin"]
+    catch_margin: Annotated[float, "where the catcher takes over, also if the arm gets there while the law fades out"]
+    return_margin: Annotated[float, "where the arm must be before the law takes over again"]
+    fade_in: Annotated[float, "time in which the law takes over [s]"]
+    fade_out: Annotated[float, "time in which the law gives way to the catcher [s]"]
+    return_speed: Annotated[float, "of the fastest joint on the way back [rad/s]"]
+    error_limit: Annotated[Array, "largest error that the law gets to see (k,)"]
+    offset_rate: Annotated[Array, "speed at which the reference goes from the arm to what is asked (k,) [1/s]"]
+    integral_rate: Annotated[Array, "integral action: growth of the reference's shift per error (k,) [1/s]; 0: none"]
+    integral_limit: Annotated[Array, "largest shift (k,)"]
+    hold_ticks: Annotated[int, "ticks without a good measurement for which the last command is held"]
+    longest_period: Annotated[float, "between two ticks; later ones call the catcher [s]"]
+    lower: Annotated[Array, "joint limits [rad] or [m]"]
+    upper: Annotated[Array, "joint limits [rad] or [m]"]
+    stop_zone: Annotated[Array, "where springs and dampers near the joint limits begin [rad] or [m]"]
+    stop_stiffness: Annotated[Array, "of these springs [N m/rad]; velocity laws: largest speed per distance [1/s]"]
+    stop_damping: Annotated[Array, "against motion towards the limit [N m s/rad]"]
+    damping: Annotated[float, "rate of the catcher's damping -d M dq [1/s]; velocity laws: of the way to the anchor"]
+    brake_stiffness: Annotated[Array, "spring of the catcher, symmetric, row by row (n * n) [N m/rad]"]
+    brake_yield: Annotated[Array, "largest torque of that spring, which gives way slowly beyond it [N m]"]
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name == "hold_ticks":
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            if setting.name == "hold_ticks":
                 require_count("hold_ticks", value, least=0)
-            elif field.type is float:
-                _require_number(field.name, value)
+            elif get_args(setting.type)[0] is float:
+                _require_number(setting.name, value)
             else:
-                object.__setattr__(self, field.name, _numbers(field.name, value))
+                object.__setattr__(self, setting.name, _numbers(setting.name, value))
         if not self.catch_margin < self.near_margin < self.return_margin < 1:
             margins = (self.catch_margin, self.near_margin, self.return_margin)
             raise InvalidValueError("margins", margins, "catch_margin < near_margin < return_margin < 1")
+
+    def in_c(self, command: Command) -> dict[str, Any]:
+        """The settings that generated C has for a kind of command, by name."""
+        unused = () if command == "torque" else _TORQUE_ONLY
+        return {setting.name: getattr(self, setting.name) for setting in fields(self) if setting.name not in unused}
+
+    @classmethod
+    def meaning(cls, name: str) -> str:
+        """What a setting means, in one line."""
+        return next(str(get_args(setting.type)[1]) for setting in fields(cls) if setting.name == name)
 
     @classmethod
     def of(cls, controller: Controller, **changes: ArrayLike) -> Self:

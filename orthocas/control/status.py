@@ -9,7 +9,8 @@ from orthocas.domains import Domain, reach
 from orthocas.postures.clear_box import ClearBox
 
 LARGEST = 1e100  #: larger numbers count as not finite, because their squares may overflow
-_SMALLEST_VOLUME = 1e-3  # of the parallelepiped of the gradients, relative to its median over the domain
+GUARD = "guard"  #: name of the guard's function
+SMALLEST_VOLUME = 1e-3  #: of the parallelepiped of the gradients, relative to its median over the domain
 
 
 class ControlStatus(IntEnum):
@@ -55,11 +56,11 @@ def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> 
         A function with the outputs command (n, 1) and status (1, 1). Its inputs are: the command of the law (n, 1),
         which may be NaN; the fallback (n, 1), whose entries become zero where they are not finite; the limit (n, 1) of
         each entry, which may be infinite; q (n, 1); all input numbers of the law; and det(J A^-1 J^T) relative to its
-        median over the domain.
+        median over the domain, and the smallest regular value of that.
     """
     command, fallback, limit, q = (ca.SX.sym(name, n) for name in ("command", "fallback", "limit", "q"))
-    inputs, volume = ca.SX.sym("inputs", numbers), ca.SX.sym("volume")
-    regular = ca.logic_and(volume > _SMALLEST_VOLUME**2, _all_finite(command))
+    inputs, volume, smallest = ca.SX.sym("inputs", numbers), ca.SX.sym("volume"), ca.SX.sym("smallest")
+    regular = ca.logic_and(volume > smallest, _all_finite(command))
     status = ca.if_else(regular, float(ControlStatus.OK), float(ControlStatus.SINGULAR))
     status = ca.if_else(_is_inside(domain, q), status, float(ControlStatus.OUTSIDE_DOMAIN))
     meant = ca.logic_and(_all_finite(inputs), ca.logic_all(limit > 0))
@@ -69,7 +70,7 @@ def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> 
     cut = _cut(chosen, limit, keep_direction)
     saturated = ca.logic_and(from_law, ca.logic_not(ca.logic_all(ca.fabs(chosen) <= limit)))
     status = ca.if_else(saturated, float(ControlStatus.SATURATED), status)
-    return ca.Function("guard", [command, fallback, limit, q, inputs, volume], [cut, status])
+    return ca.Function(GUARD, [command, fallback, limit, q, inputs, volume, smallest], [cut, status])
 
 
 def _chosen(from_law: ca.SX, command: ca.SX, fallback: ca.SX) -> ca.SX:

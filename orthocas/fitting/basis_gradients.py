@@ -2,7 +2,7 @@
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.columns import ColumnFunction, blocked
@@ -43,20 +43,37 @@ class BasisGradients:
         gradients = self._columns(blocked(points))[0]
         return gradients.reshape(len(gradients), self._n, -1, gradients.shape[2])
 
-    def dense(self, gradients: Array, samples: int, every: int = 1) -> Array:
+    def dense(self, gradients: Array, samples: int) -> Array:
         """Expand the result of `at` to all gradients sample by sample, including zeros, (N, n, K).
 
         Args:
             gradients: result of `at`, (B, n, W, c).
             samples: number of samples, without the padding of the last block.
-            every: take only every second, third, ... sample.
         """
-        stack = gradients.transpose(0, 3, 1, 2).reshape(-1, *gradients.shape[1:3])[:samples:every]
-        dense = np.zeros((len(stack), self._n, self._family.width), dtype=gradients.dtype)
-        for i, places in enumerate(self.terms_of_joints):
-            known = places[places >= 0]
-            dense[:, i, known] = stack[:, i, : len(known)]
-        return dense
+        return self.dense_part(gradients, samples, np.ones(self._family.width, dtype=bool))
+
+    def dense_part(
+        self, gradients: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike = None
+    ) -> Array:
+        """The same for some of the functions and samples, (samples, n, kept).
+
+        Args:
+            gradients: result of `at`, (B, n, W, c).
+            samples: number of samples, without the padding of the last block.
+            kept: the functions, (K,).
+            every: take only every second, third, ... sample, a divisor of c.
+            dtype: type of the numbers. Default: that of the gradients.
+        """
+        B, n, _, c = gradients.shape
+        assert c % every == 0
+        place = np.cumsum(kept) - 1
+        dense = np.zeros((B, c // every, n, kept.sum()), dtype=gradients.dtype if dtype is None else dtype)
+        for i, functions in enumerate(self.terms_of_joints):
+            rows = np.flatnonzero((functions >= 0) & kept[functions])
+            columns = place[functions[rows]]
+            for block, part in zip(dense, gradients[:, i, :, ::every], strict=True):
+                block[:, i, columns] = part[rows].T
+        return dense.reshape(-1, *dense.shape[2:])[: -(-samples // every)]
 
     @cached_property
     def _columns(self) -> ColumnFunction:

@@ -11,7 +11,7 @@ from orthocas.casadi_tools.columns import blocked, by_sample, shares
 from orthocas.casadi_tools.threads import in_threads
 from orthocas.checks import Array
 from orthocas.fitting.basis_gradients import BasisGradients
-from orthocas.fitting.loss import Loss, Sizes, Weights
+from orthocas.fitting.loss import Loss, Pairs, Sizes, Weights
 from orthocas.fitting.loss.residuals import curvature_columns, loss_columns, residual_columns, value_columns
 from orthocas.fitting.normal_blocks import normal_matrix
 from orthocas.parametrisations import LinearFamily
@@ -39,6 +39,8 @@ class BasisObjective:
         start: parameters, (size,), whose orientation the regularity term keeps.
         draw: draws fresh samples.
         kept: the coefficients (r, K) that may differ from zero; theta holds only these. Default: all.
+        exchanged: pairs of components whose sum and difference are coordinates, see `orthocas.fitting.mirror`. Then
+            C and J_xi are those of the components.
     """
 
     def __init__(
@@ -49,13 +51,14 @@ class BasisObjective:
         start: Array,
         draw: Draw,
         kept: NDArray[np.bool_] | None = None,
+        exchanged: Pairs = (),
     ) -> None:
         self.family, self.weights, self._draw = family, weights, draw
         self.r, self.K = family.outputs, family.width
         self.kept = np.ones((self.r, self.K), dtype=bool) if kept is None else kept
         m, self.n = samples.task_jacobian.shape[1:]
         self._gradients = BasisGradients(family, self.n)
-        self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name)
+        self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name, exchanged)
         self._put(samples)
         oriented = self._loss.oriented or weights.folds > 0
         self._orientation = samples.orientation(self.coordinate_jacobians(start)) if oriented else None
@@ -132,7 +135,7 @@ class BasisObjective:
     def reweighted(self, weights: Weights) -> Self:
         """The same loss on the same samples with other weights. It cannot add terms that need other sample data."""
         other = copy(self)
-        other.weights, other._loss = weights, Loss.of(self._loss.sizes, weights.by_name)
+        other.weights, other._loss = weights, Loss.of(self._loss.sizes, weights.by_name, self._loss.exchanged)
         assert set(other._loss.data) <= set(self._described)
         return other
 
@@ -144,7 +147,7 @@ class BasisObjective:
             weights: weights of the terms by name.
         """
         other = copy(self)
-        other._loss = Loss.of(self._loss.sizes, weights)
+        other._loss = Loss.of(self._loss.sizes, weights, self._loss.exchanged)
         other._put(samples)
         other._describe(samples)
         return other
@@ -167,10 +170,9 @@ class BasisObjective:
     def _halves(self) -> list[Array]:
         """G of the coefficients of each coordinate at every second sample, (N / 2, n, K_j), in single precision."""
         names = [row.tobytes().hex() for row in self.kept]
-        if not set(names) <= set(self._expanded):
-            half = self._gradients.dense(self.G.astype(np.float32), self.N, _STRIDE)
-            for name, row in zip(names, self.kept, strict=True):
-                self._expanded[name] = half if row.all() else np.ascontiguousarray(half[:, :, row])
+        for name, row in zip(names, self.kept, strict=True):
+            if name not in self._expanded:
+                self._expanded[name] = self._gradients.dense_part(self.G, self.N, row, _STRIDE, np.float32)
         return [self._expanded[name] for name in names]
 
     def _by_joint(self, theta: Array) -> Array:

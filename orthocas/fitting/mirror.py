@@ -1,14 +1,15 @@
 """Mirror symmetry: an arm whose task looks the same in a mirror needs half of the coefficients (ours)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import product
+from dataclasses import dataclass, replace
+from itertools import combinations, permutations, product
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.checks import Array
+from orthocas.fitting.loss import Pairs, coordinates_of
 from orthocas.parametrisations import JointSpace, LinearFamily
 from orthocas.problem import Problem
 from orthocas.samples import samples_at
@@ -16,6 +17,7 @@ from orthocas.samples import samples_at
 _TOLERANCE = 1e-6  # robot files give angles with ten decimals; a symmetry broken by less costs nothing
 _MOST_JOINTS = 12  # 4,096 choices of the joints that turn round
 _POINTS = 16
+_MOST_CHOICES = 8
 _SEED = 0
 
 
@@ -24,15 +26,41 @@ class Mirror:
     """A reflection S = diag(s) of the joints about the centre of the domain that keeps task directions and metric.
 
     The projector on the task gradients fulfils Pi(S q) = S Pi(q) S, and A(S q) = S A(q) S, with q from the centre. So
-    coordinates with xi_j(S q) = p_j xi_j(q), p_j = +1 or -1, have the same angles at q and at S q.
+    coordinates with xi_j(S q) = p_j xi_j(q), p_j = +1 or -1, have the same angles at q and at S q. So have coordinates
+    of which two change places, xi_i(S q) = xi_j(q): then (xi_i + xi_j) / sqrt 2 is even and (xi_i - xi_j) / sqrt 2 odd.
+    In both cases the coordinates come from even and odd components, each with half of the coefficients.
     """
 
     space: JointSpace
     signs: Array  #: s, (n,), +1 or -1
-    parities: Array  #: p, (r,): as many +1 and -1 as the null space has on the mirror, where S q = q
+    parities: Array  #: p of the components, (r,): as many +1 and -1 as the null space has on the mirror, where S q = q
+    exchanged: Pairs = ()  #: pairs of an odd and an even component, from which two coordinates are made
+
+    def choices(self) -> list["Mirror"]:
+        """Mirrors with the same reflection and all choices of what changes places, up to a number of them."""
+        odd, even = (np.flatnonzero(self.parities == sign).tolist() for sign in (-1, 1))
+        most = min(len(odd), len(even))
+        pairs = [
+            tuple(zip(some, others, strict=True))
+            for count in range(most + 1)
+            for some in combinations(odd, count)
+            for others in permutations(even, count)
+        ]
+        return [replace(self, exchanged=chosen) for chosen in pairs[:_MOST_CHOICES]]
+
+    def coordinates(self, theta: Array) -> Array:
+        """Coefficients of the coordinates, (r K,), from those of the components."""
+        rows = theta.reshape(len(self.parities), -1)
+        return np.concatenate(coordinates_of(list(rows), self.exchanged))
+
+    def components(self, theta: Array) -> Array:
+        """Coefficients of the components, (r K,), from those of the coordinates."""
+        rows = theta.reshape(len(self.parities), -1)
+        back = tuple((j, i) for i, j in self.exchanged)
+        return np.concatenate(coordinates_of(list(rows), back))
 
     def kept(self, family: LinearFamily) -> NDArray[np.bool_] | None:
-        """The coefficients (r, K) that such coordinates may have; None if a basis function is neither even nor odd."""
+        """The coefficients (r, K) that the components may have; None if a basis function is neither even nor odd."""
         q = ca.SX.sym("q", self.space.n)
         basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
         u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (self.space.n, _POINTS))

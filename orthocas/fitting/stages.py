@@ -32,6 +32,7 @@ from orthocas.solvers import GaussNewton
 
 MLP_SAMPLES = 2000  #: default sample count of families that are not linear in theta
 _START_SEED = 0  # seed of the samples of spectral starts, the same for all fits
+_TRIAL_DEGREE = 3  # of the trial that chooses among symmetric coordinates
 _FRESH = 2000  # seed tag of samples drawn while a solver runs; stages use other tags
 
 
@@ -65,8 +66,16 @@ class StageRunner:
 
     @cached_property
     def mirror(self) -> Mirror | None:
-        """The symmetry that halves the coefficients; a bound on mutual angles is met without one."""
-        return None if self.settings.max_mutual is not None else find_mirror(self.problem, self.active)
+        """The symmetry that halves the coefficients; a bound on mutual angles is met without one.
+
+        Of the coordinates that it allows, those with the least loss at degree 3 are chosen.
+        """
+        found = None if self.settings.max_mutual is not None else find_mirror(self.problem, self.active)
+        target = self.settings.parametrisation
+        if found is None or not isinstance(target, GradedParametrisation):
+            return found
+        family = target.of_degree(min(target.degree, _TRIAL_DEGREE)).family(self.space, len(found.parities))
+        return min(found.choices(), key=lambda mirror: self._trial(family, mirror))
 
     def run(self, plan: Plan) -> Stage:
         """Draw samples, find a start if none is given, and minimise. A finished stage comes from the checkpoint.
@@ -75,7 +84,7 @@ class StageRunner:
             SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
         """
         family = plan.family
-        kept = self.mirror.kept(family) if self.mirror is not None and isinstance(family, LinearFamily) else None
+        kept = self.mirror.kept(family) if isinstance(family, LinearFamily) and self.mirror is not None else None
         self.checkpoint.require_fitting(plan.label, family.size, family.size if kept is None else int(kept.sum()))
         done = self.checkpoint.finished(plan.label)
         if done is not None:
@@ -90,8 +99,7 @@ class StageRunner:
         """A stage that is not in the checkpoint."""
         count = self._sample_count(plan.family, kept)
         self.monitor(Progress(plan.label, 0.0, f"sampling {count} points"))
-        points = sample_evenly(self.problem.domain, count, (self.settings.seed, 1 + plan.tag))
-        samples = samples_at(self.problem, points).restricted_to(self.active)
+        samples = self._samples(count, 1 + plan.tag)
         with deferred():  # CasADi may swallow Ctrl-C while graphs are built
             objective, theta = self._objective(plan, samples, kept)
         keeper = self.checkpoint.keeper(plan.label)
@@ -107,8 +115,8 @@ class StageRunner:
                 raise missed_bound(plan.label, self.settings.max_mutual, objective, result)
         else:
             result.raise_if_failed()
-        if kept is not None:
-            result = replace(result, theta=expanded(result.theta, kept))
+        if kept is not None and self.mirror is not None:
+            result = replace(result, theta=self.mirror.coordinates(expanded(result.theta, kept)))
         return Stage(plan.label, plan.family.size, len(samples), result)
 
     def _objective(self, plan: Plan, samples: Samples, kept: NDArray[np.bool_] | None) -> tuple[Objective, Array]:
@@ -124,13 +132,34 @@ class StageRunner:
             self._require_graph_memory(plan.label, family, len(samples))
             theta = family.initial(self.settings.seed) if theta is None else theta
             return self.folds.added_to(GraphObjective(family, samples, weights, theta, self._draw)), theta
-        fresh = theta is None
-        theta = self._spectral_start(family, len(samples), kept) if theta is None else theta
-        theta = theta if kept is None else theta.reshape(kept.shape)[kept]
-        objective = BasisObjective(family, samples, weights, theta, self._draw, kept)
+        objective, start = self._linear_objective(family, samples, theta, None if kept is None else self.mirror)
         if self.settings.max_mutual is None:
-            return self.folds.added_to(objective), theta
-        return self._bounded(objective, theta, fresh)
+            return self.folds.added_to(objective), start
+        return self._bounded(objective, start, fresh=theta is None)
+
+    def _linear_objective(
+        self, family: LinearFamily, samples: Samples, theta: Array | None, mirror: Mirror | None
+    ) -> tuple[BasisObjective, Array]:
+        """The loss of a family that is linear in its parameters, and the start in those that a mirror leaves free."""
+        kept = None if mirror is None else mirror.kept(family)
+        if theta is None:
+            theta = self._spectral_start(family, len(samples), kept)
+        elif mirror is not None:
+            theta = mirror.components(theta)
+        theta = theta if kept is None else theta.reshape(kept.shape)[kept]
+        exchanged = () if mirror is None else mirror.exchanged
+        return BasisObjective(family, samples, self.settings.weights, theta, self._draw, kept, exchanged), theta
+
+    def _trial(self, family: LinearFamily, mirror: Mirror) -> float:
+        """The loss that a family reaches with these symmetric coordinates."""
+        samples = self._samples(self._sample_count(family, mirror.kept(family)), 0)
+        with one_blas_thread():
+            with deferred():
+                objective, start = self._linear_objective(family, samples, None, mirror)
+            result = GaussNewton().coarser().minimise(objective, start)
+        if result.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        return result.value
 
     def _bounded(self, objective: BasisObjective, theta: Array, fresh: bool) -> tuple[Objective, Array]:
         """The problem with a bound on the mutual angles, and its start."""
@@ -149,6 +178,10 @@ class StageRunner:
         """A start that does not depend on the seed: eigenvalues are close, so other samples would mix coordinates."""
         points = sample_evenly(self.problem.domain, count, _START_SEED)
         return spectral_start(family, samples_at(self.problem, points).restricted_to(self.active), kept)
+
+    def _samples(self, count: int, tag: int) -> Samples:
+        points = sample_evenly(self.problem.domain, count, (self.settings.seed, tag))
+        return samples_at(self.problem, points).restricted_to(self.active)
 
     def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
         return sample_problem(self.problem, count, (self.settings.seed, _FRESH, *seed)).restricted_to(self.active)

@@ -8,6 +8,7 @@ import numpy as np
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, Indices
 from orthocas.domains import borders
+from orthocas.inverting.nearest import Nearest
 from orthocas.inverting.newton import Attempt, LocalSolver, PhiMap, largest
 from orthocas.inverting.solutions import InverseStatus, Solutions
 from orthocas.inverting.starts import Starts
@@ -15,6 +16,10 @@ from orthocas.problem import Problem
 
 _ROWS = 16_384  # solved at once
 _RESTARTS = 8  # from points of the table, where neither the rough inverse nor the centre leads to a solution inside
+_TASK_STARTS = 3  # for the nearest coordinates, after the best q so far
+_MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, InverseStatus.OUT_OF_REACH)
+_MANY = 1024  # starts of the search for all solutions
+_SAME = 1e-6  # of the half-widths: distance up to which two solutions count as one
 _SNAP = 1e-9  # of the half-widths: solutions so close to the border are moved onto it
 _SLACK = 1e-9  # of the half-widths: joint limits are decimal numbers, see `require_within_limits`
 
@@ -55,8 +60,9 @@ class Inverse:
     problem: Problem
     phi_map: PhiMap
     local: LocalSolver
+    nearest: Nearest | None = None  #: for solutions inside the domain only
 
-    def solve(self, targets: Array, starts: Array | None, tolerance: float) -> Solutions:
+    def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
         """Solutions for targets (N, n), from starts (N, n) or our own. Rows that are not finite fail."""
         good = np.isfinite(targets).all(axis=1)
         if starts is not None:
@@ -66,29 +72,58 @@ class Inverse:
         status, iterations = np.full(len(q), int(InverseStatus.BAD_INPUT)), np.zeros(len(q), dtype=np.int64)
         for rows in np.array_split(np.flatnonzero(good), -(-int(good.sum()) // _ROWS) or 1):
             if rows.size:
-                found = self._searched(targets[rows], None if starts is None else starts[rows], tolerance)
+                found = self._searched(targets[rows], None if starts is None else starts[rows], tolerance, inside)
                 q[rows], status[rows], iterations[rows] = found.q, found.status, found.iterations
                 error[rows], distance[rows] = found.error, self._distance(targets[rows], found.residual)
+                kept = found.status == InverseStatus.NEAREST
+                error[rows[kept]] = largest(found.residual[kept, : self.problem.m])
         return Solutions(q, status, iterations, error, distance, tolerance)
 
-    def _searched(self, targets: Array, starts: Array | None, tolerance: float) -> Found:
+    def all_inside(self, target: Array, tolerance: float) -> Array:
+        """Different solutions for one target (n,) inside the domain, that nearest to the centre first, (k, n)."""
+        domain = self.problem.domain
+        starts = np.vstack([self.starts.guess(target[None]), domain.centre[None], self.starts.spread(_MANY, target)])
+        found = self._attempt(np.broadcast_to(target, starts.shape), starts, tolerance)
+        q = found.q[found.status == InverseStatus.FOUND]
+        different: list[Array] = []
+        for row in q[np.argsort(np.linalg.norm((q - domain.centre) / domain.half_width, axis=1))]:
+            if all(np.abs((row - other) / domain.half_width).max() > _SAME for other in different):
+                different.append(row)
+        return np.array(different).reshape(-1, len(target))
+
+    def _searched(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
         """What the search finds from given starts, or from the rough inverse and, where that fails, from others."""
-        if starts is not None:
-            return self._attempt(targets, starts, tolerance)
-        best = self._attempt(targets, self.starts.guess(targets), tolerance)
+        best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance)
         rows = best.missing
-        for start in self._other_starts(targets[rows]):
-            left = best.status[rows] != InverseStatus.FOUND
-            if not left.any():
-                break
-            best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
+        if inside or starts is None:
+            for start in self._other_starts(targets[rows]):
+                left = best.status[rows] != InverseStatus.FOUND
+                if not left.any():
+                    break
+                best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
+        if inside and self.nearest is not None:
+            self._move_inside(self.nearest, targets, best, tolerance)
         return best
+
+    def _move_inside(self, nearest: Nearest, targets: Array, best: Found, tolerance: float) -> None:
+        """Replace what is missing by the nearest coordinates inside the domain."""
+        rows = np.flatnonzero(np.isin(best.status, _MOVED))
+        starts = self.starts.nearest(targets[rows], _TASK_STARTS, self.problem.m) if rows.size else ()
+        for start in (best.q[rows], *starts):
+            left = best.status[rows] != InverseStatus.NEAREST
+            into = rows[left]
+            if not into.size:
+                break
+            best.q[into] = nearest.search(targets[into], start[left])
+            best.residual[into] = self.phi_map.residual(targets[into], best.q[into])
+            kept = nearest.keeps_task(targets[into], best.q[into], tolerance)
+            best.status[into] = np.where(kept, InverseStatus.NEAREST, InverseStatus.OUT_OF_REACH)
 
     def _other_starts(self, targets: Array) -> Iterator[Array]:
         """The centre of the domain, and points of the table near the targets, (N, n) each."""
         if len(targets):
             yield np.broadcast_to(self.problem.domain.centre, targets.shape)
-            yield from self.starts.nearest(targets, _RESTARTS)
+            yield from self.starts.nearest(targets, _RESTARTS, self.problem.n)
 
     def _attempt(self, targets: Array, starts: Array, tolerance: float) -> Found:
         """One search from starts (N, n), judged."""
@@ -97,7 +132,8 @@ class Inverse:
         status = np.full(len(targets), int(InverseStatus.OUT_OF_REACH))
         status[solved] = self._status(attempt.q[solved])
         doubtful = np.flatnonzero(solved & attempt.suspicious)
-        status[doubtful[self.phi_map.is_singular(attempt.q[doubtful])]] = InverseStatus.SINGULAR
+        if doubtful.size:
+            status[doubtful[self.phi_map.is_singular(attempt.q[doubtful])]] = InverseStatus.SINGULAR
         return Found(attempt.q, attempt.residual, attempt.iterations, status)
 
     def _status(self, q: Array) -> Indices:

@@ -11,15 +11,17 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.casadi_tools.threads import in_threads
 from orthocas.checks import Array, Indices
 
 MAX_ITERATIONS = 50
 _PATIENCE = 8  # iterations after which the error must have halved
 GOAL = 1e-12  #: error at which the iteration stops
-_ROUNDING = 1e-5  # of phi: 1e-9 of it are 45 units in the last place
+ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
 _KEEP = 0.1  # J is evaluated again if a step leaves more of the error
 _DECREASE = 1e-4  # of the error, relative to the part of the step taken
 _HALVINGS, _SOLVED = 10, 1e-10  # of a step; below this error only rounding stops the decrease
+_PIECE = 2048  # matrices that a thread inverts at once
 _SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
 SUSPICIOUS = 1e6  #: |J| |J^-1| above which singular values are computed
 
@@ -34,7 +36,7 @@ class PhiMap:
 
     def scale(self, targets: Array) -> Array:
         """Scale of errors (N, n): the sizes of the components, and more where rounding of phi exceeds them."""
-        scale: Array = self.sizes + _ROUNDING * np.abs(targets)
+        scale: Array = self.sizes + ROUNDING * np.abs(targets)
         return scale
 
     def residual(self, targets: Array, q: Array) -> Array:
@@ -139,7 +141,8 @@ class _Run:
 
         A row whose J is from an earlier point waits for a new one instead.
         """
-        steps = np.matmul(self._inverse[rows], self.residual[rows, :, None])[:, :, 0]
+        inverse = self._inverse if len(rows) == len(self._inverse) else self._inverse[rows]  # copies take time
+        steps = np.matmul(inverse, self.residual[rows, :, None])[:, :, 0]
         goes_on = np.zeros(len(rows), dtype=bool)
         left = np.flatnonzero(np.isfinite(steps).all(axis=1))
         for halvings in range(_HALVINGS + 1):
@@ -180,9 +183,15 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
     """
     singular: NDArray[np.bool_] = np.zeros(len(matrices), dtype=bool)
     try:
-        found = np.asarray(np.linalg.inv(matrices), dtype=float)
+        found = np.empty_like(matrices)
+        pieces = [slice(first, first + _PIECE) for first in range(0, len(matrices), _PIECE)]
+        for piece, inverse in zip(
+            pieces, in_threads(lambda piece: np.linalg.inv(matrices[piece]), pieces), strict=True
+        ):
+            found[piece] = inverse
     except np.linalg.LinAlgError:  # it does not say which
-        singular = np.asarray(np.linalg.slogdet(matrices)[0] == 0)
+        with np.errstate(invalid="ignore"):
+            singular = np.asarray(np.linalg.slogdet(matrices)[0] == 0)
         found = np.empty_like(matrices)
         found[~singular] = np.linalg.inv(matrices[~singular])
         found[singular] = np.linalg.pinv(matrices[singular])

@@ -15,75 +15,77 @@ import numpy as np
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
-from orthocas.inverting.newton import GOAL, SUSPICIOUS, Attempt, LocalSolver, PhiMap
+from orthocas.inverting.newton import GOAL, ROUNDING, SUSPICIOUS, Attempt, LocalSolver, PhiMap
 
 _FEW = 4  # rows that are solved one by one
-_STEPS = 3  # with the same Jacobian
-_REFRESHES = 4
+STEPS = 3  #: with the same Jacobian
+REFRESHES = 4
 
 
 @dataclass(frozen=True)
 class PointFunctions:
     """The two functions of a chart that `PointSolver` calls."""
 
-    inverted: ca.Function  #: q, scale -> the inverse H of J / scale, and |J| |H|
-    chord: ca.Function  #: q, H, target, scale -> q after 3 steps, its residual, and the error at each of the 4 points
+    inverted: ca.Function  #: q -> phi, H = J^-1, and |D^-1 J| |H D| with the sizes D of the components
+    chord: ca.Function  #: q, phi, H, target -> q and phi after 3 steps, and |residual| at each of the 4 points
 
     @classmethod
-    def of(cls, phi: ca.Function, jacobian: ca.Function) -> "PointFunctions":
+    def of(cls, phi: ca.Function, jacobian: ca.Function, sizes: Array) -> "PointFunctions":
         """For phi and J of a column q (n, 1)."""
-        n = phi.numel_out(0)
-        A = ca.SX.sym("A", n, n)
-        inverse = ca.solve(A, ca.SX.eye(n))
-        invert = ca.Function("invert", [A], [inverse, ca.norm_fro(A) * ca.norm_fro(inverse)])
-        q, target, scale = (ca.MX.sym(name, n) for name in ("q", "target", "scale"))
+        n = len(sizes)
+        q, known, target = (ca.MX.sym(name, n) for name in ("q", "phi", "target"))
         H = ca.MX.sym("H", n, n)
-        inverted = dense_function("inverted", [q, scale], invert.call([jacobian(q) / ca.repmat(scale, 1, n)]))
-        now, residual = q, (target - phi(q)) / scale
-        errors = [ca.norm_inf(residual)]
-        for _ in range(_STEPS):
-            now = now + H @ residual
-            residual = (target - phi(now)) / scale
-            errors.append(ca.norm_inf(residual))
-        return cls(inverted, dense_function("chord", [q, H, target, scale], [now, residual, ca.vertcat(*errors)]))
+        inverted = dense_function("inverted", [q], [phi(q), *_inversion(sizes).call([jacobian(q)])])
+        scale = ca.DM(sizes) + ROUNDING * ca.fabs(target)
+        now, value = q, known
+        errors = [ca.norm_2((target - value) / scale)]  # norm_inf drops NaN
+        for _ in range(STEPS):
+            now = now + H @ (target - value)
+            value = phi(now)
+            errors.append(ca.norm_2((target - value) / scale))
+        chord = dense_function("chord", [q, known, H, target], [now, value, ca.vertcat(*errors)])
+        return cls(inverted, chord)
 
 
 class PointSolver:
     """Solves phi(q) = target near a start; each solver has its own scratch memory, and belongs to one thread.
 
-    `q`, `target`, `scale` are its inputs, (n,). After a step, `reached`, `residual` and `errors` tell where it ended.
+    `q` and `target` are its inputs, (n,), and `phi` is that of q. After steps, `reached` and `errors` tell where they
+    ended.
     """
 
     def __init__(self, functions: PointFunctions) -> None:
         n = functions.chord.numel_out(0)
-        self.q, self.target, self.scale, self.reached, self.residual = np.empty((5, n))
-        self.errors, self.condition = np.empty(_STEPS + 1), np.empty(1)
+        self.q, self.phi, self.target, self.reached, self._phi_reached = np.empty((5, n))
+        self.errors, self.condition = np.empty(STEPS + 1), np.empty(1)
         self.iterations = 0  #: of the last solution
-        inverse = np.empty(n * n)
-        self._refresh, self._keep = _bound(functions.inverted, [self.q, self.scale], [inverse, self.condition])
-        self._step, self._keep_too = _bound(
-            functions.chord, [self.q, inverse, self.target, self.scale], [self.reached, self.residual, self.errors]
-        )
+        H = np.empty(n * n)
+        self._refresh = Bound(functions.inverted, [self.q], [self.phi, H, self.condition])
+        results = [self.reached, self._phi_reached, self.errors]
+        self._step = Bound(functions.chord, [self.q, self.phi, H, self.target], results)
 
-    def refresh(self) -> None:
-        """Evaluate J at q."""
-        self._refresh()
+    def refresh(self) -> bool:
+        """Evaluate phi and J at q. Returns whether J is regular."""
+        self._refresh.run()
+        return bool(self.condition[0] < SUSPICIOUS)
 
     def step(self) -> bool:
         """Take steps from q with the last J. Returns whether all of them reduced the error; q stays."""
-        self._step()
-        errors = self.errors.tolist()
-        return all(after < before or after <= GOAL for before, after in pairwise(errors))
+        self._step.run()
+        return decreasing(self.errors.tolist())
+
+    def accept(self) -> None:
+        """Move q to where the last steps ended."""
+        self.q[:], self.phi[:] = self.reached, self._phi_reached
 
     def solve(self) -> bool:
         """Solve for the target from q. Returns whether the error fell to rounding; then q is the solution."""
         self.iterations = 0
-        for _ in range(_REFRESHES):
-            self._refresh()
-            if not self.step():
+        for _ in range(REFRESHES):
+            if not self.refresh() or not self.step():
                 return False
-            self.q[:] = self.reached
-            self.iterations += _STEPS
+            self.accept()
+            self.iterations += STEPS
             if self.errors[-1] <= GOAL:
                 return True
         return False
@@ -101,29 +103,45 @@ class FewRows:
             return self._other(targets, starts)
         attempt = Attempt.empty(*targets.shape)
         with deferred():  # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
-            solver, scale = PointSolver(self._functions), self._map.scale(targets)
-            done = [self._row(solver, attempt, k, (starts[k], targets[k], scale[k])) for k in range(len(targets))]
+            solver = PointSolver(self._functions)
+            done = [_solved(solver, attempt, k, targets[k], starts[k]) for k in range(len(targets))]
+        attempt.residual[:] = (targets - attempt.residual) / self._map.scale(targets)
         failed = np.flatnonzero(~np.array(done, dtype=bool))
         if failed.size:
             attempt.replace(failed, self._other(targets[failed], starts[failed]))
         return attempt
 
-    @staticmethod
-    def _row(solver: PointSolver, attempt: Attempt, k: int, given: tuple[Array, Array, Array]) -> bool:
-        """Solve a row; returns whether that succeeded."""
-        solver.q[:], solver.target[:], solver.scale[:] = given
-        done = solver.solve()
-        attempt.q[k], attempt.residual[k] = solver.q, solver.residual
-        attempt.iterations[k], attempt.suspicious[k] = solver.iterations, not solver.condition[0] < SUSPICIOUS
-        return done
+
+def decreasing(errors: list[float]) -> bool:
+    """Whether errors fall until they are rounding."""
+    return all(after < before or after <= GOAL for before, after in pairwise(errors))
 
 
-def _bound(function: ca.Function, inputs: list[Array], outputs: list[Array]) -> tuple[Callable[[], Any], Any]:
-    """A call of a function on arrays that stay in place, and what has to live as long as it."""
-    buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
-    buffer, run = function.buffer()
-    for i, array in enumerate(inputs):
-        buffer.set_arg(i, array.data)
-    for i, array in enumerate(outputs):
-        buffer.set_res(i, array.data)
-    return run, (buffer, inputs, outputs)
+class Bound:
+    """A function on arrays that stay in place: `run()` evaluates it."""
+
+    def __init__(self, function: ca.Function, inputs: list[Array], outputs: list[Array]) -> None:
+        buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
+        buffer, run = function.buffer()
+        for i, array in enumerate(inputs):
+            buffer.set_arg(i, array.data)
+        for i, array in enumerate(outputs):
+            buffer.set_res(i, array.data)
+        self.run: Callable[[], Any] = run
+        self._alive = buffer, inputs, outputs
+
+
+def _solved(solver: PointSolver, attempt: Attempt, k: int, target: Array, start: Array) -> bool:
+    """Put q and phi for row k into `attempt`. Returns whether that succeeded, which it does not near singular J."""
+    solver.q[:], solver.target[:] = start, target
+    done = solver.solve()
+    attempt.q[k], attempt.residual[k], attempt.iterations[k] = solver.q, solver.phi, solver.iterations
+    return done
+
+
+def _inversion(sizes: Array) -> ca.Function:
+    """J -> J^-1, and the product of the norms of D^-1 J and its inverse; by QR, so NaN for singular J."""
+    n = len(sizes)
+    J, D = ca.SX.sym("J", n, n), ca.repmat(ca.DM(sizes), 1, n)
+    inverse = ca.solve(J, ca.SX.eye(n))
+    return ca.Function("inversion", [J], [inverse, ca.norm_fro(J / D) * ca.norm_fro(inverse * D.T)])

@@ -33,14 +33,25 @@ class Starts:
         guess: Array = np.clip(q, centre - half_width, centre + half_width)
         return guess
 
-    def nearest(self, targets: Array, count: int) -> Array:
-        """The points of the table whose phi is nearest to targets (N, n), nearest first, (count or fewer, N, n)."""
+    def nearest(self, targets: Array, count: int, components: int) -> Array:
+        """The points of the table whose phi is nearest to targets (N, n), nearest first, (count or fewer, N, n).
+
+        Args:
+            targets: values of phi.
+            count: points for each target.
+            components: how many components of phi count, the first ones.
+        """
         points, phi = self._table
-        known, wanted = self._normalised(phi), self._normalised(targets)
+        known, wanted = self._normalised(phi)[:, :components], self._normalised(targets)[:, :components]
         parts = [wanted[start : start + _AT_ONCE] for start in range(0, len(wanted), _AT_ONCE)]
         order = np.concatenate([_nearest(known, part, min(count, len(points))) for part in parts])
         nearest: Array = points[order.T]
         return nearest
+
+    def spread(self, count: int, target: Array) -> Array:
+        """Points of the table: half of them near a target (n,), the others spread over the domain, (count, n)."""
+        near = self.nearest(target[None], count // 2, len(target))[:, 0]
+        return np.vstack([near, self._table[0][: count - len(near)]])
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:

@@ -109,12 +109,18 @@ class ClearBox(Box):
         return float(self.is_clear(sample_evenly(_borders(self), _SHARE_SAMPLES, _SEED)).mean())
 
     @cached_property
+    def gram(self) -> ca.Function:
+        """q (n, 1) -> D^-1 J_x J_x^T D^-1 (m, m), whose smallest eigenvalue is s(q)^2."""
+        q = ca.SX.sym("q", len(self.centre))
+        J = self.task.jacobian_function(q) / ca.repmat(ca.DM(self.scale), 1, len(self.centre))
+        return dense_function("gram", [q], [J @ J.T])
+
+    @cached_property
     def pivots(self) -> ca.Function:
         """q (n, 1) -> the pivots (m, 1) of D^-1 J_x J_x^T D^-1 - bound^2 I; all are > 0 just where q is clear."""
         q = ca.SX.sym("q", len(self.centre))
-        J = self.task.jacobian_function(q) / ca.repmat(ca.DM(self.scale), 1, len(self.centre))
         square = self.least_singular_value * self.least_singular_value  # ** raises OverflowError for bounds of a file
-        left = J @ J.T - square * ca.SX.eye(self.task.m)
+        left = self.gram(q) - square * ca.SX.eye(self.task.m)
         found = []
         for _ in range(self.task.m):
             found.append(left[0, 0])

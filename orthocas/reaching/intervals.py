@@ -94,6 +94,19 @@ def xi_range(chart: "Chart", q: ArrayLike) -> XiRange:
     return XiRange(tuple(_interval(chart, start, k) for k in range(chart.r)))
 
 
+def too_far(chart: "Chart", q: Array, wanted: Array) -> str:
+    """The coordinate that is wanted (r,) farthest outside its range at q (n,), in words; empty if there is none."""
+    reach = xi_range(chart, q)
+    beyond = np.maximum(reach.low - wanted, wanted - reach.high)
+    k = int(np.argmax(beyond))
+    if beyond[k] <= 0:
+        return ""
+    interval = reach[k]
+    stop = interval.low_stop if wanted[k] < interval.low else interval.high_stop
+    told = f"at the last x it reaches [{interval.low:.4g}, {interval.high:.4g}], stopped by {stop}"
+    return f"; {interval.label} = {wanted[k]:.4g} is asked for, {told}"
+
+
 def start_inside(chart: "Chart", q: ArrayLike) -> Array:
     """One joint position (n,) inside the domain, where phi and J are finite.
 

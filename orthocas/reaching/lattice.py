@@ -4,9 +4,8 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthocas.checks import Array
+from orthocas.checks import Array, Indices
 from orthocas.reaching.intervals import XiRange
 
 if TYPE_CHECKING:
@@ -15,6 +14,7 @@ if TYPE_CHECKING:
 _ITERATIONS = 12
 _TOLERANCE = 1e-10  # of phi, relative to `Chart.phi_sizes`
 _FARTHEST = 3.0  # distance of a point from its neighbour, in lengths of the predicted step
+_SINGULAR = 1e12  # condition number of J
 _MOST = 4  # times as many points as wanted, at most
 
 
@@ -37,8 +37,8 @@ def filled(chart: "Chart", q: Array, alone: XiRange, samples: int) -> Array:
         targets = np.tile(start, (len(pairs), 1))
         targets[:, chart.m :] += places * spacing
         found, good = _solved(chart, np.array([known[origin] for origin, _ in pairs]), targets, float(sign))
-        front = [place for (_, place), fine in zip(pairs, good, strict=True) if fine]
-        known.update({place: point for (_, place), point, fine in zip(pairs, found, good, strict=True) if fine})
+        front = [pairs[row][1] for row in good]
+        known.update(zip(front, found[good], strict=True))
     return np.array(list(known.values()))
 
 
@@ -61,8 +61,8 @@ def _neighbours(
     return pairs
 
 
-def _solved(chart: "Chart", starts: Array, targets: Array, sign: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Newton's method from all starts (N, n), and where it found a point of the domain on the same sheet."""
+def _solved(chart: "Chart", starts: Array, targets: Array, sign: float) -> tuple[Array, Indices]:
+    """Newton's method from all starts (N, n), and the rows where it found a point of the domain on the same sheet."""
     q, sizes = starts.copy(), chart.phi_sizes
     first = np.zeros(len(q))
     for k in range(_ITERATIONS):
@@ -74,19 +74,18 @@ def _solved(chart: "Chart", starts: Array, targets: Array, sign: float) -> tuple
             break
     error = np.abs((chart.phi(q) - targets) / sizes).max(axis=1)
     near = np.linalg.norm(q - starts, axis=1) <= _FARTHEST * first + 1e-9
-    good = np.logical_and.reduce([error < _TOLERANCE, near, chart.problem.domain.contains(q)])
-    rows = np.flatnonzero(good)
-    good[rows] = np.sign(np.linalg.det(_jacobian(chart, q[rows]))) == sign
-    return q, good
+    rows = np.flatnonzero((error < _TOLERANCE) & near & chart.problem.domain.contains(q))
+    same = np.sign(np.linalg.det(_jacobian(chart, q[rows]))) == sign
+    return q, np.asarray(rows[same], dtype=np.int64)
 
 
 def _newton_step(chart: "Chart", q: Array, targets: Array) -> Array:
     """J^-1 (target - phi), at most half a radian long; zero where J is singular or not finite."""
     J, error = _jacobian(chart, q), targets - chart.phi(q)
-    fine = np.isfinite(J).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
-    fine[fine] = np.linalg.cond(J[fine]) < 1e12
+    rows = np.flatnonzero(np.isfinite(J).all(axis=(1, 2)) & np.isfinite(error).all(axis=1))
+    rows = rows[np.linalg.cond(J[rows]) < _SINGULAR]
     change = np.zeros_like(q)
-    change[fine] = np.linalg.solve(J[fine], error[fine][..., None])[..., 0]
+    change[rows] = np.linalg.solve(J[rows], error[rows][..., None])[..., 0]
     length = np.linalg.norm(change, axis=1, keepdims=True)
     return np.asarray(change * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300)))
 

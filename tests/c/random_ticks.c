@@ -1,8 +1,9 @@
 /* Random ticks inside and outside the domain and close to a singularity, with NaN, infinity and huge numbers among them.
  *
- * Compile with -DTICKS=, -DLIMIT= and -DSINGULAR= (joint positions, separated by commas). Prints how often each status
- * of the controller came. Exits with 1 at a wrong status of the controller, 2 at a command that is not finite or beyond
- * the limit, 3 at a wrong status or a number that is not finite of another function. */
+ * Compile with -DTICKS=, -DLIMIT=, -DSINGULAR= (joint positions, separated by commas) and, for a library in single
+ * precision, -DNUMBER=float. Prints how often each status of the controller came. Exits with 1 at a wrong status of the
+ * controller, 2 at a command that is not finite or beyond the limit, 3 at a wrong status or a number that is not finite
+ * of another function. */
 #include <math.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -10,8 +11,14 @@
 #include "arm.h"
 
 #define N ARM_JOINTS
+#ifndef NUMBER
+#define NUMBER double
+#endif
+#define IS_DOUBLE (sizeof(NUMBER) == sizeof(double))
+#define LARGEST (IS_DOUBLE ? 1e100 : (double)1e15f)
+#define EDGE (IS_DOUBLE ? 0.0 : 1e-6) /* so near to a border, either status is right */
 
-static const double singular[N] = {SINGULAR};
+static const NUMBER singular[N] = {SINGULAR};
 static uint64_t seed = 88172645463325252ULL;
 
 static double uniform(void) { /* -1 to 1 */
@@ -21,46 +28,47 @@ static double uniform(void) { /* -1 to 1 */
   return (double)(seed >> 11) / 4503599627370496.0 - 1.0;
 }
 
-static void fill(double *x, int count, double centre, double width) {
+static void fill(NUMBER *x, int count, double centre, double width) {
   int i;
   for (i = 0; i < count; ++i) x[i] = centre + width * uniform();
 }
 
 /* Now and then one number that is none, or at the edge of it. */
-static void spoil(double *x, int count) {
-  static const double bad[] = {NAN, INFINITY, -INFINITY, 1e300, -1e150, 1.1e100, 1e100, -1e90, 1e60, 5e-324};
+static void spoil(NUMBER *x, int count) {
+  const NUMBER bad[] = {NAN, INFINITY, -INFINITY, (NUMBER)1e300, (NUMBER)-1e150, (NUMBER)(1.1 * LARGEST), (NUMBER)LARGEST,
+                        (NUMBER)(-1e-2 * LARGEST), (NUMBER)(IS_DOUBLE ? 1e60 : 1e9), (NUMBER)5e-324}; /* or infinite */
   if (uniform() > 0.9) x[(int)((uniform() + 1.0) * 0.4999 * count)] = bad[(int)((uniform() + 1.0) * 4.999)];
 }
 
-static int are_numbers(const double *x, int count) {
+static int are_numbers(const NUMBER *x, int count) {
   int i;
   for (i = 0; i < count; ++i)
-    if (!(fabs(x[i]) <= 1e100)) return 0;
+    if (!(fabs(x[i]) <= LARGEST)) return 0;
   return 1;
 }
 
-static int are_small(const double *x, int count) { /* their squares do not overflow */
+static int are_small(const NUMBER *x, int count) { /* their squares are numbers */
   int i;
   for (i = 0; i < count; ++i)
-    if (!(fabs(x[i]) <= 1e10)) return 0;
+    if (!(fabs(x[i]) <= (IS_DOUBLE ? 1e10 : 1e6))) return 0;
   return 1;
 }
 
-static int all_finite(const double *x, int count) {
+static int all_finite(const NUMBER *x, int count) {
   int i;
   for (i = 0; i < count; ++i)
     if (!isfinite(x[i])) return 0;
   return 1;
 }
 
-static int inside(const double *q) {
+static int inside(const NUMBER *q, double slack) {
   int i;
   for (i = 0; i < N; ++i)
-    if (!(q[i] >= arm_domain_lower[i] && q[i] <= arm_domain_upper[i])) return 0;
+    if (!(q[i] >= arm_domain_lower[i] - slack && q[i] <= arm_domain_upper[i] + slack)) return 0;
   return 1;
 }
 
-static void random_position(double *q, int near_singular) {
+static void random_position(NUMBER *q, int near_singular) {
   double distance = pow(10.0, -8.0 + 8.0 * uniform()); /* down to rounding */
   int i;
   for (i = 0; i < N; ++i) {
@@ -72,47 +80,51 @@ static void random_position(double *q, int near_singular) {
   }
 }
 
-static int status_is_right(int status, const double *q, int numbers) {
+static int status_is_right(int status, const NUMBER *q, int numbers) {
   if (!numbers) return status == ARM_NOT_FINITE;
-  if (!inside(q)) return status == ARM_OUTSIDE_DOMAIN;
+  if (status == ARM_OUTSIDE_DOMAIN) return !inside(q, -EDGE);
+  if (!inside(q, EDGE)) return 0;
   return status == ARM_OK || status == ARM_SATURATED || status == ARM_SINGULAR;
 }
 
-static int others_are_right(const double *q, const double *dq) {
-  double phi[N], solution[N], start[N], matrix[N * N], bias[N], gravity[N];
+static int place_is_right(int status, const NUMBER *q) {
+  return status == ARM_OK ? inside(q, EDGE) : status == ARM_OUTSIDE_DOMAIN && !inside(q, -EDGE);
+}
+
+static int others_are_right(const NUMBER *q, const NUMBER *dq) {
+  NUMBER phi[N], solution[N], start[N], matrix[N * N], bias[N], gravity[N];
   const int numbers = are_numbers(q, N);
   int i, status = (int)arm_chart(q, phi, matrix);
   if (!all_finite(phi, N) || !all_finite(matrix, N * N)) return 0;
-  if (numbers ? status != (inside(q) ? ARM_OK : ARM_OUTSIDE_DOMAIN) && (inside(q) || status != ARM_SINGULAR)
-              : status != ARM_NOT_FINITE)
+  if (!(numbers ? place_is_right(status, q) || (status == ARM_SINGULAR && !inside(q, -EDGE)) : status == ARM_NOT_FINITE))
     return 0; /* far outside, powers of q overflow: singular */
   for (i = 0; i < N; ++i) start[i] = q[i] + 0.3 * uniform(); /* Newton's method has something to do */
   status = (int)arm_inverse(phi, start, solution);
   if (!all_finite(solution, N) || status < 0 || status > 3) return 0;
-  if (numbers && (status == ARM_OK) && !inside(solution)) return 0;
+  if (numbers && (status == ARM_OK) && !inside(solution, EDGE)) return 0;
   status = (int)arm_dynamics(q, dq, matrix, bias, gravity);
   if (!all_finite(matrix, N * N) || !all_finite(bias, N) || !all_finite(gravity, N)) return 0;
   if (!numbers || !are_numbers(dq, N)) return status == ARM_NOT_FINITE;
-  return status == (inside(q) ? ARM_OK : ARM_OUTSIDE_DOMAIN) || (status == ARM_NOT_FINITE && !are_small(dq, N));
+  return place_is_right(status, q) || (status == ARM_NOT_FINITE && !are_small(dq, N));
 }
 
 int main(void) {
   long k, counts[5] = {0, 0, 0, 0, 0};
   for (k = 0; k < TICKS; ++k) {
-    double q[N], dq[N], command[N];
+    NUMBER q[N], dq[N], command[N];
     arm_reference reference;
     arm_gains gains = arm_default_gains;
-    const int gain_count = (int)(sizeof gains / sizeof(double)) - N; /* without the limit */
+    const int gain_count = (int)(sizeof gains / sizeof(NUMBER)) - N; /* without the limit */
     int i, status, numbers;
     random_position(q, k % 8 == 0);
     fill(dq, N, 0.0, uniform() > 0.9 ? 1e6 : 2.0);
-    fill((double *)&reference, 3 * ARM_REFERENCE, 0.3, 1.0);
+    fill((NUMBER *)&reference, 3 * ARM_REFERENCE, 0.3, 1.0);
     spoil(q, N);
     spoil(dq, N);
-    spoil((double *)&reference, 3 * ARM_REFERENCE);
-    if (uniform() > 0.95) spoil((double *)&gains, gain_count);
-    numbers = are_numbers(q, N) && are_numbers(dq, N) && are_numbers((double *)&reference, 3 * ARM_REFERENCE) &&
-              are_numbers((double *)&gains, gain_count);
+    spoil((NUMBER *)&reference, 3 * ARM_REFERENCE);
+    if (uniform() > 0.95) spoil((NUMBER *)&gains, gain_count);
+    numbers = are_numbers(q, N) && are_numbers(dq, N) && are_numbers((NUMBER *)&reference, 3 * ARM_REFERENCE) &&
+              are_numbers((NUMBER *)&gains, gain_count);
     status = (int)arm_control(q, dq, &reference, &gains, command);
     if (!status_is_right(status, q, numbers)) return 1;
     counts[status]++;

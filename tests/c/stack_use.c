@@ -8,11 +8,14 @@
 #include "arm.h"
 
 #define N ARM_JOINTS
+#ifndef NUMBER
+#define NUMBER double
+#endif
 #define SIZE (4 << 20)
 #define PAINT 0x5a
 
 static char stack[SIZE] __attribute__((aligned(4096)));
-static double q[N], dq[N], phi[N], vector[N], matrix[N * N];
+static NUMBER q[N], dq[N], phi[N], vector[N], matrix[N * N];
 static arm_reference reference;
 static arm_state state;
 
@@ -26,7 +29,7 @@ static void *inverse(void *unused) { return arm_inverse(phi, q, vector), unused;
 static void *dynamics(void *unused) { return arm_dynamics(q, dq, matrix, vector, phi), unused; }
 static void *control(void *unused) { return arm_control(q, dq, &reference, &arm_default_gains, vector), unused; }
 static void *supervised(void *unused) {
-  return arm_step(&state, &arm_default_safety, q, dq, &reference, &arm_default_gains, 1e-3, vector), unused;
+  return arm_step(&state, &arm_default_safety, q, dq, &reference, &arm_default_gains, (NUMBER)1e-3, vector), unused;
 }
 
 static long used(void *(*call)(void *)) {

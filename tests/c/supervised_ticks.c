@@ -1,9 +1,9 @@
 /* Hostile ticks of a supervised law: positions that wander through the domain and out of it, now and then NaN,
  * infinities, huge numbers, wrong turns, references that stand still and claim to move, and late ticks.
  *
- * Compile with -DTICKS=, -DLIMIT= and -DSINGULAR= (unused). Prints how often each status came. Exits with 1 at a wrong
- * status, 2 at a command that is not finite or beyond the limit, 3 at a change beyond the rate, 4 at a state that makes
- * no sense. */
+ * Compile with -DTICKS=, -DLIMIT= and, for a library in single precision, -DNUMBER=float. Prints how often each status
+ * came. Exits with 1 at a wrong status, 2 at a command that is not finite or beyond the limit, 3 at a change beyond the
+ * rate, 4 at a state that makes no sense. */
 #include <math.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -13,6 +13,9 @@
 
 #define N ARM_JOINTS
 #define K ARM_REFERENCE
+#ifndef NUMBER
+#define NUMBER double
+#endif
 
 static uint64_t seed = 88172645463325252ULL;
 
@@ -23,8 +26,8 @@ static double uniform(void) { /* -1 to 1 */
   return (double)(seed >> 11) / 4503599627370496.0 - 1.0;
 }
 
-static int spoil(double *x, int count) {
-  static const double bad[] = {NAN, INFINITY, -INFINITY, 1e300, -1e150};
+static int spoil(NUMBER *x, int count) {
+  const NUMBER bad[] = {NAN, INFINITY, -INFINITY, (NUMBER)1e300, (NUMBER)-1e150}; /* infinite as floats */
   if (uniform() < 0.99) return 0;
   x[(int)((uniform() + 1.0) * 0.4999 * count)] = bad[(int)((uniform() + 1.0) * 2.499)];
   return 1;
@@ -50,7 +53,8 @@ static int status_is_right(int status, const arm_state *state, int measured, int
 
 int main(void) {
   long k, counts[11] = {0};
-  double q[N], dq[N], command[N], before[N];
+  const double rounding = sizeof(NUMBER) < sizeof(double) ? 1e-5 : 1e-9;
+  NUMBER q[N], dq[N], command[N], before[N];
   arm_state state;
   arm_reference reference;
   int i;
@@ -59,7 +63,8 @@ int main(void) {
   arm_start(&state, q, 0);
   memcpy(before, state.command, sizeof before);
   for (k = 0; k < TICKS; ++k) {
-    double measured_q[N], measured_dq[N], period = uniform() > 0.98 ? 0.05 * (1.0 + uniform()) : 1e-3;
+    NUMBER measured_q[N], measured_dq[N];
+    double period = uniform() > 0.98 ? 0.05 * (1.0 + uniform()) : 1e-3;
     int status, measured, referred;
     for (i = 0; i < N; ++i) {
       const double middle = 0.5 * (arm_domain_lower[i] + arm_domain_upper[i]);
@@ -76,7 +81,7 @@ int main(void) {
     measured = !spoil(measured_q, N) & !spoil(measured_dq, N);
     {
       arm_reference seen = reference;
-      referred = !spoil((double *)&seen, 3 * K);
+      referred = !spoil((NUMBER *)&seen, 3 * K);
       if (uniform() > 0.999) period = uniform() > 0.0 ? NAN : -period;
       if (!(period > 0.0)) measured = 0;
       status = (int)arm_step(&state, &arm_default_safety, measured_q, measured_dq, &seen, &arm_default_gains, period,
@@ -87,7 +92,7 @@ int main(void) {
     for (i = 0; i < N; ++i) {
       const double time = period > 0.0 ? fmin(period, arm_default_safety.longest_period) : 0.0;
       if (!(fabs(command[i]) <= LIMIT)) return 2;
-      if (!(fabs(command[i] - before[i]) <= arm_default_safety.command_rate[i] * time * (1.0 + 1e-9) + 1e-9)) return 3;
+      if (!(fabs(command[i] - before[i]) <= arm_default_safety.command_rate[i] * time * (1.0 + rounding) + rounding)) return 3;
     }
     if (!state_makes_sense(&state)) return 4;
     memcpy(before, command, sizeof before);

@@ -11,12 +11,14 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from public_objects import circle, clear, fitted, impedance, planar, steps, trajectory
+from public_objects import circle, clear, fitted, impedance, joint_motion, link_distances, planar, steps, trajectory
 
 import orthocas as oc
 from fuzz.child import Finding, run, verdict
 from fuzz.words import NAMES, NUMBERS, Rng, pick
 from orthocas import control, parametrisations, plotting, problems, simulation, solvers
+from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
+from orthocas.errors import CompileError
 
 Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments that it takes
 
@@ -152,7 +154,7 @@ def _objects() -> dict[str, Any]:
 @cache
 def good_calls() -> dict[str, Call]:
     """What can be called, with arguments that work and take little time."""
-    return {**_makers(), **_functions(), **_methods(), **_control(), **_physics()}
+    return {**_makers(), **_functions(), **_methods(), **_control(), **_physics(), **_supervised()}
 
 
 def _physics() -> dict[str, Call]:
@@ -169,6 +171,26 @@ def _physics() -> dict[str, Call]:
         "plant.reset": (lambda **given: _plant(robot).reset(**given), {"q": q, "dq": q}),
         "plant.push": (lambda **given: _plant(robot).push(**given), {"force": q, "link": 1, "point": q}),
         "plant.step": (lambda **given: _plant(robot).step(**given), {"torque": q, "seconds": 0.01, "loads": q}),
+    }
+
+
+def _supervised() -> dict[str, Call]:
+    """The supervised law of a compiled library, if there is a compiler."""
+    law = impedance()
+    with TemporaryDirectory() as folder:
+        try:
+            path = compile_shared(oc.generate_c(law.chart, folder, law, "arm"), Path(folder), ("-O0",))
+        except CompileError:
+            return {}
+        library = CompiledLibrary(path, "arm", 3)
+        library.check()  # it is loaded before its file goes
+    q, reference = law.problem.domain.centre, np.zeros(9)
+    supervisor = Supervisor(library, law)
+    return {
+        "supervisor": (Supervisor, {"library": library, "controller": law, "safety": control.Safety.of(law)}),
+        "supervisor.start": (supervisor.start, {"q": q, "command": q}),
+        "supervisor.take_over": (supervisor.take_over, {"q": q, "command": q}),
+        "supervisor.step": (supervisor.step, {"q": q, "dq": q, "reference": reference, "period": 1e-3}),
     }
 
 
@@ -336,7 +358,37 @@ def _methods() -> dict[str, Call]:
         "chart.quality": (chart.quality, {"q": q}),
         "grown.quality": (grown.quality, {"q": [q[:2], q[:2]]}),
         "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "tolerance": 1e-9}),
+        "chart.solve": (chart.solve, {"phi": phi, "q_start": q, "tolerance": 1e-9, "inside": True}),
+        "chart.solutions": (chart.solutions, {"phi": phi, "tolerance": 1e-9}),
+        "chart.tracker": (chart.tracker, {"q0": planar().domain.centre, "largest_step": 0.1}),
+        "tracker.step": (chart.tracker(planar().domain.centre).step, {"phi": phi}),
+        "tracker.reset": (chart.tracker(planar().domain.centre).reset, {"q": q}),
         "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
+        "follow": (
+            oc.follow,
+            {
+                "chart": clear(),
+                "tool_path": clear().task([q, q + 0.05, q]),
+                "xi": "hold",
+                "q_start": q,
+                "period": 0.05,
+                "velocity_limits": 1.0,
+                "acceleration_limits": 2.0,
+                "obstacles": [oc.obstacles.Sphere([9.0, 0, 0], 0.1)],
+                "link_radius": 0.1,
+                "clearance": 0.01,
+            },
+        ),
+        "follow by objective": (
+            oc.follow,
+            {"chart": chart, "tool_path": chart.task([q, q + 0.05]), "xi": "objective", "velocity_limits": 1.0},
+        ),
+        "motion.save_csv": (joint_motion().save_csv, {"path": "motion.csv"}),
+        "Sphere": (oc.obstacles.Sphere, {"centre": q, "radius": 0.1}),
+        "Capsule": (oc.obstacles.Capsule, {"start": q, "end": -q, "radius": 0.1}),
+        "Plane": (oc.obstacles.Plane, {"normal": q, "point": q}),
+        "LinkDistances": (oc.obstacles.LinkDistances, {"robot": robot, "obstacles": [], "radius": 0.1}),
+        "distances": (link_distances(), {"q": q}),
         "chart.xi_range": (chart.xi_range, {"q": q}),
         "chart.self_motion": (chart.self_motion, {"q": q, "samples": 20}),
         "curve of self_motion": (clear().self_motion, {"q": clear().problem.domain.centre, "step": 0.1}),

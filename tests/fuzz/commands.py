@@ -54,6 +54,10 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--workers": ("0", "-1", "1", "1.5", ""),
     **dict.fromkeys(("--seed", "--seeds", "--samples", "--held-out", "--jobs"), _COUNTS),
     **dict.fromkeys(("--rate", "--mass-factor", "--max-mutual-deg"), (*NUMBERS, "50", "10")),
+    **dict.fromkeys(("--period", "--link-radius", "--clearance"), (*NUMBERS, "0.01")),
+    **dict.fromkeys(("--start", "--velocity-limit", "--acceleration-limit"), _LISTS),
+    **dict.fromkeys(("--sphere", "--capsule", "--plane"), (*_LISTS, "0,0,5,0.1", "0,0,5,0,0,6,0.1", "0,0,1,0,0,-5")),
+    "--xi": ("hold", "schedule", "objective", "best", ""),
     **dict.fromkeys(("--leak-deg", "--conditioning"), (*NUMBERS, "5", "0.3")),
     "--domain": ("auto", "box", ""),
     **dict.fromkeys(("--out", "--checkpoint"), ("out", "out/x/y", ".", "", "chart.orthocas", "/dev/null/x", "x" * 300)),
@@ -113,6 +117,14 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         (*_LAW_OPTIONS, *_RUN_OPTIONS),
     ),
     "export": (_FILES, {"--to": "numpy", "--out": "module.py"}, ()),
+    "follow": (
+        _FILES,
+        {"--out": "q.csv", "--velocity-limit": "1", "--period": "0.05"},
+        (
+            *("--xi", "--start", "--acceleration-limit", "--sphere", "--capsule", "--plane"),
+            *("--link-radius", "--clearance"),
+        ),
+    ),
     "codegen": (
         _FILES,
         {"--controller": "pd_plus", "--out": "out"},
@@ -153,6 +165,8 @@ def line(rng: Rng) -> list[str]:
             chosen[option] = pick(rng, _VALUES[option])
     target = targets[0] if rng.integers(2) else pick(rng, targets)
     words = [*command.split(), *(word for pair in chosen.items() for word in pair), target]
+    if command == "follow":
+        words.append(pick(rng, ("path.csv", "path.csv", "steps.json", "chart.orthocas", "nothing.csv")))
     extras = ("--json", "--help", "--", "-x", "--nothing", *NAMES)
     if rng.random() < 0.3:
         words.insert(int(rng.integers(len(words) + 1)), pick(rng, extras))
@@ -172,6 +186,8 @@ def _files() -> Path:
     steps = [{"time": 0.1, "move": {"x": 0.01}}]
     plan = json.dumps({"start": start, "duration": 0.2, "steps": steps})
     (folder / "steps.json").write_text(plan)
+    x = float(chart.task(chart.problem.domain.centre)[0])
+    (folder / "path.csv").write_text(f"x\n{x}\n{x + 0.02}\n{x}\n")
     return folder
 
 

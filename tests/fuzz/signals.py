@@ -46,6 +46,8 @@ print([float(oc.evaluate(chart, 500).task_angle.std) for chart in charts])
 """
 _STEPS = {"duration": 1.0, "steps": [{"time": 0.1, "move": {"x": 0.05}}]}
 _CONTROLLED = ("--controller", "pd_plus", "--out", "out")
+_PATH = "x\n0.85\n0.9\n0.95\n0.9\n0.85\n"
+_CHOSEN = ("--xi", "objective", "--velocity-limit", "0.2", "--period", "0.002")
 _SMALL_GRID = ("--param", "linear", "--param", "polynomial:2", "--jobs", "2", "--held-out", "500", "--samples", "200")
 COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is a program of a user
     "info": ("info", "planar_3r_x"),
@@ -55,6 +57,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is
     "certify in processes": ("certify", "chart.orthocas", "--out", "out/c.orthocas", "--workers", "2", "--json"),
     "compare": ("compare", "planar_3r_x", *_SMALL_GRID, "--out", "out"),
     "simulate": ("simulate", "chart.orthocas", *_CONTROLLED, "--steps", "steps.json"),
+    "follow": ("follow", "chart.orthocas", "path.csv", *_CHOSEN, "--out", "out/q.csv", "--json"),
     "codegen": ("codegen", "chart.orthocas", *_CONTROLLED, "--check"),
     "reproduce": ("reproduce", "fig20", "--quick", "--out", "out"),
     "loop": ("-c", _LOOP),
@@ -163,6 +166,7 @@ def place() -> Iterator[Path]:
         for part in ("out", "tmp"):
             (folder / part).mkdir()
         (folder / "steps.json").write_text(json.dumps(_STEPS))
+        (folder / "path.csv").write_text(_PATH)
         shutil.copy(_chart(), folder / "chart.orthocas")
         yield folder
 

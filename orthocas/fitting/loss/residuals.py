@@ -1,8 +1,9 @@
 """The loss of one sample as least squares in J_xi, and its derivatives on columns of samples."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import casadi as ca
 
@@ -10,6 +11,8 @@ from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.columns import ColumnFunction
 from orthocas.fitting.loss.registry import term_of
 from orthocas.fitting.loss.term import SAMPLE_DATA, LossTerm, Sizes
+
+Pairs = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
@@ -21,15 +24,17 @@ class Loss:
 
     sizes: Sizes
     weights: tuple[tuple[str, float], ...]  #: names of terms and their positive weights
+    exchanged: Pairs = ()  #: rows i, j of J_xi that stand for components, see `coordinates_of`
 
     @classmethod
-    def of(cls, sizes: Sizes, weights: Mapping[str, float]) -> "Loss":
+    def of(cls, sizes: Sizes, weights: Mapping[str, float], exchanged: Pairs = ()) -> "Loss":
         """The terms with a positive weight.
 
         Raises:
             UnknownNameError: if there is no term for a weight.
         """
-        return cls(sizes, tuple((name, weight) for name, weight in weights.items() if weight > 0 and term_of(name)))
+        positive = tuple((name, weight) for name, weight in weights.items() if weight > 0 and term_of(name))
+        return cls(sizes, positive, exchanged)
 
     @cached_property
     def terms(self) -> tuple[tuple[LossTerm, float], ...]:
@@ -57,9 +62,8 @@ class Loss:
     def residuals(self, coordinate_jacobian: ca.SX, data: list[ca.SX]) -> ca.SX:
         """Residuals rho of one sample, (rows, 1)."""
         named = dict(zip(self.data, data, strict=True))
-        rho: ca.SX = ca.vertcat(
-            *(weight**0.5 * term.residuals(coordinate_jacobian, named, self.sizes) for term, weight in self.terms)
-        )
+        J = ca.vertcat(*coordinates_of([coordinate_jacobian[j, :] for j in range(self.sizes.r)], self.exchanged))
+        rho: ca.SX = ca.vertcat(*(weight**0.5 * term.residuals(J, named, self.sizes) for term, weight in self.terms))
         return rho
 
     @cached_property
@@ -103,6 +107,14 @@ class Loss:
     def arguments(self) -> tuple[ca.SX, list[ca.SX]]:
         """Symbols of J_xi (r, n) and of the data of one sample."""
         return ca.SX.sym("J", self.sizes.r, self.sizes.n), self.symbols()
+
+
+def coordinates_of(rows: Sequence[Any], exchanged: Pairs) -> list[Any]:
+    """Rows with (a + b) / sqrt 2 and (b - a) / sqrt 2 in place of the rows a, b of each pair: a rotation."""
+    turned = list(rows)
+    for i, j in exchanged:
+        turned[i], turned[j] = (rows[i] + rows[j]) * 0.5**0.5, (rows[j] - rows[i]) * 0.5**0.5
+    return turned
 
 
 @cache

@@ -1,0 +1,144 @@
+"""`orthocas follow`: joint motions along a tool path."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from orthocas.casadi_tools.interrupts import deferred
+from orthocas.chart import Chart
+from orthocas.checks import Array, require_known
+from orthocas.cli.output import AsJson, Force, number, print_json, print_rows
+from orthocas.cli.problem_argument import parse_numbers
+from orthocas.errors import InvalidValueError
+from orthocas.following.follow import HOLD, OBJECTIVE
+from orthocas.following.follow import follow as follow_path
+from orthocas.following.joint_motion import JointMotion, require_place
+from orthocas.following.path_file import read_path
+from orthocas.obstacles.shapes import Capsule, Obstacle, Plane, Sphere
+
+SCHEDULE = "schedule"
+_CHOICES = (HOLD, SCHEDULE, OBJECTIVE)
+
+
+def follow(
+    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH.csv", help="Waypoints of the tool, see docs/paths.md.")],
+    out: Annotated[Path, typer.Option("--out", help="CSV file for times, positions, velocities and accelerations.")],
+    xi: Annotated[
+        str | None,
+        typer.Option("--xi", help="Extra coordinates: hold, schedule (columns of PATH.csv) or objective."),
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--start", help='Joint positions near the start, "0,0.5,..."; default: the centre.')
+    ] = None,
+    period: Annotated[float, typer.Option("--period", parser=number, help="Distance of the time stamps [s].")] = 0.01,
+    velocity: Annotated[
+        str | None,
+        typer.Option("--velocity-limit", help="Of all joints or each [rad/s], [m/s]; default: the robot's."),
+    ] = None,
+    acceleration: Annotated[
+        str | None,
+        typer.Option("--acceleration-limit", help="Of all joints or each [rad/s^2]; default: full speed in 0.5 s."),
+    ] = None,
+    sphere: Annotated[list[str] | None, typer.Option("--sphere", help='Obstacle "x,y,z,radius" [m].')] = None,
+    capsule: Annotated[list[str] | None, typer.Option("--capsule", help='Obstacle "x,y,z,x,y,z,radius" [m].')] = None,
+    plane: Annotated[
+        list[str] | None, typer.Option("--plane", help='Obstacle: normal and point, "0,0,1,0,0,0".')
+    ] = None,
+    link_radius: Annotated[
+        float, typer.Option("--link-radius", parser=number, help="Radius of the robot's links [m].")
+    ] = 0.0,
+    clearance: Annotated[
+        float, typer.Option("--clearance", parser=number, help="Smallest distance from obstacles [m].")
+    ] = 0.0,
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Follow a tool path; write joint positions, velocities and accelerations on time stamps."""
+    require_place(out, force)
+    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+        loaded = Chart.load(chart)
+        loaded.function("xi")  # raises for grown charts
+    waypoints, choice = _task_of(path, loaded, xi)
+    begin = time.perf_counter()
+    motion = follow_path(
+        loaded,
+        waypoints,
+        choice,
+        q_start=None if start is None else parse_numbers("--start", start),
+        period=period,
+        velocity_limits=_limits("--velocity-limit", velocity),
+        acceleration_limits=_limits("--acceleration-limit", acceleration),
+        obstacles=_obstacles(sphere or (), capsule or (), plane or ()),
+        link_radius=link_radius,
+        clearance=clearance,
+    )
+    seconds = time.perf_counter() - begin
+    motion.save_csv(out, force)
+    if json:
+        print_json(_report(motion, seconds, out))
+    else:
+        print_rows({**motion.facts(), "computed in": f"{seconds:.2f} s", "file": str(out)})
+
+
+def _task_of(path: Path, chart: Chart, xi: str | None) -> tuple[Array, Any]:
+    """The waypoints, and what to do with the coordinates: as asked for, or as the columns of the file suggest."""
+    waypoints, schedule = read_path(path, chart)
+    choice = xi or (HOLD if schedule is None else SCHEDULE)
+    require_known("choice of --xi", choice, _CHOICES)
+    if (choice == SCHEDULE) != (schedule is not None):
+        columns = ", ".join(chart.labels[chart.m :])
+        want = f"columns {columns} in {path} with schedule, and none of them otherwise"
+        raise InvalidValueError("--xi", choice, want)
+    return waypoints, choice if schedule is None else schedule
+
+
+def _limits(option: str, text: str | None) -> Array | float | None:
+    """Numbers of all joints, or one number."""
+    if text is None:
+        return None
+    values = parse_numbers(option, text)
+    return float(values[0]) if len(values) == 1 else values
+
+
+def _obstacles(spheres: Sequence[str], capsules: Sequence[str], planes: Sequence[str]) -> list[Obstacle]:
+    """The obstacles of the options, spheres first."""
+    found: list[Obstacle] = []
+    for text in spheres:
+        values = _numbers("--sphere", text, 4)
+        found.append(Sphere(values[:3], values[3]))
+    for text in capsules:
+        values = _numbers("--capsule", text, 7)
+        found.append(Capsule(values[:3], values[3:6], values[6]))
+    for text in planes:
+        values = _numbers("--plane", text, 6)
+        found.append(Plane(values[:3], values[3:]))
+    return found
+
+
+def _numbers(option: str, text: str, count: int) -> Array:
+    values = parse_numbers(option, text)
+    if len(values) != count:
+        raise InvalidValueError(option, repr(text)[:80], f"{count} numbers")
+    return values
+
+
+def _report(motion: JointMotion, seconds: float, out: Path) -> dict[str, Any]:
+    r = motion.xi.shape[1]
+    return {
+        "duration": motion.duration,
+        "period": motion.period,
+        "time_stamps": len(motion.times),
+        "closed": motion.closed,
+        "xi": {
+            label: [float(values.min()), float(values.max())]
+            for label, values in zip(motion.labels[-r:], motion.xi.T, strict=True)
+        },
+        "margins": asdict(motion.margins),
+        "seconds": seconds,
+        "file": str(out),
+    }

@@ -1,0 +1,131 @@
+"""The inverse map of a chart in compiled C, for large batches on machines with a compiler (ours)."""
+
+import ctypes
+import hashlib
+import os
+import subprocess
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.casadi_tools.threads import in_threads
+from orthocas.chart import Chart
+from orthocas.checks import Array, as_path, require_kind
+from orthocas.codegen.generate import generate_c
+from orthocas.codegen.library import STRICT, compilers
+from orthocas.errors import CompileError
+from orthocas.files.atomic import made_folder, published
+from orthocas.files.drafts import draft_folder
+from orthocas.inverting import Attempt, Newton, Solutions
+from orthocas.inverting.newton import SUSPICIOUS
+from orthocas.showing import Shown
+
+_FLAGS = ("-O3", "-fPIC", "-shared")
+_ROWS = "inverse_rows.c"
+_PIECE = 512  # rows that a thread takes at once
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CompiledInverse(Shown):
+    """`Chart.solve` in compiled C; `orthocas.compile_inverse` makes it."""
+
+    chart: Chart
+    library: Path  #: the shared library
+
+    def facts(self) -> dict[str, str]:
+        """Chart and library."""
+        return {"inverse": f"compiled, of the chart of {self.chart.problem.name}", "library": str(self.library)}
+
+    def solve(
+        self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9, inside: bool = False
+    ) -> Solutions:
+        """As `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
+        return self.chart.solve(phi, q_start, tolerance=tolerance, inside=inside, local=self._local)
+
+    def _local(self, targets: Array, starts: Array) -> Attempt:
+        """Search from starts (N, n); where C finds nothing, NumPy tells how near one can get."""
+        attempt, condition = Attempt.empty(*targets.shape), np.empty(len(targets))
+        given = np.ascontiguousarray(targets), np.ascontiguousarray(starts)
+
+        def solve_piece(first: int) -> None:
+            rows = slice(first, first + _PIECE)
+            phi, q_start, q, found = (array[rows] for array in (*given, attempt.q, attempt.residual))
+            arrays = (phi, q_start, self.chart.phi_sizes, q, found, condition[rows])
+            self._c(ctypes.c_long(len(phi)), *(ctypes.c_void_p(array.ctypes.data) for array in arrays))
+
+        for _ in in_threads(solve_piece, range(0, len(targets), _PIECE)):
+            pass
+        phi_map = self.chart.phi_map
+        attempt.residual[:] = (targets - attempt.residual) / phi_map.scale(targets)
+        attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < SUSPICIOUS)
+        failed = np.flatnonzero(condition < 0)
+        if failed.size:
+            attempt.replace(failed, Newton(phi_map)(targets[failed], starts[failed]))
+        return attempt
+
+    @cached_property
+    def _c(self) -> Any:
+        try:
+            function = ctypes.CDLL(str(self.library)).arm_inverse_rows
+        except (OSError, AttributeError) as error:
+            raise CompileError(f"cannot load {self.library}: {error}; delete it and compile again") from None
+        function.restype = None
+        return function
+
+
+def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledInverse:
+    """Compile the inverse map of a chart, or find it compiled earlier; for batches of 100,000 rows and more.
+
+    The first call for a chart generates and compiles C, which takes some seconds. Later calls, also in other processes,
+    find the library in the folder: its name is a digest of the C code, the compiler and its options.
+
+    Args:
+        chart: a chart with a closed expression.
+        folder: where compiled libraries are kept; default `orthocas` in $XDG_CACHE_HOME or ~/.cache.
+
+    Raises:
+        CompileError: if there is no C compiler.
+        NoExpressionError: if the chart is grown.
+        InvalidValueError: if the folder cannot be written.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> with TemporaryDirectory() as folder:  # or without a folder, to keep the library
+        ...     compiled = oc.compile_inverse(chart, folder)
+        ...     solutions = compiled.solve(chart.phi([[0.7, 0.9, 0.6], [0.6, 0.8, 0.8]]))
+        >>> solutions.found.tolist()
+        [True, True]
+    """
+    require_kind("chart", chart, Chart)
+    place = _cache() if folder is None else as_path("folder", folder)
+    with draft_folder() as sources:
+        generate_c(chart, sources, name="arm")
+        (sources / _ROWS).write_text((files("orthocas.codegen") / "templates" / _ROWS).read_text())
+        compiler, flags = compilers()[0], (*STRICT, *_FLAGS, f"-DN={chart.n}")
+        parts = [(sources / file).read_bytes() for file in ("arm.h", "arm.c", _ROWS)]
+        parts.append(repr((compiler, flags)).encode())
+        name = f"inverse-{hashlib.sha256(b'/'.join(parts)).hexdigest()[:32]}.so"
+        library = made_folder("folder", place).resolve() / name
+        if not library.exists():
+            with published(library.parent) as drafts:
+                code = [str(sources / file) for file in ("arm.c", _ROWS)]
+                _compile([compiler, *flags, "-o", str(drafts / name), *code, "-lm"])
+    return CompiledInverse(chart, library)
+
+
+def _compile(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise CompileError(f"{' '.join(command)} failed: {done.stderr[:500]}")
+
+
+def _cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "orthocas"

@@ -1,0 +1,96 @@
+"""Campaign of path files: what is read are finite waypoints of the right shape, or the error names file and line."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import public_objects
+
+import orthocas as oc
+from fuzz.child import Finding, run
+from fuzz.mutants import TEXTS, Rng, flipped, pick
+from fuzz.sealed_files import judged
+from orthocas.following.path_file import read_path
+
+_CELLS = (
+    "0",
+    "1.5",
+    "-2e-3",
+    " 0.25 ",
+    "nan",
+    "inf",
+    "-1e999",
+    "1e7",
+    "0x10",
+    "1_000",
+    "",
+    " ",
+    "a",
+    '"1"',
+    '"1',
+    "1;2",
+)
+_NAMES = ("x", "xi1", "xi2", "xi3", "y", "X", "", " x ", '"x"', "x\ty")
+
+
+def paths(count: int) -> list[Finding]:
+    """Judge so many mutants."""
+    return run("paths", judge, range(count))
+
+
+def judge(seed: int) -> str | None:
+    """What is wrong with the treatment of a mutant."""
+    return judged(_mutant, use, seed)
+
+
+@cache
+def _chart() -> oc.Chart:
+    return oc.fit(public_objects.planar(), oc.Linear()).chart
+
+
+def use(path: Path) -> None:
+    """Read a path; its numbers have to be usable."""
+    x, xi = read_path(path, _chart())
+    assert x.shape[1] == 1
+    assert xi is None or xi.shape == (len(x), 2)
+    assert len(x) >= 2
+    assert np.isfinite(x).all()
+    assert xi is None or np.isfinite(xi).all()
+
+
+def _mutant(rng: Rng) -> bytes:
+    header = pick(rng, (["x"], ["x", "xi1", "xi2"], ["xi2", "x", "xi1"]))
+    rows = [[f"{value:.6g}" for value in rng.normal(size=len(header))] for _ in range(int(rng.integers(2, 8)))]
+    table = [[*header], *rows]
+    for _ in range(int(rng.integers(0, 3))):
+        row = table[0] if rng.random() < 0.3 else table[int(rng.integers(len(table)))]
+        _change(rng, row, _NAMES if row is table[0] else (*_CELLS, *TEXTS))
+    text = pick(rng, ("\n", "\r\n", "\r", "\n\n")).join(",".join(row) for row in table)
+    content = text.encode(errors="surrogatepass")
+    if rng.random() < 0.7:
+        return content
+    odd = (
+        flipped(rng, content),
+        content[: int(rng.integers(len(content)))],
+        b"\xef\xbb\xbf" + content,
+        text.encode("utf-16", errors="surrogatepass"),
+        content.replace(b",", b";"),
+        b"x\n" + b"1\n" * int(pick(rng, (1, 2, 99_999, 100_001, 10**6))),
+        b"x\n1," + b"1" * int(pick(rng, (10**5, 10**6))) + b"\n2\n",
+        b"x\n" + b"\n" * 10**6,
+        bytes(10**5),
+        b" " * 2**26,
+        pick(rng, (b"", b"\0", b"x", b"x\n1", b"x\n1\n2", b'x\n"1\n2\n3')),
+    )
+    return bytes(odd[int(rng.integers(len(odd)))])
+
+
+def _change(rng: Rng, row: list[str], cells: tuple[str, ...]) -> None:
+    """Replace, add or remove a cell."""
+    act, k = rng.integers(4), int(rng.integers(max(len(row), 1)))
+    if act == 0 or not row:
+        row.insert(k, pick(rng, cells))
+    elif act == 1:
+        del row[k]
+    else:
+        row[k] = pick(rng, cells)

@@ -1,0 +1,135 @@
+"""Default gains: modes of the closed loop, the delay that they bear, and what they hold."""
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from laws import torque
+from scipy.linalg import eigvalsh
+
+import orthocas as oc
+from orthocas.checks import Array
+from orthocas.control import (
+    Impedance,
+    PDPlus,
+    matched_posture_stiffness,
+    matched_stiffness,
+)
+from orthocas.domains import sample_uniform
+from orthocas.errors import (
+    InvalidValueError,
+)
+
+
+def test_matched_stiffness_has_its_modes_around_the_frequency(planar_chart: oc.Chart, arm_chart: oc.Chart) -> None:
+    """The geometric mean of the generalised eigenvalues of (K, M_phi) is omega^2, and no other K has less spread."""
+    for chart in (planar_chart, arm_chart):
+        inertias = _inertias(chart)
+        K = matched_stiffness(chart, 3.0)
+        logs = np.array([np.log(eigvalsh(np.diag(K), inertia) / 9.0) for inertia in inertias])
+        assert abs(logs.mean()) < 1e-5
+        least = (logs**2).sum(axis=1).mean()
+        rng = np.random.default_rng(3)
+        for factors in np.exp(0.05 * rng.normal(size=(10, chart.n))):
+            others = [np.log(eigvalsh(np.diag(K * factors), inertia) / 9.0) for inertia in inertias]
+            assert (np.square(others)).sum(axis=1).mean() > least
+
+
+def test_matched_stiffness_is_exact_where_the_inertia_is_constant_and_diagonal() -> None:
+    """Two sliding joints at right angles: x and xi move 3 kg and 2 kg, whatever the posture."""
+    model = pin.Model()
+    body = pin.SE3.Identity()
+    outer = model.addJoint(0, pin.JointModelPX(), body, "px")
+    inner = model.addJoint(outer, pin.JointModelPY(), body, "py")
+    for joint, mass in ((outer, 1.0), (inner, 2.0)):
+        model.appendBodyToJoint(joint, pin.Inertia(mass, np.zeros(3), np.eye(3)), body)
+    model.addFrame(pin.Frame("tip", inner, 0, body, pin.FrameType.OP_FRAME))
+    robot = oc.Robot.from_model(model, "tip")
+    problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box(np.zeros(2), 1.0))
+    chart = oc.fit(problem, oc.Linear()).chart
+    np.testing.assert_allclose(matched_stiffness(chart, 5.0), [75.0, 50.0 / chart.jacobian(np.zeros(2))[1, 1] ** 2])
+    np.testing.assert_allclose(matched_posture_stiffness(problem, 5.0), [75.0, 50.0])
+    with pytest.raises(InvalidValueError, match="frequency"):
+        matched_stiffness(chart, 0.0)
+    with pytest.raises(InvalidValueError, match="fastest"):
+        matched_stiffness(chart, 5.0, 0.0)
+    slower = matched_stiffness(chart, 5.0, 3.0) / matched_stiffness(chart, 5.0)  # 3 rad/s, not 5
+    np.testing.assert_allclose(slower, (3 / 5) ** 2, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_default_gains_of_a_pose_bear_5_ms_of_delay_although_the_flange_has_hardly_any_inertia() -> None:
+    """Joint 7 moves 3e-4 kg m^2. Springs that ignore delay give it modes beyond 23 Hz, which 5 ms make unstable."""
+    arm = oc.problems.get("iiwa")
+    problem = oc.Problem(arm.robot, oc.Task.named(arm.robot, "pose", arm.domain.centre), "euclidean", arm.domain)
+    chart = oc.fit(problem, oc.Polynomial(2), weights=(1000, 30, 150, 1)).chart
+    others = sample_uniform(arm.domain, 1000, 7)
+    assert PDPlus.on_chart(chart).modes(others).delays.min() > 5e-3
+    assert PDPlus(chart, matched_stiffness(chart, fastest=np.inf)).modes(others).delays.min() < 3e-3
+
+
+@pytest.mark.parametrize(("coupling", "damping"), [("coupled", "square_root"), ("decoupled", "double_diagonal")])
+def test_modes_are_those_of_the_simulated_dynamics(arm_chart: oc.Chart, coupling: Any, damping: Any) -> None:
+    """Stiffness and damping of the loop, from finite differences of the robot's acceleration under the law at rest."""
+    law = Impedance(arm_chart, matched_stiffness(arm_chart), 0.4, coupling, damping)
+    q, n = arm_chart.problem.domain.centre, arm_chart.n
+    phi, zero = arm_chart.phi(q), np.zeros(n)
+
+    def acceleration(state: Array) -> Array:
+        tau, _ = torque(law, state[:n], state[n:], phi, zero, zero)
+        return arm_chart.problem.robot.forward_dynamics(state[:n], state[n:], tau)
+
+    state, h = np.concatenate([q, zero]), 1e-5
+    columns = [(acceleration(state + h * unit) - acceleration(state - h * unit)) / (2 * h) for unit in np.eye(2 * n)]
+    slopes = np.array(columns).T
+    modes = law.modes(q)
+    np.testing.assert_allclose(
+        np.sort(np.sqrt(np.linalg.eigvals(-slopes[:, :n]).real)) / (2 * np.pi), modes.frequencies, 1e-5
+    )
+    rates = 2 * modes.damping_ratios * 2 * np.pi * modes.frequencies
+    assert rates.sum() == pytest.approx(-np.trace(slopes[:, n:]), rel=1e-6)
+    if damping == "double_diagonal" and coupling == "coupled":
+        np.testing.assert_allclose(modes.damping_ratios, 0.4, rtol=1e-6)
+
+
+def test_a_mode_is_unstable_beyond_its_delay(planar_chart: oc.Chart) -> None:
+    """A root of s^2 + (2 zeta omega s + omega^2) e^(-sT) crosses the imaginary axis at the longest delay T."""
+    modes = PDPlus(planar_chart, matched_stiffness(planar_chart), 0.7).modes(planar_chart.problem.domain.centre)
+    for frequency, ratio, delay in zip(modes.frequencies, modes.damping_ratios, modes.delays, strict=True):
+        omega = 2 * np.pi * frequency
+
+        def largest_real_part(T: float, omega: float = omega, ratio: float = ratio) -> float:
+            s = 1j * omega * 1.5
+            for _ in range(50):  # Newton
+                late = np.exp(-s * T)
+                value = s**2 + (2 * ratio * omega * s + omega**2) * late
+                slope = 2 * s + (2 * ratio * omega - T * (2 * ratio * omega * s + omega**2)) * late
+                s -= value / slope
+            return float(s.real)
+
+        assert largest_real_part(0.98 * delay) < 0 < largest_real_part(1.02 * delay)
+
+
+def test_default_gains_hold_an_arm_whose_masses_are_off() -> None:
+    """Static solution of J^T K e = 0.2 g on the plant with 1.2 times the mass: sag up to 20 mm, inside the domain."""
+    problem = oc.problems.get("iiwa")
+    chart = oc.fit(problem, oc.Polynomial(3), weights=(1000, 30, 150, 1)).chart
+    law, plant = PDPlus.on_chart(chart), problem.robot.with_scaled_masses(1.2)
+    rng = np.random.default_rng(5)
+    for start in problem.domain.centre + 0.6 * problem.domain.half_width * rng.uniform(-1, 1, (5, 7)):
+        q = start
+        for _ in range(30):
+            wrong = plant.gravity(q) - problem.robot.gravity(q)
+            e = -np.linalg.solve(chart.jacobian(q).T, wrong) / law.stiffness
+            q = chart.inverse(chart.phi(start) + e, q)
+        assert oc.contains(problem.domain, q)
+        sag = np.linalg.norm(problem.robot.tip_position(q) - problem.robot.tip_position(start))
+        assert 1e-3 < sag < 0.02
+
+
+def _inertias(chart: oc.Chart) -> Array:
+    points = sample_uniform(chart.problem.domain, 512, 0)
+    J, M = chart.jacobian(points), chart.problem.robot.mass_matrix(points)
+    half = np.linalg.inv(J)
+    return np.asarray(half.transpose(0, 2, 1) @ M @ half)
