@@ -6,7 +6,9 @@ from pathlib import Path
 
 SCRIPTS = (
     "dynamics",
+    "start_up",
     "command",
+    "batches",
     "fits",
     "folds",
     "quality_and_time",

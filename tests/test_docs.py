@@ -70,6 +70,17 @@ def test_python_blocks_of_the_page_on_domains_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_python_blocks_of_the_page_on_batches_run(run: Run, tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "batches.md").read_text()
+    code = "\n".join(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL))
+    printed = python(f"{code}\nchart.save('arm.orthocas')", tmp_path).splitlines()
+    assert printed == ["(100000, 3) (100000, 3, 3)", "True ('x', 'y', 'xi1')", "True"]
+    (line,) = re.findall(r"```sh\n(.*?)\n```", page, flags=re.DOTALL)
+    assert run(*shlex.split(line)[1:])[0] == 0
+    assert "import torch" in (tmp_path / "arm.py").read_text()
+
+
+@pytest.mark.slow
 def test_python_blocks_of_the_page_on_the_inverse_run(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "inverse.md").read_text(), flags=re.DOTALL)
     printed = python("\n".join(blocks), tmp_path).splitlines()

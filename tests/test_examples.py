@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import batches
 import c_timing
 import casadi as ca
 import certificates
@@ -242,6 +243,12 @@ def test_benchmarks_of_networks_and_starts_print_rows(capsys: pytest.CaptureFixt
     assert len([paper_network.row((1000.0, 30.0), quick=True)]) == 1
     starts.main(quick=True)
     assert "| polynomial:4 | gauss_newton |" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_benchmark_of_batches_prints_rows() -> None:
+    rows = batches.main(rows=500)
+    assert [row.split("|")[1].strip() for row in rows[2:5]] == ["orthocas", "NumPy, float64", "NumPy, float32"]
 
 
 def test_gradients_agree_with_pytorch() -> None:
