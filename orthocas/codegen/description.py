@@ -5,7 +5,9 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.words import words
+from orthocas.domains import Domain, borders
 from orthocas.files.chart_file import fingerprint
+from orthocas.postures.clear_box import ClearBox
 from orthocas.robots.tip_turn import TipTurn
 from orthocas.tasks import Task
 
@@ -21,7 +23,7 @@ _TILT = (
 
 def description_values(chart: Chart) -> dict[str, str]:
     """Values of the placeholders that describe the chart and its robot."""
-    tree = chart.problem.robot.tree
+    tree, domain = chart.problem.robot.tree, chart.problem.domain
     limits = [f"{low:.6g} to {high:.6g}" for low, high in zip(tree.lower, tree.upper, strict=True)]
     slides = ["m" if sliding else "rad" for sliding in tree.prismatic]
     joints = zip(words(tree.joint_names), slides, limits, tree.velocity_limits, tree.effort_limits, strict=True)
@@ -36,6 +38,8 @@ def description_values(chart: Chart) -> dict[str, str]:
         "extra_labels": ", ".join(words(chart.labels[chart.m :])),
         "tip": words([tree.tip_name])[0],
         "gravity": _row(tree.gravity),
+        "domain_lines": _domain_lines(words(tree.joint_names), *borders(domain)) + _clear_line(domain),
+        "certificate": _certificate(chart),
         "fingerprint": fingerprint(chart.problem, chart.coordinates),
     }
 
@@ -61,3 +65,25 @@ def _or_unknown(limit: float) -> str:
 
 def _row(values: Array) -> str:
     return ", ".join(f"{value:.9g}" for value in values)
+
+
+def _certificate(chart: Chart) -> str:
+    """What is proved of the chart in exact arithmetic; the code itself is compared with it on samples."""
+    known = chart.certificate
+    return "none" if known is None else f"{known.heading} ({known.method}, chart {known.fingerprint[:16]})"
+
+
+def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
+    if np.isinf(lower).all():
+        return " *   all joint positions"
+    ranges = [
+        "all positions" if np.isinf(low) else f"{low:.6g} to {high:.6g}" for low, high in zip(lower, upper, strict=True)
+    ]
+    return "\n".join(f" *   {name}: {range_}" for name, range_ in zip(names, ranges, strict=True))
+
+
+def _clear_line(domain: Domain) -> str:
+    """The condition of a ClearBox."""
+    if not isinstance(domain, ClearBox):
+        return ""
+    return f"\n *   and the {domain.heading},\n *   or else the status is OUTSIDE_DOMAIN"

@@ -10,6 +10,7 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.check import check_values
+from orthocas.codegen.control_values import control_values
 from orthocas.codegen.description import description_values
 from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.numbers import numbers
@@ -17,13 +18,11 @@ from orthocas.codegen.precision import Precision, bounds_inside
 from orthocas.codegen.supervision import supervision_values
 from orthocas.codegen.words import words
 from orthocas.control import Controller, Safety
-from orthocas.domains import Domain, borders, contains, reach
+from orthocas.domains import Domain, contains, reach
 from orthocas.postures.clear_box import ClearBox
 from orthocas.version import VERSION
 
 _MAX_EVALUATIONS = 100  # largest number of chart evaluations in one call of the inverse map
-_IN_DOMAIN = "OUTSIDE_DOMAIN: q lies outside the domain of the chart."
-_EVERYWHERE = "This law uses no chart, so the status is never OUTSIDE_DOMAIN."
 
 
 def template_values(
@@ -38,7 +37,6 @@ def template_values(
     """The values of all placeholders in the templates."""
     problem = chart.problem
     domain = problem.domain
-    lower, upper = borders(domain)
     lowest, highest = bounds_inside(domain, precision)
     somewhere = precision.rounded(_somewhere(domain))
     joints = words(problem.robot.joint_names)
@@ -52,8 +50,6 @@ def template_values(
         **precision.words(),
         "joint_list": ", ".join(joints),
         **description_values(chart),
-        "domain_lines": _domain_lines(joints, lower, upper) + _clear_line(domain),
-        "certificate": _certificate(chart),
         "domain_lower": numbers(lowest),
         "domain_upper": numbers(highest),
         "domain_centre": numbers(domain.centre),
@@ -69,7 +65,7 @@ def template_values(
         for word, size in zip(("arg", "res", "iw", "w"), sizes, strict=True):
             values[f"{kernel}_{word}"] = str(max(1, size))
     if controller is not None and safety is not None:
-        values |= _control_values(controller) | supervision_values(controller, safety)
+        values |= control_values(controller) | supervision_values(controller, safety)
         values["clearance_c"] = filled("clearance.c", values) if "clear_span" in values else ""
         values["compose"] = filled(f"compose_{controller.command}.c", values)
     values |= _clear_values(domain, values)
@@ -88,59 +84,6 @@ def _title(chart: Chart, controller: Controller | None) -> str:
     problem, label = chart.problem, chart.coordinates.label
     title = f"{what} of {problem.name}: {label}, task {problem.task.name}, metric {problem.metric.name}"
     return words([title])[0]
-
-
-def _control_values(controller: Controller) -> dict[str, str]:
-    gains = controller.gains
-    torque = controller.command == "torque"
-    return {
-        "k": str(len(controller.labels)),
-        "reference_labels": ", ".join(words(controller.labels)),
-        "gain_fields": "\n".join(f"  double {gain}[{len(gains[gain])}];{_remark(controller, gain)}" for gain in gains),
-        "gain_values": ",\n".join(f"  {{{numbers(value)}}}" for value in gains.values()),
-        "gain_table": "\n".join(f"| `{gain}` | {numbers(value)} |" for gain, value in gains.items()),
-        "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
-        "commands_torque": str(int(torque)),
-        "law": controller.formula,
-        "fallback": _fallback(controller),
-        "where": _EVERYWHERE if controller.chart is None else _IN_DOMAIN,
-        "command": controller.command,
-    }
-
-
-def _fallback(controller: Controller) -> str:
-    if controller.command == "velocity":
-        return "zero velocity"
-    if controller.settings.get("gravity") == "robot":
-        return "zero torque, because the robot compensates gravity"
-    return "the gravity torque, or zero where it is not finite"
-
-
-def _remark(controller: Controller, gain: str) -> str:
-    units = controller.gain_units.get(gain)
-    return "" if units is None else f" /* {words([units])[0]} */"
-
-
-def _certificate(chart: Chart) -> str:
-    """What is proved of the chart in exact arithmetic; the code itself is compared with it on samples."""
-    known = chart.certificate
-    return "none" if known is None else f"{known.heading} ({known.method}, chart {known.fingerprint[:16]})"
-
-
-def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
-    if np.isinf(lower).all():
-        return " *   all joint positions"
-    ranges = [
-        "all positions" if np.isinf(low) else f"{low:.6g} to {high:.6g}" for low, high in zip(lower, upper, strict=True)
-    ]
-    return "\n".join(f" *   {name}: {range_}" for name, range_ in zip(names, ranges, strict=True))
-
-
-def _clear_line(domain: Domain) -> str:
-    """The condition of a ClearBox."""
-    if not isinstance(domain, ClearBox):
-        return ""
-    return f"\n *   and the {domain.heading},\n *   or else the status is OUTSIDE_DOMAIN"
 
 
 def _clear_values(domain: Domain, values: Mapping[str, str]) -> dict[str, str]:

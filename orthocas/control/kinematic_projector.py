@@ -14,16 +14,14 @@ from orthocas.checks import Array, require_kind
 from orthocas.control.controller import Command, fallback_function, guarded_graph, law_facts, named_inputs
 from orthocas.control.gains import FEEDBACK, LIMIT, command_limit, non_negative_gains
 from orthocas.control.inertia import block_inertia, median_volume
-from orthocas.control.reference import Reference
-from orthocas.control.second_task import SecondTask
 from orthocas.control.second_tasks import named_second, second_task
+from orthocas.control.two_task_law import TwoTaskLaw
 from orthocas.problem import Problem
-from orthocas.showing import Shown
 from orthocas.tasks import Task
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class KinematicProjector(Shown):
+class KinematicProjector(TwoTaskLaw):
     """Joint velocity dq = J_x^#A (d_x_d + Lambda_x (x_d - x)) + P J_2^#A (d_x_2d + Lambda_2 (x_2d - x_2)).
 
     J_x P = 0, so the task moves exactly as commanded, whatever the second task x_2(q) is. With zero feedback and a
@@ -85,18 +83,9 @@ class KinematicProjector(Shown):
         feedback = non_negative_gains(f"feedback (task, then {name})", settings.pop("feedback", 0.0), k)
         return cls(chart.problem, feedback[:m], feedback[m:], limit, second, **settings)
 
-    def remarks(self) -> list[str]:
-        """No warnings."""
-        return []
-
     def facts(self) -> dict[str, str]:
         """Quantities, gains and problem."""
         return law_facts(self)
-
-    @property
-    def chart(self) -> Chart | None:
-        """The chart of the second task, if it is one."""
-        return self._second.chart
 
     @property
     def settings(self) -> Mapping[str, str]:
@@ -104,24 +93,9 @@ class KinematicProjector(Shown):
         return {"second": self._second.name}
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        """Task labels, then those of the second task."""
-        return self._second.labels
-
-    @property
     def gains(self) -> dict[str, Array]:
         """Feedback and limit."""
         return {"feedback": self.feedback, "limit": self.limit}
-
-    @property
-    def measured(self) -> ca.Function:
-        """[h(q); x_2(q)]."""
-        return self._second.measured
-
-    @cached_property
-    def function(self) -> ca.Function:
-        """q, dq (n, 1), reference and its derivatives (m + k_2, 1), gains -> command (n, 1), status (1, 1)."""
-        return self._second.runnable(self.graph)
 
     @cached_property
     def graph(self) -> ca.Function:
@@ -145,14 +119,3 @@ class KinematicProjector(Shown):
         """q, gains -> zero velocity."""
         n = self.problem.n
         return fallback_function(named_inputs(n, self.gains, 0), ca.MX(n, 1))
-
-    def require_reachable(self, reference: Reference, q_start: Array) -> None:
-        """Raise UnreachableReferenceError if the reference leaves the joint limits (joints) or the domain (xi).
-
-        Nothing is checked for a second task of your own.
-        """
-        self._second.require_reachable(reference, q_start)
-
-    @cached_property
-    def _second(self) -> SecondTask:
-        return second_task(self.problem, self.second)

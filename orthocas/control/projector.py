@@ -31,17 +31,15 @@ from orthocas.control.gains import (
 )
 from orthocas.control.inertia import block_inertia, median_volume
 from orthocas.control.matched_stiffness import matched_posture_stiffness, matched_stiffness
-from orthocas.control.reference import Reference
-from orthocas.control.second_task import SecondTask
 from orthocas.control.second_tasks import named_second, second_task
 from orthocas.control.two_task_forces import errors_and_damping, two_task_forces
+from orthocas.control.two_task_law import TwoTaskLaw
 from orthocas.problem import Problem
-from orthocas.showing import Shown
 from orthocas.tasks import Task
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Projector(Shown):
+class Projector(TwoTaskLaw):
     """Impedance control of the task x, with springs of a second task x_2(q) in the null space of the task.
 
     tau = J_x^T (-K_x (x - x_d) - D_x J_x dq) + P^T J_2^T (-K_2 (x_2 - x_2d) - D_2 J_2 dq + f_2) + g,
@@ -147,10 +145,6 @@ class Projector(Shown):
             **settings,
         )
 
-    def remarks(self) -> list[str]:
-        """No warnings."""
-        return []
-
     def facts(self) -> dict[str, str]:
         """Quantities, gains and problem."""
         return law_facts(self)
@@ -163,35 +157,15 @@ class Projector(Shown):
         return f"{law} plus {springs} in the null space of the task, plus g(q)."
 
     @property
-    def chart(self) -> Chart | None:
-        """The chart of the second task, if it is one."""
-        return self._second.chart
-
-    @property
     def settings(self) -> Mapping[str, str]:
         """The second task."""
         return {"second": self._second.name, "feed_forward": "yes" if self.feed_forward else "no"}
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Task labels, then those of the second task."""
-        return self._second.labels
 
     @property
     def gains(self) -> dict[str, Array]:
         """Stiffness, damping ratio, the second force if there is one, and limit."""
         force = {} if self.second_force is None else {"second_force": self.second_force}
         return {"stiffness": self.stiffness, "damping_ratio": self.damping_ratio, **force, "limit": self.limit}
-
-    @property
-    def measured(self) -> ca.Function:
-        """[h(q); x_2(q)]."""
-        return self._second.measured
-
-    @cached_property
-    def function(self) -> ca.Function:
-        """q, dq (n, 1), reference and its derivatives (m + k_2, 1), gains -> command (n, 1), status (1, 1)."""
-        return self._second.runnable(self.graph)
 
     @cached_property
     def graph(self) -> ca.Function:
@@ -232,17 +206,6 @@ class Projector(Shown):
         power = ca.bilin(D_x, J @ dq, J @ dq) + ca.bilin(D_2, J_2 @ through, J_2 @ dq)
         outputs = {"storage": storage, "dissipated_power": power}
         return self._second.runnable(named_function("energy", inputs, outputs))
-
-    def require_reachable(self, reference: Reference, q_start: Array) -> None:
-        """Raise UnreachableReferenceError if the reference leaves the joint limits (joints) or the domain (xi).
-
-        Nothing is checked for a second task of your own.
-        """
-        self._second.require_reachable(reference, q_start)
-
-    @cached_property
-    def _second(self) -> SecondTask:
-        return second_task(self.problem, self.second)
 
     def _inputs(self) -> dict[str, ca.MX]:
         return named_inputs(self.problem.n, self.gains, len(self.labels))

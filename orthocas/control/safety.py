@@ -32,7 +32,7 @@ class Safety:
     per joint (n,), or per controlled quantity (k,) where that is said. The meanings are those of the generated header.
     """
 
-    command_rate: Annotated[Array, "largest change of the command [N m/s], [rad/s^2]"]
+    command_rate: Annotated[Array, "largest change of the command [N m/s], [rad/s^2]; in a tick: times its period"]
     speed_limit: Annotated[Array, "joint speed at which the catcher takes over; 30 times that is a bad one [rad/s]"]
     rest_speed: Annotated[Array, "joint speed below which the arm counts as slow [rad/s]"]
     near_margin: Annotated[float, "distance to the border at which NEAR_BORDER and additional damping begin"]
