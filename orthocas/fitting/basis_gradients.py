@@ -53,7 +53,7 @@ class BasisGradients:
         return self.dense_part(gradients, samples, np.ones(self._family.width, dtype=bool))
 
     def dense_part(
-        self, gradients: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike = None
+        self, gradients: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
     ) -> Array:
         """The same for some of the functions and samples, (samples, n, kept).
 
