@@ -11,7 +11,7 @@ from programs import Run, needs_c
 import orthocas as oc
 from orthocas.checks import Array
 from orthocas.codegen import library
-from orthocas.control import ControlStatus, Kinematic, PDPlus, Projector, Reference, Safety
+from orthocas.control import ControlStatus, Kinematic, PDPlus, Projector, Reference, Safety, matched_stiffness
 from orthocas.errors import CompileError, InvalidValueError, ShapeError
 from orthocas.simulation import Outcome, Push, Trajectory, simulate
 from orthocas.simulation.figure import trajectory_figure
@@ -29,7 +29,7 @@ def chart() -> oc.Chart:
 
 @pytest.fixture(scope="module")
 def law(chart: oc.Chart) -> PDPlus:
-    return PDPlus.on_chart(chart, limit=120.0)
+    return PDPlus(chart, matched_stiffness(chart, 8 * np.pi), limit=120.0)
 
 
 @pytest.fixture(scope="module")
