@@ -64,6 +64,7 @@ def save_drawing(path: Path, log: Log, ticks: np.ndarray, chart: oc.Chart) -> No
         reference_acceleration=np.zeros_like(phi),
         storage=unknown,
         dissipated_power=unknown,
+        cause=np.zeros_like(log.status[ticks]),
     )
     save_animation(path, run, chart.problem, force=True)
 

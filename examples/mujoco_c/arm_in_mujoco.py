@@ -23,7 +23,7 @@ from orthocas.control import ControlStatus, PDPlus
 HERE = Path(__file__).parent
 WEIGHTS = (1000, 30, 150, 1, 1000)
 GAP = 0.02  # between hand and wall at the start [m]
-PUSH_START, PUSH_END, PUSH = 7.0, 7.5, np.array([0.0, 90.0, 0.0])  # as in main.c [s], [N]
+PUSH_START, PUSH_END, PUSH = 7.0, 7.5, np.array([0.0, 120.0, 0.0])  # as in main.c [s], [N]
 EVERY, PERIOD = 200, 0.1  # the film shows every 200th tick for 0.1 s: twice as fast as the run
 
 

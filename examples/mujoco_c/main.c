@@ -42,7 +42,7 @@ static const step STEPS[] = {
 /* What happens to the arm. */
 #define PUSH_START 7.0
 #define PUSH_END 7.5
-static const double PUSH[3] = {0.0, 90.0, 0.0}; /* at the elbow, in world axes [N] */
+static const double PUSH[3] = {0.0, 120.0, 0.0}; /* at the elbow, in world axes [N] */
 
 typedef struct {
   mjModel *model;
