@@ -1,6 +1,5 @@
 """Collects the commands, and turns errors into one line and exit code 2."""
 
-import sys
 from collections.abc import Sequence
 from importlib import import_module
 
@@ -50,11 +49,11 @@ def _complain(text: str) -> None:
     typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
 
 
-def run() -> int:
-    """Run the command line; bad input gives one line on standard error and exit code 2, a signal its own code."""
+def run(app: typer.Typer) -> int:
+    """Run a command line of `app_for`; bad input gives one line on standard error and exit code 2, a signal its own."""
     with ended_in_order(), remembered() as pressed:
         try:
-            code = app_for(sys.argv[1:])(standalone_mode=False) or 0
+            code = app(standalone_mode=False) or 0
         except KeyboardInterrupt:
             code = INTERRUPTED
         except Exception as error:

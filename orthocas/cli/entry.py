@@ -33,10 +33,11 @@ def main() -> None:
     watched = signal.getsignal(signal.SIGINT) is _leave
     os.environ["MPLBACKEND"] = "agg"  # pictures go to files; a name that is none would stop matplotlib
     commands = importlib.import_module("orthocas.cli.commands")  # not above, since it takes a second
+    app = commands.app_for(sys.argv[1:])  # which imports the command
     try:
         if watched:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-        code = commands.run()
+        code = commands.run(app)
         sys.stdout.flush()
     except KeyboardInterrupt:
         code = commands.interrupted()
