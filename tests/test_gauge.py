@@ -36,7 +36,7 @@ def test_seeds_lead_to_the_same_coordinates_in_the_same_order_and_sign(
 def test_order_and_sign_follow_the_gradients_at_the_centre(iiwa_fit: oc.Fit, iiwa: oc.Problem) -> None:
     g = iiwa_fit.chart.coordinates.jacobian(iiwa.domain.centre[None])[0][:3]  # the fourth is the idle joint
     moved = (g**2 @ np.arange(7)) / (g**2).sum(axis=1)
-    assert (np.diff(moved) > 0).all()
+    assert (np.diff(moved) > -1e-6).all()  # coordinates that change places in the mirror have the same mean
     assert (np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1) > 0).all()
 
 

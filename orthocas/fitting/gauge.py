@@ -15,6 +15,8 @@ from orthocas.parametrisations.family import JointSpace
 from orthocas.problem import Problem
 from orthocas.samples import Samples
 
+_DIGITS = 6  # of gradients at the centre that count for the order: fits end with about as many
+
 
 def in_closed_form(problem: Problem, parametrisation: Parametrisation, samples: Samples) -> Coordinates:
     """Coordinates in closed form, which need no fit; see `orthocas.parametrisations.ClosedForm`."""
@@ -45,13 +47,16 @@ def in_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
 
     Coordinates that move the first joints come first. They are sorted by the mean index of the joints that move,
     sum_k k g_k^2 / |g|^2, with the gradient g at the centre of the domain. The joint with the largest |g_k| moves in
-    the positive direction. Idle joints stay last.
+    the positive direction. Coordinates that change places in the arm's mirror have the same mean; the one that moves
+    the first joint on which they differ further comes first. Idle joints stay last.
     """
     g = coordinates.jacobian(centre[None, :])[0, : len(coordinates.offset)]
     size = (g**2).sum(axis=1)
     moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)  # g = 0: a fold at the centre
     largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]
-    return _rearranged(coordinates, np.argsort(moved, kind="stable"), np.where(largest < 0, -1.0, 1.0))
+    signs = np.where(largest < 0, -1.0, 1.0)
+    keys = np.round(np.column_stack([moved, -signs[:, None] * g]), _DIGITS)
+    return _rearranged(coordinates, np.lexsort(keys.T[::-1]), signs)
 
 
 def aligned(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordinates:
