@@ -58,7 +58,6 @@ def calls_of_chart(chart: oc.Chart) -> list[Call]:
     q = points_of(chart)
     phi = chart.phi(q)
     fitted_calls: list[Call] = [
-        lambda k: chart.xi_range(q[k % 2]).high,
         lambda k: np.asarray(chart.function("phi")(q[k % 6])),
         lambda k: np.asarray(chart.function("jacobian")(q[k % 6])),
         lambda k: np.append(chart.quality(q[k % 6]).leak_deg, chart.quality(q[k % 6]).conditioning),
@@ -102,6 +101,15 @@ def test_threads_share(name: str) -> None:
     shared = build()  # its functions are not built yet: that happens in the threads
     for k, found in enumerate(in_threads(lambda k: shared[k % len(shared)](k), count)):
         np.testing.assert_array_equal(found, expected[k % len(expected)], err_msg=f"call {k}")
+
+
+@pytest.mark.slow
+def test_threads_share_the_ranges_of_a_chart() -> None:
+    chart = copy.deepcopy(fitted().chart)
+    q = points_of(chart)
+    expected = [fitted().chart.xi_range(point).high for point in q[:2]]
+    for k, found in enumerate(in_threads(lambda k: chart.xi_range(q[k % 2]).high, 48)):
+        np.testing.assert_array_equal(found, expected[k % 2])
 
 
 def test_simulations_share_a_law() -> None:
