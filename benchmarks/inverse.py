@@ -15,6 +15,7 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.codegen import CompiledInverse
 from orthocas.domains import sample_uniform
 
 REPEATS = 3
@@ -65,7 +66,7 @@ def batch(
     return {f"{key} s": min(seconds), f"{key} found": float(good.mean()), f"{key} wrong": wrong}
 
 
-def stream(chart: oc.Chart, compiled: oc.codegen.CompiledInverse, ticks: int) -> dict[str, float]:
+def stream(chart: oc.Chart, compiled: CompiledInverse, ticks: int) -> dict[str, float]:
     """Median times of single calls along a circle of the tool and one coordinate at 1 kHz, 0.3 m/s [us]."""
     time_of = np.arange(ticks) * 1e-3
     path = np.tile(chart.phi(chart.problem.domain.centre), (ticks, 1))
@@ -92,7 +93,7 @@ def stream(chart: oc.Chart, compiled: oc.codegen.CompiledInverse, ticks: int) ->
     }
 
 
-def in_c(compiled: oc.codegen.CompiledInverse, path: Any, q: Any) -> float:
+def in_c(compiled: CompiledInverse, path: Any, q: Any) -> float:
     """Seconds of a call of NAME_inverse: means of 100 calls in one thread, the best of some."""
     run, seconds = ctypes.CDLL(str(compiled.library)).arm_inverse_rows, []
     targets, starts = path[1:].copy(), q[:-1].copy()

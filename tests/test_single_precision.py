@@ -17,6 +17,7 @@ from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, check_c, c
 from orthocas.codegen.library import compilers
 from orthocas.codegen.precision import SINGLE
 from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, KinematicProjector, PDPlus, Projector
+from orthocas.domains import borders
 from orthocas.errors import ProofError
 from orthocas.fitting.fit import Fit
 
@@ -168,7 +169,7 @@ def test_a_processor_in_single_precision_emulates_nothing(generated: GeneratedC,
 
 def test_bounds_belong_to_the_domain(library: CompiledLibrary, law: Controller) -> None:
     low, high = library.domain
-    np.testing.assert_allclose(library.domain, oc.domains.borders(law.problem.domain), rtol=3e-7)
+    np.testing.assert_allclose(library.domain, borders(law.problem.domain), rtol=3e-7)
     for corner in (low, high):
         assert law.problem.domain.contains(corner)
         assert library.chart(corner)[2] == ControlStatus.OK
