@@ -96,6 +96,12 @@ def planar_chart(planar_x: oc.Problem) -> oc.Chart:
 
 
 @pytest.fixture(scope="session")
+def planar_for_control(planar_x: oc.Problem) -> oc.Chart:
+    """Cubic coordinates that keep away from folds, for laws at the border of the domain."""
+    return oc.fit(planar_x, oc.Polynomial(3), weights=(1000, 30, 150, 0.1, 1000), samples=1500).chart
+
+
+@pytest.fixture(scope="session")
 def arm_chart() -> oc.Chart:
     """The 7-DoF arm with A = M, roughly fitted: laws have to be right for any regular chart."""
     problem = oc.problems.get("iiwa")

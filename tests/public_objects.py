@@ -48,6 +48,11 @@ def fitted() -> Fit:
 
 
 @cache
+def linear() -> oc.Chart:
+    return oc.fit(planar(), oc.Linear()).chart
+
+
+@cache
 def network() -> oc.Chart:
     return oc.fit(planar(), oc.MLP((6, 6)), solvers.LBFGS(max_iterations=10), samples=300).chart
 

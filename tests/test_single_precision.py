@@ -34,10 +34,8 @@ def compiled(generated: GeneratedC) -> CompiledLibrary:
 
 
 @pytest.fixture(scope="module")
-def law() -> Controller:
-    problem = oc.problems.get("planar_3r_x")
-    chart = oc.fit(problem, oc.Polynomial(3), weights=(1000, 30, 150, 0.1, 1000), samples=1500).chart
-    return PDPlus.on_chart(chart, limit=120.0)
+def law(planar_for_control: oc.Chart) -> Controller:
+    return PDPlus.on_chart(planar_for_control, limit=120.0)
 
 
 @pytest.fixture(scope="module")

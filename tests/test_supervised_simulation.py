@@ -22,9 +22,8 @@ RATE = 500.0
 
 
 @pytest.fixture(scope="module")
-def chart() -> oc.Chart:
-    problem = oc.problems.get("planar_3r_x")
-    return oc.fit(problem, oc.Polynomial(3), weights=(1000, 30, 150, 0.1, 1000), samples=1500).chart
+def chart(planar_for_control: oc.Chart) -> oc.Chart:
+    return planar_for_control
 
 
 @pytest.fixture(scope="module")

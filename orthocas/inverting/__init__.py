@@ -6,31 +6,13 @@
 - `nearest` finds the nearest coordinates inside the domain where there is no solution inside.
 - `tracker` follows a stream of phi.
 - `implicit` makes a CasADi function with derivatives of it.
+- `methods` has the methods of charts.
 - `inverse` restarts where needed and tells how each row ended; `solutions` holds the result.
 """
 
-from orthocas.inverting.implicit import inverse_function
-from orthocas.inverting.inverse import Inverse
-from orthocas.inverting.nearest import Nearest
-from orthocas.inverting.newton import Attempt, LocalSolver, Newton, PhiMap
-from orthocas.inverting.own_inverse import OwnInverse
-from orthocas.inverting.point import FewRows, PointFunctions
+from orthocas.inverting.methods import InverseMethods
+from orthocas.inverting.newton import Attempt, Newton
 from orthocas.inverting.solutions import InverseStatus, Solutions
 from orthocas.inverting.tracker import Tracker, TrackerStatus
 
-__all__ = [
-    "Attempt",
-    "FewRows",
-    "Inverse",
-    "InverseStatus",
-    "LocalSolver",
-    "Nearest",
-    "Newton",
-    "OwnInverse",
-    "PhiMap",
-    "PointFunctions",
-    "Solutions",
-    "Tracker",
-    "TrackerStatus",
-    "inverse_function",
-]
+__all__ = ["Attempt", "InverseMethods", "InverseStatus", "Newton", "Solutions", "Tracker", "TrackerStatus"]

@@ -1,12 +1,10 @@
 """Campaign of path files: what is read are finite waypoints of the right shape, or the error names file and line."""
 
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import public_objects
 
-import orthocas as oc
 from fuzz.child import Finding, run
 from fuzz.mutants import TEXTS, Rng, flipped, pick
 from fuzz.sealed_files import judged
@@ -43,14 +41,9 @@ def judge(seed: int) -> str | None:
     return judged(_mutant, use, seed)
 
 
-@cache
-def _chart() -> oc.Chart:
-    return oc.fit(public_objects.planar(), oc.Linear()).chart
-
-
 def use(path: Path) -> None:
     """Read a path; its numbers have to be usable."""
-    x, xi = read_path(path, _chart())
+    x, xi = read_path(path, public_objects.linear())
     assert x.shape[1] == 1
     assert xi is None or xi.shape == (len(x), 2)
     assert len(x) >= 2

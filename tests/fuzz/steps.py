@@ -1,14 +1,12 @@
 """Campaign of steps files: what is read is a reference that can be sampled, or the error names the place."""
 
 import json
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import public_objects
 
-import orthocas as oc
 from fuzz.child import Finding, run
 from fuzz.mutants import NUMBERS, OTHERS, TEXTS, Rng, changed_data, flipped, pick
 from fuzz.sealed_files import judged
@@ -45,21 +43,16 @@ def judge(seed: int) -> str | None:
     return judged(_mutant, use, seed)
 
 
-@cache
-def _chart() -> oc.Chart:
-    return oc.fit(public_objects.planar(), oc.Linear()).chart
-
-
 def use(path: Path) -> None:
     """Read a plan and sample it."""
-    plan = read_steps(path, _chart())
+    plan = read_steps(path, public_objects.linear())
     duration = plan.reference.duration
     for values in plan.reference.sample(np.linspace(0, duration, 50)):
         assert values.shape == (50, 3)
         assert np.isfinite(values).all(), "the reference is not finite"
     assert len(plan.reference.grid()) < 10**7
     for push in plan.pushes:
-        assert Loads(_chart().problem.robot.tree, [push]).size == 6
+        assert Loads(public_objects.linear().problem.robot.tree, [push]).size == 6
         assert push.start < duration
 
 

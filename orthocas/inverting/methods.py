@@ -1,0 +1,212 @@
+"""Methods of charts around the inverse map q(phi), and the CasADi functions of a chart, the inverse among them."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.checks import (
+    Array,
+    as_float_array,
+    as_point,
+    as_point_set,
+    require_at_least,
+    require_kind,
+    require_known,
+)
+from orthocas.coordinates.map import InvertibleMap
+from orthocas.coordinates.phi import PhiFunctions
+from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError, SingularTaskError
+from orthocas.inverting.implicit import inverse_function
+from orthocas.inverting.inverse import Inverse
+from orthocas.inverting.nearest import Nearest
+from orthocas.inverting.newton import LocalSolver, Newton, PhiMap
+from orthocas.inverting.own_inverse import OwnInverse
+from orthocas.inverting.point import FewRows, PointFunctions
+from orthocas.inverting.solutions import Solutions
+from orthocas.inverting.tracker import Tracker
+from orthocas.problem import task_sizes
+
+FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "inverse")
+
+
+class InverseMethods(PhiFunctions):
+    """What a chart has on top of phi: its inverse in batches, for streams, and as a CasADi function."""
+
+    def inverse(self, phi: ArrayLike, q_start: ArrayLike | None = None, tolerance: float = 1e-9) -> Array:
+        """Solve phi(q) = phi for q: fitted charts by Newton's method with line search, grown ones along the flow.
+
+        Args:
+            phi: target values, (n,) or (N, n).
+            q_start: initial guess (n,), or (N, n) with one guess per row of phi; default: starts that are found as in
+                `solve`. For grown coordinates it selects the number of full turns and the sheet of a linear leaf.
+            tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
+
+        Returns:
+            q, (n,) or (N, n). It may lie outside the domain; check with `orthocas.contains`.
+
+        Raises:
+            InverseError: if no solution is found, or J is singular there. The message names the rows.
+        """
+        targets, single = as_point_set("phi", phi, self.n)
+        if q_start is not None:
+            as_point_set("q_start", q_start, self.n)
+        q = self.solve(targets, q_start, tolerance=tolerance).require(inside=False).q
+        return q[0] if single else q
+
+    def solve(
+        self,
+        phi: ArrayLike,
+        q_start: ArrayLike | None = None,
+        *,
+        tolerance: float = 1e-9,
+        inside: bool = False,
+        local: LocalSolver | None = None,
+    ) -> Solutions:
+        """Solve phi(q) = phi for q, with a status for each row: a row that fails does not disturb the others.
+
+        Newton's method works on all rows at once. With `q_start`, it searches from there only, and q is the solution
+        near the start. Otherwise it starts at a rough inverse of phi, a polynomial fitted to points of the domain.
+        Rows that do not lead to a solution inside the domain start again at its centre, and at the 8 points of a table
+        whose phi is nearest.
+
+        Args:
+            phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
+            q_start: initial guess (n,), or (N, n) with one guess per row of phi.
+            tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
+            inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
+                other starts, get the q inside with the same x and the nearest xi that Ipopt finds (10 ms a row),
+                status NEAREST, or OUT_OF_REACH if none has that x. Not for grown coordinates.
+            local: another solver of phi(q) = phi near given starts; `orthocas.compile_inverse` has one.
+
+        Returns:
+            `Solutions` with q (N, n), status, iterations, error and distance (N,); N = 1 for one phi.
+
+        Raises:
+            ShapeError: if a row has another number of entries, or q_start another number of rows.
+            NoExpressionError: if `inside` is asked of grown coordinates.
+
+        Source:
+            ours: docs/inverse.md.
+        """
+        require_at_least("tolerance", tolerance, 0)
+        targets = self._rows("phi", phi)
+        starts = None if q_start is None else self._rows("q_start", q_start)
+        if starts is None and isinstance(self.coordinates, InvertibleMap):
+            starts = self.problem.domain.centre[None]
+        if starts is not None:
+            if len(starts) not in (1, len(targets)):
+                raise ShapeError("q_start", starts.shape, targets.shape)
+            starts = np.broadcast_to(starts, targets.shape)
+        require_kind("inside", inside, bool)
+        if local is not None and not callable(local):
+            raise InvalidValueError("local", repr(local)[:80], "a function of targets and starts")
+        if inside:
+            self._require_expression("inside=True")
+        inverse = self._inverse if local is None else replace(self._inverse, local=local)
+        return inverse.solve(targets, starts, float(tolerance), inside)
+
+    def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
+        """All q inside the domain with phi(q) = phi that a search from 1,026 starts finds.
+
+        A chart that does not fold has one at most. The search is no proof: it may miss solutions near folds.
+
+        Args:
+            phi: target values, (n,).
+            tolerance: as in `solve`.
+
+        Returns:
+            Different solutions, the one nearest to the centre of the domain first, (k, n).
+
+        Raises:
+            NoExpressionError: if the coordinates are grown.
+
+        Example:
+            >>> import numpy as np
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[1.0, 1.0])
+            >>> problem = oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Box([0.5, 0.5], 1.0))
+            >>> chart = oc.fit(problem, oc.Linear()).chart  # it folds
+            >>> len(chart.solutions(chart.phi([0.4, 0.3])))
+            2
+        """
+        require_at_least("tolerance", tolerance, 0)
+        self._require_expression("a search for all solutions")
+        return self._inverse.all_inside(as_point("phi", phi, self.n), float(tolerance))
+
+    def tracker(self, q0: ArrayLike, largest_step: ArrayLike | None = None) -> Tracker:
+        """A tracker that follows a stream of phi from q0; see `Tracker`.
+
+        Args:
+            q0: a joint position inside the domain, (n,).
+            largest_step: largest change of each joint in a call, (n,) or one number [rad] or [m]; default: a tenth of
+                the half-widths of the domain.
+
+        Raises:
+            NoExpressionError: if the coordinates are grown.
+            InvalidValueError: if q0 lies outside the domain, or J is singular there.
+        """
+        self._require_expression("a tracker")
+        return Tracker(self._point_functions, self.problem.domain, q0, largest_step)
+
+    def function(self, name: str) -> ca.Function:
+        """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.
+
+        The input q is a column (n, 1). second_derivative takes q, v, w (n, 1) and returns d^2 phi(q)[v, w] =
+        (d/ds) J(q + s v) w, (n, 1). For v = dq this is dJ/dt w. inverse takes phi and q_start (n, 1), and returns q
+        (n, 1) with phi(q) = phi, or NaN where Newton's method finds none. Its derivatives are those of the implicit
+        function theorem, of any order; so it can be part of an optimal control problem.
+
+        Raises:
+            UnknownNameError: if there is no such function.
+            NoExpressionError: if the coordinates are grown. `orthocas.distil` fits an expression to them.
+        """
+        require_known("chart function", name, FUNCTIONS)
+        return self._inverse_function if name == "inverse" else self._graph(name)
+
+    @cached_property
+    def phi_sizes(self) -> Array:
+        """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
+        return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
+
+    @cached_property
+    def phi_map(self) -> PhiMap:
+        """phi and J for solvers of phi(q) = phi."""
+        return PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes)
+
+    @cached_property
+    def _inverse(self) -> Inverse:
+        phi_map = self.phi_map
+        if isinstance(self.coordinates, InvertibleMap):
+            return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map, self.m))
+        local = FewRows(phi_map, self._point_functions, Newton(phi_map))
+        return Inverse(self.problem, phi_map, local, Nearest(self.problem, self.function("phi"), phi_map))
+
+    @cached_property
+    def _inverse_function(self) -> ca.Function:
+        return inverse_function(self.function("phi"), self.phi_sizes)
+
+    @cached_property
+    def _point_functions(self) -> PointFunctions:
+        return PointFunctions.of(self.function("phi"), self.function("jacobian"), self.phi_sizes)
+
+    def _jacobian_or_nan(self, points: Array) -> Array:
+        """J at points (N, n), with NaN where the task has no finite Jacobian."""
+        try:
+            return self.jacobian(points)
+        except SingularTaskError:
+            J_x = self.problem.task.batched_jacobian(points)[0].reshape(-1, self.m, self.n)
+            return np.concatenate([J_x, self.coordinates.jacobian(points)], axis=1)
+
+    def _require_expression(self, what: str) -> None:
+        """Raise NoExpressionError if the coordinates are grown."""
+        if isinstance(self.coordinates, InvertibleMap):
+            raise NoExpressionError(f"{what} needs coordinates with a CasADi expression; received grown coordinates")
+
+    def _rows(self, name: str, value: ArrayLike) -> Array:
+        """One point or a set, as `as_point_set` takes them, but finite or not, (N, n)."""
+        array = as_float_array(name, value)
+        as_point_set(name, np.zeros_like(array), self.n)
+        return array.reshape(-1, self.n)
