@@ -9,20 +9,16 @@ from public_objects import CHARTS
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.casadi_tools import blocks, threads
+from orthocas.casadi_tools import blocks
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.blocks import BlockedFunction
+from orthocas.casadi_tools.threads import using_threads
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import sample_uniform
 from orthocas.parametrisations import JointSpace
 
 MANY = 700  # three blocks, the last one not full
-
-
-def use(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    for module in (threads, blocks):
-        monkeypatch.setattr(module, "THREADS", count)
 
 
 def of_arm(parametrisation: oc.Polynomial | oc.MLP) -> Coordinates:
@@ -52,13 +48,11 @@ def test_values_are_those_of_numpy(count: int) -> None:
 
 @pytest.mark.parametrize("name", ["xi", "jacobian"])
 @pytest.mark.parametrize("parametrisation", [oc.Polynomial(3), oc.MLP((5, 4))])
-def test_threads_change_nothing(
-    monkeypatch: pytest.MonkeyPatch, parametrisation: oc.Polynomial | oc.MLP, name: str
-) -> None:
+def test_threads_change_nothing(parametrisation: oc.Polynomial | oc.MLP, name: str) -> None:
     coordinates, points, found = of_arm(parametrisation), points_of(7, 9000), []
     for count in (1, 2, 5):
-        use(monkeypatch, count)
-        found.append(getattr(coordinates, name)(points))
+        with using_threads(count):
+            found.append(getattr(coordinates, name)(points))
     for other in found[1:]:
         np.testing.assert_array_equal(other, found[0])
 

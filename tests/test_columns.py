@@ -4,8 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from orthocas.casadi_tools import columns
 from orthocas.casadi_tools.columns import COLUMNS, ColumnFunction, blocked, by_sample, shares
+from orthocas.casadi_tools.threads import using_threads
 
 
 def example() -> ca.Function:
@@ -15,12 +15,12 @@ def example() -> ca.Function:
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("N", [1, 7, COLUMNS, COLUMNS + 1, 3 * COLUMNS - 5])
-def test_columns_agree_with_single_samples(monkeypatch: pytest.MonkeyPatch, N: int, threads: int) -> None:
-    monkeypatch.setattr(columns, "THREADS", threads)
+def test_columns_agree_with_single_samples(N: int, threads: int) -> None:
     rng = np.random.default_rng(3)
     A, b = rng.normal(size=(N, 2, 3)), rng.normal(size=(N, 3))
     f = example()
-    outputs = ColumnFunction(f)(blocked(A), blocked(b))
+    with using_threads(threads):
+        outputs = ColumnFunction(f)(blocked(A), blocked(b))
     assert [out.shape for out in outputs] == [(-(-N // COLUMNS), size, COLUMNS) for size in (2, 6, 3)]
     matrices = by_sample(outputs[1].reshape(len(outputs[1]), 2, 3, COLUMNS), N)
     assert matrices.shape == (N, 3, 2)

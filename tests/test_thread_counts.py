@@ -1,5 +1,6 @@
 """Fits of linear families give the same numbers for any number of threads, and BLAS has its own back afterwards."""
 
+import os
 import subprocess
 import sys
 import time
@@ -12,15 +13,9 @@ from threadpoolctl import threadpool_info
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.casadi_tools import columns, threads
-from orthocas.casadi_tools.threads import in_threads, one_blas_thread
+from orthocas.casadi_tools.threads import in_threads, in_threads_with, one_blas_thread, using_threads
 from orthocas.fitting import normal_blocks
 from orthocas.minimising.solver import Solver
-
-
-def use(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    for module in (threads, columns, normal_blocks):
-        monkeypatch.setattr(module, "THREADS", count)
 
 
 def blas_threads() -> list[int]:
@@ -28,20 +23,56 @@ def blas_threads() -> list[int]:
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_results_come_in_order(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    use(monkeypatch, count)
-
+def test_results_come_in_order(count: int) -> None:
     def late(k: int) -> int:
         time.sleep(0.01 * (k == 0))
         return k * k
 
-    assert list(in_threads(late, range(7))) == [k * k for k in range(7)]
-    assert list(in_threads(late, [])) == []
-    with pytest.raises(ZeroDivisionError):
-        list(in_threads(lambda k: 1 // k, range(3)))
+    with using_threads(count):
+        assert in_threads(late, range(7)) == [k * k for k in range(7)]
+        assert in_threads(late, []) == []
+        with pytest.raises(ZeroDivisionError):
+            in_threads(lambda k: 1 // k, range(3))
 
 
-def test_normal_blocks_are_sums_of_products(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_an_exception_no_piece_is_at_work() -> None:
+    """Scratch memory can be used again at once."""
+    busy: list[int] = []
+
+    def work(k: int) -> None:
+        if k == 0:
+            raise KeyError
+        busy.append(k)
+        time.sleep(0.05)
+        busy.remove(k)
+
+    with using_threads(3):
+        for _ in range(3):
+            with pytest.raises(KeyError):
+                in_threads(work, range(20))
+            assert not busy
+
+
+def test_threads_within_threads_do_not_wait_for_each_other() -> None:
+    with using_threads(2):
+        found = in_threads(lambda k: sum(in_threads(lambda i: i, range(k))), range(6))
+    assert found == [0, 0, 1, 3, 6, 10]
+
+
+def test_a_tool_serves_one_piece_at_a_time() -> None:
+    tools: list[list[int]] = [[], [], []]
+
+    def work(tool: list[int], piece: int) -> int:
+        tool.append(piece)
+        time.sleep(0.001)
+        assert tool.pop() == piece
+        return piece
+
+    with using_threads(3):
+        assert in_threads_with(tools, work, range(60)) == list(range(60))
+
+
+def test_normal_blocks_are_sums_of_products() -> None:
     """Against the dense sum in double precision; and 1, 2 and 5 threads agree to the last bit."""
     rng, K = np.random.default_rng(5), 23
     gradients = [rng.normal(size=(1300, 4, width)).astype(np.float32) for width in (K, 9)]
@@ -49,8 +80,8 @@ def test_normal_blocks_are_sums_of_products(monkeypatch: pytest.MonkeyPatch) -> 
     X = [D.astype(float) @ G.astype(float) for D, G in zip(derivatives, gradients, strict=True)]
     found = []
     for count in (1, 2, 5):
-        use(monkeypatch, count)
-        found.append(normal_blocks.normal_matrix(derivatives, gradients, [(1, 0, 2, 1)]))
+        with using_threads(count):
+            found.append(normal_blocks.normal_matrix(derivatives, gradients, [(1, 0, 2, 1)]))
     for j, part in enumerate((slice(K), slice(K, None))):
         np.testing.assert_allclose(found[0][part, part], np.einsum("srk,srl->kl", X[j], X[j]), rtol=0, atol=5e-2)
     np.testing.assert_allclose(found[0][K:, :K], X[1][:, 2].T @ X[0][:, 1], rtol=0, atol=5e-2)  # of sums near 1e4
@@ -64,21 +95,19 @@ def test_normal_blocks_are_sums_of_products(monkeypatch: pytest.MonkeyPatch) -> 
     [solvers.GaussNewton(), solvers.LBFGS(max_iterations=20), solvers.Adam(epochs=2), solvers.GradientFlow(8)],
     ids=lambda solver: solver.name,
 )
-def test_threads_do_not_change_a_fit(planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch, solver: Solver) -> None:
+def test_threads_do_not_change_a_fit(planar_x: oc.Problem, solver: Solver) -> None:
     found = []
     for count in (1, 2, 5):
-        use(monkeypatch, count)
-        fit = oc.fit(planar_x, oc.Polynomial(3), solver, samples=3000, weights=(1000, 30, 150, 0.1))
+        fit = oc.fit(planar_x, oc.Polynomial(3), solver, samples=3000, weights=(1000, 30, 150, 0.1), threads=count)
         found.append(fit.chart.coordinates.theta)
     for other in found[1:]:
         np.testing.assert_array_equal(other, found[0])
 
 
-def test_threads_do_not_change_a_bounded_fit(planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_do_not_change_a_bounded_fit(planar_x: oc.Problem) -> None:
     found = []
     for count in (1, 3):
-        use(monkeypatch, count)
-        fit = oc.fit(planar_x, oc.Polynomial(2), samples=1500, max_mutual_deg=3.0)
+        fit = oc.fit(planar_x, oc.Polynomial(2), samples=1500, max_mutual_deg=3.0, threads=count)
         found.append(fit.chart.coordinates.theta)
     np.testing.assert_array_equal(found[1], found[0])
 
@@ -125,6 +154,28 @@ fits = [
 ]
 np.savez(sys.argv[2], *(fit.chart.coordinates.theta for fit in fits))
 """
+
+
+FORKED = """
+import os, sys, warnings
+import numpy as np
+import orthocas as oc
+from orthocas import problems
+
+warnings.simplefilter("ignore")  # Python's warning about processes that fork while they have threads
+problem = problems.get("planar_3r_xy")
+fits = [oc.fit(problem, oc.Polynomial(2), samples=2000, threads=2).chart.coordinates.theta]
+child = os.fork()
+if not child:
+    fits.append(oc.fit(problem, oc.Polynomial(2), samples=2000, threads=2).chart.coordinates.theta)
+    os._exit(0 if np.array_equal(*fits) else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_process_starts_threads_of_its_own() -> None:
+    assert subprocess.run([sys.executable, "-c", FORKED], check=False, timeout=60).returncode == 0
 
 
 @pytest.mark.slow

@@ -5,17 +5,16 @@ that of one block in each thread.
 """
 
 from collections.abc import Callable
-from queue import SimpleQueue
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.casadi_tools.batch import THREADS, Batched
+from orthocas.casadi_tools.batch import Batched
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.columns import COLUMNS, ColumnFunction
-from orthocas.casadi_tools.threads import in_threads
+from orthocas.casadi_tools.threads import in_threads_with, thread_count
 from orthocas.checks import Array
 
 MANY = 64  #: joint positions from which blocks pay off
@@ -34,21 +33,16 @@ def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction]
         make: makes the function (n, c) -> (entries, c), once for each thread.
     """
     starts = range(0, len(points), _PIECE)
-    ready: SimpleQueue[BlockFunction] = SimpleQueue()
-    for _ in range(min(THREADS, len(starts))):
-        ready.put(make())  # not in the threads, see ColumnFunction
+    functions = [make() for _ in range(min(thread_count(), len(starts)))]  # not in the threads, see ColumnFunction
 
-    def one_piece(start: int) -> None:
-        function = ready.get()
+    def one_piece(function: BlockFunction, start: int) -> None:
         for first in range(start, min(start + _PIECE, len(points)), COLUMNS):
             part = points[first : first + COLUMNS]
             values = function(_columns(part))
             by_entry = values.reshape(*results.shape[1:], COLUMNS)[..., : len(part)]
             results[first : first + COLUMNS] = np.moveaxis(by_entry, -1, 0)
-        ready.put(function)
 
-    for _ in in_threads(one_piece, starts):
-        pass
+    in_threads_with(functions, one_piece, starts)
 
 
 def _columns(points: Array) -> Array:
@@ -86,7 +80,7 @@ class BlockedFunction:
     def _on_one_block(self) -> BlockFunction:
         """The function for `fill`."""
         assert self._by_rows is not None
-        run = self._by_rows.on_one_block(reused=True)
+        run = self._by_rows.on_one_block()
         return lambda columns: run(columns)[0]
 
     @cached_property

@@ -7,20 +7,23 @@ A blocked array is (B, entries, c): B blocks of c samples. The entries of a matr
 block is padded with copies of the first sample.
 """
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.batch import THREADS
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.tape import Tape, replay, to_tape
+from orthocas.casadi_tools.threads import in_threads_with, thread_count
 from orthocas.checks import Array
 from orthocas.errors import OrthocasError
 
 COLUMNS = 256  #: samples in a block
+
+#: Evaluates contiguous inputs (entries, c), and writes contiguous outputs (entries, c).
+Run = Callable[[Sequence[Array], Sequence[Array]], None]
 
 
 def blocked(stack: Array) -> Array:
@@ -61,38 +64,67 @@ class ColumnFunction:
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Outputs (B, entries, c) for contiguous inputs (B, entries, c). Threads share the blocks."""
-        parts = max(1, min(THREADS, len(arguments[0])))
-        # CasADi lets go of Python's lock while it evaluates. It must not build in a thread: its own lock against
-        # Python's is a deadlock.
-        runs = [self.on_one_block() for _ in range(parts)]
-        split = zip(*(np.array_split(argument, parts) for argument in arguments), strict=True)
-        if parts == 1:
-            return _of_blocks(runs[0], *arguments)
-        with ThreadPoolExecutor(parts) as pool:
-            results = list(pool.map(lambda run, part: _of_blocks(run, *part), runs, split))
-        return [np.concatenate(outputs) for outputs in zip(*results, strict=True)]
+        blocks, count = len(arguments[0]), thread_count()
+        results = [np.empty((blocks, *shape)) for shape in self._shapes]
 
-    def on_one_block(self, reused: bool = False) -> Callable[..., list[Array]]:
-        """A function of contiguous inputs (entries, c) with its own scratch memory. It returns (entries, c).
+        def evaluate(run: Run, part: range) -> None:
+            for b in part:
+                run([argument[b] for argument in arguments], [result[b] for result in results])
 
-        Args:
-            reused: return the same arrays at every call. Large ones need time to allocate.
+        with self.borrowed(min(count, blocks)) as runs:
+            in_threads_with(runs, evaluate, [range(k, blocks, count) for k in range(len(runs))])
+        return results
+
+    @contextmanager
+    def borrowed(self, count: int) -> Iterator[list[Run]]:
+        """Functions of blocks for so many threads, with scratch memory that nobody else uses meanwhile.
+
+        They are kept for the next time. CasADi lets go of Python's lock while it evaluates. It must not build in a
+        thread of a pool: its own lock against Python's is a deadlock.
         """
+        runs: list[Run] = []
+        for _ in range(count):
+            try:
+                runs.append(self._spare.pop())
+            except IndexError:
+                runs.append(self._new_run())
+        try:
+            yield runs
+        finally:
+            self._spare.extend(runs)
+
+    def on_one_block(self) -> Callable[..., list[Array]]:
+        """A function of contiguous inputs (entries, c) that returns the same arrays (entries, c) at every call."""
+        run, results = self._new_run(), [np.empty(shape) for shape in self._shapes]
+
+        def evaluate(*arguments: Array) -> list[Array]:
+            run(arguments, results)
+            return results
+
+        return evaluate
+
+    def _new_run(self) -> Run:
         buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
         buffer, evaluate = self._on_block.buffer()
-        shapes = [(self._function.numel_out(i), COLUMNS) for i in range(self._function.n_out())]
-        own = [np.empty(shape) for shape in shapes] if reused else None
 
-        def run(*arguments: Array) -> list[Array]:
-            results = own or [np.empty(shape) for shape in shapes]
+        def run(arguments: Sequence[Array], results: Sequence[Array]) -> None:
             for i, array in enumerate(arguments):
                 buffer.set_arg(i, array.data)
             for i, array in enumerate(results):
                 buffer.set_res(i, array.data)
             evaluate()
-            return results
 
         return run
+
+    @cached_property
+    def _spare(self) -> list[Run]:
+        """Functions that nobody uses now."""
+        return []
+
+    @property
+    def _shapes(self) -> list[tuple[int, int]]:
+        """Shapes of the outputs on one block."""
+        return [(self._function.numel_out(i), COLUMNS) for i in range(self._function.n_out())]
 
     @cached_property
     def _on_block(self) -> ca.Function:
@@ -126,9 +158,3 @@ class ColumnFunction:
         outputs = self._function.call(parts)
         stacked = ca.densify(ca.vertcat(*(ca.vec(ca.densify(out)) for out in outputs)))
         return to_tape(ca.Function("flat", [column], [ca.cse(stacked)]))
-
-
-def _of_blocks(run: Callable[..., list[Array]], *arguments: Array) -> list[Array]:
-    """Evaluate some blocks in one thread."""
-    blocks = [run(*block) for block in zip(*arguments, strict=True)]
-    return [np.stack(outputs) for outputs in zip(*blocks, strict=True)]

@@ -58,8 +58,7 @@ class CompiledInverse(Shown):
             arrays = (phi, q_start, self.chart.phi_sizes, q, found, condition[rows])
             self._c(ctypes.c_long(len(phi)), *(ctypes.c_void_p(array.ctypes.data) for array in arrays))
 
-        for _ in in_threads(solve_piece, range(0, len(targets), _PIECE)):
-            pass
+        in_threads(solve_piece, range(0, len(targets), _PIECE))
         phi_map = self.chart.phi_map
         attempt.residual[:] = (targets - attempt.residual) / phi_map.scale(targets)
         attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < SUSPICIOUS)

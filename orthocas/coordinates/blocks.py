@@ -36,7 +36,7 @@ def _values(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
     basis = ColumnFunction(ca.Function("basis", [q], [ca.densify(family.basis(q))]))
 
     def make() -> BlockFunction:
-        psi, xi = basis.on_one_block(reused=True), np.empty((coordinates.r, COLUMNS))
+        psi, xi = basis.on_one_block(), np.empty((coordinates.r, COLUMNS))
 
         def on_one_block(columns: Array) -> Array:
             np.matmul(C, psi(columns[active])[0], out=xi[:r])
@@ -63,7 +63,7 @@ def _slopes(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
     basis = ColumnFunction(ca.Function("smaller_basis", [q], [ca.densify(smaller)]))
 
     def make() -> BlockFunction:
-        psi, J = basis.on_one_block(reused=True), np.empty((coordinates.r * n, COLUMNS))
+        psi, J = basis.on_one_block(), np.empty((coordinates.r * n, COLUMNS))
         J[r * n :] = of_idle
 
         def on_one_block(columns: Array) -> Array:

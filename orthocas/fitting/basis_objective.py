@@ -1,14 +1,14 @@
 """The loss of families linear in theta: basis gradients are sampled once, the rest is dense products (ours)."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from copy import copy
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.casadi_tools.columns import blocked, by_sample, shares
-from orthocas.casadi_tools.threads import in_threads
+from orthocas.casadi_tools.columns import COLUMNS, Run, blocked, by_sample, shares
+from orthocas.casadi_tools.threads import in_threads, in_threads_with, thread_count
 from orthocas.checks import Array
 from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.loss import Loss, Pairs, Sizes, Weights
@@ -97,9 +97,9 @@ class BasisObjective:
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        C, on_blocks = self._by_joint(theta), loss_columns(self._loss)
-        pieces = [(on_blocks.on_one_block(), part) for part in self._parts]  # not built in threads, see ColumnFunction
-        sums = list(in_threads(lambda piece: self._sums(C, *piece), pieces))
+        C, columns, parts = self._by_joint(theta), loss_columns(self._loss), self._parts
+        with columns.borrowed(min(thread_count(), len(parts))) as runs:
+            sums = in_threads_with(runs, lambda run, part: self._sums(C, run, part), parts)
         return sum(value for value, _ in sums), self._collected(np.sum([gradient for _, gradient in sums], axis=0))
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
@@ -127,7 +127,7 @@ class BasisObjective:
                 H[i, :, j] += G[part].reshape(-1, K).T @ raised.reshape(-1, K) / self.N
             H[j, :, i] = H[i, :, j].T
 
-        list(in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)]))
+        in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)])
         free = self.kept.ravel()
         block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
         return block
@@ -193,20 +193,21 @@ class BasisObjective:
         """The blocks of samples in parts."""
         return [slice(start, start + _BLOCKS) for start in range(0, len(self.G), _BLOCKS)]
 
-    def _sums(self, C: Array, on_block: Callable[..., list[Array]], part: slice) -> tuple[float, Array]:
+    def _sums(self, C: Array, run: Run, part: slice) -> tuple[float, Array]:
         """Share of some blocks in the loss, and in its slopes with respect to the coefficients of `_by_joint`."""
         value, gradient = 0.0, np.zeros_like(C)
+        losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
         arrays = (self.G, self._share, *self._data)
         for G, share, *data in zip(*(array[part] for array in arrays), strict=True):  # G leaves memory only once
-            losses, slopes = on_block((C @ G).reshape(self.n * self.r, -1), *data)
-            value += float(losses[0] @ share)
+            run([C @ G, *data], [losses, slopes])
+            value += float(losses @ share)
             gradient += (slopes * share).reshape(self.n, self.r, -1) @ G.transpose(0, 2, 1)
         return value, gradient
 
     def _jacobian_entries(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
         C = self._by_joint(theta)
-        J = np.concatenate(list(in_threads(lambda part: C @ self.G[part], self._parts)))
+        J = np.concatenate(in_threads(lambda part: C @ self.G[part], self._parts))
         return J.reshape(len(J), self.n * self.r, -1)
 
     def _gauss_newton_matrix(self, derivatives: list[Array]) -> Array:

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from orthocas.casadi_tools.interrupts import remembered
+from orthocas.casadi_tools.threads import using_threads
 from orthocas.chart import Chart
-from orthocas.checks import as_path, require_kind
+from orthocas.checks import as_path, require_count, require_kind
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.errors import Interrupted
 from orthocas.fitting.checkpoint import Checkpoint, Stage
@@ -98,6 +99,7 @@ def fit(
     max_mutual_deg: float | None = None,
     checkpoint: str | Path | None = None,
     align_to: Chart | None = None,
+    threads: int | None = None,
 ) -> Fit:
     """Find coordinates xi(q) that are as orthogonal as possible to the task.
 
@@ -124,6 +126,8 @@ def fit(
         checkpoint: a file that keeps the state of a long fit. If it exists, the fit resumes from it.
         align_to: a chart of the same robot that defines order and signs of the coordinates, for a refit. By default,
             coordinates that move the first joints come first, and each moves its main joint in the positive direction.
+        threads: threads that share the work; coordinates linear in their parameters do not depend on their number.
+            Default: OMP_NUM_THREADS, or the number of cores.
 
     Returns:
         The chart, the result of each stage, and the seconds.
@@ -154,7 +158,7 @@ def fit(
     warn_unless_savable(settings.parametrisation)
     if isinstance(settings.parametrisation, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))
-    with remembered() as pressed:
+    with remembered() as pressed, using_threads(None if threads is None else require_count("threads", threads)):
         result = _fitted(problem, settings, monitor, checkpoint, align_to, start)
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)

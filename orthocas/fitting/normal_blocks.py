@@ -6,8 +6,7 @@ from math import ceil
 
 import numpy as np
 
-from orthocas.casadi_tools.batch import THREADS
-from orthocas.casadi_tools.threads import in_threads
+from orthocas.casadi_tools.threads import in_threads, thread_count
 from orthocas.checks import Array
 
 _CHUNK = 512  # samples in a product: the rows stay in the cache
@@ -30,7 +29,7 @@ def normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array], shar
     places = [slice(end - G.shape[2], end) for G, end in zip(gradients, ends, strict=True)]
     H = np.zeros((ends[-1], ends[-1]))
     chunks = range(0, len(gradients[0]), _CHUNK)
-    together = ceil(THREADS / r)  # chunks, so that there is work for all threads
+    together = ceil(thread_count() / r)  # chunks, so that there is work for all threads
     for k in range(0, len(chunks), together):
         _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
     for i, j, *_ in shared:
@@ -73,5 +72,4 @@ def _add(
     X = dict(zip(pieces, in_threads(rows, pieces), strict=True))
     work: list[Callable[[], None]] = [partial(square, j) for j in range(r)]
     work += [partial(mixed, pair) for pair in rows_of]
-    for _ in in_threads(lambda block: block(), work):
-        pass
+    in_threads(lambda block: block(), work)
