@@ -1,9 +1,9 @@
 """Certificates of the 7-DoF arm: boxes, seconds to find and to check, and the part that is one-to-one."""
 
-import argparse
 import time
 
 import numpy as np
+from benchmark import run, table
 
 import orthocas as oc
 
@@ -34,15 +34,8 @@ def row(degree: int, half_width: float) -> str:
 
 def main(quick: bool = False) -> list[str]:
     """All rows; `quick` takes the smallest box."""
-    rows = []
-    for case in CASES[:1] if quick else CASES:
-        rows.append(row(*case))
-        print(rows[-1], flush=True)
-    return rows
+    return table(HEADER, (row(*case) for case in (CASES[:1] if quick else CASES)))
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    print(HEADER)
-    main(parser.parse_args().quick)
+    run(main, __doc__)

@@ -1,8 +1,8 @@
 """What a bound on the relative singular value of the task does to folds, angles and the size of the domain."""
 
-import argparse
 import time
 
+from benchmark import run, table
 from folds import least
 from suggested_domains import robot_of
 
@@ -43,15 +43,8 @@ def row(name: str, half_width: float, bound: float | None, degree: int, samples:
 def main(quick: bool = False) -> list[str]:
     """All rows; `quick` takes one of degree 2 and few samples."""
     cases = [(name, width, bound, 5, 1_000_000) for name, width, bounds in CASES for bound in bounds]
-    rows = []
-    for case in [("iiwa", 0.785, 0.2, 2, 20_000)] if quick else cases:
-        rows.append(row(*case))
-        print(rows[-1], flush=True)
-    return rows
+    return table(HEADER, (row(*case) for case in ([("iiwa", 0.785, 0.2, 2, 20_000)] if quick else cases)))
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    print(HEADER)
-    main(parser.parse_args().quick)
+    run(main, __doc__)

@@ -4,12 +4,13 @@ The code is compiled with gcc -O2, as a user would do. The peer is the projector
 plain loop only multiplies for some microseconds, so its worst time shows the effect of the machine on any program.
 """
 
-import argparse
 import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+
+from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
@@ -88,6 +89,4 @@ def _plain_loop(folder: Path, n: int) -> CompiledLibrary:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    main(parser.parse_args().quick)
+    run(main, __doc__)

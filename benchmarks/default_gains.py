@@ -7,7 +7,6 @@ of the paper; smaller ones, or in the other direction, where these leave the dom
 law, which holds still, without and with integral action, on position tasks.
 """
 
-import argparse
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -16,6 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
@@ -201,6 +201,4 @@ def main(quick: bool = False) -> list[str]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    main(parser.parse_args().quick)
+    run(main, __doc__)

@@ -1,9 +1,10 @@
 """Quality and time of fits on the named problems and on two arms directly from their URDFs."""
 
-import argparse
 from importlib.metadata import files
 from pathlib import Path
 from statistics import median
+
+from benchmark import run, table
 
 import orthocas as oc
 from orthocas import problems
@@ -56,12 +57,9 @@ def row(name: str, label: str, runs: int, samples: int) -> str:
 def main(quick: bool = False) -> list[str]:
     """All rows; `quick` uses low degrees, one run and few samples."""
     cases = [("iiwa", "polynomial:2"), ("planar_3r_xy", "polynomial:2")] if quick else CASES
-    return [row(name, label, 1 if quick else 3, 2_000 if quick else 100_000) for name, label in cases]
+    size = (1, 2_000) if quick else (3, 100_000)
+    return table(HEADER, (row(*case, *size) for case in cases))
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    print(HEADER)
-    for line in main(parser.parse_args().quick):
-        print(line)
+    run(main, __doc__)

@@ -1,9 +1,9 @@
 """Default fits look for folds: time and quality, and the least conditioning at millions of other samples."""
 
-import argparse
 import time
 
 import numpy as np
+from benchmark import run, table
 from suggested_domains import robot_of
 
 import orthocas as oc
@@ -60,15 +60,8 @@ def main(quick: bool = False) -> list[str]:
         robot = robot_of(name)
         problem = oc.Problem(robot, oc.Task.named(robot, task), domain=oc.default_box(robot))
         cases.append((problem, f"{name}, {task}", 5, 400_000))
-    rows = []
-    for case in [(arm, "iiwa", 2, 20_000)] if quick else cases:
-        rows.append(row(*case))
-        print(rows[-1], flush=True)
-    return rows
+    return table(HEADER, (row(*case) for case in ([(arm, "iiwa", 2, 20_000)] if quick else cases)))
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    print(HEADER)
-    main(parser.parse_args().quick)
+    run(main, __doc__)

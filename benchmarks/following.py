@@ -4,12 +4,12 @@ Times are the best of three calls of the same chart; charts are fitted before. A
 "closed to" is the distance of the last joint position from the first.
 """
 
-import argparse
 import time
 from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
+from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
@@ -107,6 +107,4 @@ def _closed(motion: JointMotion) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    main(parser.parse_args().quick)
+    run(main, __doc__)

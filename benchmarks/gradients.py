@@ -4,12 +4,13 @@ n = 7, m = 3, r = 4, no joint split off, lambda = (1000, 30). The implementation
 of several rounds. Values and gradients are checked to agree before the clock starts.
 """
 
-import argparse
 import time
+from itertools import chain
 from statistics import median
 
 import numpy as np
 import torch
+from benchmark import run, table
 from torch_loss import WEIGHTS, Step, basis_step, network_step
 
 import orthocas as oc
@@ -31,8 +32,9 @@ BASES = ((oc.Polynomial(3), 4000), (oc.Polynomial(4), 8000), (oc.Fourier(2), 400
 def main(quick: bool = False) -> list[str]:
     """All rows; `quick` uses small sizes and one round."""
     rounds = 1 if quick else 9
-    rows = [network_row(*case, rounds) for case in ((((8, 8), 100),) if quick else CASES)]
-    return rows + [basis_row(*case, rounds) for case in (((oc.Polynomial(2), 100),) if quick else BASES)]
+    networks = (network_row(*case, rounds) for case in ((((8, 8), 100),) if quick else CASES))
+    bases = (basis_row(*case, rounds) for case in (((oc.Polynomial(2), 100),) if quick else BASES))
+    return table(HEADER, chain(networks, bases))
 
 
 def network_row(hidden: tuple[int, ...], samples: int, rounds: int) -> str:
@@ -92,8 +94,4 @@ def _times(steps: dict[str, Step], rounds: int) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    print(HEADER)
-    for line in main(parser.parse_args().quick):
-        print(line, flush=True)
+    run(main, __doc__)

@@ -4,13 +4,13 @@ The peer is the method of the paper: equation (23) by Runge-Kutta 45, stopped wh
 two steps. Errors are distances from the same flow at tolerance 1e-13.
 """
 
-import argparse
 import resource
 import time
 from collections.abc import Callable
 from statistics import median
 
 import numpy as np
+from benchmark import run
 from scipy.integrate import RK45
 
 import orthocas as oc
@@ -130,6 +130,4 @@ def main(quick: bool = False) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    main(parser.parse_args().quick)
+    run(main, __doc__)

@@ -4,7 +4,6 @@
 domain. Targets are phi of random points of the domain; starts "near" are off by up to so much in each joint.
 """
 
-import argparse
 import ctypes
 import time
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
@@ -109,6 +109,4 @@ def in_c(compiled: CompiledInverse, path: Any, q: Any) -> float:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    main(parser.parse_args().quick)
+    run(main, __doc__)

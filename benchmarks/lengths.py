@@ -1,6 +1,6 @@
 """Cost and benefit of the length term: task angle and spread of gradient lengths against lambda4 (1 min)."""
 
-import argparse
+from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
@@ -23,6 +23,4 @@ def main(quick: bool = False) -> dict[str, oc.Report]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    main(parser.parse_args().quick)
+    run(main, __doc__)

@@ -1,12 +1,12 @@
 """Time of a disk chart of a planar 3R leaf: surface, harmonic map, closest points; compared with bare libigl."""
 
-import argparse
 import time
 from collections.abc import Callable
 from typing import Any
 
 import igl
 import numpy as np
+from benchmark import run, table
 
 from orthocas.growing.harmonic import harmonic_disk
 from orthocas.growing.level_surface import TriangleMesh, level_surface, require_disk
@@ -59,12 +59,9 @@ def row(cells: int, queries: int = 100_000) -> str:
 
 def main(quick: bool = False) -> list[str]:
     """Rows for grids of 60 to 300 cells; `quick` uses one grid of 20 cells."""
-    return [row(20, 1_000)] if quick else [row(cells) for cells in (60, 100, 150, 204, 300)]
+    grids = [(20, 1_000)] if quick else [(cells,) for cells in (60, 100, 150, 204, 300)]
+    return table(HEADER, (row(*grid) for grid in grids))
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    print(HEADER)
-    for line in main(parser.parse_args().quick):
-        print(line)
+    run(main, __doc__)

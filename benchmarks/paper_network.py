@@ -4,7 +4,7 @@ Adam uses a learning rate of 1e-3 that falls to zero (the paper does not state o
 once with lambda2 = 30. The idle joint, which does not move the task, is split off as in every fit here.
 """
 
-import argparse
+from benchmark import run, table
 
 import orthocas as oc
 from orthocas import problems, solvers
@@ -31,13 +31,8 @@ def row(weights: tuple[float, ...], quick: bool) -> str:
 
 def main(quick: bool = False) -> list[str]:
     """One row per choice of weights; `quick` uses a small network and two epochs."""
-    return [row(weights, quick) for weights in WEIGHTS]
+    return table(HEADER, (row(weights, quick) for weights in WEIGHTS))
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    quick = parser.parse_args().quick
-    print(HEADER)
-    for weights in WEIGHTS:
-        print(row(weights, quick), flush=True)
+    run(main, __doc__)

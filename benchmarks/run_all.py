@@ -1,8 +1,17 @@
-"""Runs every benchmark in turn (about an hour on 2 cores). The results are in docs/performance.md."""
+"""Runs every benchmark in turn (about an hour on 2 cores), and sums up in a table which ones ran, and for how long.
 
+The results are in docs/performance.md. Names on the command line choose some; `--quick` takes small cases, to see that
+all of them run. A benchmark that fails does not stop the others.
+"""
+
+import argparse
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
 from pathlib import Path
+
+from benchmark import table
 
 SCRIPTS = (
     "dynamics",
@@ -37,8 +46,32 @@ SCRIPTS = (
     "against_torch",
     "paper_network",
 )
+#: those without a small case
+WHOLE = frozenset({"dynamics", "start_up", "command", "batches", "choices", "compiled_loss", "against_torch"})
+HEADER = "| benchmark | seconds | result |\n| --- | --- | --- |"
+
+
+def ran(name: str, quick: bool) -> tuple[str, float, int]:
+    """Run one benchmark: its name, seconds and exit code."""
+    print(f"\n## {name}", flush=True)
+    start = time.perf_counter()
+    path = Path(__file__).parent / f"{name}.py"
+    done = subprocess.run([sys.executable, str(path), *(["--quick"] if quick else [])], check=False)
+    return name, time.perf_counter() - start, done.returncode
+
+
+def main(names: Sequence[str], quick: bool = False) -> int:
+    """Run benchmarks, and print the summary; 1 if one of them failed."""
+    found = [ran(name, quick) for name in names if not (quick and name in WHOLE)]
+    print("\n## Summary\n")
+    results = ((name, seconds, "done" if code == 0 else f"FAILED, exit code {code}") for name, seconds, code in found)
+    table(HEADER, (f"| {name} | {seconds:.0f} | {result} |" for name, seconds, result in results))
+    return int(any(code for *_, code in found))
+
 
 if __name__ == "__main__":
-    for name in SCRIPTS:
-        print(f"\n## {name}", flush=True)
-        subprocess.run([sys.executable, str(Path(__file__).parent / f"{name}.py")], check=True)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", help="default: all", metavar="NAME")
+    parser.add_argument("--quick", action="store_true", help=f"small cases; leaves out {', '.join(sorted(WHOLE))}")
+    arguments = parser.parse_args()
+    sys.exit(main(arguments.names or SCRIPTS, arguments.quick))

@@ -1,9 +1,9 @@
 """Cost of a fit against the number of joints, the degree and the number of samples: planar arms and the 7-DoF arm."""
 
-import argparse
 import resource
 
 import numpy as np
+from benchmark import run, table
 
 import orthocas as oc
 from orthocas import problems
@@ -36,16 +36,11 @@ def planar(n: int) -> oc.Problem:
 def main(quick: bool = False) -> list[str]:
     """Rows for n, then degree, then samples."""
     iiwa = problems.get("iiwa")
-    if quick:
-        return [row(planar(3), 2), row(iiwa, 2, 500)]
-    rows = [row(planar(n), 3) for n in (3, 4, 5, 6, 7, 8)]
-    rows += [row(iiwa, degree) for degree in (1, 2, 3, 4, 5)]
-    return rows + [row(iiwa, 4, samples) for samples in (2_000, 4_000, 8_000, 16_000)]
+    cases: list[tuple[oc.Problem, int, int | None]] = [(planar(n), 3, None) for n in (3, 4, 5, 6, 7, 8)]
+    cases += [(iiwa, degree, None) for degree in (1, 2, 3, 4, 5)]
+    cases += [(iiwa, 4, samples) for samples in (2_000, 4_000, 8_000, 16_000)]
+    return table(HEADER, (row(*case) for case in ([(planar(3), 2, None), (iiwa, 2, 500)] if quick else cases)))
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    print(HEADER)
-    for line in main(parser.parse_args().quick):
-        print(line)
+    run(main, __doc__)

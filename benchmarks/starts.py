@@ -4,8 +4,9 @@ The spread is (largest - smallest) / median of held-out figures over the seeds. 
 samples.
 """
 
-import argparse
 from collections.abc import Sequence
+
+from benchmark import run
 
 import orthocas as oc
 from orthocas import problems, solvers
@@ -48,6 +49,4 @@ def main(quick: bool = False) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    main(parser.parse_args().quick)
+    run(main, __doc__)

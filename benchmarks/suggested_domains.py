@@ -1,10 +1,10 @@
 """Suggested domains of real arms from their URDFs, without tuning: time, size, and quality at many samples."""
 
-import argparse
 from importlib.metadata import files
 from pathlib import Path
 
 import numpy as np
+from benchmark import run, table
 
 import orthocas as oc
 from orthocas import problems
@@ -61,15 +61,9 @@ def row(name: str, task: str, metric: str, degree: int, samples: int) -> str:
 def main(quick: bool = False) -> list[str]:
     """All rows; `quick` takes one arm, quadratic coordinates and few samples."""
     cases = [("ur10", "position", "euclidean")] if quick else CASES
-    rows = []
-    for case in cases:
-        rows.append(row(*case, 2 if quick else 4, 50_000 if quick else 1_000_000))
-        print(rows[-1], flush=True)
-    return rows
+    size = (2, 50_000) if quick else (4, 1_000_000)
+    return table(HEADER, (row(*case, *size) for case in cases))
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    print(HEADER)
-    main(parser.parse_args().quick)
+    run(main, __doc__)

@@ -5,13 +5,13 @@ all of its parts in every tick: the program puts the law back in command after e
 follows a circle of 5 cm in 4 s, three times, in MuJoCo at 1 kHz, under the compiled law of either type.
 """
 
-import argparse
 import ctypes
 import subprocess
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
@@ -95,6 +95,4 @@ def flange(chart: oc.Chart, law: Controller, supervisor: Supervisor, circles: in
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    main(parser.parse_args().quick)
+    run(main, __doc__)

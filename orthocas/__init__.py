@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from orthocas.problem import Problem, check
     from orthocas.quality import Report, evaluate
     from orthocas.robots import Robot
-    from orthocas.simulation import simulate
+    from orthocas.simulation import simulate, simulate_many
     from orthocas.singularities import jumps, singular_points
     from orthocas.tasks import Task
 
@@ -122,6 +122,7 @@ __all__ = [
     "register_loss_term",
     "register_parametrisation",
     "simulate",
+    "simulate_many",
     "simulation",
     "singular_points",
     "solvers",
@@ -157,7 +158,7 @@ _HOMES = {
     "orthocas.problem": ["Problem", "check"],
     "orthocas.quality": ["Report", "evaluate"],
     "orthocas.robots": ["Robot"],
-    "orthocas.simulation": ["simulate"],
+    "orthocas.simulation": ["simulate", "simulate_many"],
     "orthocas.singularities": ["jumps", "singular_points"],
     "orthocas.tasks": ["Task"],
 }

@@ -165,6 +165,12 @@ def as_point(name: str, value: ArrayLike, n: int) -> Array:
     return frozen_array(name, points[0], (n,))
 
 
+def require_executor(executor: object) -> None:
+    """Raise InvalidValueError unless the argument `executor` is None or has a method `submit`."""
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise InvalidValueError("executor", f"a {type(executor).__name__}", "an executor with a method submit, or None")
+
+
 def require_kind(name: str, value: object, kind: type) -> None:
     """Raise InvalidValueError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):

@@ -207,8 +207,9 @@ def _report(chart: Chart, points: Array, seed: int | None, worst: WorstPoints | 
     if len(judged.points) == 0:
         where = "given points" if seed is None else "samples of the domain"
         raise SingularTaskError(f"a gradient vanishes, or a coordinate has no value, at all {len(points)} {where}")
-    angles, idle = Angles.of(judged), _idle_coordinates(chart, judged)
+    idle = _idle_coordinates(chart, judged)
     others = [j for j in range(chart.r) if j not in idle]
+    angles, without_idle = Angles.of(judged, [range(chart.r), others])
     short, long = np.quantile(np.linalg.norm(judged.jacobian, axis=2), [0.01, 0.99], axis=0)
     return Report(
         n=chart.n,
@@ -228,7 +229,7 @@ def _report(chart: Chart, points: Array, seed: int | None, worst: WorstPoints | 
         length_ratio=float((long / short).max()),
         folded_samples=int(min((judged.signs > 0).sum(), (judged.signs <= 0).sum())),
         idle_joints=tuple(idle.values()),
-        without_idle=Angles.of(judged.of_coordinates(others)) if idle and others else None,
+        without_idle=without_idle if idle and others else None,
     )
 
 

@@ -32,9 +32,12 @@ def test_table_of_controllers_shows_what_fitted_coordinates_are_good_for() -> No
     assert fitted < found["planar_3r_x projector, A = M"] < found["planar_3r_x projector, A = I"]
 
 
-def test_closed_loop_benchmark_agrees_with_its_peer() -> None:
+@needs_c
+def test_closed_loop_benchmark_agrees_with_its_peer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     found = closed_loop.main(quick=True)
     assert found["planar_3r_x continuous error"] < 1e-6
+    assert found["planar_3r_x continuous, compiled error"] < 1e-6
     assert found["planar_3r_x SciPy LSODA error"] < 1e-6
     assert 1e-6 < found["planar_3r_x sampled at 1 kHz error"] < 1e-3  # half a tick late
 

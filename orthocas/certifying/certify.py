@@ -13,7 +13,7 @@ from orthocas.certifying.judges import InjectivityJudge, RegularityJudge, inject
 from orthocas.certifying.outside import judge_of
 from orthocas.certifying.search import Limits, Look, Search, distances, largest_first, nearest_first
 from orthocas.chart import Chart
-from orthocas.checks import Array, as_number, require_at_least, require_kind
+from orthocas.checks import Array, as_number, require_at_least, require_executor, require_kind
 from orthocas.domains import Box, Domain, contains, reach
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.files.chart_file import fingerprint
@@ -138,8 +138,7 @@ def certified_box(
 def checked_options(chart: Chart, time_limit: float | None, executor: Executor | None) -> float:
     """Seconds of a time limit, inf for none. Chart and executor are checked as well."""
     require_kind("chart", chart, Chart)
-    if executor is not None and not callable(getattr(executor, "submit", None)):
-        raise InvalidValueError("executor", f"a {type(executor).__name__}", "an executor with a method submit, or None")
+    require_executor(executor)
     if time_limit is None:
         return float("inf")
     require_at_least("time_limit", time_limit, 0)

@@ -1,11 +1,7 @@
 """The inverse map of a chart in compiled C, for large batches on machines with a compiler (ours)."""
 
 import ctypes
-import hashlib
-import os
-import subprocess
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +11,16 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.threads import in_threads
 from orthocas.chart import Chart
-from orthocas.checks import Array, as_path, require_kind
+from orthocas.checks import Array, require_kind
 from orthocas.codegen.generate import generate_c
-from orthocas.codegen.library import STRICT, compilers
-from orthocas.errors import CompileError
-from orthocas.files.atomic import made_folder, published
+from orthocas.codegen.kept_libraries import kept_library, loaded, template
+from orthocas.codegen.library import STRICT
 from orthocas.files.drafts import draft_folder
 from orthocas.inverting import Attempt, Newton, Solutions
 from orthocas.inverting.newton import SUSPICIOUS
 from orthocas.showing import Shown
 
-_FLAGS = ("-O3", "-fPIC", "-shared")
+_FLAGS = (*STRICT, "-O3")
 _ROWS = "inverse_rows.c"
 _PIECE = 512  # rows that a thread takes at once
 
@@ -69,10 +64,7 @@ class CompiledInverse(Shown):
 
     @cached_property
     def _c(self) -> Any:
-        try:
-            function = ctypes.CDLL(str(self.library)).arm_inverse_rows
-        except (OSError, AttributeError) as error:
-            raise CompileError(f"cannot load {self.library}: {error}; delete it and compile again") from None
+        function = loaded(self.library).arm_inverse_rows
         function.restype = None
         return function
 
@@ -104,27 +96,8 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
         [True, True]
     """
     require_kind("chart", chart, Chart)
-    place = _cache() if folder is None else as_path("folder", folder)
-    with draft_folder() as sources:
-        generate_c(chart, sources, name="arm")
-        (sources / _ROWS).write_text((files("orthocas.codegen") / "templates" / _ROWS).read_text())
-        compiler, flags = compilers()[0], (*STRICT, *_FLAGS, f"-DN={chart.n}")
-        parts = [(sources / file).read_bytes() for file in ("arm.h", "arm.c", _ROWS)]
-        parts.append(repr((compiler, flags)).encode())
-        name = f"inverse-{hashlib.sha256(b'/'.join(parts)).hexdigest()[:32]}.so"
-        library = made_folder("folder", place).resolve() / name
-        if not library.exists():
-            with published(library.parent) as drafts:
-                code = [str(sources / file) for file in ("arm.c", _ROWS)]
-                _compile([compiler, *flags, "-o", str(drafts / name), *code, "-lm"])
-    return CompiledInverse(chart, library)
-
-
-def _compile(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise CompileError(f"{' '.join(command)} failed: {done.stderr[:500]}")
-
-
-def _cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "orthocas"
+    with draft_folder() as drafts:
+        generate_c(chart, drafts, name="arm")
+        sources = {name: (drafts / name).read_text(encoding="utf-8") for name in ("arm.h", "arm.c")}
+    sources[_ROWS] = template(_ROWS)
+    return CompiledInverse(chart, kept_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))

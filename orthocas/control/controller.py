@@ -93,6 +93,11 @@ class Controller(Protocol):
         ...
 
     @property
+    def energy_graph(self) -> ca.Function | None:
+        """The same function as a graph with shared subexpressions; compiled simulations use it."""
+        ...
+
+    @property
     def measured(self) -> ca.Function:
         """q (n, 1) -> the controlled quantities (k, 1)."""
         ...

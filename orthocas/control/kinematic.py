@@ -45,6 +45,7 @@ class Kinematic(Shown):
     formula: ClassVar[str] = "Velocity control dq = J^-1 (d phi_d + Lambda (phi_d - phi)); does not use the input dq."
     command: ClassVar[Command] = "velocity"
     energy: ClassVar[None] = None
+    energy_graph: ClassVar[None] = None
     gain_units: ClassVar[Mapping[str, str]] = {"feedback": FEEDBACK, "limit": LIMIT}
     settings: ClassVar[Mapping[str, str]] = {}
     options: ClassVar[tuple[str, ...]] = ("feedback",)

@@ -51,6 +51,7 @@ class KinematicProjector(TwoTaskLaw):
     formula: ClassVar[str] = "Velocity control by pseudo-inverse and projector; does not use the input dq."
     command: ClassVar[Command] = "velocity"
     energy: ClassVar[None] = None
+    energy_graph: ClassVar[None] = None
     gain_units: ClassVar[Mapping[str, str]] = {"feedback": FEEDBACK, "limit": LIMIT}
     options: ClassVar[tuple[str, ...]] = ("feedback", "second")
 

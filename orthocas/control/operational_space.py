@@ -233,6 +233,11 @@ class _OperationalSpace(Shown):
 
     @cached_property
     def energy(self) -> ca.Function:
+        """The fast form of `energy_graph`."""
+        return self.chart.runnable(self.energy_graph)
+
+    @cached_property
+    def energy_graph(self) -> ca.Function:
         """V = 1/2 de^T M_phi de + 1/2 e^T K e [J] and P = de^T D de [W], e = phi - phi_d.
 
         Impedance control uses the velocity J dq instead of de, so V is the kinetic energy plus that of the springs.
@@ -249,7 +254,7 @@ class _OperationalSpace(Shown):
         kinetic = ca.bilin(M_phi, de, de) if self.feed_forward else ca.bilin(M, inputs["dq"], inputs["dq"])
         storage = (kinetic + ca.bilin(K, e, e)) / 2
         outputs = {"storage": storage, "dissipated_power": ca.bilin(D, de, de)}
-        return self.chart.runnable(named_function("energy", inputs, outputs))
+        return named_function("energy", inputs, outputs)
 
     @cached_property
     def damping_matrix(self) -> ca.Function:

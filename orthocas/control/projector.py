@@ -191,6 +191,11 @@ class Projector(TwoTaskLaw):
 
     @cached_property
     def energy(self) -> ca.Function:
+        """The fast form of `energy_graph`."""
+        return self._second.runnable(self.energy_graph)
+
+    @cached_property
+    def energy_graph(self) -> ca.Function:
         """V, the kinetic energy plus all springs, also their projected-out part [J], and power of both dampers [W].
 
         The work of a given second force is not part of either.
@@ -205,7 +210,7 @@ class Projector(TwoTaskLaw):
         storage = (ca.bilin(problem.robot.mass_matrix(q), dq, dq) + ca.dot(e, inputs["stiffness"] * e)) / 2
         power = ca.bilin(D_x, J @ dq, J @ dq) + ca.bilin(D_2, J_2 @ through, J_2 @ dq)
         outputs = {"storage": storage, "dissipated_power": power}
-        return self._second.runnable(named_function("energy", inputs, outputs))
+        return named_function("energy", inputs, outputs)
 
     def _inputs(self) -> dict[str, ca.MX]:
         return named_inputs(self.problem.n, self.gains, len(self.labels))

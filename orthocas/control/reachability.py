@@ -7,7 +7,8 @@ from orthocas.chart import Chart
 from orthocas.checks import Array, as_point, require_kind
 from orthocas.control.reference import Reference
 from orthocas.domains import borders, contains
-from orthocas.errors import InvalidValueError, InverseError, UnreachableReferenceError
+from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError
+from orthocas.inverting import Tracker, TrackerStatus
 from orthocas.postures.clear_box import ClearBox
 from orthocas.reaching.intervals import too_far
 
@@ -30,10 +31,11 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
     values = reference.sample(times)[0]
     path, q = np.empty((len(times), chart.n)), q_start
     targets = reference.targets[reference.segment(times)]
+    follower = _Follower(chart, q_start)
     for k, value in enumerate(values):
         where = f"at t = {times[k]:.3g} s, at {_list(reference.labels, value)}"
         try:
-            new = chart.inverse(value, q)
+            new = follower.step(value, q)
         except InverseError as error:
             text = f"the reference cannot be reached {where}: {error}{too_far(chart, q, targets[k, chart.m :])}"
             raise UnreachableReferenceError(text) from None
@@ -42,6 +44,34 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
             raise UnreachableReferenceError(f"the reference leaves the domain {where}: {reason}")
         path[k] = q = new
     return path
+
+
+class _Follower:
+    """Solves phi(q) = phi step by step: with a tracker, or with more care where that gives up or J is singular."""
+
+    def __init__(self, chart: Chart, q_start: Array) -> None:
+        self._chart = chart
+        self._tracker = self._tracker_at(q_start)
+
+    def step(self, phi: Array, q: Array) -> Array:
+        """The solution near q.
+
+        Raises:
+            InverseError: if there is none.
+        """
+        if self._tracker is not None:
+            found = self._tracker.step(phi)
+            if self._tracker.status == TrackerStatus.OK:
+                return found
+        found = self._chart.inverse(phi, q)
+        self._tracker = self._tracker_at(found)
+        return found
+
+    def _tracker_at(self, q: Array) -> Tracker | None:
+        try:
+            return self._chart.tracker(q)
+        except OrthocasError:  # grown coordinates, a singular J, or a point outside the domain
+            return None
 
 
 def _outside(chart: Chart, q: Array) -> str:

@@ -1,7 +1,6 @@
 """Angles, leaks, conditioning and orientation of coordinate gradients at joint positions."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -11,11 +10,13 @@ from orthocas.casadi_tools.threads import in_threads
 from orthocas.checks import Array
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.fitting.loss import pairs
+from orthocas.judging.small_matrices import by_entry, by_sample, products, smallest_eigenvalues, whitened
 from orthocas.problem import Problem, task_jacobians
 from orthocas.samples import Samples, samples_at
 
 _CHUNK = 40_000  # joint positions evaluated at once
 _PIECE = 2500  # of these, judged by a thread at once
+_SMALLEST_PIVOT = 1e-14  # keeps singular samples finite
 _LONGEST = 1e100  # squares of longer gradients overflow: they have no value
 
 
@@ -40,20 +41,8 @@ class Judged:
         for start in range(0, max(len(points), 1), _CHUNK):
             sampled = _Sampled.at(problem, coordinates, points[start : start + _CHUNK])
             parts += in_threads(sampled.judged, range(0, max(len(sampled.points), 1), _PIECE))
-        return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-    def of_coordinates(self, chosen: Sequence[int]) -> Self:
-        """The same without the other coordinates. Conditioning and signs are still those of all."""
-        columns = list(chosen)
-        kept = [k for k, pair in enumerate(pairs(self.jacobian.shape[1])) if set(pair) <= set(columns)]
-        shortened = {
-            "jacobian": self.jacobian[:, columns],
-            "task_cosines": self.task_cosines[:, :, columns],
-            "leak_sines": self.leak_sines[:, columns],
-            "mutual_cosines": self.mutual_cosines[:, kept],
-            "metric_mutual_cosines": self.metric_mutual_cosines[:, kept],
-        }
-        return type(self)(**({part.name: getattr(self, part.name) for part in fields(self)} | shortened))
+        found = cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+        return replace(found, metric_mutual_cosines=found.mutual_cosines) if problem.metric.is_identity else found
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,67 +73,85 @@ class _Sampled:
 
 def _judged(samples: Samples, J: Array, kept: NDArray[np.bool_]) -> tuple[Any, ...]:
     """The fields of `Judged` for samples with coordinate gradients J (N, r, n). `kept` tells which positions remain."""
-    lengths = _lengths(J)
+    lengths = _lengths(by_entry(J))
     measured = (lengths > 0) & (lengths < _LONGEST)  # false for NaN, as grown coordinates have it
-    alive: NDArray[np.bool_] = np.asarray(measured.all(axis=1))
+    alive: NDArray[np.bool_] = np.asarray(measured.all(axis=0))
     kept[kept] = alive
     if not alive.all():
-        samples, J, lengths = samples[alive], J[alive], lengths[alive]
-    raised = samples.raised(J)
+        samples, J, lengths = samples[alive], J[alive], lengths[:, alive]
+    metric = _InTheMetric.of(samples, J)
+    unit_task = metric.task_gradients / _lengths(metric.task_gradients)[:, None]
     first, second = (np.array([pair[k] for pair in pairs(J.shape[1])], dtype=int) for k in (0, 1))
-    products = np.einsum("spn,spn->sp", raised[:, first], J[:, second])
-    metric_lengths = _metric_lengths(J, raised)
-    leak_sines, conditioning, signs = in_the_metric(samples, J)
+    mutual = (metric.gradients[first] * metric.covectors[second]).sum(axis=1)
     return (
         kept,
         samples.points,
         J,
-        samples.unit_task_gradients @ (J / lengths[:, :, None]).transpose(0, 2, 1),
-        products / (_lengths(raised)[:, first] * lengths[:, second]),
-        leak_sines,
-        products / (metric_lengths[:, first] * metric_lengths[:, second]),
-        conditioning,
-        signs,
+        by_sample(products(unit_task, metric.covectors / lengths[:, None])),
+        by_sample(mutual / (_lengths(metric.gradients)[first] * lengths[second])),
+        by_sample(metric.leak_sines),
+        by_sample(mutual / (metric.lengths[first] * metric.lengths[second])),
+        metric.conditioning,
+        signs(samples.task_jacobian, J),
     )
 
 
 def _lengths(vectors: Array) -> Array:
-    """Euclidean norms of vectors (N, k, n), (N, k)."""
-    squares: Array = np.einsum("skn,skn->sk", vectors, vectors)
+    """Euclidean norms of vectors (k, n, N), (k, N)."""
+    with np.errstate(over="ignore", under="ignore"):
+        squares: Array = (vectors * vectors).sum(axis=1)
     if squares.size and not (squares.max() < _LONGEST and squares.min() > 1 / _LONGEST):  # or with NaN
-        return np.asarray(np.linalg.norm(vectors, axis=2))
+        return np.asarray(np.linalg.norm(vectors, axis=1))
     return np.asarray(np.sqrt(squares))
 
 
 def in_the_metric(samples: Samples, J: Array) -> tuple[Array, Array, Array]:
     """Sines of the leaks (N, r), conditioning (N,) and signs of det J (N,), for gradients J (N, r, n) without zeros."""
-    raised = samples.raised(J)
-    lengths = _metric_lengths(J, raised)[:, :, None]
-    along = samples.task_basis @ (J / lengths).transpose(0, 2, 1)  # (N, m, r)
-    return (
-        np.sqrt((along**2).sum(axis=1)),
-        _smallest_singular_values(J / lengths, raised / lengths, along),
-        np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1))),
-    )
+    metric = _InTheMetric.of(samples, J)
+    return by_sample(metric.leak_sines), metric.conditioning, signs(samples.task_jacobian, J)
 
 
-def _metric_lengths(J: Array, raised: Array) -> Array:
-    """|v|_A^-1 of the gradients v, (N, r)."""
-    lengths: Array = np.sqrt(np.einsum("sjn,sjn->sj", J, raised))
-    return lengths
+def signs(task_jacobian: Array, J: Array) -> Array:
+    """Signs of det [J_x; J_xi], (N,)."""
+    return np.asarray(np.sign(np.linalg.det(np.concatenate([task_jacobian, J], axis=1))))
 
 
-def _smallest_singular_values(unit: Array, raised: Array, along: Array) -> Array:
-    """Roots of the smallest eigenvalues of the Gram matrix [[I, E v], [v^T E^T, v^T A^-1 v]], (N,).
+@dataclass(frozen=True, eq=False)
+class _InTheMetric:
+    """Gradients of task and coordinates at N samples, entry by entry."""
 
-    Args:
-        unit: gradients v of unit length in the metric, (N, r, n).
-        raised: A^-1 v, (N, r, n).
-        along: E v, components along an A-orthonormal basis E of the task gradients, (N, m, r).
-    """
-    m = along.shape[1]
-    identity = np.broadcast_to(np.eye(m), (len(unit), m, m))
-    above = np.concatenate([identity, along], axis=2)
-    below = np.concatenate([along.transpose(0, 2, 1), raised @ unit.transpose(0, 2, 1)], axis=2)
-    gram = np.concatenate([above, below], axis=1)
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[:, 0], 0.0))
+    task_gradients: Array  #: A^-1 v of the task's rows v, (m, n, N)
+    covectors: Array  #: rows of J_xi, (r, n, N)
+    gradients: Array  #: A^-1 v of them, (r, n, N)
+    lengths: Array  #: |v|_A^-1 of them, (r, N)
+    along: Array  #: components of the unit gradients along an A-orthonormal basis of the task's, (m, r, N)
+
+    @classmethod
+    def of(cls, samples: Samples, J: Array) -> Self:
+        """For coordinate gradients J (N, r, n)."""
+        task, covectors = by_entry(samples.task_jacobian), by_entry(J)
+        raised, gradients = task, covectors
+        if samples.metric_inverse is not None:
+            inverse = by_entry(samples.metric_inverse)
+            raised, gradients = products(task, inverse), products(covectors, inverse)  # A^-1 is symmetric
+        gram = products(raised, task)
+        scale = np.sqrt(np.einsum("iic->ic", gram))  # normalise rows first, so that units do not matter
+        lengths = np.sqrt((covectors * gradients).sum(axis=1))
+        shares = products(raised, covectors) / scale[:, None] / lengths
+        along = whitened(gram / scale[:, None] / scale, shares, _SMALLEST_PIVOT)
+        return cls(raised, covectors, gradients, lengths, along)
+
+    @property
+    def leak_sines(self) -> Array:
+        """Sin(leak_j), (r, N)."""
+        return np.asarray(np.sqrt((self.along**2).sum(axis=0)))
+
+    @property
+    def conditioning(self) -> Array:
+        """Roots of the smallest eigenvalues of the Gram matrix [[I, E v], [v^T E^T, v^T A^-1 v]], (N,)."""
+        m, r, N = self.along.shape
+        gram = np.empty((m + r, m + r, N))
+        gram[:m, :m] = np.eye(m)[:, :, None]
+        gram[:m, m:], gram[m:, :m] = self.along, self.along.transpose(1, 0, 2)
+        gram[m:, m:] = products(self.gradients, self.covectors) / self.lengths[:, None] / self.lengths
+        return np.asarray(np.sqrt(smallest_eigenvalues(gram)))

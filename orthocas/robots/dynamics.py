@@ -14,6 +14,10 @@ from orthocas.robots.spatial import constant, skew, turn
 from orthocas.robots.tree import KinematicTree
 
 _Z = ca.SX([0, 0, 1])
+_OF_BODY = {  # which of mass, mass times centre, and inertia xx, xy, xz, yy, yz, zz are not 0 after `_regroup`
+    "revolute": [1, 2, 4, 5, 6, 8, 9],
+    "prismatic": list(range(10)),
+}
 
 
 @dataclass
@@ -34,13 +38,14 @@ class _Body:
     inertia: Array  # about the origin, (3, 3)
 
 
-def mass_matrix(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None) -> ca.SX:
+def mass_matrix(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None, inertials: ca.SX | None = None) -> ca.SX:
     """M(q), (n, n), symmetric positive definite, [kg m^2] for revolute joints. The diagonal includes rotor inertias.
 
-    A payload (10, 1) is mass, centre in the tip frame, and inertia about it: Ixx, Ixy, Ixz, Iyy, Iyz, Izz.
+    A payload (10, 1) is mass, centre in the tip frame, and inertia about it: Ixx, Ixy, Ixz, Iyy, Iyz, Izz. Inertials
+    are the numbers of `inertial_numbers`, if they are not those of the tree.
     """
     joints = _joint_transforms(tree, q)
-    bodies = _bodies(tree, payload)
+    bodies = _bodies(tree, payload, inertials)
     mass, moment, inertia = ([getattr(body, name) for body in bodies] for name in ("mass", "moment", "inertia"))
     M = ca.SX.zeros(tree.n, tree.n)
     for i in reversed(range(tree.n)):
@@ -63,11 +68,17 @@ def mass_matrix(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None) -> 
 
 
 def inverse_dynamics(
-    tree: KinematicTree, q: ca.SX, dq: ca.SX, ddq: ca.SX, gravity: Array, payload: ca.SX | None = None
+    tree: KinematicTree,
+    q: ca.SX,
+    dq: ca.SX,
+    ddq: ca.SX,
+    gravity: Array,
+    payload: ca.SX | None = None,
+    inertials: ca.SX | None = None,
 ) -> ca.SX:
     """tau = M ddq + C dq + g, (n, 1) [N m] or [N], for a gravity acceleration (3,) in the world."""
     joints = _joint_transforms(tree, q)
-    bodies = _bodies(tree, payload)
+    bodies = _bodies(tree, payload, inertials)
     states: list[tuple[ca.SX, ca.SX, ca.SX]] = []  # angular velocity, angular acceleration matrix, linear acceleration
     accelerations: list[ca.SX] = []
     at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-gravity))
@@ -88,15 +99,24 @@ def inverse_dynamics(
     return _joint_forces(tree, joints, bodies, states, accelerations) + ca.SX(ca.DM(tree.armatures)) * ddq
 
 
-def forward_dynamics(tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, gravity: Array) -> ca.SX:
+def forward_dynamics(
+    tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, gravity: Array, inertials: ca.SX | None = None
+) -> ca.SX:
     """ddq = M^-1 (tau - C dq - g), (n, 1), with M = L D L^T."""
-    D, LT, order = ca.ldl(mass_matrix(tree, q), False)
-    return ca.ldl_solve(tau - bias(tree, q, dq, gravity), D, LT, order)
+    D, LT, order = ca.ldl(mass_matrix(tree, q, inertials=inertials), False)
+    return ca.ldl_solve(tau - bias(tree, q, dq, gravity, inertials=inertials), D, LT, order)
 
 
-def bias(tree: KinematicTree, q: ca.SX, dq: ca.SX, gravity: Array, payload: ca.SX | None = None) -> ca.SX:
+def bias(
+    tree: KinematicTree,
+    q: ca.SX,
+    dq: ca.SX,
+    gravity: Array,
+    payload: ca.SX | None = None,
+    inertials: ca.SX | None = None,
+) -> ca.SX:
     """C(q, dq) dq + g(q), (n, 1)."""
-    return inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity, payload)
+    return inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity, payload, inertials)
 
 
 def coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, payload: ca.SX | None = None) -> ca.SX:
@@ -182,9 +202,32 @@ def _unit_acceleration_wrench(
     return ca.cross(_Z, moment), inertia[:, 2]
 
 
-def _bodies(tree: KinematicTree, payload: ca.SX | None) -> list[_Inertials]:
+def inertial_numbers(tree: KinematicTree) -> Array:
+    """The inertial parameters on which the dynamics depend, (k,): 7 of each revolute joint's body, 10 of others."""
+    numbers = []
+    for kind, body in zip(tree.joint_kinds, _regroup(tree), strict=True):
+        all_ten = np.concatenate([[body.mass], body.moment, body.inertia[np.triu_indices(3)]])
+        numbers.append(all_ten[_OF_BODY[kind]])
+    return np.concatenate(numbers)
+
+
+def _given_bodies(tree: KinematicTree, inertials: ca.SX) -> list[_Inertials]:
+    """Bodies with the numbers of `inertial_numbers`."""
+    bodies, start = [], 0
+    for kind in tree.joint_kinds:
+        ten = ca.SX(10, 1)
+        for place in _OF_BODY[kind]:
+            ten[place], start = inertials[start], start + 1
+        bodies.append(_Inertials(ten[0], ten[1:4], ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)))
+    return bodies
+
+
+def _bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX | None) -> list[_Inertials]:
     """The regrouped bodies, with the payload on the one that carries the tip."""
-    bodies = [_Inertials(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
+    if inertials is None:
+        bodies = [_Inertials(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
+    else:
+        bodies = _given_bodies(tree, inertials)
     if payload is not None and tree.tip_parent >= 0:
         body = bodies[tree.tip_parent]
         mass, moment, inertia = _payload(tree, payload)

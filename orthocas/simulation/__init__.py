@@ -3,6 +3,7 @@
 from orthocas.simulation.breakdown import Breakdown, task_acceleration_breakdown
 from orthocas.simulation.coupling import Coupling, coupling_index
 from orthocas.simulation.disturbances import Friction, Noise, Push, Stops
+from orthocas.simulation.many import simulate_many
 from orthocas.simulation.mujoco_plant import MuJoCoPlant
 from orthocas.simulation.mujoco_scene import MuJoCo, Payload, Wall
 from orthocas.simulation.run import simulate
@@ -23,5 +24,6 @@ __all__ = [
     "Wall",
     "coupling_index",
     "simulate",
+    "simulate_many",
     "task_acceleration_breakdown",
 ]

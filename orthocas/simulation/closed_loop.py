@@ -14,7 +14,7 @@ from orthocas.checks import Array
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.errors import SimulationError
-from orthocas.robots import Robot
+from orthocas.robots import Robot, dynamics
 from orthocas.simulation.disturbances import Friction, Stops
 from orthocas.simulation.loads import Loads
 
@@ -35,6 +35,11 @@ class ClosedLoop:
         return self.plant.n
 
     @property
+    def size(self) -> int:
+        """Numbers of a state."""
+        return 2 * self.n if self.torque else self.n
+
+    @property
     def torque(self) -> bool:
         """Whether the command is a torque."""
         return self.controller.command == "torque"
@@ -47,17 +52,54 @@ class ClosedLoop:
     @cached_property
     def plant_rate(self) -> ca.Function:
         """state, command (n, 1), load (`Loads.size`, 1) -> rate of the state."""
+        state, command, load, _ = self.plant_of_numbers.sx_in()
+        rate = self.plant_of_numbers.call([state, command, load, ca.SX(ca.DM(self.plant_numbers))])
+        return ca.Function("plant", [state, command, load], rate)
+
+    @property
+    def plant_of_numbers(self) -> ca.Function:
+        """The same with `plant_numbers` as a fourth input: one function for robots and friction of any amounts."""
         n = self.n
         q, dq, command, load = (
             ca.SX.sym(name, size) for name, size in (("q", n), ("dq", n), ("u", n), ("load", self.loads.size))
         )
+        numbers = ca.SX.sym("numbers", len(self.plant_numbers))
         if not self.torque:
-            return ca.Function("plant", [q, command, load], [command])
-        external = self.loads.joint_torques(q, load)
+            return ca.Function("plant", [q, command, load, numbers], [command])
+        torque = command + self.loads.joint_torques(q, load)
         if self.stops is not None:
-            external += self.stops.torque(self.plant.tree, q, dq)
-        ddq = self.plant.forward_dynamics(q, dq, command + external - self.friction.torque(dq))
-        return ca.Function("plant", [ca.vertcat(q, dq), command, load], [ca.vertcat(dq, ddq)])
+            torque += self.stops.torque(self.plant.tree, q, dq)
+        if self.rubs:
+            torque -= self.friction.torque(dq, numbers[: 2 * n])
+        inertials = numbers[2 * n :] if self.rubs else numbers
+        tree = self.plant.tree
+        ddq = dynamics.forward_dynamics(tree, q, dq, torque, tree.gravity, inertials)
+        return ca.Function("plant", [ca.vertcat(q, dq), command, load, numbers], [ca.vertcat(dq, ddq)])
+
+    @property
+    def plant_numbers(self) -> Array:
+        """Amounts of friction, if there is any, then the inertial parameters of the robot."""
+        if not self.torque:
+            return np.zeros(0)
+        inertials = dynamics.inertial_numbers(self.plant.tree)
+        return np.concatenate([self.friction.numbers(self.n), inertials]) if self.rubs else inertials
+
+    @property
+    def plant_key(self) -> tuple[object, ...]:
+        """Equal for loops with the same `plant_of_numbers`."""
+        if not self.torque:
+            return (self.n,)
+        tree = self.plant.tree
+        arrays = [tree.rotations, tree.translations, tree.armatures, tree.gravity]
+        if self.stops is not None:
+            arrays += [np.asarray(self.stops.stiffness), np.asarray(self.stops.damping), tree.lower, tree.upper]
+        numbers = tuple(array.tobytes() for array in arrays)
+        return (tree.joint_kinds, tree.parents, numbers, self.loads.places, self.rubs, self.stops is None)
+
+    @property
+    def rubs(self) -> bool:
+        """Whether there is friction."""
+        return bool(self.friction.numbers(self.n).any())
 
     def commanded(self, state: ca.MX, reference: Sequence[ca.MX]) -> tuple[ca.MX, ca.MX]:
         """Command and status for a (measured) state and a reference with two derivatives."""

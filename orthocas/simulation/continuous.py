@@ -1,6 +1,6 @@
-"""Closed loops in continuous time. CVODES integrates segment by segment, so that it never steps across a jump."""
+"""Closed loops in continuous time, integrated segment by segment, so that no step goes across a jump."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -11,6 +11,7 @@ from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.simulation.closed_loop import ClosedLoop, Piece, cvodes_options, run_compiled
+from orthocas.simulation.compiled_loop import CompiledLoop
 from orthocas.simulation.disturbances import Push
 
 _OUTPUTS = 25  # instants per integrator call: one integrator serves all calls, and Ctrl-C waits for one call at most
@@ -19,23 +20,46 @@ _OUTPUTS = 25  # instants per integrator call: one integrator serves all calls, 
 _SAME = 1e-9  # [s]: events closer than this differ only by rounding
 
 
-def integrate(loop: ClosedLoop, reference: Reference, start: Array, step: float, tolerance: float) -> Iterator[Piece]:
+#: span [s], start of the reference's segment [s], its parameters, load, state -> states at 25 equally spaced instants
+Integrator = Callable[[tuple[float, float], float, Array, Array, Array], Array]
+
+
+def integrate(
+    loop: ClosedLoop,
+    reference: Reference,
+    start: Array,
+    step: float,
+    tolerance: float,
+    compiled: CompiledLoop | None = None,
+) -> Iterator[Piece]:
     """Yield pieces of 25 instants, from just after the start to the end of the reference.
 
     Raises:
-        SimulationError: if CVODES gives up.
+        SimulationError: if the integrator gives up.
     """
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
-        run = _integrator(loop, reference, tolerance)
+    run: Integrator = (
+        _by_cvodes(loop, reference, tolerance)
+        if compiled is None
+        else compiled.continuous(step, tolerance, outputs=_OUTPUTS)
+    )
     state = start
     for begin, end in _pieces(reference, loop.loads.pushes, step * _OUTPUTS):
         middle = np.array([(begin + end) / 2])
         segment, load = int(reference.segment(middle)[0]), loop.loads.at(middle)[0]
-        since = begin - reference.times[segment]
-        p = np.concatenate([[end - begin, since], reference.parameters[segment], load])
-        states = np.asarray(run_compiled(run, x0=ca.DM(state), p=ca.DM(p))["xf"]).T
+        states = run((begin, end), reference.times[segment], reference.parameters[segment], load, state)
         state = states[-1]
         yield Piece(begin + (end - begin) * np.arange(1, _OUTPUTS + 1) / _OUTPUTS, states)
+
+
+def _by_cvodes(loop: ClosedLoop, reference: Reference, tolerance: float) -> Integrator:
+    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+        integrator = _integrator(loop, reference, tolerance)
+
+    def run(span: tuple[float, float], since: float, parameters: Array, load: Array, state: Array) -> Array:
+        p = np.concatenate([[span[1] - span[0], span[0] - since], parameters, load])
+        return np.asarray(run_compiled(integrator, x0=ca.DM(state), p=ca.DM(p))["xf"]).T
+
+    return run
 
 
 def _pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> Iterator[tuple[float, float]]:

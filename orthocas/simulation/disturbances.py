@@ -82,11 +82,15 @@ class Friction:
     viscous: ArrayLike = 0.0
     coulomb: ArrayLike = 0.0
 
-    def torque(self, dq: ca.SX) -> ca.SX:
-        """Friction torque, to be subtracted from the joint torque, (n, 1)."""
-        viscous = ca.DM(non_negative_gains("viscous", self.viscous, dq.shape[0]))
-        coulomb = ca.DM(non_negative_gains("coulomb", self.coulomb, dq.shape[0]))
-        friction: ca.SX = viscous * dq + coulomb * ca.tanh(dq / _STICTION_SPEED)
+    def numbers(self, n: int) -> Array:
+        """Viscous and Coulomb friction of n joints in one row, (2 n,)."""
+        return np.concatenate([non_negative_gains(name, getattr(self, name), n) for name in ("viscous", "coulomb")])
+
+    @staticmethod
+    def torque(dq: ca.SX, numbers: ca.SX) -> ca.SX:
+        """Friction torque, to be subtracted from the joint torque, (n, 1), for `numbers` as a column (2 n, 1)."""
+        n = dq.shape[0]
+        friction: ca.SX = numbers[:n] * dq + numbers[n:] * ca.tanh(dq / _STICTION_SPEED)
         return friction
 
 

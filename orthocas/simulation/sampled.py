@@ -1,4 +1,4 @@
-"""Closed loops with a sampled controller: the command is held between ticks while CVODES integrates the plant."""
+"""Closed loops with a sampled controller: the command is held between ticks while the plant is integrated."""
 
 from collections.abc import Callable, Iterator
 
@@ -9,9 +9,12 @@ from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
 from orthocas.simulation.closed_loop import ClosedLoop, Held, Piece, cvodes_options, run_compiled
+from orthocas.simulation.compiled_loop import CompiledLoop
 from orthocas.simulation.disturbances import Noise
 
 _TICKS = 50  # ticks per integrator call
+#: state; references with derivatives (N, 3 k), noise and loads of N ticks -> states after them, commands, status (N, 1)
+Ticks = Callable[..., tuple[Array, Array, Array]]
 
 
 def run_ticks(
@@ -21,29 +24,28 @@ def run_ticks(
     rate: float,
     noise: Noise,
     tolerance: float,
+    compiled: CompiledLoop | None = None,
 ) -> Iterator[Piece]:
     """Yield pieces of 50 ticks, with the commands that were held.
 
     Raises:
-        SimulationError: if CVODES gives up.
+        SimulationError: if the integrator gives up.
     """
     ticks = int(np.floor(reference.duration * rate + 1e-9))  # whole ticks: the reference ends with its last segment
     times = np.arange(ticks) / rate
     columns = (
         np.hstack(reference.sample(times)),
-        noise.sample(ticks, loop.n)[:, : loop.plant_rate.size1_in(0)],
+        noise.sample(ticks, loop.n)[:, : loop.size],
         loop.loads.mean(times, 1 / rate),
     )
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
-        run = _tick(loop, 1 / rate, len(reference.labels), tolerance).mapaccum(_TICKS)
+    k, period = len(reference.labels), 1 / rate
+    run = _by_cvodes(loop, period, k, tolerance) if compiled is None else compiled.ticks(period, tolerance)
     state = start
     for first in range(0, ticks, _TICKS):
-        count = min(_TICKS, ticks - first)
-        inputs = [_filled(column[first : first + count]).T for column in columns]
-        outputs = run_compiled(run, ca.DM(state), *map(ca.DM, inputs))
-        states, commands, status = (np.asarray(out).T[:count] for out in outputs)
+        part = slice(first, min(first + _TICKS, ticks))
+        states, commands, status = run(state, *(column[part] for column in columns))
         state = states[-1]
-        yield Piece(times[first : first + count] + 1 / rate, states, Held(commands, status[:, 0], 0 * status[:, 0]))
+        yield Piece(times[part] + period, states, Held(commands, status[:, 0], 0 * status[:, 0]))
 
 
 def pieces(tick: Callable[[int], Array], times: Array, period: float, size: int) -> Iterator[Piece]:
@@ -68,6 +70,19 @@ def held_plant(loop: ClosedLoop, length: float, tolerance: float) -> ca.Function
     x, u, w = (ca.SX.sym(*of) for of in (("x", loop.plant_rate.size1_in(0)), ("u", loop.n), ("load", loop.loads.size)))
     ode = {"x": x, "p": ca.vertcat(u, w), "ode": loop.plant_rate(x, u, w)}
     return ca.integrator("plant", "cvodes", ode, 0.0, length, cvodes_options(tolerance, loop.stiff))
+
+
+def _by_cvodes(loop: ClosedLoop, period: float, k: int, tolerance: float) -> Ticks:
+    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+        ticks = _tick(loop, period, k, tolerance).mapaccum(_TICKS)
+
+    def run(state: Array, *columns: Array) -> tuple[Array, Array, Array]:
+        inputs = [ca.DM(_filled(column).T) for column in columns]
+        outputs = run_compiled(ticks, ca.DM(state), *inputs)
+        states, commands, status = (np.asarray(out).T[: len(columns[0])] for out in outputs)
+        return states, commands, status
+
+    return run
 
 
 def _filled(rows: Array) -> Array:

@@ -488,7 +488,12 @@ def _control() -> dict[str, Call]:
         "simulate sampled": (
             oc.simulate,
             {"controller": law, "reference": reference, "q_start": centre, "control_rate": 50.0, "dq_start": centre * 0}
-            | {"noise": None, "plant": None},
+            | {"noise": None, "plant": None, "compiled": False},
+        ),
+        "simulate_many": (
+            oc.simulate_many,
+            {"controller": law, "reference": reference, "q_start": centre, "changes": [{"step": 0.1}]}
+            | {"executor": None, "control_rate": 50.0},
         ),
         "simulate supervised": (
             oc.simulate,
