@@ -10,6 +10,7 @@ import pytest
 import test_reproduce_control
 import test_reproduce_motion
 import test_reproduce_plane
+import test_reproduce_sketches
 import test_reproduce_space
 import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -80,7 +81,10 @@ CHECKS: dict[str, Callable[[Numbers], None]] = {"fig06": fig06, "fig07": fig07, 
 
 
 def test_every_figure_has_a_check() -> None:
-    elsewhere = (test_reproduce_control, test_reproduce_motion, test_reproduce_plane, test_reproduce_space)
+    elsewhere = (
+        *(test_reproduce_control, test_reproduce_motion, test_reproduce_plane),
+        *(test_reproduce_sketches, test_reproduce_space),
+    )
     assert {*CHECKS, *(name for module in elsewhere for name in module.NAMES)} == set(FIGURES)
 
 

@@ -98,6 +98,7 @@ def fit(
     max_mutual_deg: float | None = None,
     checkpoint: str | Path | None = None,
     align_to: Chart | None = None,
+    split_idle: bool = True,
 ) -> Fit:
     """Find coordinates xi(q) that are as orthogonal as possible to the task.
 
@@ -124,6 +125,8 @@ def fit(
         checkpoint: a file that keeps the state of a long fit. If it exists, the fit resumes from it.
         align_to: a chart of the same robot that defines order and signs of the coordinates, for a refit. By default,
             coordinates that move the first joints come first, and each moves its main joint in the positive direction.
+        split_idle: whether joints that do not affect the task become coordinates themselves. The paper's network learns
+            them; False is for comparisons with it.
 
     Returns:
         The chart, the result of each stage, and the seconds.
@@ -150,7 +153,7 @@ def fit(
     wanted = (
         default_parametrisation(problem, max_mutual_deg is not None) if parametrisation is None else parametrisation
     )
-    settings = FitSettings.checked(problem, wanted, solver, weights, samples, seed, max_mutual_deg)
+    settings = FitSettings.checked(problem, wanted, solver, weights, samples, seed, max_mutual_deg, split_idle)
     warn_unless_savable(settings.parametrisation)
     if isinstance(settings.parametrisation, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))
@@ -178,7 +181,7 @@ def _fitted(
         worst = None
         coordinates = in_closed_form(problem, settings.parametrisation, first)
     else:
-        idle = tuple(idle_joints(problem, first)[-problem.r :])
+        idle = tuple(idle_joints(problem, first)[-problem.r :]) if settings.split_idle else ()
         file = Checkpoint(None if checkpoint is None else as_path("checkpoint", checkpoint), settings.identity(problem))
         stages, coordinates, worst = _minimised(problem, settings, idle, monitor, file, first)
         if stages:

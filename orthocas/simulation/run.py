@@ -11,6 +11,7 @@ from orthocas.checks import Array, as_number, as_point
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
+from orthocas.coordinates.turns import shortest
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
 from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.simulation.closed_loop import ClosedLoop, Piece
@@ -188,7 +189,7 @@ def _trajectory(
         dq=dq if loop.torque else command,
         command=command,
         status=status.ravel().astype(int),
-        value=Batched(controller.measured)(q)[0],
+        value=_near(controller, Batched(controller.measured)(q)[0], wanted[0]),
         reference=wanted[0],
         reference_velocity=wanted[1],
         reference_acceleration=wanted[2],
@@ -196,6 +197,14 @@ def _trajectory(
         dissipated_power=power[:, 0],
         cause=cause.astype(int),
     )
+
+
+def _near(controller: Controller, value: Array, wanted: Array) -> Array:
+    """Measured quantities (N, k), circle-valued ones with the whole turns that bring them nearest to the reference."""
+    chart = controller.chart
+    if chart is None or controller.labels != chart.labels:
+        return value
+    return np.asarray(wanted + shortest(value - wanted, chart.turns)) if chart.turns.any() else value
 
 
 def _with_last(parts: Sequence[Array]) -> Array:
