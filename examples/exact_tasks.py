@@ -48,10 +48,10 @@ class Case:
 def cases() -> list[Case]:
     """All problems."""
     hexarotor, arm, pair = problems.get("hexarotor"), planar_4r(True), two_arms()
-    tilted = oc.Metric.custom(hexarotor.robot, "coupled", lambda w: ca.SX.eye(6) + 0.3 * w @ w.T)
+    tilted = oc.Metric.custom(hexarotor.robot, "of the neighbours", lambda w: ca.diag(1 + w[[1, 2, 3, 4, 5, 0]] ** 2))
     return [
         Case("hexarotor, A = I", hexarotor, True, logarithms),
-        Case("hexarotor, coupled metric", _with_metric(hexarotor, tilted), False),
+        Case("hexarotor, metric of the neighbours", _with_metric(hexarotor, tilted), False),
         Case("planar 4R: x, y, sum of angles", arm, True, cross_ratio),
         Case("the same, A = I", _with_metric(arm, "euclidean"), False),
         Case("planar 4R: x, y", planar_4r(False), False),
@@ -79,7 +79,7 @@ def planar_4r(with_sum: bool) -> oc.Problem:
         return ca.vertcat(*tip, *([ca.dot(weights, a)] if with_sum else []))
 
     labels = ("x", "y", "angles") if with_sum else ("x", "y")
-    box = oc.Box([0.2, 0.9, -0.7, 1.0], 0.25)
+    box = oc.Box([0.2, 1.0, -1.8, 2.6], 0.25)
     metric = TURNED.T @ np.diag(LENGTHS) @ TURNED
     return oc.Problem(robot, oc.Task.custom(robot, "planar", task, labels), metric, box, "planar_4r")
 

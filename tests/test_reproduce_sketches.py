@@ -29,7 +29,9 @@ def test_the_paper_has_thirty_figures() -> None:
 def test_map_to_poses_is_one_to_one_and_regular(drawings: dict[str, Drawing]) -> None:
     """Sec. 2: the task manifold is SE(2); with two joints the map embeds the torus in it."""
     n = drawings["fig03"].numbers
-    assert n["least_singular_value"] == pytest.approx((3 - 5**0.5) / 2, abs=1e-3)  # of [[1, 0], [1, 1], [0, 0]] at worst
+    assert n["least_singular_value"] == pytest.approx(
+        (3 - 5**0.5) / 2, abs=1e-3
+    )  # of [[1, 0], [1, 1], [0, 0]] at worst
     assert n["error_of_inverse_rad"] < 1e-12
     assert n["error_of_drawn_tips_m"] < 1e-12
 

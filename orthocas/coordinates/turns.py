@@ -20,7 +20,8 @@ def shortest(difference: Any, turns: Array) -> Any:
         return difference
     periods = np.where(turns > 0, turns, 1.0)
     if isinstance(difference, ca.SX | ca.MX | ca.DM):
-        return difference - ca.DM(turns) * ca.floor(difference / ca.DM(periods) + 0.5)
+        whole: Any = ca.floor(difference / ca.DM(periods) + 0.5)
+        return difference - ca.DM(turns) * whole
     return difference - turns * np.round(difference / periods)
 
 

@@ -135,7 +135,7 @@ class CircleFamily:
     def turned(self, theta: Array, angles: Array) -> Array:
         """Parameters of xi - angles, (size,): every pair is turned back by its angle (r,) [rad]."""
         c, s = np.diag(np.cos(angles)), np.diag(np.sin(angles))
-        return self._combined(theta, np.block([[c, s], [-s, c]]))
+        return self._combined(theta, np.asarray(np.block([[c, s], [-s, c]]), dtype=float))
 
     def _combined(self, theta: Array, B: Array) -> Array:
         """Parameters of the pairs B (u, v), for a matrix B (2 r, 2 r)."""

@@ -6,6 +6,7 @@ With the joints themselves as inputs it has exactly 535,044; with sines and cosi
 
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from orthocas.checks import Array
@@ -16,7 +17,7 @@ from orthocas.reproduce.style import EXTRA, GREY, INK, LABEL, TASK, THIRD, new_f
 
 _HIDDEN, _JOINTS, _OUTPUTS = (1024, 512), 7, 4  # of the paper's network
 _COLUMNS = (0.0, 1.5, 3.2, 4.9, 6.5)  # places of joints, inputs, hidden layers and outputs
-_RADIUS = 0.16
+_Place = tuple[float, float] | None  # None: units that are left out
 
 
 def draw(quick: bool) -> Drawing:
@@ -46,11 +47,9 @@ def draw(quick: bool) -> Drawing:
     return Drawing({"": figure}, _numbers())
 
 
-def _column(
-    axes: Any, column: int, names: tuple[str, ...], colour: str, step: float
-) -> list[tuple[float, float] | None]:
+def _column(axes: Any, column: int, names: tuple[str, ...], colour: str, step: float) -> list[_Place]:
     """Draw the units of a layer; an empty name stands for those that are left out. Returns their places."""
-    x, places = _COLUMNS[column], []
+    x, places = _COLUMNS[column], list[_Place]()
     heights = 1.95 + step * (np.arange(len(names))[::-1] - (len(names) - 1) / 2)
     for y, name in zip(heights, names, strict=True):
         if not name:
@@ -76,7 +75,7 @@ def _numbers() -> dict[str, float]:
     sizes = {raw: MLP(_HIDDEN, raw).family(unit, _OUTPUTS).size for raw in (False, True)}
     small = MLP((5, 4)).family(unit, _OUTPUTS)
     theta, q = small.initial(0), np.random.default_rng(1).normal(size=(_JOINTS, 1))
-    found = np.asarray(small.expression(q, theta))
+    found = np.asarray(small.expression(ca.MX(ca.DM(q)), ca.MX(ca.DM(theta))).to_DM())
     return {
         "parameters_with_sines_and_cosines": float(sizes[False]),
         "parameters_with_raw_inputs": float(sizes[True]),

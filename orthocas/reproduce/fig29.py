@@ -67,7 +67,7 @@ def _draw_ring(axes: Any, leaf: DiskLeaf, i: int, j: int, opposite: tuple[int, i
     lift = 0.03 * normal / np.linalg.norm(normal)
     ends = leaf.vertices[[i, j]]
     for side in (lift, -lift):
-        scene.add_tube(np.linspace(*(ends + side), 12), 0.02, EXTRA)
+        scene.add_tube(np.linspace(ends[0] + side, ends[1] + side, 12), 0.02, EXTRA)
     scene.add_ball(ends[0], 0.055, INK)
     scene.add_ball(ends[1], 0.055, EXTRA)
     away = normal / np.linalg.norm(normal)

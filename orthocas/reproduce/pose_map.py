@@ -12,7 +12,7 @@ from orthocas import problems
 from orthocas.checks import Array
 from orthocas.reproduce.charted_surface import add_with_lines
 from orthocas.reproduce.fig06 import embedded
-from orthocas.reproduce.painting import Isolines
+from orthocas.reproduce.painting import Isolines, Numbers
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.solids import Mesh
 from orthocas.reproduce.style import EXTRA, TASK
@@ -76,18 +76,18 @@ def tangent_plane(corner: Array, along: Array, half: float, cells: int = 8) -> M
     return corner + shares @ along, _faces(cells)
 
 
-def _grid(cells: int) -> tuple[Array, Array]:
+def _grid(cells: int) -> tuple[Array, Numbers]:
     line = np.linspace(-np.pi, np.pi, cells + 1)
     return np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2), _faces(cells)
 
 
-def _faces(cells: int) -> Array:
+def _faces(cells: int) -> Numbers:
     number = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
     return np.concatenate([np.stack(f, axis=-1).reshape(-1, 3) for f in ((a, b, d), (a, d, c))])
 
 
-def _add(scene: Scene, vertices: Array, faces: Array, q: Array, width: float) -> None:
+def _add(scene: Scene, vertices: Array, faces: Numbers, q: Array, width: float) -> None:
     paints = [np.tile(to_rgba(colour), (len(_LEVELS), 1)) for colour in LINES.values()]
     families = [Isolines(q[:, k], _LEVELS, paint, width) for k, paint in enumerate(paints)]
     add_with_lines(scene, vertices, faces, SURFACE, families)

@@ -103,7 +103,7 @@ def chosen(name: str) -> list[str]:
     number = re.fullmatch(r"(?:fig)?0*(\d{1,4})", name)
     figure = f"fig{int(number[1]):02d}" if number else name
     if figure not in FIGURES:
-        raise UnknownNameError("figure", name, [*FIGURES, "all"])
+        raise UnknownNameError("figure", name, [f"{min(FIGURES)} to {max(FIGURES)}", "all"])
     return [figure]
 
 
