@@ -1,15 +1,15 @@
-"""Tasks with m >= 2 that have exact coordinates: found by thinking, checked by their brackets, grown, and fitted (60 s).
+"""Tasks with m >= 2 that have exact coordinates: found by thinking, checked by brackets, grown, and fitted (2 min).
 
 Exact coordinates for two or more task components are rare ([AS2023] Theorem 1). These are three kinds:
 
-- *separable maps*: every task component is a sum of functions of single joints with the same slopes up to factors,
-  h = B f(q), so the gradients commute: the propellers of `orthocas.problems.propellers`;
-- *a metric*: the planar arm with four joints, seen in the absolute angles a of its links, with their lengths as weights.
-  The gradients of x, of y and of the weighted sum of the angles are -sin a, cos a and 1 per link: the three fields of
-  projective motions of a circle, which are closed under brackets for any number of links. What such motions leave alone
-  is the cross-ratio of the four link directions;
-- *a mechanism*: two arms on one base, one task component for each, in the metric of their common mass matrix. Gradients of one
-  arm do not feel the other.
+- *separable maps*: task components are sums of functions of single joints, h = B f(q) with one f_k for each joint, so
+  the gradients commute: the propellers of `orthocas.problems.propellers`;
+- *a metric*: the planar arm with four joints, in the absolute angles a of its links, with their lengths as weights.
+  Per link, the gradients of x, of y and of the weighted sum of the angles are -sin a, cos a and 1: the fields of the
+  projective motions of a circle, which are closed under brackets for any number of links. What such motions leave
+  alone is the cross-ratio of the four link directions;
+- *a mechanism*: two arms on one base, one task component for each, in the metric of their common mass matrix. The
+  gradient of one arm does not feel the other.
 
 Next to each stands a neighbour that is not exact.
 """
@@ -67,8 +67,8 @@ def _with_metric(problem: oc.Problem, metric: "oc.Metric | str") -> oc.Problem:
 def planar_4r(with_sum: bool) -> oc.Problem:
     """Task (x, y) of the tip, and with `with_sum` the sum of the links' angles weighted by their lengths.
 
-    The metric is A = T^T diag(lengths) T, with the absolute angles a = T q. It is constant: that of rotors in the base which
-    turn the links through belts, with inertias in proportion to the lengths.
+    The metric is A = T^T diag(lengths) T, with the absolute angles a = T q. It is constant: that of rotors in the base
+    which turn the links through belts, with inertias in proportion to the lengths.
     """
     robot = oc.Robot.planar(LENGTHS, [1.0] * 4)
     weights = ca.DM(LENGTHS)
@@ -85,9 +85,9 @@ def planar_4r(with_sum: bool) -> oc.Problem:
 
 
 def cross_ratio(q: ca.SX) -> ca.SX:
-    """Logarithm of the cross-ratio of the tangents of half the absolute angles.
+    """The logarithm of the cross-ratio of t_i = tan(a_i / 2), with the absolute angles a.
 
-    (t_1 - t_2)(t_3 - t_4) / ((t_1 - t_4)(t_3 - t_2)), and t_i - t_j = sin((a_i - a_j) / 2) / (cos cos), whose cosines cancel.
+    It is (t_1 - t_2)(t_3 - t_4) / ((t_1 - t_4)(t_3 - t_2)), with t_i - t_j = sin((a_i - a_j) / 2) over common cosines.
     """
     a = ca.DM(TURNED) @ q
 
@@ -98,7 +98,7 @@ def cross_ratio(q: ca.SX) -> ca.SX:
 
 
 def two_arms(together: bool = False) -> oc.Problem:
-    """Two planar arms of two joints on one base, A = M: the x of both tips; or with `together`, x and y of a point between."""
+    """Two planar arms on one base, A = M: the x of both tips, or with `together`, their mean in x and y."""
     left, right = (oc.Robot.planar([1.0, 0.8], [3.0, 2.0]).tree for _ in range(2))
     robot = oc.Robot(_side_by_side(left, right))
 

@@ -1,4 +1,4 @@
-"""Figures that the paper sketches, those of its network and its appendix: what they show is computed, and checked here."""
+"""Figures that the paper sketches, and those of its network and appendix: what they show is computed."""
 
 import casadi as ca
 import numpy as np

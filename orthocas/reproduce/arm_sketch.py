@@ -10,7 +10,6 @@ from orthocas.checks import Array
 from orthocas.reproduce.style import GREY, INK, LABEL
 from orthocas.robots import Robot
 
-
 _HALO = {"facecolor": "white", "edgecolor": "none", "pad": 0.6}
 
 

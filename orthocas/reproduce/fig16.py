@@ -75,7 +75,7 @@ def _numbers() -> dict[str, float]:
     sizes = {raw: MLP(_HIDDEN, raw).family(unit, _OUTPUTS).size for raw in (False, True)}
     small = MLP((5, 4)).family(unit, _OUTPUTS)
     theta, q = small.initial(0), np.random.default_rng(1).normal(size=(_JOINTS, 1))
-    found = np.asarray(small.expression(ca.MX(ca.DM(q)), ca.MX(ca.DM(theta))).to_DM())
+    found = np.asarray(ca.evalf(small.expression(ca.MX(ca.DM(q)), ca.MX(ca.DM(theta)))))
     return {
         "parameters_with_sines_and_cosines": float(sizes[False]),
         "parameters_with_raw_inputs": float(sizes[True]),
