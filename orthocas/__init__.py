@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from orthocas.inverting import InverseStatus, Solutions, Tracker, TrackerStatus
     from orthocas.involutivity import Involutivity, involutivity, lie_bracket
     from orthocas.metrics import Metric
-    from orthocas.parametrisations import MLP, SEW, Fourier, Given, Linear, Polynomial, cyclic_joints
+    from orthocas.parametrisations import MLP, SEW, Circle, Fourier, Given, Linear, Polynomial, cyclic_joints
     from orthocas.parametrisations import register as register_parametrisation
     from orthocas.postures.clear_box import ClearBox
     from orthocas.postures.suggest import suggest_domain
@@ -71,6 +71,7 @@ __all__ = [
     "Box",
     "Certificate",
     "Chart",
+    "Circle",
     "ClearBox",
     "Comparison",
     "Fit",
@@ -150,7 +151,7 @@ _HOMES = {
     "orthocas.involutivity": ["Involutivity", "involutivity", "lie_bracket"],
     "orthocas.metrics": ["Metric"],
     "orthocas.parametrisations": [
-        *("MLP", "SEW", "Fourier", "Given", "Linear", "Polynomial", "cyclic_joints"),
+        *("MLP", "SEW", "Circle", "Fourier", "Given", "Linear", "Polynomial", "cyclic_joints"),
         "register as register_parametrisation",
     ],
     "orthocas.postures.clear_box": ["ClearBox"],

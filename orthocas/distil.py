@@ -12,12 +12,14 @@ from orthocas.casadi_tools.blas_graph import NumpyGraph
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_count, require_kind, require_memory
 from orthocas.coordinates.fitted import Coordinates
+from orthocas.coordinates.turns import shortest
 from orthocas.domains import sample_evenly, sample_uniform
 from orthocas.errors import GrowError, InvalidValueError
 from orthocas.growing.grown import GrownCoordinates
 from orthocas.minimising.solver import Solver
 from orthocas.minimising.watch import Monitor, Progress, Watch, silent
 from orthocas.parametrisations import Family, JointSpace, LinearFamily, Parametrisation, Polynomial
+from orthocas.parametrisations.circle import CircleFamily
 from orthocas.quality import Report, evaluate
 from orthocas.showing import Shown, number_list
 from orthocas.solvers import LBFGS
@@ -74,6 +76,7 @@ def distil(
 
     Minimises the mean of |xi - xi_grown|^2 + w^2 |J_xi - J_grown|^2 over samples of the domain, where w is the mean
     half-width of the domain. Bases that are linear in their parameters use least squares, networks use a minimiser.
+    With `Circle` pairs, it fits cos xi and sin xi of a closed leaf instead, which are smooth across its cut.
 
     Args:
         chart: a grown chart.
@@ -111,7 +114,11 @@ def distil(
     if not isinstance(chart.coordinates, GrownCoordinates):
         raise InvalidValueError("chart", f"a chart of kind {chart.coordinates.label}", "a grown chart")
     space = JointSpace.of(chart.problem)
-    family = parametrisation.family(space, chart.r)
+    whole = parametrisation.family(space, chart.r)
+    circle = whole if isinstance(whole, CircleFamily) else None
+    if circle is not None and not chart.turns.any():
+        raise InvalidValueError("parametrisation", parametrisation.label, "one that is not circle-valued for this leaf")
+    family = whole if circle is None else circle.pairs
     if isinstance(family, LinearFamily):
         if solver is not None:
             raise InvalidValueError("solver", repr(solver), "no solver, because bases are fitted by least squares")
@@ -124,15 +131,25 @@ def distil(
     require_memory(f"distilling with {count} samples", 8.0 * count * chart.n * (chart.n + 4))
     points = sample_evenly(chart.problem.domain, count, require_count("seed", seed, least=0))
     targets = _targets(chart, points)
+    wanted_values = targets if circle is None else _pairs(targets)
     if isinstance(family, LinearFamily):
-        theta, offset = _least_squares(family, targets, watch)
+        theta, offset = _least_squares(family, wanted_values, watch)
     else:
         minimiser = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
-        theta, offset = _minimised(family, targets, minimiser, seed, watch)
+        theta, offset = _minimised(family, wanted_values, minimiser, seed, watch)
+    if circle is not None:
+        theta, offset = np.concatenate([theta, -offset[: circle.constants]]), np.zeros(chart.r)
     coordinates = Coordinates(parametrisation, space, (), theta, offset, np.ones(chart.r))
     return _judged(
         chart, Chart(chart.problem, coordinates, {"distilled from": chart.coordinates.label}), targets, count
     )
+
+
+def _pairs(targets: _Targets) -> _Targets:
+    """Cosines, then sines of angles, and their gradients."""
+    c, s, g = np.cos(targets.xi), np.sin(targets.xi), targets.gradients
+    gradients = np.concatenate([-s[:, :, None] * g, c[:, :, None] * g], axis=1)
+    return _Targets(targets.points, np.concatenate([c, s], axis=1), gradients, targets.weight)
 
 
 def _targets(chart: Chart, points: Array) -> _Targets:
@@ -148,7 +165,7 @@ def _targets(chart: Chart, points: Array) -> _Targets:
 def _judged(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
     held_out = sample_uniform(chart.problem.domain, min(count, 5000), _HELD_OUT_SEED)
     known = _targets(chart, held_out)
-    errors = distilled.coordinates.xi(known.points) - known.xi
+    errors = shortest(distilled.coordinates.xi(known.points) - known.xi, distilled.turns[chart.m :])
     gradients = known.gradients / known.weight
     turned = np.linalg.norm(distilled.coordinates.jacobian(known.points) - gradients, axis=2)
     relative = turned / np.linalg.norm(gradients, axis=2)

@@ -4,13 +4,14 @@ from collections.abc import Callable
 
 from orthocas.checks import require_known
 from orthocas.problem import Problem
-from orthocas.problems import iiwa, planar
+from orthocas.problems import iiwa, planar, propellers
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "planar_2r": planar.planar_2r,
     "planar_3r_x": planar.planar_3r_x,
     "planar_3r_xy": planar.planar_3r_xy,
     "iiwa": iiwa.iiwa,
+    "hexarotor": propellers.hexarotor,
 }
 
 

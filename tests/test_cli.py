@@ -170,7 +170,10 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fit", "spot"], "unknown problem 'spot', known: planar_2r, planar_3r_x, planar_3r_xy, iiwa, or a FILE"),
+        (
+            ["fit", "spot"],
+            "unknown problem 'spot', known: planar_2r, planar_3r_x, planar_3r_xy, iiwa, hexarotor, or a FILE",
+        ),
         (["fit", "nowhere.urdf"], "cannot read URDF file nowhere.urdf: No such file or directory"),
         (["fit", PANDA, "--tip", "hand"], "unknown frame 'hand'"),
         (["fit", PANDA], "name the tip frame"),

@@ -77,6 +77,8 @@ def test_task_basis_is_orthonormal_in_the_metric_and_spans_the_gradients(planar_
 
 def test_named_problems_have_the_paper_dimensions() -> None:
     sizes = {name: (p.n, p.m, p.r) for name in problems.names() for p in [problems.get(name)]}
+    own = sizes.pop("hexarotor")
+    assert own == (6, 4, 2)
     assert sizes == {"planar_2r": (2, 1, 1), "planar_3r_x": (3, 1, 2), "planar_3r_xy": (3, 2, 1), "iiwa": (7, 3, 4)}
     with pytest.raises(UnknownNameError, match="unknown problem 'spot', known: planar_2r"):
         problems.get("spot")

@@ -10,6 +10,7 @@ import pytest
 import test_reproduce_control
 import test_reproduce_motion
 import test_reproduce_plane
+import test_reproduce_sketches
 import test_reproduce_space
 import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -80,7 +81,10 @@ CHECKS: dict[str, Callable[[Numbers], None]] = {"fig06": fig06, "fig07": fig07, 
 
 
 def test_every_figure_has_a_check() -> None:
-    elsewhere = (test_reproduce_control, test_reproduce_motion, test_reproduce_plane, test_reproduce_space)
+    elsewhere = (
+        *(test_reproduce_control, test_reproduce_motion, test_reproduce_plane),
+        *(test_reproduce_sketches, test_reproduce_space),
+    )
     assert {*CHECKS, *(name for module in elsewhere for name in module.NAMES)} == set(FIGURES)
 
 
@@ -173,8 +177,17 @@ def test_figures_have_short_names(word: str) -> None:
 
 @pytest.mark.parametrize("word", ["fig99", "figure7", "", "-7", "7b", "99999"])
 def test_unknown_figures_are_listed(word: str) -> None:
-    with pytest.raises(UnknownNameError, match=r"known: .*fig07.*, all$"):
+    with pytest.raises(UnknownNameError, match=r"known: .*fig01 to fig30"):
         chosen(word)
+
+
+def test_a_fit_is_chosen_for_figures_of_a_fit_only(run: Run, tmp_path: Path) -> None:
+    code, out, err = run("reproduce", "fig05", "--param", "mlp:4x4", "--out", "new")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "fit is chosen for fig05, expected a figure of a fit: fig10, fig17" in err
+    code, _, err = run("reproduce", "fig20", "--log", "joints.csv", "--out", "new")
+    assert (code, "--log is given for fig20, expected fig28" in err) == (2, True)
+    assert not list(tmp_path.iterdir())
 
 
 def test_unwritable_folder_is_refused(tmp_path: Path) -> None:
@@ -201,7 +214,7 @@ def test_command_prints_rows_or_json(run: Run, two_figures: list[tuple[str, bool
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("fig99", "--out", "new"), "unknown figure 'fig99', known: fig06, fig11, all"),
+        (("fig99", "--out", "new"), "unknown figure 'fig99', known: fig06 to fig11, all"),
         (("fig06", "--out", "file"), "--out is file, expected a folder that can be written"),
         (("fig06", "--out", "file/deeper"), "--out is file/deeper, expected a folder"),
         (("fig06",), "Missing option '--out'"),

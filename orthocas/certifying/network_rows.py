@@ -18,7 +18,7 @@ class NetworkRows:
     """J_xi of xi = W_out tanh(W_2 tanh(W_1 [sin q; cos q; q] + b_1) + b_2) on boxes."""
 
     layers: tuple[tuple[Array, Array], ...]  #: weights (out, in) and biases (out,)
-    prismatic: tuple[bool, ...]
+    direct: tuple[bool, ...]  #: which joints enter as q itself
 
     @classmethod
     def of(cls, family: MLPFamily, theta: Array) -> "NetworkRows":
@@ -28,12 +28,12 @@ class NetworkRows:
             end = start + out * width
             layers.append((theta[start:end].reshape(width, out).T.copy(), theta[end : end + out]))
             start = end + out
-        return cls(tuple(layers), family.space.prismatic)
+        return cls(tuple(layers), family.direct)
 
     def __call__(self, joints: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
         """J_xi, (r, n, boxes), for models of the joints."""
-        turning = [q for q, slides in zip(joints, self.prismatic, strict=True) if not slides]
-        sliding = [q for q, slides in zip(joints, self.prismatic, strict=True) if slides]
+        turning = [q for q, slides in zip(joints, self.direct, strict=True) if not slides]
+        sliding = [q for q, slides in zip(joints, self.direct, strict=True) if slides]
         sines, cosines = [sine(q) for q in turning], [cosine(q) for q in turning]
         layer, slopes = stacked([*sines, *cosines, *sliding]), []
         one = TaylorModel.constant(np.ones((1, 1)))
@@ -52,7 +52,7 @@ class NetworkRows:
         """Derivatives by the joints from those by the inputs [sin q; cos q; q]."""
         turning, columns = len(sines), []
         angle, slide = 0, 2 * turning
-        for slides in self.prismatic:
+        for slides in self.direct:
             if slides:
                 columns.append(gradient[slide])
                 slide += 1

@@ -5,24 +5,44 @@ from typing import Annotated
 
 import typer
 
-from orthocas.cli.output import AsJson, Force, print_json, print_rows
+from orthocas.chart import load
+from orthocas.cli.output import AsJson, Force, print_json, print_rows, whole_number
 from orthocas.cli.progress import terminal_monitor
+from orthocas.errors import InvalidValueError
 from orthocas.files.atomic import output_folder
-from orthocas.reproduce.registry import FIGURES, chosen
+from orthocas.parametrisations import parse_parametrisation
+from orthocas.reproduce.chosen_fit import ChosenFit
+from orthocas.reproduce.registry import FIGURES, chosen, reproduce_log, require_fit
 from orthocas.reproduce.registry import reproduce as reproduce_figures
 
 
 def reproduce(
     figure: Annotated[str, typer.Argument(metavar="figNN|all", help=f"One of {', '.join(FIGURES)}, or all.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for pictures, numbers and meshes.")],
+    param: Annotated[
+        str | None,
+        typer.Option("--param", help="Parametrisation for figures of a fit, such as mlp:64x64 or polynomial:6."),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", parser=whole_number, help="Seed for figures of a fit.")] = 0,
+    log: Annotated[
+        Path | None, typer.Option("--log", help="CSV file of logged joint positions, for fig28; see docs/paper.md.")
+    ] = None,
+    chart: Annotated[Path | None, typer.Option("--chart", help="Chart file of the arm of the log.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Use coarser settings that run faster.")] = False,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Redraw figures of the paper and print the numbers they show."""
-    chosen(figure)
+    fit = ChosenFit(None if param is None else parse_parametrisation(param), seed)
+    names = chosen(figure)
+    require_fit(figure, fit)
+    _require_log(names, log, chart)
+    known = None if chart is None else load(chart)
     with output_folder("--out", out) as folder, terminal_monitor() as monitor:
-        numbers = reproduce_figures(figure, folder, quick, monitor, force)
+        if log is None:
+            numbers = reproduce_figures(figure, folder, quick, monitor, force, fit)
+        else:
+            numbers = reproduce_log(log, folder, known, force, fit)
     if json:
         print_json(numbers)
         return
@@ -30,3 +50,11 @@ def reproduce(
         typer.echo(f"{name}: {FIGURES[name].title}")
         print_rows({f"  {key}": f"{value:.6g}" for key, value in values.items()})
     print_rows({"files": str(out)})
+
+
+def _require_log(names: list[str], log: Path | None, chart: Path | None) -> None:
+    """Raise InvalidValueError unless a log is given for Fig. 28 only, and a chart only for a log."""
+    if log is not None and names != ["fig28"]:
+        raise InvalidValueError("--log", f"given for {', '.join(names[:3])}", "fig28, the figure of a motion")
+    if chart is not None and log is None:
+        raise InvalidValueError("--chart", "given", "a log to draw on it: --log FILE.csv")

@@ -18,6 +18,7 @@ from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
 from orthocas.codegen.supervision import supervision_kernels
 from orthocas.control import Controller, Safety
 from orthocas.control.controller import require_controller
+from orthocas.coordinates.turns import require_no_turns
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.files.atomic import output_folder, published, require_writable
 from orthocas.postures.clear_box import ClearBox
@@ -107,6 +108,7 @@ def _functions(chart: Chart, controller: Controller | None, precision: Precision
         scalar_code(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)])),
     ]
     domain = chart.problem.domain
+    require_no_turns(chart.labels, chart.turns, "generated C")
     if isinstance(domain, ClearBox):
         found.append(scalar_code(ca.Function("pivots", [q], [domain.pivots(q)])))
     if controller is not None:

@@ -8,20 +8,23 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
+from orthocas.coordinates.turns import shortest
 from orthocas.domains import Box
 from orthocas.parametrisations import CyclicParametrisation
 
 
 def without_turns(chart: Chart, difference: Any) -> Any:
-    """A difference of two phi (n, 1) without the whole turns of unbounded joints; the spring takes the shorter way.
+    """A difference of two phi (n, 1) without whole turns of unbounded joints, and of circle-valued coordinates.
 
     A turn of joint k changes phi by the constant 2 pi dphi/dq_k, a column of T (n, u), if the coordinates are linear in
-    q_k. The difference becomes e - T round(T^+ e). So sensors may report angles with or without whole turns.
+    q_k. The difference becomes e - T round(T^+ e). So sensors may report angles with or without whole turns, and the
+    spring takes the shorter way.
 
     Args:
         chart: the chart.
         difference: phi - phi_d, an expression.
     """
+    difference = shortest(difference, chart.turns)
     T = _turns(chart)
     if T.shape[1] == 0:
         return difference

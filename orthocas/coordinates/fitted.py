@@ -17,6 +17,7 @@ from orthocas.checks import Array, frozen_array, require_shape
 from orthocas.coordinates.blocks import Maker, block_function
 from orthocas.coordinates.point_functions import point_functions
 from orthocas.parametrisations import Family, JointSpace, Parametrisation
+from orthocas.parametrisations.circle import TURN, CircleFamily
 from orthocas.parametrisations.family import Expression, GradedParametrisation, SelfDerivativeFamily
 
 _FEW = 8  # joint positions below which networks are evaluated one by one
@@ -66,6 +67,13 @@ class Coordinates:
     def active(self) -> list[int]:
         """Joints that the fitted family depends on."""
         return [i for i in range(self.space.n) if i not in self.idle]
+
+    @property
+    def turns(self) -> Array:
+        """Periods of the coordinates, (r,): 2 pi scale for circle-valued ones, 0 for others."""
+        fitted = len(self.offset)
+        own = TURN * np.abs(self.scale) if fitted and isinstance(self.family, CircleFamily) else np.zeros(fitted)
+        return np.concatenate([own, np.zeros(len(self.idle))])
 
     @property
     def as_matrices(self) -> bool:

@@ -21,7 +21,7 @@ def network_form(coordinates: Coordinates) -> Form | None:
     W_out = np.zeros((coordinates.r, family.hidden[-1]))
     W_out[:fitted] = scale * layers[depth][0]
     c[:fitted] = scale * (layers[depth][1] - coordinates.offset[:, None])
-    active, slides = np.array(coordinates.active, dtype=int), np.array(family.space.prismatic, dtype=bool)
+    active, slides = np.array(coordinates.active, dtype=int), np.array(family.direct, dtype=bool)
     turning, sliding, idle = active[~slides], active[slides], np.array(coordinates.idle, dtype=int)
     indices = {"turning": turning, "sliding": sliding, "idle": idle}
     indices["order"] = np.argsort(np.concatenate(list(indices.values())))

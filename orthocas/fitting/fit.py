@@ -100,6 +100,7 @@ def fit(
     checkpoint: str | Path | None = None,
     align_to: Chart | None = None,
     threads: int | None = None,
+    split_idle: bool = True,
 ) -> Fit:
     """Find coordinates xi(q) that are as orthogonal as possible to the task.
 
@@ -128,6 +129,8 @@ def fit(
             coordinates that move the first joints come first, and each moves its main joint in the positive direction.
         threads: threads that share the work; coordinates linear in their parameters do not depend on their number.
             Default: OMP_NUM_THREADS, or the number of cores.
+        split_idle: whether joints that do not affect the task become coordinates themselves. The paper's network learns
+            them; False is for comparisons with it.
 
     Returns:
         The chart, the result of each stage, and the seconds.
@@ -154,7 +157,7 @@ def fit(
     wanted = (
         default_parametrisation(problem, max_mutual_deg is not None) if parametrisation is None else parametrisation
     )
-    settings = FitSettings.checked(problem, wanted, solver, weights, samples, seed, max_mutual_deg)
+    settings = FitSettings.checked(problem, wanted, solver, weights, samples, seed, max_mutual_deg, split_idle)
     warn_unless_savable(settings.parametrisation)
     if isinstance(settings.parametrisation, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))
@@ -182,7 +185,7 @@ def _fitted(
         worst = None
         coordinates = in_closed_form(problem, settings.parametrisation, first)
     else:
-        idle = tuple(idle_joints(problem, first)[-problem.r :])
+        idle = tuple(idle_joints(problem, first)[-problem.r :]) if settings.split_idle else ()
         file = Checkpoint(None if checkpoint is None else as_path("checkpoint", checkpoint), settings.identity(problem))
         stages, coordinates, worst = _minimised(problem, settings, idle, monitor, file, first)
         if stages:

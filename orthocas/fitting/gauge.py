@@ -11,6 +11,7 @@ from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.errors import InvalidValueError, OrthocasError
 from orthocas.parametrisations import Parametrisation, ReorderableFamily
+from orthocas.parametrisations.circle import CircleFamily
 from orthocas.parametrisations.family import JointSpace
 from orthocas.problem import Problem
 from orthocas.samples import Samples
@@ -36,6 +37,8 @@ def normalised(raw: Coordinates, origin: Array, samples: Samples) -> Coordinates
         OrthocasError: if the gradient of a coordinate vanishes on the domain.
     """
     r = len(raw.offset)
+    if isinstance(raw.family, CircleFamily):  # an angle keeps its period
+        return replace(raw, theta=raw.family.turned(raw.theta, raw.xi(origin[None, :])[0, :r]))
     lengths = np.linalg.norm(raw.jacobian(samples.points)[:, :r], axis=2).mean(axis=0)
     if not lengths.min() > 0:
         raise OrthocasError(f"coordinate {int(np.argmin(lengths))} has a vanishing gradient on the domain")

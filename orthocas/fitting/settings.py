@@ -29,6 +29,7 @@ class FitSettings:
     samples: int | None
     seed: int
     max_mutual_deg: float | None
+    split_idle: bool = True
 
     @classmethod
     def checked(
@@ -40,6 +41,7 @@ class FitSettings:
         samples: int | None,
         seed: int,
         max_mutual_deg: float | None,
+        split_idle: bool = True,
     ) -> "FitSettings":
         """Check the settings, and fill in the default solver and the default angles.
 
@@ -58,7 +60,8 @@ class FitSettings:
             raise InvalidValueError("solver", solver.name, "ipopt, the only solver that supports max_mutual_deg")
         count = None if samples is None else require_count("samples", samples, least=2)
         loss = Weights.of(weights).for_metric(problem.metric)
-        return cls(bound, solver, loss, count, require_count("seed", seed, least=0), max_mutual_deg)
+        require_kind("split_idle", split_idle, bool)
+        return cls(bound, solver, loss, count, require_count("seed", seed, least=0), max_mutual_deg, split_idle)
 
     @property
     def max_mutual(self) -> float | None:
@@ -80,6 +83,7 @@ class FitSettings:
             "samples": repr(self.samples),
             "seed": repr(self.seed),
             "max_mutual_deg": repr(self.max_mutual_deg),
+            **({} if self.split_idle else {"split_idle": "False"}),
         }
 
 

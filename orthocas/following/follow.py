@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_float_array, as_number, as_point, require_kind
+from orthocas.coordinates.turns import require_no_turns
 from orthocas.errors import InvalidValueError, SolveError
 from orthocas.following.checks import Limits
 from orthocas.following.choose_xi import XiChoice
@@ -86,6 +87,7 @@ def follow(
     """
     require_kind("chart", chart, Chart)
     chart.function("second_derivative")  # raises for grown charts
+    require_no_turns(chart.labels, chart.turns, "paths")
     start = chart.problem.domain.centre if q_start is None else as_point("q_start", q_start, chart.n)
     distances = LinkDistances(chart.problem.robot, obstacles, link_radius)
     limits = _limits(chart, velocity_limits, acceleration_limits, distances, clearance)

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.checks import Array
+from orthocas.coordinates.turns import shortest
 from orthocas.inverting.newton import ROUNDING
 
 _TOLERANCE = 1e-9  # the largest relative error of a solution
@@ -22,13 +23,13 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-def inverse_function(phi: ca.Function, sizes: Array) -> ca.Function:
+def inverse_function(phi: ca.Function, sizes: Array, turns: Array) -> ca.Function:
     """phi (n, 1), q_start (n, 1) -> q (n, 1) with phi(q) = phi, NaN where Newton's method finds none from q_start."""
     n = len(sizes)
     q, target, start = (ca.MX.sym(name, n) for name in ("q", "phi", "q_start"))
 
-    def residual(at: ca.MX) -> ca.MX:
-        return (phi(at) - target) / (ca.DM(sizes) + ROUNDING * ca.fabs(target))
+    def residual(at: ca.MX) -> Any:
+        return shortest(phi(at) - target, turns) / (ca.DM(sizes) + ROUNDING * ca.fabs(target))
 
     solve = ca.rootfinder("solve", "newton", {"x": q, "p": target, "g": residual(q)}, _OPTIONS)
     found = solve(start, target)

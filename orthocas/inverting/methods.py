@@ -16,6 +16,7 @@ from orthocas.checks import (
     require_kind,
     require_known,
 )
+from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import InvertibleMap
 from orthocas.coordinates.phi import PhiFunctions
 from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError, SingularTaskError
@@ -171,26 +172,33 @@ class InverseMethods(PhiFunctions):
         """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
         return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
 
+    @property
+    def turns(self) -> Array:
+        """Periods of the components of phi, (n,): 2 pi for circle-valued coordinates, 0 where there is none."""
+        own = self.coordinates
+        periods = own.turns if isinstance(own, Coordinates) else np.full(self.r, getattr(own, "turn", 0.0))
+        return np.concatenate([np.zeros(self.m), periods])
+
     @cached_property
     def phi_map(self) -> PhiMap:
         """phi and J for solvers of phi(q) = phi."""
-        return PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes)
+        return PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes, self.turns)
 
     @cached_property
     def _inverse(self) -> Inverse:
         phi_map = self.phi_map
         if isinstance(self.coordinates, InvertibleMap):
-            return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map, self.m))
+            return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map))
         local = FewRows(phi_map, self._point_functions, Newton(phi_map))
         return Inverse(self.problem, phi_map, local, Nearest(self.problem, self.function("phi"), phi_map))
 
     @cached_property
     def _inverse_function(self) -> ca.Function:
-        return inverse_function(self.function("phi"), self.phi_sizes)
+        return inverse_function(self.function("phi"), self.phi_sizes, self.turns)
 
     @cached_property
     def _point_functions(self) -> PointFunctions:
-        return PointFunctions.of(self.function("phi"), self.function("jacobian"), self.phi_sizes)
+        return PointFunctions.of(self.function("phi"), self.function("jacobian"), self.phi_sizes, self.turns)
 
     def _jacobian_or_nan(self, points: Array) -> Array:
         """J at points (N, n), with NaN where the task has no finite Jacobian."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from orthocas.casadi_tools.batch import evaluate_columns
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
+from orthocas.coordinates.turns import shortest
 from orthocas.domains import borders
 from orthocas.inverting.newton import PhiMap, largest
 from orthocas.postures.clear_box import ClearBox
@@ -65,7 +66,7 @@ class Nearest:
         """start (n, 1), target (n, 1) -> q (n, 1)."""
         m, domain = self.problem.m, self.problem.domain
         q, target = ca.MX.sym("q", self.problem.n), ca.MX.sym("phi", self.problem.n)
-        difference = self.phi(q) - target
+        difference = shortest(self.phi(q) - target, self.phi_map.turns)
         constraints = [difference[:m] / ca.DM(self.phi_map.sizes[:m])]
         upper = np.zeros(m)
         if isinstance(domain, ClearBox):

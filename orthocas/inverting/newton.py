@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from orthocas.casadi_tools.threads import in_threads
 from orthocas.checks import Array, Indices
+from orthocas.coordinates.turns import shortest
 
 MAX_ITERATIONS = 50
 _PATIENCE = 8  # iterations after which the error must have halved
@@ -33,6 +34,7 @@ class PhiMap:
     phi: Callable[[Array], Array]  #: (N, n) -> (N, n)
     jacobian: Callable[[Array], Array]  #: (N, n) -> (N, n, n)
     sizes: Array  #: sizes of the components, (n,)
+    turns: Array  #: periods of the components, (n,); 0 for those that have none
 
     def scale(self, targets: Array) -> Array:
         """Scale of errors (N, n): the sizes of the components, and more where rounding of phi exceeds them."""
@@ -40,9 +42,14 @@ class PhiMap:
         return scale
 
     def residual(self, targets: Array, q: Array) -> Array:
-        """(phi - phi(q)) / scale, (N, n)."""
-        residual: Array = (targets - self.phi(q)) / self.scale(targets)
+        """(phi - phi(q)) / scale, (N, n), by the shorter way around for periodic components."""
+        residual: Array = self.difference(targets, self.phi(q)) / self.scale(targets)
         return residual
+
+    def difference(self, targets: Array, values: Array) -> Array:
+        """Targets - values, (N, n), without whole turns of periodic components."""
+        difference: Array = shortest(targets - values, self.turns)
+        return difference
 
     def is_singular(self, q: Array) -> NDArray[np.bool_]:
         """Whether J is singular or undefined at points (N, n), (N,)."""

@@ -15,17 +15,12 @@ class OwnInverse:
 
     coordinates: InvertibleMap
     phi_map: PhiMap
-    m: int  #: number of task components
 
     def __call__(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n)."""
         q = self.coordinates.inverse(targets, starts).reshape(targets.shape)
         known = np.asarray(np.isfinite(q).all(axis=1))
         q = np.where(known[:, None], q, starts)
-        residual, turn = self.phi_map.residual(targets, q), self.coordinates.turn
-        if turn:
-            scale = self.phi_map.scale(targets)[:, self.m :]
-            difference = residual[:, self.m :] * scale
-            residual[:, self.m :] = (difference - turn * np.round(difference / turn)) / scale
+        residual = self.phi_map.residual(targets, q)
         residual[~known] = np.inf
         return Attempt(q, residual, np.zeros(len(q), dtype=np.int64), known)

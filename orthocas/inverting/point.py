@@ -15,6 +15,7 @@ import numpy as np
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
+from orthocas.coordinates.turns import shortest
 from orthocas.inverting.newton import GOAL, ROUNDING, SUSPICIOUS, Attempt, LocalSolver, PhiMap
 
 _FEW = 4  # rows that are solved one by one
@@ -30,19 +31,20 @@ class PointFunctions:
     chord: ca.Function  #: q, phi, H, target -> q and phi after 3 steps, and |residual| at each of the 4 points
 
     @classmethod
-    def of(cls, phi: ca.Function, jacobian: ca.Function, sizes: Array) -> "PointFunctions":
-        """For phi and J of a column q (n, 1)."""
+    def of(cls, phi: ca.Function, jacobian: ca.Function, sizes: Array, turns: Array) -> "PointFunctions":
+        """For phi and J of a column q (n, 1), and the sizes and periods of the components of phi."""
         n = len(sizes)
         q, known, target = (ca.MX.sym(name, n) for name in ("q", "phi", "target"))
         H = ca.MX.sym("H", n, n)
         inverted = dense_function("inverted", [q], [phi(q), *_inversion(sizes).call([jacobian(q)])])
         scale = ca.DM(sizes) + ROUNDING * ca.fabs(target)
-        now, value = q, known
-        errors = [ca.norm_2((target - value) / scale)]  # norm_inf drops NaN
+        now, value, left = q, known, shortest(target - known, turns)
+        errors = [ca.norm_2(left / scale)]  # norm_inf drops NaN
         for _ in range(STEPS):
-            now = now + H @ (target - value)
+            now = now + H @ left
             value = phi(now)
-            errors.append(ca.norm_2((target - value) / scale))
+            left = shortest(target - value, turns)
+            errors.append(ca.norm_2(left / scale))
         chord = dense_function("chord", [q, known, H, target], [now, value, ca.vertcat(*errors)])
         return cls(inverted, chord)
 
@@ -105,7 +107,7 @@ class FewRows:
         with deferred():  # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
             solver = PointSolver(self._functions)
             done = [_solved(solver, attempt, k, targets[k], starts[k]) for k in range(len(targets))]
-        attempt.residual[:] = (targets - attempt.residual) / self._map.scale(targets)
+        attempt.residual[:] = self._map.difference(targets, attempt.residual) / self._map.scale(targets)
         failed = np.flatnonzero(~np.array(done, dtype=bool))
         if failed.size:
             attempt.replace(failed, self._other(targets[failed], starts[failed]))

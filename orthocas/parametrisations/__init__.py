@@ -1,9 +1,11 @@
 """Parametrisations xi_theta(q): linear, polynomial, Fourier, MLP, closed forms, and your own."""
 
 from orthocas.parametrisations.basis import BasisFamily
+from orthocas.parametrisations.circle import Circle
 from orthocas.parametrisations.cyclic_joints import cyclic_joints
 from orthocas.parametrisations.family import (
     ClosedForm,
+    CombinableFamily,
     CyclicParametrisation,
     Family,
     GradedFamily,
@@ -36,7 +38,9 @@ __all__ = [
     "MLP",
     "SEW",
     "BasisFamily",
+    "Circle",
     "ClosedForm",
+    "CombinableFamily",
     "CyclicParametrisation",
     "Family",
     "Fourier",

@@ -59,3 +59,8 @@ class BasisFamily:
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
         """The rows of C in another order, (size,)."""
         return theta.reshape(self.outputs, self.width)[list(order)].ravel()
+
+    def combined(self, theta: Array, B: Array) -> Array:
+        """Coefficients of B xi, (size,), for a matrix B (r, r)."""
+        coefficients: Array = (B @ theta.reshape(self.outputs, self.width)).ravel()
+        return coefficients

@@ -90,6 +90,15 @@ class ReorderableFamily(Family, Protocol):
 
 
 @runtime_checkable
+class CombinableFamily(Family, Protocol):
+    """A family that contains all linear combinations of its components."""
+
+    def combined(self, theta: Array, B: Array) -> Array:
+        """Parameters of B xi, (size,), for a matrix B (r, r)."""
+        ...
+
+
+@runtime_checkable
 class LinearFamily(Family, Protocol):
     """A family linear in its parameters: xi_theta(q) = C psi(q), where theta holds the rows of C (r, K) in a row.
 

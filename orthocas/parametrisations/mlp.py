@@ -1,4 +1,4 @@
-"""Multilayer perceptron with sine and cosine inputs ([AS2023] Sec. 6, Fig. 16)."""
+"""Multilayer perceptron of sines and cosines of the joints, or of the joints themselves ([AS2023] Sec. 6, Fig. 16)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import casadi as ca
 import numpy as np
 
-from orthocas.checks import Array, require_count
+from orthocas.checks import Array, require_count, require_kind
 from orthocas.errors import InvalidValueError
 from orthocas.parametrisations.family import Expression, JointSpace
 
@@ -22,6 +22,8 @@ class MLP:
 
     Args:
         hidden: widths of the hidden layers, each >= 1.
+        raw: whether revolute joints enter as q itself, too. Coordinates are then not periodic. The number of parameters
+            that the paper states for its network in Sec. 9 is that of raw inputs.
 
     Example:
         >>> import orthocas as oc
@@ -31,9 +33,12 @@ class MLP:
         >>> chart = oc.fit(problems.get("planar_3r_xy"), network, solver, samples=100).chart
         >>> chart.coordinates.label, chart.coordinates.size
         ('mlp:6x6', 91)
+        >>> oc.MLP(hidden=(1024, 512), raw=True).label
+        'mlp:1024x512:raw'
     """
 
     hidden: tuple[int, ...] = (64, 64)
+    raw: bool = False
     linear: ClassVar[bool] = False
     closed_form: ClassVar[None] = None
 
@@ -41,11 +46,12 @@ class MLP:
         if not isinstance(self.hidden, tuple | list) or not self.hidden:
             raise InvalidValueError("hidden", self.hidden, "the widths of at least one hidden layer, such as (64, 64)")
         object.__setattr__(self, "hidden", tuple(require_count("hidden", width) for width in self.hidden))
+        require_kind("raw", self.raw, bool)
 
     @property
     def label(self) -> str:
-        """'mlp:WIDTHxWIDTH'."""
-        return "mlp:" + "x".join(map(str, self.hidden))
+        """'mlp:WIDTHxWIDTH', and ':raw' for raw inputs."""
+        return "mlp:" + "x".join(map(str, self.hidden)) + (":raw" if self.raw else "")
 
     def for_problem(self, problem: "Problem") -> "MLP":
         """The object itself: it does not depend on the problem."""
@@ -53,7 +59,7 @@ class MLP:
 
     def family(self, space: JointSpace, outputs: int) -> "MLPFamily":
         """The network on the given joints."""
-        return MLPFamily(space, outputs, self.hidden)
+        return MLPFamily(space, outputs, self.hidden, self.raw)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +69,18 @@ class MLPFamily:
     space: JointSpace
     outputs: int
     hidden: tuple[int, ...]
+    raw: bool = False
     as_matrices: bool = True
+
+    @property
+    def direct(self) -> tuple[bool, ...]:
+        """Which joints enter as q itself."""
+        return (True,) * self.space.n if self.raw else self.space.prismatic
 
     @property
     def widths(self) -> tuple[int, ...]:
         """Widths of all layers, from the inputs to the outputs."""
-        return (2 * self.space.n - sum(self.space.prismatic), *self.hidden, self.outputs)
+        return (2 * self.space.n - sum(self.direct), *self.hidden, self.outputs)
 
     @property
     def size(self) -> int:
@@ -102,17 +114,17 @@ class MLPFamily:
         t = len(self._turning)
         by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[self._turning, :]), 1, self.outputs)
         by_angle -= gradients[t : 2 * t, :] * ca.repmat(ca.sin(q[self._turning, :]), 1, self.outputs)
-        rows = np.argsort([*self._turning, *self._sliding]).tolist()  # back to the order of the joints
+        rows = np.argsort([*self._turning, *self._direct_joints]).tolist()  # back to the order of the joints
         stacked = ca.vertcat(by_angle, gradients[2 * t :, :])[rows, :]
         return [stacked[:, j * N : (j + 1) * N] for j in range(self.outputs)]
 
     @property
     def _turning(self) -> list[int]:
-        return [i for i, slides in enumerate(self.space.prismatic) if not slides]
+        return [i for i, direct in enumerate(self.direct) if not direct]
 
     @property
-    def _sliding(self) -> list[int]:
-        return [i for i, slides in enumerate(self.space.prismatic) if slides]
+    def _direct_joints(self) -> list[int]:
+        return [i for i, direct in enumerate(self.direct) if direct]
 
     def _layers(self, theta: Expression) -> list[tuple[Expression, Expression]]:
         """Weights and biases of every layer."""
@@ -128,7 +140,7 @@ class MLPFamily:
     ) -> tuple[Expression, list[Expression]]:
         """Outputs (r, N), and the derivatives 1 - tanh^2 of the hidden layers, (width, N) each."""
         angles = q[self._turning, :]
-        layer = ca.vertcat(ca.sin(angles), ca.cos(angles), q[self._sliding, :])
+        layer = ca.vertcat(ca.sin(angles), ca.cos(angles), q[self._direct_joints, :])
         slopes = []
         for depth, (W, b) in enumerate(layers):
             layer = W @ layer + ca.repmat(b, 1, q.shape[1])
@@ -148,6 +160,10 @@ class MLPFamily:
 
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
         """Parameters with the outputs in another order, (size,)."""
+        return self.combined(theta, np.eye(self.outputs)[list(order)])  # the products with 0 and 1 are exact
+
+    def combined(self, theta: Array, B: Array) -> Array:
+        """Parameters of B xi, (size,), for a matrix B (r, r)."""
         last = self.outputs * (self.widths[-2] + 1)  # W_out column by column, then b_out
-        columns = theta[-last:].reshape(-1, self.outputs)[:, list(order)]
+        columns = theta[-last:].reshape(-1, self.outputs) @ B.T
         return np.concatenate([theta[:-last], columns.ravel()])

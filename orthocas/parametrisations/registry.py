@@ -8,6 +8,7 @@ from typing import Any
 
 from orthocas.checks import require_kind, require_known
 from orthocas.errors import InvalidValueError, NotSavableWarning
+from orthocas.parametrisations.circle import Circle
 from orthocas.parametrisations.cyclic import Cyclic, parse_suffix
 from orthocas.parametrisations.family import Parametrisation
 from orthocas.parametrisations.fourier import Fourier
@@ -93,7 +94,9 @@ def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
             kind.__name__,
             f"a registered one, so that it can be saved: orthocas.register_parametrisation('...', {kind.__name__})",
         )
-    settings = asdict(parametrisation)
+    parts = {part.name: getattr(parametrisation, part.name) for part in fields(parametrisation)}
+    inner = {name: parametrisation_to_data(part) for name, part in parts.items() if isinstance(part, Parametrisation)}
+    settings = {**asdict(parametrisation), **inner}
     try:
         json.dumps(settings)
     except (TypeError, ValueError) as error:
@@ -115,13 +118,15 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
     kind = kinds[name]
     require_kind("settings", settings, dict)
     known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    inner = {name: part for name, part in settings.items() if isinstance(part, dict) and "parametrisation" in part}
+    settings = settings | {name: parametrisation_from_data(part) for name, part in inner.items()}
     if not settings.keys() <= known:
         raise InvalidValueError(f"settings of {kind.__name__}", sorted(settings), f"some of {sorted(known)}")
     return kind(**settings)
 
 
 def parse_parametrisation(label: str) -> Parametrisation:
-    """Parse a label: 'polynomial:4', 'fourier:2:cyclic', 'mlp:64x64', 'linear', 'sew:stereographic', or your own.
+    """Parse a label: 'polynomial:4', 'fourier:2:cyclic', 'mlp:64x64:raw', 'circle:mlp:32x32', 'linear', or your own.
 
     Raises:
         UnknownNameError: if there is no such parametrisation.
@@ -149,6 +154,13 @@ def _degree_and_cyclic(text: str) -> tuple[int, Cyclic]:
     return _whole(degree), parse_suffix(rest)
 
 
+def _mlp(text: str) -> MLP:
+    widths, colon, inputs = text.partition(":")
+    if colon and inputs != "raw":
+        raise InvalidValueError("parametrisation", repr(f"mlp:{text}")[:80], "nothing but ':raw' after the widths")
+    return MLP(tuple(_whole(width) for width in widths.split("x")), bool(colon))
+
+
 def _linear(text: str) -> Linear:
     if text:
         raise InvalidValueError("parametrisation", repr(f"linear:{text}"), "'linear' without a number")
@@ -158,6 +170,7 @@ def _linear(text: str) -> Linear:
 register("linear", Linear, _linear)
 register("polynomial", Polynomial, lambda text: Polynomial(*_degree_and_cyclic(text)))
 register("fourier", Fourier, lambda text: Fourier(*_degree_and_cyclic(text)))
-register("mlp", MLP, lambda text: MLP(tuple(_whole(width) for width in text.split("x"))))
+register("mlp", MLP, _mlp)
 register("sew", SEW, lambda text: SEW(text or "stereographic"))
+register("circle", Circle, lambda text: Circle(parse_parametrisation(text)))
 register("given", Given)

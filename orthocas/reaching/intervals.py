@@ -96,6 +96,8 @@ def xi_range(chart: "Chart", q: ArrayLike) -> XiRange:
 
 def too_far(chart: "Chart", q: Array, wanted: Array) -> str:
     """The coordinate that is wanted (r,) farthest outside its range at q (n,), in words; empty if there is none."""
+    if chart.turns.any():
+        return ""
     reach = xi_range(chart, q)
     beyond = np.maximum(reach.low - wanted, wanted - reach.high)
     k = int(np.argmax(beyond))
@@ -135,9 +137,17 @@ def branch_along(chart: "Chart", q: Array, k: int, sign: float) -> Branch:
     return curve.follow(q, sign * chart.jacobian(q)[row], rising)
 
 
+def xi_along(chart: "Chart", points: Array) -> Array:
+    """Coordinates (N, r) along a curve from its first point on, without the jumps of circle-valued ones."""
+    xi, turns = chart.xi(points), chart.turns[chart.m :]
+    for k in np.flatnonzero(turns):
+        xi[:, k] = np.unwrap(xi[:, k], period=turns[k])
+    return xi
+
+
 def _interval(chart: "Chart", q: Array, k: int) -> Interval:
     down, up = branch_along(chart, q, k, -1.0), branch_along(chart, q, k, 1.0)
-    low, high = (float(chart.xi(branch.q[-1])[k]) for branch in (down, up))
+    low, high = (float(xi_along(chart, branch.q)[-1, k]) for branch in (down, up))
     return Interval(
         chart.labels[chart.m + k],
         float(chart.xi(q)[k]),

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.checks import Array, as_number, frozen_array, require_count
+from orthocas.coordinates.turns import require_no_turns
 from orthocas.errors import InvalidValueError
 from orthocas.reaching.curves import Branch, LevelCurve
-from orthocas.reaching.intervals import Interval, XiRange, branch_along, start_inside, xi_range
+from orthocas.reaching.intervals import Interval, XiRange, branch_along, start_inside, xi_along, xi_range
 from orthocas.reaching.lattice import filled
 from orthocas.showing import Shown
 
@@ -76,7 +77,7 @@ def _curve(chart: "Chart", q: Array, step: float) -> SelfMotionCurve:
     up = curve.follow(q, gradient)
     down = Branch(q[None], np.zeros(1), up.stop) if up.endless else curve.follow(q, -gradient)
     points = np.concatenate([down.q[:0:-1], up.q])
-    xi = _unwrapped(chart, chart.xi(points))
+    xi = xi_along(chart, points)
     rises = np.sign(np.diff(xi[:, 0]))
     low, high = (down, up) if xi[0, 0] <= xi[-1, 0] else (up, down)
     place = len(down.q) - 1
@@ -95,6 +96,7 @@ def _curve(chart: "Chart", q: Array, step: float) -> SelfMotionCurve:
 
 def _set(chart: "Chart", q: Array, samples: int) -> SelfMotion:
     """Points on a lattice in xi, and the extent from its outermost points on."""
+    require_no_turns(chart.labels, chart.turns, "a set of self-motions")
     alone = xi_range(chart, q)
     points = filled(chart, q, alone, samples)
     xi = chart.xi(points)
@@ -110,12 +112,6 @@ def _widest(chart: "Chart", points: Array, xi: Array, alone: Interval, k: int) -
     up = branch_along(chart, points[np.argmax(xi[:, k])], k, 1.0)
     low, high = (float(chart.xi(branch.q[-1])[k]) for branch in (down, up))
     return Interval(alone.label, alone.here, low, high, down.stop, up.stop)
-
-
-def _unwrapped(chart: "Chart", xi: Array) -> Array:
-    """Coordinates (N, 1) along a curve, without the jumps of periodic ones."""
-    turn = getattr(chart.coordinates, "turn", 0.0)
-    return np.unwrap(xi, axis=0, period=turn) if turn else xi
 
 
 def _extents(extent: XiRange) -> dict[str, str]:

@@ -14,13 +14,12 @@ import numpy as np
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
 from orthocas.checks import Array
-from orthocas.fitting.fit import fit
 from orthocas.growing.flow import TaskFlow
 from orthocas.involutivity import TaskBrackets, lie_bracket
 from orthocas.parametrisations import Polynomial
 from orthocas.problem import Problem
+from orthocas.reproduce.chosen_fit import USUAL, ChosenFit
 from orthocas.reproduce.drawing import Drawing
-from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.section import curves_inside, isosurface, section, tilts, unit_gradients
 from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, add_3d, joint_cube, line_legend, new_figure
@@ -43,13 +42,13 @@ _ARROW = 0.22  # length of unit gradients in the picture [rad]
 _VIEW = (20, 14)
 
 
-def draw(quick: bool) -> Drawing:
+def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     """Draw both paths, self-motion curves, gradients and a fitted leaf; the numbers tell how far apart the paths end.
 
     `quick` draws a coarser leaf.
     """
     problem = section(_LOW, _HIGH)
-    chart = fit(problem, Polynomial(degree=_DEGREE), weights=PAPER_LOSS).chart
+    chart = chosen.chart(problem, Polynomial(degree=_DEGREE), quick)
     ways = [way(problem, _START, order, _DRAWN) for order in ((0, 1), (1, 0))]
     figure = new_figure(4.6, layout=None)
     axes = add_3d(figure, 0.1, 0.1, 0.8, 0.89)

@@ -8,15 +8,16 @@ from matplotlib.colors import LightSource
 from matplotlib.ticker import MaxNLocator
 
 from orthocas.checks import Array
+from orthocas.reproduce.chosen_fit import USUAL, ChosenFit
 from orthocas.reproduce.drawing import Drawing
-from orthocas.reproduce.planar_fit import fitted_from_grown
-from orthocas.reproduce.planar_flow import cell_centres, corners, deviations, planar_problem
+from orthocas.reproduce.planar_fit import freely_fitted
+from orthocas.reproduce.planar_flow import cell_centres, corners, deviations
 from orthocas.reproduce.style import LABEL, TICK, add_3d, joint_axis, new_figure
 
 
-def draw(quick: bool) -> Drawing:
+def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     """Draw both surfaces; the numbers give their ranges and show right angles almost everywhere."""
-    chart = fitted_from_grown(planar_problem("euclidean"), quick)
+    chart = freely_fitted("euclidean", quick, chosen)
     cells = 40 if quick else 160
     q, points = corners(cells)
     h, xi = (values.reshape(cells + 1, cells + 1) for values in chart.phi(points).T)

@@ -9,14 +9,13 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
-from orthocas.fitting.fit import fit
 from orthocas.involutivity import involutivity
 from orthocas.parametrisations import Polynomial
 from orthocas.problem import Problem
 from orthocas.quality import evaluate
+from orthocas.reproduce.chosen_fit import USUAL, ChosenFit
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.fig10 import GREEN, RED
-from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.section import curves_inside, isosurface, section, tilts, unit_gradients
 from orthocas.reproduce.style import TASK, add_3d, joint_cube, line_legend, new_figure
@@ -32,13 +31,13 @@ _LEAF, _PLANE = "#c9cdd3", "#e4572e"
 _VIEW = (25, 244)
 
 
-def draw(quick: bool) -> Drawing:
+def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     """Draw curves, gradients, planes and isosurfaces; the numbers tell how far planes and isosurfaces are from tangent.
 
     `quick` draws coarser surfaces.
     """
     problem = section(_LOW, _HIGH)
-    chart = fit(problem, Polynomial(degree=_DEGREE), weights=PAPER_LOSS).chart
+    chart = chosen.chart(problem, Polynomial(degree=_DEGREE), quick)
     levels = np.quantile(chart.xi(sample_uniform(problem.domain, _SAMPLES, 3))[:, 0], _SHARES)
     curves = curves_inside(problem, _starts(problem), 0.02)
     places = np.concatenate([_crossings(chart, curve, levels) for curve in curves])

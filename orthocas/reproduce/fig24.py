@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from orthocas.reproduce.chosen_fit import USUAL, ChosenFit
 from orthocas.reproduce.closed_loop_picture import (
     COLOURS,
     curve_legend,
@@ -46,13 +47,13 @@ _COLUMNS = {  # name: title, place, view of the camera
 _LEFT, _RIGHT = 0.115, 0.985
 
 
-def draw(quick: bool) -> Drawing:
+def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     """Draw three columns of coordinates, planes, joints and curves in joint space; the numbers describe each column."""
     arm = Arm()
     charts = {
         "gentle_linear": arm.linear("x", GENTLE),
         "strong_linear": arm.linear("x", STRONG),
-        "strong_fitted": arm.fitted("x", STRONG, quick),
+        "strong_fitted": arm.fitted("x", STRONG, quick, chosen),
     }
     figure = new_figure(9.1, layout=None)
     grid = figure.add_gridspec(

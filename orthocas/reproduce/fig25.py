@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from orthocas.reproduce.chosen_fit import USUAL, ChosenFit
 from orthocas.reproduce.closed_loop_picture import (
     curve_legend,
     draw_coordinates,
@@ -28,10 +29,10 @@ _PARTS = {  #: terms of the unwanted task acceleration: field of the breakdown, 
 }
 
 
-def draw(quick: bool) -> Drawing:
+def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     """Draw coordinates, acceleration terms, plane and joints; numbers compare the terms, also for linear charts."""
     arm = Arm()
-    chart = arm.fitted("x", GENTLE, quick)
+    chart = arm.fitted("x", GENTLE, quick, chosen)
     run = follow(chart, arm.base(GENTLE), INTERLEAVED, feed_forward=False)
     linear = follow(arm.linear("x", GENTLE), arm.base(GENTLE), INTERLEAVED, feed_forward=False)
     numbers = run.numbers() | {"task_angle_std_deg": task_angle_std(chart, arm.box(GENTLE), quick)}

@@ -9,6 +9,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from orthocas.reproduce.chosen_fit import USUAL, ChosenFit
 from orthocas.reproduce.closed_loop_picture import (
     curve_legend,
     draw_coordinates,
@@ -28,11 +29,11 @@ _TITLES = {
 }
 
 
-def draw(quick: bool) -> Drawing:
+def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     """Draw four columns of coordinates, plane and joints; the numbers describe each column."""
     arm = Arm()
     start, box = arm.base(FOLDED), arm.box(FOLDED)
-    linear, fitted = arm.linear("xy", FOLDED), arm.fitted("xy", FOLDED, quick)
+    linear, fitted = arm.linear("xy", FOLDED), arm.fitted("xy", FOLDED, quick, chosen)
     runs = {
         "linear_small": follow(linear, start, SMALL),
         "linear_large": follow(linear, start, LARGE),

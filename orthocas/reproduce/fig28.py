@@ -1,24 +1,29 @@
 """[AS2023] Fig. 28: a journey of the 7-DoF arm in task and extra coordinates, which ends where it began.
 
 The control law is velocity control dq = J^-1 d_phi_d without feedback (Sec. 9), with A = I and polynomials instead of
-the network. The paper shows measurements on a robot; here dq is integrated, and the steps are ours.
+the network. The paper shows measurements on a robot; here dq is integrated, and the steps are ours. `draw_log` does the
+same for logged joints.
 """
 
+from functools import lru_cache
 from itertools import cycle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from orthocas import problems
 from orthocas.chart import Chart
+from orthocas.checks import Array
 from orthocas.control import Kinematic, Reference
-from orthocas.fitting.fit import fit
 from orthocas.parametrisations import Polynomial
 from orthocas.quality import evaluate
+from orthocas.reproduce.chosen_fit import USUAL, ChosenFit
 from orthocas.reproduce.drawing import Drawing
-from orthocas.reproduce.paper_loss import PAPER_LOSS
+from orthocas.reproduce.joint_log import read_joint_log
 from orthocas.reproduce.style import LABEL, TICK, new_figure
-from orthocas.simulation import Trajectory, coupling_index, simulate
+from orthocas.simulation import coupling_index, simulate
 
 JOURNEY = (  # coordinate and target of each step, relative to the value at the start, [m] or [1]
     *(("xi1", -0.5), ("x", 0.12), ("xi3", -0.5), ("y", -0.25), ("xi4", 0.6), ("z", -0.15), ("xi2", 0.4)),
@@ -31,20 +36,18 @@ _TOLERANCE = 1e-10  # of CVODES; without feedback, its errors remain in the join
 _COLOURS = ("#1f5fa8", "#d95f02", "#1b9e77", "#e7298a", "#7570b3", "#a6761d", "#222222")
 
 
-def draw(quick: bool) -> Drawing:
+@lru_cache(maxsize=4)
+def arm_chart(quick: bool, chosen: ChosenFit) -> Chart:
+    """The coordinates of the 7-DoF arm that Figs. 27 and 28 show."""
+    return chosen.chart(problems.get("iiwa"), Polynomial(4), quick)
+
+
+def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     """Draw task, coordinates and joints over time; the numbers tell how exactly the arm returns."""
-    chart = fit(problems.get("iiwa"), Polynomial(4), weights=PAPER_LOSS).chart
+    chart = arm_chart(quick, chosen)
     reference = journey(chart)
     run = simulate(Kinematic(chart, limit=np.inf), reference, chart.problem.domain.centre, tolerance=_TOLERANCE)
-    figure = new_figure(6.2)
-    panes = figure.subplots(3, 1, sharex=True)
-    names = [rf"$\xi_{k + 1}$" for k in range(chart.r)]
-    _draw_values(
-        panes[0], run, slice(chart.m), list(chart.problem.task.labels), "(a) task $x$ [m]; wide: desired, thin: actual"
-    )
-    _draw_values(panes[1], run, slice(chart.m, None), names, r"(b) coordinates $\xi$ [1]")
-    _draw_joints(panes[2], run)
-    panes[2].set_xlabel("time [s]", fontsize=LABEL)
+    figure = _picture(chart, run.times, run.q, run.value, run.reference)
     quality = evaluate(chart, 5_000 if quick else 30_000)
     away = np.abs(run.q - run.q[0])
     numbers = {
@@ -71,20 +74,60 @@ def journey(chart: Chart) -> Reference:
     return Reference.steps(chart.labels, start, changes, times[-1] + _REST)
 
 
-def _draw_values(axes: Any, run: Trajectory, which: slice, names: list[str], title: str) -> None:
-    """Draw desired values wide and pale, and actual values thin and dark on top."""
-    for wanted, reached, name, colour in zip(
-        run.reference[:, which].T, run.value[:, which].T, names, cycle(_COLOURS), strict=False
+def draw_log(path: str | Path, chart: Chart) -> Drawing:
+    """Draw logged joint positions, and the task and coordinates that they have on a chart.
+
+    Args:
+        path: CSV file, see `orthocas.reproduce.joint_log`.
+        chart: a chart of the arm. Where the log leaves its domain, coordinates mean nothing; a number tells the share.
+
+    Raises:
+        PathFileError: if the file cannot be read.
+    """
+    log = read_joint_log(path, chart)
+    phi, away = chart.phi(log.q), np.abs(log.q - log.q[0])
+    numbers = {
+        "instants": float(len(log.times)),
+        "seconds": float(np.ptp(log.times)),
+        "joint_difference_of_end_and_start_rad": float(away[-1].max()),
+        "largest_joint_excursion_rad": float(away.max()),
+        "share_outside_the_domain": float(1 - np.mean(chart.problem.domain.contains(log.q))),
+    }
+    for label, actual, wanted in zip(chart.labels, phi.T, log.desired.T, strict=True):
+        numbers[f"difference_of_end_and_start_{label}"] = float(abs(actual[-1] - actual[0]))
+        if np.isfinite(wanted).all():
+            numbers[f"largest_error_{label}"] = float(np.abs(actual - wanted).max())
+    return Drawing({"": _picture(chart, log.times, log.q, phi, log.desired)}, numbers)
+
+
+def _picture(chart: Chart, times: Array, q: Array, actual: Array, desired: Array) -> Figure:
+    """Draw phi, actual and desired (N, n), and the joints (N, n) over time."""
+    figure = new_figure(6.2)
+    panes = figure.subplots(3, 1, sharex=True)
+    m, units = chart.m, sorted(set(chart.problem.task.units))
+    names = [*chart.problem.task.labels, *(rf"$\xi_{k + 1}$" for k in range(chart.r))]
+    for axes, which, title in (
+        (panes[0], slice(m), f"(a) task $x$ [{', '.join(units)}]; wide: desired, thin: actual"),
+        (panes[1], slice(m, None), r"(b) coordinates $\xi$ [1]"),
     ):
-        axes.plot(run.times, wanted, color=colour, linewidth=3.2, alpha=0.3)
-        axes.plot(run.times, reached, color=colour, linewidth=0.9, label=name)
+        _draw_values(axes, times, desired[:, which], actual[:, which], names[which], title)
+    _draw_joints(panes[2], times, q)
+    panes[2].set_xlabel("time [s]", fontsize=LABEL)
+    return figure
+
+
+def _draw_values(axes: Any, times: Array, desired: Array, actual: Array, names: list[str], title: str) -> None:
+    """Draw desired values wide and pale, and actual values thin and dark on top."""
+    for wanted, reached, name, colour in zip(desired.T, actual.T, names, cycle(_COLOURS), strict=False):
+        axes.plot(times, wanted, color=colour, linewidth=3.2, alpha=0.3)
+        axes.plot(times, reached, color=colour, linewidth=0.9, label=name)
     _finish(axes, title)
 
 
-def _draw_joints(axes: Any, run: Trajectory) -> None:
-    """Draw joint angles, with dotted lines at their start values."""
-    for k, (q, colour) in enumerate(zip(run.q.T, _COLOURS, strict=True), 1):
-        axes.plot(run.times, q, color=colour, linewidth=0.9, label=f"$q_{k}$")
+def _draw_joints(axes: Any, times: Array, joints: Array) -> None:
+    """Draw joint positions, with dotted lines at their start values."""
+    for k, (q, colour) in enumerate(zip(joints.T, cycle(_COLOURS), strict=False), 1):
+        axes.plot(times, q, color=colour, linewidth=0.9, label=f"$q_{{{k}}}$")
         axes.axhline(q[0], color=colour, linewidth=0.9, linestyle=":")
     _finish(axes, "(c) joints $q$ [rad]; dotted: start values")
 

@@ -2,6 +2,7 @@
 
 from matplotlib.figure import Figure
 
+from orthocas.reproduce.chosen_fit import USUAL, ChosenFit
 from orthocas.reproduce.closed_loop_picture import (
     curve_legend,
     draw_coordinates,
@@ -16,10 +17,10 @@ from orthocas.reproduce.style import LABEL, new_figure
 _TITLES = {"feed_forward": "with feed-forward", "feedback": "feedback only"}
 
 
-def draw(quick: bool) -> Drawing:
+def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     """Draw two columns of coordinates, planes and joints; the numbers describe each column."""
     arm = Arm()
-    chart, start = arm.fitted("xy", FOLDED, quick), arm.base(FOLDED)
+    chart, start = arm.fitted("xy", FOLDED, quick, chosen), arm.base(FOLDED)
     runs = {name: follow(chart, start, ALL_OF_XY, name == "feed_forward") for name in _TITLES}
     numbers = {key: value for name, run in runs.items() for key, value in run.numbers(f"{name}_").items()}
     numbers["task_angle_std_deg"] = task_angle_std(chart, arm.box(FOLDED), quick)

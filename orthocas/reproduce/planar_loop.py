@@ -24,10 +24,10 @@ from orthocas.control.damping import DampingDesign
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import Box, Domain, Torus
 from orthocas.fitting.fit import fit
-from orthocas.parametrisations import Linear, Polynomial
+from orthocas.parametrisations import CombinableFamily, Linear, Polynomial
 from orthocas.problem import Problem
 from orthocas.quality import evaluate
-from orthocas.reproduce.paper_loss import PAPER_LOSS
+from orthocas.reproduce.chosen_fit import USUAL, ChosenFit
 from orthocas.robots import Robot
 from orthocas.simulation import Coupling, Trajectory, coupling_index, simulate
 from orthocas.tasks import Task
@@ -92,20 +92,20 @@ class Arm:
         base = tuple(self.base(place).tolist())
         return fit(self.problem(axes, Torus(3)), Linear(base, "paper")).chart
 
-    def fitted(self, axes: Axes, place: Place, quick: bool) -> Chart:
-        """Polynomials fitted on the box of the place, in the combination that agrees with `linear` at the base.
+    def fitted(self, axes: Axes, place: Place, quick: bool, chosen: ChosenFit = USUAL) -> Chart:
+        """Coordinates fitted on the box of the place, in the combination that agrees with `linear` at the base.
 
         The same steps then begin with the same motion. Linear combinations of coordinates stay orthogonal to the task.
         """
-        return _fitted(self, axes, place, quick)
+        return _fitted(self, axes, place, quick, chosen)
 
 
 @lru_cache(maxsize=16)
-def _fitted(arm: Arm, axes: Axes, place: Place, quick: bool) -> Chart:
+def _fitted(arm: Arm, axes: Axes, place: Place, quick: bool, chosen: ChosenFit) -> Chart:
     """Fit a chart once, because several figures share it."""
     degree = 8 if axes == "x" and not quick else 6
     samples = 3000 if quick else 4000  # with 1500, rounding decides which minimum a fit of degree 6 ends in
-    chart = fit(arm.problem(axes, arm.box(place)), Polynomial(degree), weights=PAPER_LOSS, samples=samples).chart
+    chart = chosen.chart(arm.problem(axes, arm.box(place)), Polynomial(degree), quick, samples)
     base = arm.base(place)
     return combined(chart, base, arm.linear(axes, place).jacobian(base)[chart.m :])
 
@@ -114,10 +114,11 @@ def combined(chart: Chart, base: Array, gradients: Array) -> Chart:
     """The chart of B (xi - xi(base)), with the constant B for which B J_xi(base) is nearest to `gradients` (r, n)."""
     old = chart.coordinates
     assert isinstance(old, Coordinates)
+    assert isinstance(old.family, CombinableFamily)
     B = gradients @ np.linalg.pinv(chart.jacobian(base)[chart.m :])
-    C = B * old.scale @ old.theta.reshape(chart.r, -1)  # xi = scale (C psi - offset)
+    theta = old.family.combined(old.theta, B * old.scale)  # xi = scale (family - offset)
     offset = B @ (old.scale * old.offset + chart.xi(base))
-    return replace(chart, coordinates=replace(old, theta=C.ravel(), offset=offset, scale=np.ones(chart.r)))
+    return replace(chart, coordinates=replace(old, theta=theta, offset=offset, scale=np.ones(chart.r)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind
 from orthocas.control.reference import Reference
+from orthocas.coordinates.turns import shortest
 from orthocas.errors import InvalidValueError
 from orthocas.showing import Shown
 from orthocas.simulation.trajectory import Trajectory
@@ -56,7 +57,8 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
     require_kind("trajectory", trajectory, Trajectory)
     if reference.labels != chart.labels:
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
-    away = np.abs(chart.phi(trajectory.q) - reference.sample(np.minimum(trajectory.times, reference.duration))[0])
+    wanted = reference.sample(np.minimum(trajectory.times, reference.duration))[0]
+    away = np.abs(shortest(chart.phi(trajectory.q) - wanted, chart.turns))
     steps = np.diff(np.vstack([reference.start, reference.targets]), axis=0)
     index = np.full((chart.n, chart.n), np.nan)
     for segment, step in enumerate(steps):

@@ -12,6 +12,7 @@ from orthocas.checks import Array, as_number, as_point, require_kind
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
+from orthocas.coordinates.turns import shortest
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
 from orthocas.minimising.watch import Monitor, Progress
 from orthocas.simulation.closed_loop import ClosedLoop, Piece
@@ -142,7 +143,7 @@ class Prepared:
             dq=dq if loop.torque else command,
             command=command,
             status=status.ravel().astype(int),
-            value=self._rows("measured", q)[0],
+            value=_near(controller, self._rows("measured", q)[0], wanted[0]),
             reference=wanted[0],
             reference_velocity=wanted[1],
             reference_acceleration=wanted[2],
@@ -198,3 +199,11 @@ def _start_state(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | Non
             )
         return q
     return np.concatenate([q, np.zeros(loop.n) if dq_start is None else as_point("dq_start", dq_start, loop.n)])
+
+
+def _near(controller: Controller, value: Array, wanted: Array) -> Array:
+    """Measured quantities (N, k), circle-valued ones with the whole turns that bring them nearest to the reference."""
+    chart = controller.chart
+    if chart is None or controller.labels != chart.labels:
+        return value
+    return np.asarray(wanted + shortest(value - wanted, chart.turns)) if chart.turns.any() else value

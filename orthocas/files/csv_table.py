@@ -1,0 +1,75 @@
+"""Tables of numbers in CSV files: a header of names, and one row of finite numbers a line."""
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from orthocas.checks import Array
+from orthocas.errors import PathFileError
+
+_LARGEST_FILE = 2**25  # bytes
+_LARGEST = 1e6  # larger numbers are mistakes
+LONGEST = 60  #: characters of a cell in an error
+
+
+def read_table(
+    path: str | Path, what: str, rows: str, most: int, columns: Callable[[Sequence[str]], list[int]]
+) -> Array:
+    """The chosen columns of a table, in their order, (N, k).
+
+    Args:
+        path: the file.
+        what: what it is, for errors, such as "path file".
+        rows: what its rows are, such as "waypoints". There are at least two.
+        most: largest number of rows.
+        columns: takes the names of the header, and returns the indices of the columns; raises ValueError for others.
+
+    Raises:
+        PathFileError: names the file, the line, and what is wrong there.
+    """
+    lines = _lines(Path(path), what, rows, most)
+    try:
+        order = columns([cell.strip() for cell in lines[0][1]])
+        table = np.array([_numbers(line, cells, lines[0][1]) for line, cells in lines[1:]])
+    except ValueError as error:
+        raise PathFileError(f"{what} {path}: {error}") from None
+    return np.asarray(table[:, order])
+
+
+def _lines(path: Path, what: str, rows: str, most: int) -> list[tuple[int, list[str]]]:
+    """The lines that are not empty, with their numbers; a header and at least two rows."""
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(_LARGEST_FILE + 1)
+        if len(content) > _LARGEST_FILE:
+            raise PathFileError(f"{what} {path}: larger than {_LARGEST_FILE / 2**20:.0f} MiB")
+        reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
+        lines = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except OSError as error:
+        raise PathFileError(f"{what} {path}: cannot be read, {error.strerror}") from None
+    except (ValueError, csv.Error) as error:  # also bytes that are no text
+        raise PathFileError(f"{what} {path}: no CSV text, {str(error)[:LONGEST]}") from None
+    if not 3 <= len(lines) <= most + 1:
+        came = f"it has {max(len(lines) - 1, 0)} {rows} after the header"
+        raise PathFileError(f"{what} {path}: {came}, expected 2 to {most}")
+    return lines
+
+
+def _numbers(line: int, cells: Sequence[str], header: Sequence[str]) -> list[float]:
+    if len(cells) != len(header):
+        raise ValueError(f"line {line}: {len(cells)} numbers, expected {len(header)} as in the header")
+    return [_number(line, cell, name) for cell, name in zip(cells, header, strict=True)]
+
+
+def _number(line: int, cell: str, name: str) -> float:
+    try:
+        value = float("nan" if "_" in cell else cell)
+    except ValueError:
+        value = np.nan
+    if not abs(value) <= _LARGEST:
+        want = f"a number from {-_LARGEST:g} to {_LARGEST:g}"
+        raise ValueError(f"line {line}: {name.strip()} is {cell[:LONGEST]!r}, expected {want}")
+    return value

@@ -1,0 +1,150 @@
+"""Circle-valued coordinates: smooth around closed leaves, in fits, inverse maps, control laws and simulation."""
+
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas import solvers
+from orthocas.control import Kinematic, Reference
+from orthocas.control.turns import without_turns
+from orthocas.coordinates.turns import shortest
+from orthocas.errors import InvalidValueError
+from orthocas.parametrisations import JointSpace
+from orthocas.parametrisations.circle import CircleFamily
+
+RING = oc.Box([0.0, 1.2], [np.pi, 0.4], unbounded=[0])  # joint 1 turns without end
+
+
+def ring() -> oc.Problem:
+    """The radius of a planar arm: its leaves are circles of q1."""
+    robot = oc.Robot.planar([1.0, 0.7], [3.0, 2.0])
+    task = oc.Task.custom(robot, "radius", lambda q: ca.sqrt(1.49 + 1.4 * ca.cos(q[1])))
+    return oc.Problem(robot, task, "euclidean", RING)
+
+
+@pytest.fixture(scope="module")
+def around() -> oc.Chart:
+    """Coordinates of the ring; joint 1 is not split off, so that they have to be learned."""
+    weights, solver = (1000, 0, 150), solvers.LBFGS(max_iterations=150)  # the third forbids folds, and so makes it wind
+    return oc.fit(ring(), oc.Circle(oc.Fourier(2)), solver, weights=weights, samples=300, split_idle=False).chart
+
+
+def family() -> tuple[CircleFamily, np.ndarray, np.ndarray]:
+    space = JointSpace(np.zeros(3), np.ones(3), (False,) * 3, ("a", "b", "c"))
+    found = oc.Circle(oc.Polynomial(2)).family(space, 2)
+    return found, np.random.default_rng(3).normal(size=found.size), np.random.default_rng(4).normal(size=(3, 5))
+
+
+def evaluated(found: CircleFamily, theta: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angles (r, N) and gradients (r, n, N)."""
+    points, parameters = ca.SX.sym("q", *q.shape), ca.SX.sym("theta", len(theta))
+    parts = [found.expression(points, parameters), *found.jacobian(points, parameters)]
+    xi, *gradients = ca.Function("circle", [points, parameters], parts).call([q, theta])
+    return np.asarray(xi), np.array([np.asarray(part) for part in gradients])
+
+
+def test_gradients_are_those_of_the_angles() -> None:
+    found, theta, q = family()
+    gradients = evaluated(found, theta, q)[1]
+    for k in range(3):
+        shift = 1e-6 * np.eye(3)[:, [k]]
+        ahead, behind = (evaluated(found, theta, q + sign * shift)[0] for sign in (1, -1))
+        slopes = shortest((ahead - behind).T, np.full(2, 2 * np.pi)).T / 2e-6
+        assert gradients[:, k] == pytest.approx(slopes, rel=1e-5, abs=1e-6)
+
+
+def test_turning_and_reordering_the_pairs_does_so_to_the_angles() -> None:
+    found, theta, q = family()
+    xi, angles = evaluated(found, theta, q)[0], np.array([0.4, -2.0])
+    turned = evaluated(found, found.turned(theta, angles), q)[0]
+    assert np.exp(1j * turned) == pytest.approx(np.exp(1j * (xi - angles[:, None])))
+    assert evaluated(found, found.reordered(theta, [1, 0]), q)[0] == pytest.approx(xi[::-1])
+
+
+def test_coordinate_of_a_closed_leaf_has_no_fold_and_no_cut(around: oc.Chart) -> None:
+    """Real-valued coordinates have a fold on every circle. This one follows the angle of joint 1 all around."""
+    turn = np.linspace(0, 2 * np.pi, 200)
+    points = np.column_stack([turn, np.full(200, 1.3)])
+    xi = np.unwrap(around.xi(points)[:, 0])
+    assert abs(xi[-1] - xi[0]) == pytest.approx(2 * np.pi * round(abs(xi[-1] - xi[0]) / (2 * np.pi)), abs=1e-9)
+    rises = np.diff(xi)
+    assert (rises > 0).all() or (rises < 0).all()
+    assert abs(xi[-1] - xi[0]) > 6
+    assert oc.evaluate(around, 2000).task_angle.max < 0.5  # q1 itself is exact
+    assert around.turns.tolist() == [0, 2 * np.pi]
+    assert around.xi([0.0, 1.2]) == pytest.approx([0.0], abs=1e-12)
+
+
+def test_inverse_goes_the_shorter_way_across_the_cut(around: oc.Chart) -> None:
+    """Targets just beyond pi are reached from starts just before, by all solvers of phi(q) = phi."""
+    q = around.inverse([around.task([0.0, 1.3])[0], np.pi - 0.01], [0.5, 1.3])
+    phi = around.phi(q)
+    beyond = phi + np.array([0.0, 0.03])
+    many = np.tile(beyond, (20, 1))  # more than a few rows go another way
+    starts = np.tile(q, (20, 1))
+    found = around.solve(many, starts).require(inside=False).q
+    steps = [around.inverse(beyond, q), found[7], around.function("inverse")(beyond, q).full().ravel()]
+    steps.append(around.tracker(q).step(beyond))
+    for reached in steps:
+        assert np.abs(reached - q).max() < 0.1
+        assert shortest(around.phi(reached) - beyond, around.turns) == pytest.approx(np.zeros(2), abs=1e-8)
+    wanted = beyond - np.array([0.0, 2 * np.pi])  # the same point of the circle
+    assert around.inverse(wanted, q) == pytest.approx(steps[0], abs=1e-9)
+
+
+def test_laws_pull_the_shorter_way(around: oc.Chart) -> None:
+    error = without_turns(around, ca.DM([0.1, 6.0]))
+    assert np.asarray(error).ravel() == pytest.approx([0.1, 6.0 - 2 * np.pi])
+
+
+def test_velocity_control_goes_round_more_than_once(around: oc.Chart) -> None:
+    """The reference counts turns, the measured angle does not; the error stays that of the integration."""
+    q0 = np.array([0.0, 1.2])
+    start = around.phi(q0)
+    reference = Reference.steps(around.labels, start, [(0.0, {"xi1": start[1] + 9.0})], 4.0)
+    run = oc.simulate(Kinematic(around, 5.0, limit=np.inf), reference, q0, must_be_reachable=False)
+    assert run.tracking_error.max() < 1e-4
+    assert 7 < abs(run.q[-1, 0] - q0[0]) < 11  # one turn and a half
+    assert run.value[-1, 1] == pytest.approx(start[1] + 9.0, abs=0.01)
+
+
+def test_self_motion_counts_on_across_the_cut(around: oc.Chart) -> None:
+    motion = around.self_motion([0.0, 1.2])
+    assert motion.closed
+    assert np.abs(np.diff(motion.xi[:, 0])).max() < 0.5
+    assert np.ptp(motion.xi[:, 0]) > 6
+
+
+def test_grown_circle_is_distilled_across_its_cut() -> None:
+    """cos xi and sin xi are smooth where xi jumps; here xi is the angle of joint 1 itself."""
+    grown = oc.grow(ring(), leaf="circle")
+    smooth = oc.distil(grown, oc.Circle(oc.Fourier(1)), samples=500)
+    assert smooth.value_rms[0] < 1e-6
+    assert smooth.gradient_rms[0] < 1e-6
+    assert oc.distil(grown, oc.Fourier(4), samples=500).value_rms[0] > 0.1
+    with pytest.raises(InvalidValueError, match="not circle-valued for this leaf"):
+        oc.distil(oc.grow(oc.problems.get("planar_3r_x"), leaf="linear"), oc.Circle(oc.Fourier(1)))
+
+
+def test_chart_file_keeps_the_circle(around: oc.Chart, tmp_path: Path) -> None:
+    around.save(tmp_path / "c.orthocas")
+    again = oc.load(tmp_path / "c.orthocas")
+    q = np.array([[0.4, 1.1], [3.0, 1.4]])
+    assert (again.xi(q) == around.xi(q)).all()
+    assert again.coordinates.label == "circle:fourier:2"
+    assert again.turns.tolist() == around.turns.tolist()
+
+
+def test_consumers_without_circles_refuse_in_one_line(around: oc.Chart, tmp_path: Path) -> None:
+    for call in (lambda: oc.generate_c(around, tmp_path), lambda: oc.follow(around, [[1.5], [1.6]], velocity_limits=1)):
+        with pytest.raises(InvalidValueError, match=r"chart is one with circle-valued coordinates \(xi1\)"):
+            call()
+
+
+@pytest.mark.parametrize("pairs", [oc.Linear(), oc.Circle(oc.Fourier(1)), "fourier:2", oc.Fourier(2, cyclic=("q1",))])
+def test_pairs_are_families_to_fit(pairs: object) -> None:
+    with pytest.raises(InvalidValueError, match="pairs"):
+        oc.Circle(pairs)  # type: ignore[arg-type]
