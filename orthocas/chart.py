@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.cached import cached_property
-from orthocas.casadi_tools.scalar_code import scalar_code
+from orthocas.casadi_tools.scalar_code import fast_form
 from orthocas.certificates.certificate import Certificate
 from orthocas.checks import (
     Array,
@@ -130,9 +130,12 @@ class Chart(Shown):
         return (*self.problem.task.labels, *(f"xi{k + 1}" for k in range(self.r)))
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        """The fast form of a graph of this chart's functions: scalar code, or the graph itself for networks."""
+        """The fast form of a graph of this chart's functions: scalar code, or the graph itself for networks.
+
+        It is also the graph itself for robots with more than 10 joints.
+        """
         matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.as_matrices
-        return graph if matrices else scalar_code(graph)
+        return graph if matrices else fast_form(graph, self.n)
 
     @overload
     def xi(self, q: Symbolic) -> Symbolic: ...
