@@ -18,9 +18,10 @@ from conftest import ROBOTS, arm, pinocchio_position
 from programs import Run, needs_c, needs_cmake, output_of
 
 import orthocas as oc
-from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared
+from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
 from orthocas.codegen.library import STRICT, compilers
 from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector
+from orthocas.domains import sample_uniform
 from orthocas.errors import CompileError, InvalidValueError, NoExpressionError, ProofError, one_line
 from orthocas.fitting.fit import Fit
 
@@ -377,3 +378,33 @@ def test_compiled_kinematics_and_dynamics_match_pinocchio(name: str, tmp_path: P
         np.testing.assert_allclose(phi[: task.m], data.oMf[frame].translation[rows], atol=1e-10)
         jacobian = pin.computeFrameJacobian(model, data, p, frame, pin.LOCAL_WORLD_ALIGNED)
         np.testing.assert_allclose(J[: task.m], jacobian[rows], atol=1e-10)
+
+
+def law_of_chain(n: int) -> PDPlus:
+    """PD+ on linear coordinates of a planar arm with many joints."""
+    robot = oc.Robot.planar([1.0 / n] * n, [1.0] * n)
+    box = oc.Box(np.concatenate([[0.6], np.full(n - 1, 2.0 / n)]), 0.2)
+    problem = oc.Problem(robot, oc.Task.position(robot, "xy"), "inertia", box)
+    return PDPlus(oc.fit(problem, oc.Linear()).chart, 50.0, coupling="decoupled")
+
+
+@needs_c
+def test_c_of_robots_with_many_joints_is_short_and_right(tmp_path: Path) -> None:
+    """Inverses of large matrices have code of their own."""
+    lengths = []
+    for n in (12, 24):
+        law = law_of_chain(n)
+        generated = oc.generate_c(law.chart, tmp_path / str(n), law, "arm")
+        lengths.append((generated.folder / "arm.c").stat().st_size)
+    assert lengths[1] < 3.5 * lengths[0]
+    small = law_of_chain(12)
+    generated = oc.generate_c(small.chart, tmp_path / "small", small, "arm")
+    library = CompiledLibrary(compile_shared(generated, tmp_path, ("-O1",)), "arm", 12)
+    assert library.check() < 1e-12
+    q = sample_uniform(small.problem.domain, 5, 3)
+    for k, (point, dq) in enumerate(zip(q, np.random.default_rng(1).normal(size=q.shape), strict=True)):
+        reference = [small.chart.phi(q[k - 1]), 0.1 * dq, dq]
+        want = small.function(point, dq, *reference, *small.gains.values())[0].full().ravel()
+        found, status = library.control(point, dq, np.concatenate(reference), gain_numbers(small))
+        assert status == 0
+        np.testing.assert_allclose(found, want, atol=1e-11 * np.abs(want).max())

@@ -63,6 +63,16 @@ def test_inverse_and_determinant_agree_with_numpy() -> None:
     assert float(determinant) == pytest.approx(np.linalg.det(given), rel=1e-10)
 
 
+@pytest.mark.parametrize("size", [2, 11, 30])
+def test_matrices_in_loops_are_those_written_out(size: int) -> None:
+    """What graphs compute by sweeps, as for robots with many joints."""
+    A = ca.MX.sym("A", size, size)
+    inverse, determinant, root = ca.Function("f", [A], [*spd_inverse(A), square_root(A)])(given := spd(size, 1e4))
+    np.testing.assert_allclose(inverse.full() @ given, np.eye(size), atol=1e-10)
+    assert float(determinant) == pytest.approx(np.linalg.det(given), rel=1e-10)
+    np.testing.assert_allclose(root.full() @ root.full(), given, atol=1e-8)
+
+
 def damping(design: str, inertia: Array, K: Array, Z: Array) -> Array:
     M = ca.SX.sym("M", *inertia.shape)
     return np.asarray(ca.Function("D", [M], [damping_matrix(design, M, ca.SX(K), ca.SX(Z))])(inertia).full())  # type: ignore[arg-type]

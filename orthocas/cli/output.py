@@ -1,13 +1,15 @@
 """Output of the commands: aligned text for people, or one JSON object."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from orthocas.errors import one_line, printable
 from orthocas.files.json import to_json
-from orthocas.quality import Report
+
+if TYPE_CHECKING:
+    from orthocas.quality import Report
 
 
 def whole_number(text: str) -> int:
@@ -60,7 +62,7 @@ def note(text: str) -> None:
     typer.echo(f"note: {one_line(text)}", err=True)
 
 
-def report_rows(report: Report) -> dict[str, str]:
+def report_rows(report: "Report") -> dict[str, str]:
     """The rows of a quality report, with advice on command-line options."""
     rows = report.facts()
     if report.length_ratio > _UNEVEN:

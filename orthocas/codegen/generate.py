@@ -8,7 +8,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.scalar_code import scalar_code
+from orthocas.casadi_tools.scalar_code import fast_form, scalar_code
 from orthocas.chart import Chart
 from orthocas.checks import as_path, require_kind, require_shape
 from orthocas.codegen.generated import GeneratedC
@@ -105,7 +105,7 @@ def _functions(chart: Chart, controller: Controller | None, precision: Precision
     found = [
         ca.Function("chart", [q], [chart.function("phi")(q), chart.function("jacobian")(q).T]),
         ca.Function("curvature", [q, dq, v], [chart.function("second_derivative")(q, dq, v)]),
-        scalar_code(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)])),
+        fast_form(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)]), n),
     ]
     domain = chart.problem.domain
     require_no_turns(chart.labels, chart.turns, "generated C")

@@ -6,6 +6,7 @@ from typing import Any
 
 import casadi as ca
 
+from orthocas.codegen.own_code import with_own_code
 from orthocas.codegen.work_arrays import compacted
 
 _OPTIONS: dict[str, Any] = {"with_header": False, "with_export": False, "casadi_int": "int"}
@@ -37,6 +38,7 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     for function in functions:
         generator.add(function)
     items, doubles = compacted(_definitions(_with_products_of_known_sizes(generator.dump())), functions)
+    items = with_own_code(items, functions)
     names = [function.name() for function in functions]
     code = "\n\n".join(_without_warnings(items[name]) for name in _needed(items, names))
     code = re.sub(r"\bcasadi_inf\b", "INFINITY", re.sub(r"\bcasadi_nan\b", "NAN", code))

@@ -26,7 +26,7 @@ def compacted(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dic
     Raises:
         CompileError: if a new version of CasADi lays the code out in another way.
     """
-    names = {hash(f): f"casadi_f{number}" for number, f in enumerate(_in_order_of_generation(functions))}
+    names = {hash(f): f"casadi_f{number}" for number, f in enumerate(in_order_of_generation(functions))}
     changed = dict(blocks)
     needed: dict[str, int] = {}
 
@@ -43,7 +43,7 @@ def compacted(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dic
     return changed, {function.name(): need(function) for function in functions}
 
 
-def _in_order_of_generation(functions: list[ca.Function]) -> list[ca.Function]:
+def in_order_of_generation(functions: list[ca.Function]) -> list[ca.Function]:
     """The functions and all that they call, callers before callees."""
     found: dict[int, ca.Function] = {}
 

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.control.linear_algebra import spd_inverse
+from orthocas.control.linear_algebra import kind_of, spd_inverse
 from orthocas.domains import sample_uniform
 from orthocas.metrics import Metric
 from orthocas.problem import Problem
@@ -20,9 +20,10 @@ def block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
     singularities.
     """
     k = sum(blocks)
-    J, A = ca.SX.sym("J", k, n), ca.SX.sym("A", n, n)
-    B = ca.SX(spd_inverse(A)[0]) @ J.T
-    parts, volume, start = [], ca.SX(1), 0
+    kind = kind_of(n)
+    J, A = kind.sym("J", k, n), kind.sym("A", n, n)
+    B = spd_inverse(A)[0] @ J.T
+    parts, volume, start = [], kind(1), 0
     for size in blocks:
         rows = list(range(start, start + size))
         inverse, determinant = spd_inverse(J[rows, :] @ B[:, rows])

@@ -4,26 +4,51 @@ Generated C contains them, so they use no eigenvectors (which jump) and no loops
 """
 
 from functools import cache
+from typing import Any
 
 import casadi as ca
 
+from orthocas.casadi_tools.scalar_code import WRITTEN_OUT
 from orthocas.parametrisations.family import Expression
 
+LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
 _ROUNDS = 8  # accurate to rounding up to a condition number of 1e6 (tests/test_control_algebra.py)
 
 
-def spd_inverse(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Inverse and determinant of a symmetric positive definite matrix (k, k), by L D L^T without pivoting.
+def spd_inverse(matrix: Expression) -> tuple[Any, Any]:
+    """Inverse and determinant of a symmetric positive definite matrix (k, k), without pivoting.
 
-    NaN or infinite where the matrix is singular.
+    NaN or infinite where the matrix is singular. SX are written out, by L D L^T; graphs (MX) have loops instead, whose
+    code does not grow with k.
     """
     k = matrix.shape[0]
+    if isinstance(matrix, ca.MX) and k > 1:
+        return _swept(k)(matrix)
+    if k == 1:
+        return 1 / matrix, matrix
     D, LT, order = ca.ldl(matrix, False)
     inverse = ca.ldl_solve(ca.SX.eye(k), D, LT, order)
     determinant = ca.SX(1)
     for i in range(k):
         determinant *= D[i]
     return _symmetric(inverse), determinant
+
+
+@cache
+def _swept(k: int) -> ca.Function:
+    """Inverse and determinant of A (k, k) by k sweeps: each pivots on the first entry, and moves it to the end.
+
+    A sweep turns [[p, w^T], [w, R]] into [[R - w w^T / p, w / p], [w^T / p, -1 / p]]; k of them lead to -A^-1.
+    """
+    state = ca.MX.sym("state", k * k + 1)  # the matrix and the product of the pivots: what `fold` carries along
+    A = ca.reshape(state[:-1], k, k)
+    p, w = A[0, 0], A[1:, 0]
+    share = w / p
+    moved = ca.vertcat(ca.horzcat(A[1:, 1:] - w @ share.T, share), ca.horzcat(share.T, -1 / p))
+    sweeps = ca.Function("sweep", [state], [ca.vertcat(ca.vec(moved), state[-1] * p)]).fold(k)
+    matrix = ca.MX.sym("A", k, k)
+    end = sweeps(ca.vertcat(ca.vec(matrix), 1))
+    return ca.Function(LARGE_INVERSE, [matrix], [-ca.reshape(end[:-1], k, k), end[-1]])
 
 
 def square_root(matrix: Expression) -> Expression:
@@ -48,7 +73,8 @@ def square_root(matrix: Expression) -> Expression:
 @cache
 def _newton_round(k: int) -> ca.Function:
     """One round on S and the product X, both (k, k); all are rational functions of A and therefore symmetric."""
-    root, product, identity = ca.SX.sym("S", k, k), ca.SX.sym("X", k, k), ca.SX.eye(k)
+    kind = kind_of(k)
+    root, product, identity = kind.sym("S", k, k), kind.sym("X", k, k), ca.DM.eye(k)
     inverse, determinant = spd_inverse(product)
     mu_squared = determinant ** (-1 / k)
     next_root = ca.sqrt(mu_squared) * (root + root @ inverse / mu_squared) / 2
@@ -56,6 +82,11 @@ def _newton_round(k: int) -> ca.Function:
     return ca.Function("newton_round", [root, product], [_symmetric(next_root), _symmetric(next_product)])
 
 
-def _symmetric(matrix: ca.SX) -> ca.SX:
-    """Mirror the lower triangle of a matrix that is symmetric up to rounding, which halves the operations."""
-    return ca.SX(ca.tril2symm(ca.tril(matrix)))
+def _symmetric(matrix: Any) -> Any:
+    """Mirror the lower triangle of an SX that is symmetric up to rounding, which halves the operations."""
+    return matrix if isinstance(matrix, ca.MX) else ca.SX(ca.tril2symm(ca.tril(matrix)))
+
+
+def kind_of(k: int) -> Any:
+    """SX for matrices with few rows, which are fastest written out; MX for others, which then take C too long."""
+    return ca.SX if k <= WRITTEN_OUT else ca.MX

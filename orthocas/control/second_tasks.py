@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.cached import cached_property
-from orthocas.casadi_tools.scalar_code import scalar_code
+from orthocas.casadi_tools.scalar_code import fast_form
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_known
 from orthocas.control.inertia import block_inertia, median_volume
@@ -83,7 +83,7 @@ class _Joints:
         return difference
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        return scalar_code(graph)
+        return fast_form(graph, self.problem.n)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if a posture of the reference leaves the joint limits."""
@@ -147,7 +147,7 @@ class _OwnTask:
         return difference
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        return scalar_code(graph)
+        return fast_form(graph, self.problem.n)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         pass

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.cached import cached_property
-from orthocas.casadi_tools.scalar_code import scalar_code
+from orthocas.casadi_tools.scalar_code import fast_form
 from orthocas.checks import Array, as_point_set, require_shape
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
@@ -43,9 +43,12 @@ class PhiFunctions:
         return (*self.problem.task.labels, *(f"xi{k + 1}" for k in range(self.r)))
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        """The fast form of a graph of this chart's functions: scalar code, or the graph itself for networks."""
+        """The fast form of a graph of this chart's functions: scalar code, or the graph itself for networks.
+
+        It is also the graph itself for robots with more than 10 joints.
+        """
         matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.as_matrices
-        return graph if matrices else scalar_code(graph)
+        return graph if matrices else fast_form(graph, self.n)
 
     @overload
     def xi(self, q: Symbolic) -> Symbolic: ...
