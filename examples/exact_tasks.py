@@ -32,7 +32,7 @@ from orthocas.robots import KinematicTree
 LENGTHS = (1.0, 0.8, 0.7, 0.5)  # of the links [m]
 TURNED = np.tril(np.ones((4, 4)))  # absolute angles of the links from joint angles
 WEIGHTS = (1000.0, 30.0)
-DEGREES = (1, 2, 3, 4, 5, 6)
+DEGREES = (1, 2, 3, 4, 5)
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,13 @@ def suggestion() -> Any:
 
 
 @cache
+def ring() -> oc.Chart:
+    """Circle-valued coordinates on the torus."""
+    solver = solvers.LBFGS(max_iterations=10)
+    return oc.fit(problems.get("planar_2r"), oc.Circle(oc.Fourier(1)), solver, samples=200).chart
+
+
+@cache
 def circle() -> oc.Chart:
     return oc.grow(problems.get("planar_2r"), 1.0, origin=[np.pi / 3, 0.0])
 
@@ -168,6 +175,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "polynomial chart": lambda: fitted().chart,
     "linear chart": lambda: oc.fit(planar(), oc.Linear()).chart,
     "Fourier chart": lambda: oc.fit(planar(), oc.Fourier(1), samples=300).chart,
+    "circle-valued chart": ring,
     "network chart": network,
     "given chart": given,
     "chart with an idle joint": with_idle_joint,
@@ -219,6 +227,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "linear": oc.Linear,
     "Fourier": lambda: oc.Fourier(2),
     "network": oc.MLP,
+    "circle-valued": lambda: oc.Circle(oc.Fourier(2)),
     "SEW": oc.SEW,
     "given coordinates": lambda: given().coordinates.parametrisation,  # type: ignore[attr-defined]
     "solver": solvers.GaussNewton,

@@ -92,6 +92,12 @@ def test_python_blocks_of_the_page_on_the_inverse_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_python_block_of_the_page_on_circles_runs(tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "circle.md").read_text(), flags=re.DOTALL)
+    assert python(code, tmp_path).splitlines() == ["[0.   6.28] True", "True"]
+
+
+@pytest.mark.slow
 def test_python_blocks_of_the_page_on_paths_run(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "paths.md").read_text(), flags=re.DOTALL)
     printed = python("\n".join(blocks), tmp_path)

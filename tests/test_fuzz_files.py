@@ -3,7 +3,7 @@
 import pytest
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
-from fuzz.paths import paths
+from fuzz.paths import logs, paths
 from fuzz.runs import runs
 from fuzz.steps import steps
 
@@ -21,6 +21,11 @@ def test_mutated_checkpoints_are_resumed_or_refused_in_one_line() -> None:
 @pytest.mark.slow
 def test_mutated_paths_are_usable_or_refused_in_one_line() -> None:
     assert paths(300) == []
+
+
+@pytest.mark.slow
+def test_mutated_joint_logs_are_usable_or_refused_in_one_line() -> None:
+    assert logs(200) == []
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ class JointLog:
 def read_joint_log(path: str | Path, chart: Chart) -> JointLog:
     """Read a log: columns `time_s`, the names of the joints, and `desired_x`, `desired_xi1`, ... for those desired.
 
-    Columns `d_JOINT` and `dd_JOINT`, velocities and accelerations as in files of `orthocas follow`, are not used.
+    Other columns of files of `orthocas follow` (velocities, accelerations and the values of phi) are not used.
 
     Raises:
         PathFileError: names the file, the line, and what is wrong there.
@@ -54,7 +54,7 @@ def read_joint_log(path: str | Path, chart: Chart) -> JointLog:
 def _columns(names: Sequence[str], chart: Chart) -> tuple[list[int], list[str]]:
     """Columns of time, joints and desired values, and the labels of the latter."""
     joints = chart.problem.robot.joint_names
-    unused = {f"{prefix}_{joint}" for prefix in ("d", "dd") for joint in joints}
+    unused = {*chart.labels, *(f"{prefix}_{joint}" for prefix in ("d", "dd") for joint in joints)}
     desired = [label for label in chart.labels if _WANTED + label in names]
     needed = (_TIME, *joints)
     for name in names:

@@ -217,7 +217,8 @@ def _makers() -> dict[str, Call]:
         "Torus": (oc.Torus, {"n": 3}),
         "Polynomial": (oc.Polynomial, {"degree": 2, "cyclic": ["q1"]}),
         "Fourier": (oc.Fourier, {"degree": 2, "cyclic": "auto"}),
-        "MLP": (oc.MLP, {"hidden": (3, 3)}),
+        "MLP": (oc.MLP, {"hidden": (3, 3), "raw": True}),
+        "Circle": (oc.Circle, {"pairs": oc.Fourier(1)}),
         "SEW": (oc.SEW, {"kind": "stereographic"}),
         "Linear": (oc.Linear, {"base": (0.1, 0.2, 0.3), "normals": "orthonormal"}),
         "Given.from_function": (

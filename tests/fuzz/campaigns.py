@@ -8,7 +8,7 @@ from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
 from fuzz.commands import commands
-from fuzz.paths import paths
+from fuzz.paths import logs, paths
 from fuzz.robots import robots
 from fuzz.runs import runs
 from fuzz.steps import steps
@@ -18,6 +18,7 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "charts": charts,
     "checkpoints": checkpoints,
     "commands": commands,
+    "logs": logs,
     "paths": paths,
     "robots": robots,
     "runs": runs,

@@ -36,6 +36,10 @@ _WORDS = (
     "polynomial:",
     "polynomial:-1",
     "mlp:0x9",
+    "mlp:2x2:raw",
+    "circle:fourier:1",
+    "circle:linear",
+    "circle:circle:mlp:2x2",
     ":",
 )
 _SOLVERS = ("gauss_newton", "lbfgs", "ipopt", "newton")  # Adam takes the paper's 10,000 steps, 20 s, for any fit
@@ -66,6 +70,8 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose", "position:xx", "position+axis", ""),
     "--metric": ("euclidean", "inertia", "identity"),
     "--param": _WORDS,
+    "--log": ("path.csv", "nothing.csv", "steps.json", ""),
+    "--chart": ("chart.orthocas", "grown.orthocas", "cut.orthocas", ""),
     "--solver": _SOLVERS,
     "--controller": _LAWS,
     "--plant": ("mujoco", "cvodes", "MuJoCo", ""),
@@ -110,7 +116,11 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--param": "polynomial:1", "--samples": "30", "--held-out": "50", "--jobs": "0"},
         (*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, "--solver", "--seeds", "--weights", "--out"),
     ),
-    "reproduce": (("fig99", "fig", "all?", ""), {"--out": "chart.orthocas"}, ()),
+    "reproduce": (
+        ("fig99", "fig", "all?", "", "fig05"),
+        {"--out": "chart.orthocas"},
+        ("--param", "--seed", "--log", "--chart"),
+    ),
     "simulate": (
         _FILES,
         {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},

@@ -1,5 +1,6 @@
-"""Campaign of path files: what is read are finite waypoints of the right shape, or the error names file and line."""
+"""Campaigns of path files and joint logs: finite numbers of the right shape, or an error that names file and line."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from fuzz.child import Finding, run
 from fuzz.mutants import TEXTS, Rng, flipped, pick
 from fuzz.sealed_files import judged
 from orthocas.following.path_file import read_path
+from orthocas.reproduce.joint_log import read_joint_log
 
 _CELLS = (
     "0",
@@ -29,6 +31,9 @@ _CELLS = (
     "1;2",
 )
 _NAMES = ("x", "xi1", "xi2", "xi3", "y", "X", "", " x ", '"x"', "x\ty")
+_PATHS = (["x"], ["x", "xi1", "xi2"], ["xi2", "x", "xi1"])
+_LOG_NAMES = ("time_s", "q1", "q2", "q3", "q4", "d_q1", "dd_q3", "desired_x", "desired_xi2", "desired_", "", "time")
+_LOGS = (["time_s", "q1", "q2", "q3"], ["time_s", "q3", "q1", "desired_x", "q2"], ["q1", "q2", "q3", "time_s", "d_q1"])
 
 
 def paths(count: int) -> list[Finding]:
@@ -36,9 +41,19 @@ def paths(count: int) -> list[Finding]:
     return run("paths", judge, range(count))
 
 
+def logs(count: int) -> list[Finding]:
+    """Judge so many mutants of joint logs."""
+    return run("logs", judge_log, range(count))
+
+
 def judge(seed: int) -> str | None:
     """What is wrong with the treatment of a mutant."""
-    return judged(_mutant, use, seed)
+    return judged(partial(_mutant, headers=_PATHS, cells=_NAMES), use, seed)
+
+
+def judge_log(seed: int) -> str | None:
+    """What is wrong with the treatment of a mutant of a log."""
+    return judged(partial(_mutant, headers=_LOGS, cells=_LOG_NAMES), use_log, seed)
 
 
 def use(path: Path) -> None:
@@ -51,13 +66,23 @@ def use(path: Path) -> None:
     assert xi is None or np.isfinite(xi).all()
 
 
-def _mutant(rng: Rng) -> bytes:
-    header = pick(rng, (["x"], ["x", "xi1", "xi2"], ["xi2", "x", "xi1"]))
-    rows = [[f"{value:.6g}" for value in rng.normal(size=len(header))] for _ in range(int(rng.integers(2, 8)))]
+def use_log(path: Path) -> None:
+    """Read a log; its numbers have to be usable."""
+    log = read_joint_log(path, _chart())
+    assert len(log.times) == len(log.q) == len(log.desired) >= 2
+    assert log.q.shape[1] == log.desired.shape[1] == 3
+    assert np.isfinite(log.q).all()
+    assert (np.diff(log.times) > 0).all()
+
+
+def _mutant(rng: Rng, headers: tuple[list[str], ...], cells: tuple[str, ...]) -> bytes:
+    header = pick(rng, headers)
+    numbers = np.sort(rng.normal(size=(int(rng.integers(2, 8)), len(header))), axis=0)
+    rows = [[f"{value:.6g}" for value in row] for row in numbers]
     table = [[*header], *rows]
     for _ in range(int(rng.integers(0, 3))):
         row = table[0] if rng.random() < 0.3 else table[int(rng.integers(len(table)))]
-        _change(rng, row, _NAMES if row is table[0] else (*_CELLS, *TEXTS))
+        _change(rng, row, cells if row is table[0] else (*_CELLS, *TEXTS))
     text = pick(rng, ("\n", "\r\n", "\r", "\n\n")).join(",".join(row) for row in table)
     content = text.encode(errors="surrogatepass")
     if rng.random() < 0.7:
