@@ -1,0 +1,125 @@
+"""A real browser for tests: Debian's chromium without a window, driven by its DevTools protocol."""
+
+import base64
+import itertools
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+SIZE = (1500, 900)  # of the window, in pixels
+PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'")
+needs_browser = pytest.mark.skipif(PROGRAM is None, reason="no chromium: apt-get install chromium")
+_OPTIONS = (
+    *("--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-angle=swiftshader"),
+    *("--enable-unsafe-swiftshader", "--remote-debugging-port=0", "--no-first-run", "--hide-scrollbars"),
+    *("--disable-extensions", "--disable-background-networking", "--disable-component-update"),
+)
+
+
+class Page:
+    """One tab."""
+
+    def __init__(self, address: str) -> None:
+        self._socket = import_module("websockets.sync.client").connect(address, max_size=None)
+        self._numbers = itertools.count(1)
+        self.call("Page.enable")
+        self.call("Runtime.enable")
+        self.call("Network.enable")
+        self.asked: list[str] = []  #: addresses that the page has asked for
+
+    def call(self, method: str, **parameters: Any) -> Any:
+        """Call a method of the protocol, and wait for its answer."""
+        number = next(self._numbers)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
+        while True:
+            message = json.loads(self._socket.recv(timeout=60))
+            if message.get("method") == "Network.requestWillBeSent":
+                self.asked.append(message["params"]["request"]["url"])
+            if message.get("id") == number:
+                assert "error" not in message, message
+                return message["result"]
+
+    def open(self, url: str) -> None:
+        """Go to an address."""
+        self.call("Page.navigate", url=url)
+
+    def value(self, code: str) -> Any:
+        """What an expression of JavaScript is in the page; promises are awaited."""
+        found = self.call("Runtime.evaluate", expression=code, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in found, found
+        return found["result"].get("value")
+
+    def wait(self, code: str, seconds: float = 30.0) -> float:
+        """Wait until an expression is true; how long that took [s]."""
+        begin = time.monotonic()
+        while not self.value(code):
+            assert time.monotonic() - begin < seconds, f"{code} did not come true in {seconds} s"
+            time.sleep(0.02)
+        return time.monotonic() - begin
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 20, pause: float = 0.02) -> None:
+        """Press the mouse at a point, move it to another one, and let it go."""
+        self._mouse("mouseMoved", *start, 0)
+        self._mouse("mousePressed", *start)
+        for k in range(1, steps + 1):
+            share = k / steps
+            self._mouse("mouseMoved", *(a + share * (b - a) for a, b in zip(start, end, strict=True)))
+            time.sleep(pause)
+        self._mouse("mouseReleased", *end)
+
+    def click(self, code: str) -> None:
+        """Click the middle of an element that an expression gives."""
+        x, y, width, height = self.box(code)
+        for kind in ("mousePressed", "mouseReleased"):
+            self._mouse(kind, x + width / 2, y + height / 2)
+
+    def box(self, code: str) -> tuple[float, float, float, float]:
+        """Left, top, width and height of an element."""
+        found = self.value(
+            f"(() => {{ const b = ({code}).getBoundingClientRect(); return [b.x, b.y, b.width, b.height] }})()"
+        )
+        return tuple(found)
+
+    def picture(self, path: Path) -> None:
+        """Write a screenshot."""
+        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
+
+    def _mouse(self, kind: str, x: float, y: float, buttons: int = 1) -> None:
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=buttons, clickCount=1)
+
+
+@contextmanager
+def browser(folder: Path) -> Iterator[Page]:
+    """A browser with an empty profile in a folder, and its tab."""
+    assert PROGRAM is not None
+    words = [PROGRAM, *_OPTIONS, f"--window-size={SIZE[0]},{SIZE[1]}", f"--user-data-dir={folder}", "about:blank"]
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        port = _port(folder / "DevToolsActivePort", process)
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
+            tabs = [tab for tab in json.load(answer) if tab["type"] == "page"]
+        yield Page(tabs[0]["webSocketDebuggerUrl"])
+    finally:
+        process.terminate()
+        process.wait(10)
+
+
+def _port(path: Path, process: subprocess.Popen[bytes]) -> int:
+    """The port that the browser writes to a file once it listens."""
+    for _ in range(600):
+        assert process.poll() is None, "the browser ended"
+        if path.exists() and (lines := path.read_text().splitlines()):
+            return int(lines[0])
+        time.sleep(0.05)
+    raise AssertionError("the browser does not start")
