@@ -16,12 +16,11 @@ from typing import Any
 
 import pytest
 
-SIZE = (1500, 900)  # of the window, in pixels
 PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'")
 needs_browser = pytest.mark.skipif(PROGRAM is None, reason="no chromium: apt-get install chromium")
 _OPTIONS = (
-    *("--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-angle=swiftshader"),
+    *("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--disable-gpu-compositing"),
     *("--enable-unsafe-swiftshader", "--remote-debugging-port=0", "--no-first-run", "--hide-scrollbars"),
     *("--disable-extensions", "--disable-background-networking", "--disable-component-update"),
 )
@@ -60,7 +59,7 @@ class Page:
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def wait(self, code: str, seconds: float = 30.0) -> float:
+    def wait(self, code: str, seconds: float = 60.0) -> float:
         """Wait until an expression is true; how long that took [s]."""
         begin = time.monotonic()
         while not self.value(code):
@@ -100,10 +99,10 @@ class Page:
 
 
 @contextmanager
-def browser(folder: Path) -> Iterator[Page]:
-    """A browser with an empty profile in a folder, and its tab."""
+def browser(folder: Path, size: tuple[int, int] = (1000, 640)) -> Iterator[Page]:
+    """A browser with an empty profile in a folder, and its tab; small, because it renders without a graphics card."""
     assert PROGRAM is not None
-    words = [PROGRAM, *_OPTIONS, f"--window-size={SIZE[0]},{SIZE[1]}", f"--user-data-dir={folder}", "about:blank"]
+    words = [PROGRAM, *_OPTIONS, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={folder}", "about:blank"]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         port = _port(folder / "DevToolsActivePort", process)

@@ -180,8 +180,8 @@ def test_shapes_of_urdf_are_drawn_at_their_origins(tmp_path: Path) -> None:
     text = """<robot name="r"><material name="blue"><color rgba="0 0 1 1"/></material><link name="a"><visual>
     <geometry><box size="1 2 3"/></geometry></visual></link>
     <link name="b"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-    <visual>    <origin xyz="1 0 0" rpy="0 0 0"/><geometry><sphere radius="0.5"/></geometry><material name="blue"/></visual><visual>
-    <geometry><cylinder radius="0.1" length="2"/></geometry><material name="nothing"/></visual></link>
+    <visual><origin xyz="1 0 0" rpy="0 0 0"/><geometry><sphere radius="0.5"/></geometry><material name="blue"/></visual>
+    <visual><geometry><cylinder radius="0.1" length="2"/></geometry><material name="nothing"/></visual></link>
     <joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/>
     <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
     path = tmp_path / "r.urdf"

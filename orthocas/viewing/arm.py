@@ -7,7 +7,7 @@ import numpy as np
 from orthocas.checks import Array
 from orthocas.robots import Robot
 from orthocas.viewing.body_poses import BodyPoses
-from orthocas.viewing.solids import joined
+from orthocas.viewing.solids import COARSE, joined
 from orthocas.viewing.stick_arm import Look, stick_arm
 
 GHOSTS = 11  #: arms of a fan
@@ -57,7 +57,9 @@ class Ghosts:
     def __init__(self, scene: Any, name: str, robot: Robot) -> None:
         self._scene, self._name, self._robot = scene, name, robot
         self._poses = BodyPoses(robot.tree)
-        self._look = [joined(solids, (255, 255, 255)) if solids else None for solids in stick_arm(robot.tree, _SLIM)]
+        self._look = [
+            joined(solids, (255, 255, 255)) if solids else None for solids in stick_arm(robot.tree, _SLIM, COARSE)
+        ]
         self._nodes: list[Any] = []
 
     def show(self, q: Array, curve: Array) -> None:

@@ -93,12 +93,18 @@ class ChartPage:
         self._undo = self._button("Undo", "arrow-back-up", self._undone)
         with gui.add_folder("What a coordinate reaches"):
             labels = self._chart.labels[self._chart.m :]
-            self._chosen = gui.add_dropdown("coordinate", (*labels, _NONE), labels[0])
+            self._chosen = gui.add_dropdown("coordinate", (*labels, _NONE), initial_value=self._widest())
             self._sweep = self._button("Sweep", "repeat", self._swept)
 
         @self._chosen.on_update
         async def _(event: Any) -> None:
             self._loop.ask("fan", self._show_fan)
+
+    def _widest(self) -> str:
+        """The coordinate that moves the joints farthest."""
+        robot = self._chart.problem.robot
+        self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
+        return max(self._fans, key=lambda fan: float(np.ptp(robot.joint_points(fan.spread(5)), axis=0).max())).label
 
     def _button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
         button = self._server.gui.add_button(label, icon=icon)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from html import escape
+from itertools import takewhile
 
 import numpy as np
 
@@ -17,7 +18,7 @@ STYLE = """<style>
 .oc{font:13px/1.45 system-ui,sans-serif;color:#22262b;padding:2px 4px 6px}
 .oc h4{font-size:11px;letter-spacing:.06em;text-transform:uppercase;color:#7a828c;margin:14px 0 5px;font-weight:600}
 .oc .name{font-size:16px;font-weight:650}.oc .about{color:#6a727c;font-size:12px}
-.oc .row{display:grid;grid-template-columns:5.2em 1fr 5.2em;gap:8px;align-items:center;margin:3px 0}
+.oc .row{display:grid;grid-template-columns:6.4em 1fr 4.6em;gap:8px;align-items:center;margin:3px 0}
 .oc .row>span:first-child{overflow:hidden;text-overflow:ellipsis;white-space:nowrap}
 .oc .row>b{font-weight:500;text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
 .oc .bar{position:relative;height:8px;border-radius:4px;background:#e9ecef}
@@ -74,30 +75,40 @@ class JointBars:
     """One bar for each joint: its limits, the domain as a darker band, and where the joint is."""
 
     def __init__(
-        self, names: Iterable[str], prismatic: Iterable[bool], lower: Array, upper: Array, low: Array, high: Array
+        self, names: Sequence[str], prismatic: Iterable[bool], lower: Array, upper: Array, low: Array, high: Array
     ) -> None:
         low, high = np.maximum(low, lower), np.minimum(high, upper)
         ends = np.where(np.isfinite(lower), lower, np.where(np.isfinite(low), low, -np.pi))
         tops = np.where(np.isfinite(upper), upper, np.where(np.isfinite(high), high, np.pi))
         spans = np.maximum(tops - ends, 1e-9)
         bands = np.clip(np.column_stack([low - ends, high - ends]) / spans[:, None], 0, 1)
-        self._joints = list(zip(names, prismatic, ends.tolist(), spans.tolist(), bands.tolist(), strict=True))
+        shown = without_shared_words(names)
+        self._joints = list(zip(names, shown, prismatic, ends.tolist(), spans.tolist(), bands.tolist(), strict=True))
 
     def html(self, q: Array) -> str:
         """The bars at a joint position (n,)."""
         return "".join(self._bar(*joint, value) for joint, value in zip(self._joints, q.tolist(), strict=True))
 
-    def _bar(self, name: str, slides: bool, end: float, span: float, band: list[float], value: float) -> str:
+    def _bar(
+        self, name: str, shown_name: str, slides: bool, end: float, span: float, band: list[float], value: float
+    ) -> str:
         place = (value - end) / span
         shown = place % 1 if not 0 <= place <= 1 else place
         text = f"{value:.3f} m" if slides else f"{np.degrees(value):.1f}°"
         near = min(place - band[0], band[1] - place) / max(band[1] - band[0], 1e-9)
         return (
-            f'<div class="row"><span title="{escape(name)}">{escape(name)}</span><div class="bar">'
+            f'<div class="row"><span title="{escape(name)}">{escape(shown_name)}</span><div class="bar">'
             f'<i style="left:{100 * band[0]:.1f}%;right:{100 - 100 * band[1]:.1f}%;background:#c9d3df"></i>'
             f'<u style="left:{100 * shown:.2f}%;background:{grade(near, 0.03, 0.005)}"></u></div>'
             f"{number(name, value, text)}</div>"
         )
+
+
+def without_shared_words(names: Sequence[str]) -> list[str]:
+    """Names without the words before a "_" that all of them begin with, as in panda_joint1, panda_joint2."""
+    words = [name.split("_") for name in names]
+    shared = len(list(takewhile(lambda same: len(set(same)) == 1, zip(*(each[:-1] for each in words), strict=False))))
+    return ["_".join(each[shared if len(names) > 1 else 0 :]) for each in words]
 
 
 def bar(label: str, share: float, text: str, colour: str, value: float) -> str:
@@ -198,6 +209,7 @@ class PlayerPanel:
             for k, degrees in motion.returns(seconds)
         ]
         return (
-            f'<h4>{escape(motion.name)}</h4><div class="held"><span>joints from their start</span>{shown}</div>'
+            f'<h4></h4><div class="name">{escape(motion.name)}</div>'
+            f'<div class="held"><span>joints from their start</span>{shown}</div>'
             f"{''.join(ends)}{self._joints.html(motion.at(seconds))}"
         )

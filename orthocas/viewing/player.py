@@ -12,7 +12,7 @@ from orthocas.viewing.loop import Loop
 from orthocas.viewing.motion import Motion
 from orthocas.viewing.panel import PlayerPanel
 from orthocas.viewing.stick_arm import Look, chain_length
-from orthocas.viewing.window import place_camera, place_floor, up_of
+from orthocas.viewing.window import direction_of_camera, place_camera, place_floor, up_of
 
 PATHS = ((31, 95, 168), (217, 95, 2), (27, 158, 119))  #: colours of the tool paths
 _APART = 0.9  # of arms that are side by side, as a share of their length
@@ -78,8 +78,8 @@ class PlayerPage:
         gui = self._server.gui
         self._play = gui.add_button("Play", icon="player-play")
         self._time = gui.add_slider("time [s]", 0.0, max(round(self._stage.duration, 2), _TICK), _TICK, 0.0)
-        self._speed = gui.add_dropdown("speed", _SPEEDS, "1x")
-        self._again = gui.add_checkbox("repeat", True)
+        self._speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1x")
+        self._again = gui.add_checkbox("repeat", initial_value=True)
         self._playing = False
 
         @self._play.on_click
@@ -134,11 +134,9 @@ class PlayerPage:
 
 
 def side_by_side(robot: Robot, count: int) -> Array:
-    """Where arms stand, (count, 3) [m]: in a row that is seen from the front."""
-    up = up_of(robot)
-    across = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    """Where arms stand, (count, 3) [m]: in a row from left to right for the camera."""
     places = (np.arange(count) - (count - 1) / 2) * _APART * chain_length(robot.tree)
-    return np.outer(places, across / np.linalg.norm(across))
+    return np.outer(places, np.cross(up_of(robot), direction_of_camera(robot)))
 
 
 def few(q: Array) -> Array:

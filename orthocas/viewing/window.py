@@ -19,6 +19,7 @@ from orthocas.viewing.stick_arm import chain_length
 LOCAL = "127.0.0.1"
 BRAND = (31, 95, 168)
 _VIEW_ANGLE = 0.7  # [rad] of the camera
+_ROOM = 1.1  # around the arms in the picture
 _FLAT = 1e-9
 
 
@@ -106,15 +107,13 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
     """
     points = robot.joint_points(q).reshape(-1, 3)
     points = np.concatenate([points, *(points + other for other in ([] if shift is None else shift))])
-    flat = is_planar(robot)
     low, high = points.min(axis=0), points.max(axis=0)
     middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 0.4 * chain_length(robot.tree))
     up = up_of(robot)
-    direction = np.array([0.0, 0.0, 1.0]) if flat else _front(up)
     server.scene.set_up_direction(tuple(up))
     camera = server.initial_camera
     camera.fov = _VIEW_ANGLE
-    camera.position = tuple(middle + direction * radius * 1.25 / np.sin(_VIEW_ANGLE / 2))
+    camera.position = tuple(middle + _ROOM * radius / np.sin(_VIEW_ANGLE / 2) * direction_of_camera(robot))
     camera.look_at = tuple(middle)
 
 
@@ -139,19 +138,22 @@ def is_planar(robot: Robot) -> bool:
     )
 
 
+def direction_of_camera(robot: Robot) -> Array:
+    """Unit vector to the camera: from the front, the side and above, or from where a plane is seen."""
+    if is_planar(robot):
+        return np.array([0.0, 0.0, 1.0])
+    up = up_of(robot)
+    ahead = np.eye(3)[int(np.argmin(np.abs(up)))]
+    ahead = ahead - (ahead @ up) * up
+    direction = ahead / np.linalg.norm(ahead) - 1.25 * np.cross(up, ahead) + 0.55 * up
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
 def up_of(robot: Robot) -> Array:
     """Against gravity; z without gravity."""
     gravity = robot.tree.gravity
     strength = float(np.linalg.norm(gravity))
     return np.array([0.0, 0.0, 1.0]) if strength < _FLAT else -gravity / strength
-
-
-def _front(up: Array) -> Array:
-    """A direction from the front, the side and above."""
-    ahead = np.eye(3)[int(np.argmin(np.abs(up)))]
-    ahead = ahead - (ahead @ up) * up
-    direction = 1.0 * ahead / np.linalg.norm(ahead) - 1.25 * np.cross(up, ahead) + 0.55 * up
-    return np.asarray(direction / np.linalg.norm(direction))
 
 
 def _not_shared(verbose: bool = True) -> None:
