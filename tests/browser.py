@@ -67,35 +67,21 @@ class Page:
             time.sleep(0.02)
         return time.monotonic() - begin
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 20, pause: float = 0.02) -> None:
-        """Press the mouse at a point, move it to another one, and let it go."""
-        self._mouse("mouseMoved", *start, 0)
-        self._mouse("mousePressed", *start)
-        for k in range(1, steps + 1):
-            share = k / steps
-            self._mouse("mouseMoved", *(a + share * (b - a) for a, b in zip(start, end, strict=True)))
-            time.sleep(pause)
-        self._mouse("mouseReleased", *end)
+    def press(self, key: str) -> None:
+        """Press a key, such as "End"."""
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key)
 
     def click(self, code: str) -> None:
         """Click the middle of an element that an expression gives."""
-        x, y, width, height = self.box(code)
+        middle = f"(b => [b.x + b.width / 2, b.y + b.height / 2])(({code}).getBoundingClientRect())"
+        x, y = self.value(middle)
         for kind in ("mousePressed", "mouseReleased"):
-            self._mouse(kind, x + width / 2, y + height / 2)
-
-    def box(self, code: str) -> tuple[float, float, float, float]:
-        """Left, top, width and height of an element."""
-        found = self.value(
-            f"(() => {{ const b = ({code}).getBoundingClientRect(); return [b.x, b.y, b.width, b.height] }})()"
-        )
-        return tuple(found)
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 
     def picture(self, path: Path) -> None:
         """Write a screenshot."""
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
-
-    def _mouse(self, kind: str, x: float, y: float, buttons: int = 1) -> None:
-        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=buttons, clickCount=1)
 
 
 @contextmanager

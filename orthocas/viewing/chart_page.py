@@ -79,12 +79,12 @@ class ChartPage:
         slider = self._server.gui.add_slider(name, low, high, _STEP, min(max(shown, low), high), hint=hint)
         what = label or name
 
-        @slider.on_update
-        async def _(event: Any) -> None:
+        async def moved(event: Any) -> None:
             if event.client is not None:  # otherwise the page itself moved it
                 given = float(event.target.value)
                 self._loop.ask(what, lambda: self._wish({what: given}))
 
+        slider.on_update(moved)
         return slider
 
     def _add_buttons(self) -> None:
@@ -95,10 +95,10 @@ class ChartPage:
             labels = self._chart.labels[self._chart.m :]
             self._chosen = gui.add_dropdown("coordinate", (*labels, _NONE), initial_value=self._widest())
             self._sweep = self._button("Sweep", "repeat", self._swept)
+        self._chosen.on_update(self._another)
 
-        @self._chosen.on_update
-        async def _(event: Any) -> None:
-            self._loop.ask("fan", self._show_fan)
+    async def _another(self, event: Any) -> None:
+        self._loop.ask("fan", self._show_fan)
 
     def _widest(self) -> str:
         """The coordinate that moves the joints farthest."""
@@ -109,10 +109,10 @@ class ChartPage:
     def _button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
         button = self._server.gui.add_button(label, icon=icon)
 
-        @button.on_click
-        async def _(event: Any) -> None:
+        async def clicked(event: Any) -> None:
             self._loop.ask(label, job)
 
+        button.on_click(clicked)
         return button
 
     def _add_handle(self) -> Any:
@@ -128,12 +128,12 @@ class ChartPage:
         )
         moved = [axis for axis, active in zip("xyz", axes, strict=True) if active]
 
-        @handle.on_update
-        async def _(event: Any) -> None:
+        async def dragged(event: Any) -> None:
             place = dict(zip("xyz", map(float, event.target.position), strict=True))
             self._dragging = event.phase != "end"
             self._loop.ask("tool", lambda: self._wish({axis: place[axis] for axis in moved}))
 
+        handle.on_update(dragged)
         return handle
 
     def _wish(self, values: dict[str, float]) -> None:

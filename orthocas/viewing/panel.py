@@ -83,15 +83,17 @@ class JointBars:
         spans = np.maximum(tops - ends, 1e-9)
         bands = np.clip(np.column_stack([low - ends, high - ends]) / spans[:, None], 0, 1)
         shown = without_shared_words(names)
-        self._joints = list(zip(names, shown, prismatic, ends.tolist(), spans.tolist(), bands.tolist(), strict=True))
+        places = zip(ends.tolist(), spans.tolist(), bands.tolist(), strict=True)
+        self._joints = list(zip(names, shown, prismatic, places, strict=True))
 
     def html(self, q: Array) -> str:
         """The bars at a joint position (n,)."""
         return "".join(self._bar(*joint, value) for joint, value in zip(self._joints, q.tolist(), strict=True))
 
     def _bar(
-        self, name: str, shown_name: str, slides: bool, end: float, span: float, band: list[float], value: float
+        self, name: str, shown_name: str, slides: bool, track: tuple[float, float, list[float]], value: float
     ) -> str:
+        end, span, band = track
         place = (value - end) / span
         shown = place % 1 if not 0 <= place <= 1 else place
         text = f"{value:.3f} m" if slides else f"{np.degrees(value):.1f}°"

@@ -81,16 +81,16 @@ class PlayerPage:
         self._speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1x")
         self._again = gui.add_checkbox("repeat", initial_value=True)
         self._playing = False
+        self._play.on_click(self._clicked)
+        self._time.on_update(self._slid)
 
-        @self._play.on_click
-        async def _(event: Any) -> None:
-            self._loop.ask("play", self._toggle)
+    async def _clicked(self, event: Any) -> None:
+        self._loop.ask("play", self._toggle)
 
-        @self._time.on_update
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                wanted = float(event.target.value)
-                self._loop.ask("time", lambda: self._jump(wanted))
+    async def _slid(self, event: Any) -> None:
+        if event.client is not None:  # otherwise the page itself moved it
+            wanted = float(event.target.value)
+            self._loop.ask("time", lambda: self._jump(wanted))
 
     def _toggle(self) -> None:
         """Play from where the slider is, or stop."""
@@ -141,4 +141,5 @@ def side_by_side(robot: Robot, count: int) -> Array:
 
 def few(q: Array) -> Array:
     """Some of the joint positions (N, n), from first to last."""
-    return q[np.unique(np.linspace(0, len(q) - 1, 20).astype(int))]
+    rows: Array = q[np.unique(np.linspace(0, len(q) - 1, 20).astype(int))]
+    return rows

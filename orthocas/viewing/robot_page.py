@@ -35,11 +35,7 @@ class RobotPage:
             self._sliders = [self._slider(i) for i in range(robot.n)]
         home = server.gui.add_button("Home", icon="home")
 
-        @home.on_click
-        async def _(event: Any) -> None:
-            for slider, value in zip(self._sliders, self._home.tolist(), strict=True):
-                slider.value = min(max(round(value, 3), slider.min), slider.max)
-
+        home.on_click(self._go_home)
         self._show()
         self._loop.start()
 
@@ -56,11 +52,15 @@ class RobotPage:
             robot.joint_names[i], low, high, _STEP, min(max(round(middle, 3), low), high)
         )
 
-        @slider.on_update
-        async def _(event: Any) -> None:
-            self._loop.ask("joints", self._show)
-
+        slider.on_update(self._moved)
         return slider
+
+    async def _moved(self, event: Any) -> None:
+        self._loop.ask("joints", self._show)
+
+    async def _go_home(self, event: Any) -> None:
+        for slider, value in zip(self._sliders, self._home.tolist(), strict=True):
+            slider.value = min(max(round(value, 3), slider.min), slider.max)
 
     def _show(self) -> None:
         q = np.array([slider.value for slider in self._sliders])

@@ -40,7 +40,8 @@ class Session:
         self._tracker = chart.tracker(home)
         self._readers, self._walls = Readers(chart), Walls(chart.problem)
         self._past: list[Array] = []
-        self._place(home)
+        self._wished: Array = chart.phi(home)
+        self.stop = ""  #: what stopped the last motion, or ""
 
     @property
     def q(self) -> Array:

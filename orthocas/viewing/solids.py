@@ -55,7 +55,8 @@ def drum(radius: float, half_height: float, colour: Colour, facets: int = FINE) 
 
 def block(size: Array, colour: Colour) -> Solid:
     """A box of a size (3,) [m] with its middle at the origin. Faces share no vertices, so that edges look sharp."""
-    vertices, faces = [], []
+    vertices: list[Array] = []
+    faces: list[list[int]] = []
     for axis in range(3):
         for sign in (-1.0, 1.0):
             across = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)[:: int(sign)]
