@@ -3,12 +3,13 @@
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from browser import Page, browser, needs_browser, needs_viser
+from browser import PROGRAM, Page, browser
 from PIL import Image
 
 import orthocas as oc
@@ -16,7 +17,11 @@ from orthocas.fitting.fit import Fit
 from orthocas.problems.iiwa import urdf_path
 from orthocas.viewing import cyclic_motions, export_page
 
-pytestmark = [needs_viser, needs_browser, pytest.mark.slow]
+pytestmark = [
+    pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'"),
+    pytest.mark.skipif(PROGRAM is None, reason="no chromium: apt-get install chromium"),
+    pytest.mark.slow,
+]
 NUMBERS = "Object.fromEntries([...document.querySelectorAll('[data-oc]')].map(b => [b.dataset.oc, +b.dataset.value]))"
 SLIDERS = "document.querySelectorAll('.mantine-Slider-root')"
 

@@ -12,7 +12,7 @@ from orthocas.viewing.stick_arm import Look, stick_arm
 
 GHOSTS = 11  #: arms of a fan
 _SLIM = 0.32  # thickness of a ghost, as a share of the arm's
-_LOW, _MIDDLE, _HIGH = (49, 104, 189), (122, 160, 120), (230, 126, 34)  # colours along a coordinate
+_LOW, _MIDDLE, _HIGH = (24, 92, 214), (64, 168, 116), (245, 118, 10)  # colours along a coordinate
 _TRACE = 0.004  # thickness of a line, as a share of the size of the arm
 
 
@@ -71,7 +71,7 @@ class Ghosts:
             if i > 0 and solid is not None:
                 node = self._scene.add_batched_meshes_simple(
                     f"{self._name}/{i}", solid.vertices, solid.faces, quaternions[:, i], positions[:, i],
-                    batched_colors=colours, opacity=0.45, cast_shadow=False, receive_shadow=False, lod="off",
+                    batched_colors=colours, opacity=0.55, cast_shadow=False, receive_shadow=False, lod="off",
                 )  # fmt: skip
                 self._nodes.append(node)
         self._show_traces(curve)

@@ -9,7 +9,7 @@ Job = Callable[[], None]
 Tick = Callable[[float], bool]  #: seconds since it began -> whether it goes on
 
 _log = logging.getLogger(__name__)
-_FRAME = 1 / 60  # [s] between ticks
+_FRAME = 1 / 30  # [s] between ticks; browsers without a graphics card fall behind more
 _QUIET = 0.25  # [s] without jobs, after which the page settles
 
 
@@ -51,7 +51,7 @@ class Loop:
             self._wake.notify()
 
     def animate(self, tick: Tick | None) -> None:
-        """Call a function up to 60 times a second until it returns False; None ends an animation."""
+        """Call a function up to 30 times a second until it returns False; None ends an animation."""
         with self._wake:
             self._tick, self._begun = tick, time.monotonic()
             self._wake.notify()

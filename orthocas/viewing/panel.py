@@ -15,7 +15,7 @@ from orthocas.viewing.readings import Readings
 
 GOOD, FAIR, POOR = "#2f9e62", "#e0a100", "#d64545"
 STYLE = """<style>
-.oc{font:13px/1.45 system-ui,sans-serif;color:#22262b;padding:2px 4px 6px}
+.oc{font:13px/1.45 system-ui,sans-serif;color:#22262b;padding:2px 14px 6px 4px}
 .oc h4{font-size:11px;letter-spacing:.06em;text-transform:uppercase;color:#7a828c;margin:14px 0 5px;font-weight:600}
 .oc .name{font-size:16px;font-weight:650}.oc .about{color:#6a727c;font-size:12px}
 .oc .row{display:grid;grid-template-columns:6.4em 1fr 4.6em;gap:8px;align-items:center;margin:3px 0}
@@ -96,7 +96,7 @@ class JointBars:
         end, span, band = track
         place = (value - end) / span
         shown = place % 1 if not 0 <= place <= 1 else place
-        text = f"{value:.3f} m" if slides else f"{np.degrees(value):.1f}°"
+        text = f"{value:.3f} m" if slides else f"{round(np.degrees(value), 1) + 0.0:.1f}°"
         near = min(place - band[0], band[1] - place) / max(band[1] - band[0], 1e-9)
         return (
             f'<div class="row"><span title="{escape(name)}">{escape(shown_name)}</span><div class="bar">'
@@ -206,7 +206,7 @@ class PlayerPanel:
         turned = float(np.degrees(np.abs(np.where(self._prismatic, 0.0, away)).max()))
         shown = number(name, turned, f"{turned:.2f}°")
         ends = [
-            f'<div class="row"><span>after {k}</span><span class="about">cycle{"s" if k > 1 else ""}</span>'
+            f'<div class="row"><span>after {k}</span><span class="about">{"cycles" if k > 1 else "cycle"}</span>'
             f"{number(f'{motion.name} after {k}', degrees, f'{degrees:.2f}°')}</div>"
             for k, degrees in motion.returns(seconds)
         ]

@@ -1,4 +1,4 @@
-"""A real browser for tests: Debian's chromium without a window, driven by its DevTools protocol."""
+"""A real browser for tests and benchmarks: chromium without a window, driven by its DevTools protocol."""
 
 import base64
 import itertools
@@ -10,15 +10,10 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'")
-needs_browser = pytest.mark.skipif(PROGRAM is None, reason="no chromium: apt-get install chromium")
 _OPTIONS = (
     *("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--disable-gpu-compositing"),
     *("--enable-unsafe-swiftshader", "--remote-debugging-port=0", "--no-first-run", "--hide-scrollbars"),
