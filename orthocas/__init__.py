@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from orthocas.simulation import simulate, simulate_many
     from orthocas.singularities import jumps, singular_points
     from orthocas.tasks import Task
+    from orthocas.viewing.view import view
 
 __version__ = _VERSION
 __all__ = [
@@ -128,6 +129,7 @@ __all__ = [
     "singular_points",
     "solvers",
     "suggest_domain",
+    "view",
 ]
 
 # Everything is imported on first use: all of it takes half a second, and few programs need all.
@@ -162,6 +164,7 @@ _HOMES = {
     "orthocas.simulation": ["simulate", "simulate_many"],
     "orthocas.singularities": ["jumps", "singular_points"],
     "orthocas.tasks": ["Task"],
+    "orthocas.viewing.view": ["view"],
 }
 _PLACES = {name.split()[-1]: (home, name.split()[0]) for home, names in _HOMES.items() for name in names}
 

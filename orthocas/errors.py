@@ -195,6 +195,10 @@ class PathFileError(ArchiveError):
     """A file of a tool path or of joint positions cannot be read or written."""
 
 
+class ViewError(OrthocasError, RuntimeError):
+    """A page in the browser cannot be opened: its port is taken, or its address is not one of this machine."""
+
+
 class GrowError(OrthocasError, ValueError):
     """Coordinates cannot be grown with the given arguments."""
 

@@ -86,7 +86,7 @@ def build_robot(path: str, options: ProblemOptions) -> Robot:
         OrthocasError: if anything does not fit together.
     """
     tool = None if options.tool is None else parse_numbers("--tool", options.tool)
-    return Robot.from_file(path, options.tip, _locked(options.lock), tool)
+    return Robot.from_file(path, options.tip, locked_joints(options.lock), tool)
 
 
 def build_problem(name: str, options: ProblemOptions) -> Problem:
@@ -149,7 +149,7 @@ def _half_width(options: ProblemOptions) -> Array | None:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-def _locked(words: tuple[str, ...]) -> dict[str, float]:
+def locked_joints(words: tuple[str, ...]) -> dict[str, float]:
     """Parse "joint=value" words."""
     locked = {}
     for word in words:

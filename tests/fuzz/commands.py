@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from public_objects import circle, fitted
+from public_objects import circle, fitted, joint_motion
 
 from fuzz.child import Finding, run
 from fuzz.robots import text_of, urdf_chain
@@ -76,9 +76,17 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--controller": _LAWS,
     "--plant": ("mujoco", "cvodes", "MuJoCo", ""),
     "--steps": _FILES,
+    **dict.fromkeys(("--export",), ("page.html", "", ".", "/dev/null/x", "chart.orthocas")),
+    "--host": ("203.0.113.7", "", "nowhere", "::2"),
+    "--port": ("0", "-1", "99999", "1.5", ""),
+    "--path": _FILES,
+    "--chart": _FILES,
+    "--robot": ("arm.urdf", "nothing.urdf", "chart.orthocas"),
+    "--cycles": ("0", "1", "99999", ""),
     "--to": ("numpy", "torch", "jax", "", "tensorflow"),
     "--name": ("arm", "int", "1arm", "a b", "math", "é", "x" * 200, "main"),
 }
+_KEPT = ("--export",)  # without it, the command serves until Ctrl-C
 _PROBLEM_OPTIONS = ("--tip", "--lock", "--tool")
 _DOMAIN_OPTIONS = ("--task", "--metric", "--centre", "--home", "--half-width")
 _AUTO_OPTIONS = ("--domain", "--leak-deg", "--conditioning")
@@ -135,6 +143,11 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
             *("--link-radius", "--clearance"),
         ),
     ),
+    "view": (
+        (*_FILES, "q.csv"),
+        {"--export": "page.html"},
+        ("--chart", "--path", "--robot", "--cycles", "--host", "--port", *_PROBLEM_OPTIONS),
+    ),
     "codegen": (
         _FILES,
         {"--controller": "pd_plus", "--out": "out"},
@@ -169,7 +182,7 @@ def line(rng: Rng) -> list[str]:
     chosen = dict(options)
     for _ in range(int(rng.integers(4))):
         option = pick(rng, (*options, *others))
-        if option in options and _VALUES[option] is not _COUNTS and rng.random() < 0.1:
+        if option in options and _VALUES[option] is not _COUNTS and option not in _KEPT and rng.random() < 0.1:
             chosen.pop(option, None)
         elif option not in ("--jobs",):
             chosen[option] = pick(rng, _VALUES[option])
@@ -197,6 +210,7 @@ def _files() -> Path:
     plan = json.dumps({"start": start, "duration": 0.2, "steps": steps})
     (folder / "steps.json").write_text(plan)
     x = float(chart.task(chart.problem.domain.centre)[0])
+    joint_motion().save_csv(folder / "q.csv")
     (folder / "path.csv").write_text(f"x\n{x}\n{x + 0.02}\n{x}\n")
     return folder
 

@@ -1,0 +1,173 @@
+"""`orthocas view`: a chart, a robot or a motion in the browser."""
+
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from orthocas import problems
+from orthocas.casadi_tools.interrupts import deferred
+from orthocas.chart import Chart
+from orthocas.cli.output import AsJson, Force, note, print_json, print_rows, whole_number
+from orthocas.cli.problem_argument import (
+    Locks,
+    ProblemOptions,
+    TipName,
+    ToolText,
+    build_robot,
+    is_robot_file,
+    locked_joints,
+)
+from orthocas.errors import InvalidValueError
+from orthocas.following.path_file import read_path
+from orthocas.robots import Robot
+from orthocas.viewing import View, cyclic_motions, export_page
+from orthocas.viewing import view as open_view
+from orthocas.viewing.motion import read_joint_motion, read_run
+from orthocas.viewing.view import PORT, require_page
+from orthocas.viewing.window import LOCAL, is_local, require_free
+
+_RUN = "trajectory.npz"  # in the folders of `orthocas simulate`
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What is to be shown, and whose it is."""
+
+    shown: Any
+    robot: Robot | Chart | None
+    meshes: Path | None
+    locked: dict[str, float]
+
+
+def view(
+    target: Annotated[
+        str,
+        typer.Argument(
+            metavar="CHART|RUN|FILE.urdf",
+            help="A chart file; trajectory.npz or a folder of simulate; a CSV file of follow; a robot file or problem.",
+        ),
+    ],
+    chart: Annotated[Path | None, typer.Option("--chart", help="For runs: a chart of the robot that moved.")] = None,
+    robot: Annotated[
+        Path | None, typer.Option("--robot", metavar="FILE.urdf", help="Robot file with the meshes of the links.")
+    ] = None,
+    tip: TipName = None,
+    lock: Locks = None,
+    tool: ToolText = None,
+    compare: Annotated[
+        bool,
+        typer.Option("--compare", help="Play a closed path with constant xi beside the pseudo-inverse, which drifts."),
+    ] = False,
+    path: Annotated[
+        Path | None, typer.Option("--path", metavar="PATH.csv", help="With --compare: waypoints of a closed path.")
+    ] = None,
+    cycles: Annotated[int, typer.Option("--cycles", parser=whole_number, help="With --compare: how often.")] = 3,
+    export: Annotated[
+        Path | None,
+        typer.Option("--export", metavar="PAGE.html", help="Write a page that moves by itself and works offline."),
+    ] = None,
+    host: Annotated[str, typer.Option("--host", help="Address to listen at; 0.0.0.0: open to the network.")] = LOCAL,
+    port: Annotated[int, typer.Option("--port", parser=whole_number, help="0: any free one.")] = PORT,
+    browse: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Show a chart, a robot or a motion in the browser, until Ctrl-C."""
+    if export is None:
+        require_free(host, port)
+    else:
+        require_page(export, force)
+    if not compare and path is not None:
+        raise InvalidValueError("--path", path, "--compare as well, which follows the path")
+    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+        asked = _asked(target, chart, robot, ProblemOptions(tip, tuple(lock or ()), tool))
+    if compare:
+        asked = _compared(asked, path, cycles)
+    if export is not None:
+        _export(asked, export, force, json)
+    else:
+        _serve(asked, host, port, browse, json)
+
+
+def _asked(target: str, chart: Path | None, meshes: Path | None, words: ProblemOptions) -> _Asked:
+    """What the target is: its suffix tells, or it is a folder of a run or the name of a problem."""
+    place = Path(target)
+    locked = locked_joints(words.lock)
+    if is_robot_file(target):
+        meshes = place if meshes is None and place.suffix.lower() == ".urdf" else meshes
+        return _Asked(build_robot(target, words), None, meshes, locked)
+    if target in problems.names() and not place.exists():
+        words.require_no_robot(f"the named problem '{target}'")
+        return _Asked(problems.get(target).robot, None, meshes, locked)
+    if place.is_dir() or place.suffix.lower() in (".npz", ".csv"):
+        owner = _owner(chart, meshes, words)
+        arm = owner.problem.robot if isinstance(owner, Chart) else owner
+        file = place / _RUN if place.is_dir() else place
+        motion = read_joint_motion(file, arm) if file.suffix.lower() == ".csv" else read_run(file, arm)
+        return _Asked(motion, owner, meshes, locked)
+    if chart is not None:
+        raise InvalidValueError("--chart", chart, f"no chart beside the chart {target}")
+    return _Asked(Chart.load(place), None, meshes, locked)
+
+
+def _owner(chart: Path | None, meshes: Path | None, words: ProblemOptions) -> Robot | Chart:
+    """Whose motion it is."""
+    if chart is not None:
+        return Chart.load(chart)
+    if meshes is None:
+        raise InvalidValueError("--chart", "missing", "--chart or --robot, because files of motions hold no robot")
+    return build_robot(str(meshes), words)
+
+
+def _compared(asked: _Asked, path: Path | None, cycles: int) -> _Asked:
+    """Motions along a closed path instead of a chart."""
+    chart = asked.shown
+    if not isinstance(chart, Chart):
+        raise InvalidValueError("--compare", "given", "a chart file, whose coordinates are compared")
+    points = None if path is None else read_path(path, chart)[0]
+    return _Asked(cyclic_motions(chart, points, cycles), chart, asked.meshes, asked.locked)
+
+
+def _export(asked: _Asked, page: Path, force: bool, json: bool) -> None:
+    shape = export_page(
+        asked.shown, page, robot=asked.robot, robot_file=asked.meshes, locked=asked.locked, force=force
+    )  # fmt: skip
+    _note_missing(shape.missing)
+    size = page.stat().st_size
+    if json:
+        print_json({"page": str(page), "bytes": size, "missing_meshes": list(shape.missing)})
+    else:
+        print_rows({"page": str(page), "size": f"{size / 2**20:.1f} MiB, with all it needs: it works offline"})
+
+
+def _serve(asked: _Asked, host: str, port: int, browse: bool, json: bool) -> None:
+    page = open_view(
+        asked.shown, robot=asked.robot, robot_file=asked.meshes, locked=asked.locked, host=host, port=port
+    )  # fmt: skip
+    with page:
+        _note_missing(page.missing)
+        _tell(page, host, json)
+        if browse and not webbrowser.open(page.url):
+            note(f"no browser could be opened here; open {page.url} yourself")
+        page.wait()
+
+
+def _tell(page: View, host: str, json: bool) -> None:
+    """Where the page is, and who can open it."""
+    local = is_local(host)
+    if json:
+        print_json({"url": page.url, "host": host, "local": local, "missing_meshes": list(page.missing)})
+    else:
+        who = (
+            "this machine only (--host opens it to others)" if local else "all who reach this machine, without password"
+        )
+        print_rows({"page": page.url, "open to": who, "end": "Ctrl-C"})
+
+
+def _note_missing(missing: tuple[str, ...]) -> None:
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        note(f"mesh file {missing[0]}{more} cannot be found or read; rods stand for these links")

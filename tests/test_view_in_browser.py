@@ -1,0 +1,138 @@
+"""Views in a real browser: what a person sees and moves, by the page's own numbers."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from browser import PROGRAM, Page, browser
+from PIL import Image
+
+import orthocas as oc
+from orthocas.fitting.fit import Fit
+from orthocas.problems.iiwa import urdf_path
+from orthocas.viewing import cyclic_motions, export_page
+
+pytestmark = [
+    pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'"),
+    pytest.mark.skipif(PROGRAM is None, reason="no chromium: apt-get install chromium"),
+    pytest.mark.slow,
+]
+NUMBERS = "Object.fromEntries([...document.querySelectorAll('[data-oc]')].map(b => [b.dataset.oc, +b.dataset.value]))"
+SLIDERS = "document.querySelectorAll('.mantine-Slider-root')"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("profile")) as tab:
+        yield tab
+
+
+def opened(page: Page, url: str) -> None:
+    """Open a page with a coarse picture, which takes seconds less without a graphics card."""
+    page.open(f"{url}/?fixedDpr=0.3")
+    page.wait("!!document.querySelector('[data-oc]') && !!document.querySelector('canvas')")
+
+
+def button(words: str) -> str:
+    return f"[...document.querySelectorAll('button')].find(b => b.textContent.includes('{words}'))"
+
+
+def to_the_end(page: Page, slider: int) -> None:
+    """Move a slider to its highest value, by the keyboard."""
+    page.value(f"{SLIDERS}[{slider}].querySelector('[role=slider]').focus()")
+    page.press("End")
+
+
+def joints(page: Page, chart: oc.Chart) -> np.ndarray:
+    shown = page.value(NUMBERS)
+    return np.array([shown[name] for name in chart.problem.robot.joint_names])
+
+
+def flange(q: np.ndarray) -> np.ndarray:
+    """Where Pinocchio has the flange."""
+    with urdf_path() as path:
+        model = pin.buildModelFromUrdf(str(path))
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return np.array(data.oMf[model.getFrameId("link_ee")].translation)
+
+
+def colours(path: Path) -> int:
+    """Different colours in the middle of a screenshot, where the scene is."""
+    with Image.open(path) as picture:
+        width, height = picture.size
+        scene = picture.convert("RGB").crop((int(0.4 * width), int(0.2 * height), int(0.6 * width), int(0.8 * height)))
+        return len(np.unique(np.asarray(scene).reshape(-1, 3), axis=0))
+
+
+def test_a_slider_moves_the_joints_and_the_flange_stays(page: Page, iiwa_fit: Fit, tmp_path: Path) -> None:
+    chart = iiwa_fit.chart
+    with oc.view(chart, port=0) as view:
+        opened(page, view.url)
+        before = joints(page, chart)
+        start = float(before[1])
+        np.testing.assert_allclose(before, chart.problem.domain.centre, atol=1e-12)
+        to_the_end(page, 0)
+        page.wait(f"Math.abs(({NUMBERS})['A2'] - {start!r}) > 0.02")
+        page.wait(f"({button('Undo')}).disabled === false")
+        after, shown = joints(page, chart), page.value(NUMBERS)
+        assert np.abs(after - before).max() > 0.05
+        assert shown["drift"] <= 1e-6
+        assert np.abs(flange(after) - flange(before)).max() <= 1e-6
+        page.picture(tmp_path / "chart.png")
+        assert colours(tmp_path / "chart.png") > 100
+        page.click(button("Home"))
+        page.wait(f"Math.abs(({NUMBERS})['A2'] - {start!r}) < 1e-9")
+        to_the_end(page, 4)  # the task: now the flange moves
+        page.wait(f"Math.abs(({NUMBERS})['A2'] - {start!r}) > 1e-3")
+        moved = joints(page, chart)
+        assert np.abs(flange(moved) - flange(before)).max() > 1e-3
+        np.testing.assert_allclose(chart.xi(moved), chart.xi(before), atol=1e-8)
+        assert chart.problem.domain.contains(moved)
+
+
+def test_two_arms_on_a_closed_path(page: Page, iiwa_fit: Fit, tmp_path: Path) -> None:
+    motions = cyclic_motions(iiwa_fit.chart, cycles=1)
+    with oc.view(motions, robot=iiwa_fit.chart, port=0) as view:
+        opened(page, view.url)
+        to_the_end(page, 0)
+        page.wait(f"({NUMBERS})['pseudo-inverse after 1'] > 0.1")
+        shown = page.value(NUMBERS)
+        assert shown["constant ξ after 1"] < 1e-6
+        page.picture(tmp_path / "arms.png")
+        assert colours(tmp_path / "arms.png") > 100
+
+
+def test_a_written_page_needs_no_server_and_no_network(page: Page, tmp_path: Path) -> None:
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [3.0, 3.0, 3.0])
+    chart = oc.fit(
+        oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.6, 0.8, 0.8], 0.39)), oc.Linear()
+    ).chart
+    export_page(chart, tmp_path / "page.html")
+    page.asked.clear()
+    page.open((tmp_path / "page.html").as_uri())
+    page.wait("!!document.querySelector('canvas') && !!document.querySelector('.mantine-Slider-root')")  # of the player
+    page.wait("+document.querySelector('input').value > 0.5")  # it plays
+    page.picture(tmp_path / "page.png")
+    assert colours(tmp_path / "page.png") > 30
+    assert all(address.startswith(("file:", "data:", "blob:")) for address in page.asked)
+    assert (tmp_path / "page.html").stat().st_size < 4 * 2**20
+
+
+def test_the_command_line_serves_until_ctrl_c(page: Page, tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "orthocas", "view", "iiwa", "--port", "0"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        first, second = process.stdout.readline().split(), process.stdout.readline()
+        assert "this machine only" in second
+        opened(page, first[1])
+        assert page.value(NUMBERS)["A1"] == 0.0
+        process.send_signal(2)
+        assert process.wait(20) == 130
+        assert process.stderr is not None
+        assert process.stderr.read() == "orthocas: interrupted\n"
