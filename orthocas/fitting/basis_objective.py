@@ -41,6 +41,7 @@ class BasisObjective:
         kept: the coefficients (r, K) that may differ from zero; theta holds only these. Default: all.
         exchanged: pairs of components whose sum and difference are coordinates, see `orthocas.fitting.mirror`. Then
             C and J_xi are those of the components.
+        gradients: gradients of the basis, if they are known already. Default: those of the family.
     """
 
     def __init__(
@@ -52,12 +53,13 @@ class BasisObjective:
         draw: Draw,
         kept: NDArray[np.bool_] | None = None,
         exchanged: Pairs = (),
+        gradients: BasisGradients | None = None,
     ) -> None:
         self.family, self.weights, self._draw = family, weights, draw
         self.r, self.K = family.outputs, family.width
         self.kept = np.ones((self.r, self.K), dtype=bool) if kept is None else kept
         m, self.n = samples.task_jacobian.shape[1:]
-        self._gradients = BasisGradients(family, self.n)
+        self._gradients = BasisGradients(family, self.n) if gradients is None else gradients
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name, exchanged)
         self._put(samples)
         oriented = self._loss.oriented or weights.folds > 0
