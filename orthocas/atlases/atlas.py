@@ -190,7 +190,7 @@ class Atlas(Shown):
         """
         number = require_count("number", number, least=0, most=len(self) - 1)
         if number not in self._kept:
-            self._kept[number] = self._built(number)
+            self._kept[number] = self._made(number)
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return self._kept[number]
@@ -213,7 +213,7 @@ class Atlas(Shown):
         bend = np.array(chart.function("second_derivative")(q0, v, v))[:, 0]
         return chart.phi(q0), J @ v, J @ a + bend
 
-    def _built(self, number: int) -> Chart:
+    def _made(self, number: int) -> Chart:
         plan, index, numbers = self._stock.plan, self._index, np.array([number])
         fitted = index.rows(numbers)[1]
         signs = index.map_signs(numbers)[0]

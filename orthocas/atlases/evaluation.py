@@ -46,7 +46,7 @@ class Evaluation:
             u, numbers, scale = self._on_cube(q[part], charts[part])
             slopes = self.basis.slopes(u) * scale[:, :, None]  # (N, n, K)
             J = (slopes @ numbers[:, :, 1:].transpose(0, 2, 1)).transpose(0, 2, 1)
-            found[part, : plan.fitted, active] = np.moveaxis(self.turned(J, charts[part]), 2, 0)
+            found[part, : plan.fitted, active] = self.turned(J, charts[part])
         for row, joint in enumerate(plan.idle):
             found[:, plan.fitted + row, joint] = 1.0
         return found

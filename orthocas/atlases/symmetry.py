@@ -76,18 +76,14 @@ def _candidates(n: int, turning: list[int]) -> tuple[Array, Array]:
 def _symmetric(problem: Problem, joints: tuple[int, ...], points: Array, signs: Array, shifts: Array) -> Array:
     """For which maps the tensors at the images of the points are the images of those at the points, (maps,)."""
     here = _tensors(problem, joints, points)
-    kept = np.zeros(len(signs), dtype=bool)
-    for k, (s, t) in enumerate(zip(signs, shifts, strict=True)) if len(points) > 1 else ():
-        kept[k] = np.abs(_tensors(problem, joints, s * points + t) - s[:, None] * here * s).max() <= _TOLERANCE
-    if len(points) == 1:  # many maps, one point
-        there = _tensors(problem, joints, signs * points + shifts)
-        images = signs[:, None, :, None] * here * signs[:, None, None, :]
-        kept = np.abs(there - images).max(axis=(1, 2, 3)) <= _TOLERANCE
-    return kept
+    images = signs[:, None] * points + shifts[:, None]  # (maps, points, k)
+    there = _tensors(problem, joints, images.reshape(-1, len(joints))).reshape(len(signs), *here.shape)
+    wanted = signs[:, None, None, :, None] * here * signs[:, None, None, None, :]
+    return np.asarray(np.abs(there - wanted).max(axis=(1, 2, 3, 4)) <= _TOLERANCE)
 
 
 def _tensors(problem: Problem, joints: tuple[int, ...], points: Array) -> Array:
-    """A^-1 and Pi with its second index raised, both at most of size 1, (N, 2, k, k); NaN where a gradient vanishes."""
+    """A^-1 and Pi with its second index raised, both of size 1, (N, 2, k, k); NaN where a gradient vanishes."""
     q = np.repeat(problem.domain.centre[None], len(points), axis=0)
     q[:, list(joints)] = points
     samples = samples_at(problem, q).restricted_to(list(joints))
@@ -97,4 +93,5 @@ def _tensors(problem: Problem, joints: tuple[int, ...], points: Array) -> Array:
     projector = basis.transpose(0, 2, 1) @ basis
     inverse = samples.metric_inverse
     inverse = np.broadcast_to(np.eye(len(joints)), projector.shape) if inverse is None else inverse
-    return np.stack([inverse / np.abs(inverse).max(), projector / np.abs(projector).max()], axis=1)
+    both = np.stack([inverse, projector], axis=1)
+    return np.asarray(both / np.abs(both).max(axis=(2, 3), keepdims=True))
