@@ -90,9 +90,7 @@ def _best(cosines: Array) -> tuple[Indices, Array, Array]:
     return chosen, np.where(picked < 0, -1.0, 1.0), np.abs(picked).mean(axis=1)
 
 
-def _walked(
-    count: int, r: int, first: Indices, second: Indices, order: Indices, signs: Array, match: Array
-) -> Turns:
+def _walked(count: int, r: int, first: Indices, second: Indices, order: Indices, signs: Array, match: Array) -> Turns:
     """Turns along a spanning tree of the greatest match; every part of the graph begins with a chart as it is."""
     turned, flipped = np.tile(np.arange(r), (count, 1)), np.ones((count, r))
     if len(first):

@@ -217,7 +217,9 @@ class Atlas(Shown):
         plan, index, numbers = self._stock.plan, self._index, np.array([number])
         fitted = index.rows(numbers)[1]
         signs = index.map_signs(numbers)[0]
-        own = self._evaluation.numbers(fitted)[0] * np.append(1.0, np.prod(signs ** self._evaluation.basis.exponents, axis=1))
+        own = self._evaluation.numbers(fitted)[0] * np.append(
+            1.0, np.prod(signs**self._evaluation.basis.exponents, axis=1)
+        )
         values = self._evaluation.turned(own[None], numbers)[0]
         if self._evaluation.turns is not None:
             values[:, 0] += self._evaluation.turns.constants[number]
@@ -231,7 +233,7 @@ class Atlas(Shown):
         if shift.any() or (scale != 1).any():
             values = moved(values, self._evaluation.basis.exponents.astype(int), shift, scale)
         clear = float(self._stock.records["clear"][self._stock.charts[fitted[0]]])
-        return chart_of(plan, box, values, clear)
+        return chart_of(plan, box, values, clear, plan.problem)
 
     def _borders(self, number: int) -> tuple[Array, Array]:
         """Borders of the box of a chart in the joints that boxes divide, also beyond the limits."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from orthocas.atlases.jobs import Outcome, Result
 from orthocas.atlases.lattice import Lattice
 from orthocas.atlases.plan import AtlasSettings, Plan
-from orthocas.atlases.regions import JointRange, Region, Surroundings
+from orthocas.atlases.regions import Region, Surroundings, joint_range_of
 from orthocas.atlases.symmetry import Symmetries
 from orthocas.checks import Array, Indices, frozen_array, frozen_indices, require_count
 from orthocas.errors import AtlasFileError, InvalidValueError, OrthocasError
@@ -166,7 +166,7 @@ def require_whole(stock: Stock) -> Stock:
     """The stock; raises AtlasFileError if the file ends within a block."""
     if stock.contents.end < stock.contents.size:
         raise AtlasFileError(
-            f"{stock.path} is truncated, expected a whole number of blocks: the command that built it goes on from there"
+            f"{stock.path} is truncated, expected whole blocks: the command that built it goes on from there"
         )
     return stock
 
@@ -223,16 +223,18 @@ def _plan(header: Mapping[str, Any]) -> tuple[Plan, Region]:
         Symmetries(active, signs, shifts),
         frozen_array("scale", arrays["scale"], (problem.m,)),
     )
-    return plan, _region(header, arrays, k)
+    return plan, _region(header, arrays, plan)
 
 
-def _region(header: Mapping[str, Any], arrays: Mapping[str, Stored], k: int) -> Region:
+def _region(header: Mapping[str, Any], arrays: Mapping[str, Stored], plan: Plan) -> Region:
+    whole = joint_range_of(plan.problem.domain, plan.joints)
     if "postures" not in arrays:
-        return JointRange()
+        return whole
     radius = header.get("radius")
     if isinstance(radius, bool) or not isinstance(radius, float) or not 0 < radius < np.pi:
         raise InvalidValueError("field 'radius'", repr(radius)[:80], "a positive number below pi")
-    return Surroundings(frozen_array("postures", arrays["postures"], (None, k)), radius)
+    postures = frozen_array("postures", arrays["postures"], (None, len(plan.joints)))
+    return Surroundings(whole.low, whole.high, postures, radius)
 
 
 def _records(path: Path, plan: Plan, contents: Contents) -> tuple[Records, Indices]:

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from orthocas.atlases.chart_of_box import without_limits
 from orthocas.atlases.cube_basis import CubeBasis
 from orthocas.atlases.plan import Plan
 from orthocas.casadi_tools.cached import cached_property
@@ -17,12 +19,13 @@ from orthocas.fitting.loss import Weights
 from orthocas.metrics import metric_matrices
 from orthocas.minimising.solver import Status
 from orthocas.postures.probe import leak_and_conditioning
-from orthocas.problem import task_jacobians
+from orthocas.problem import Problem, task_jacobians
 from orthocas.samples import Samples, samples_at
 from orthocas.solvers import GaussNewton
 
-_EVEN, _HEAVY = 600, 200  # training samples
-_TESTS = 1500  # held-out samples, two thirds near faces and corners
+Mask = NDArray[np.bool_]
+_EVEN, _HEAVY = 384, 128  # training samples, and those of them near faces and corners
+_UNIFORM, _JUDGES = 600, 300  # held-out samples, and those near faces and corners
 _FRAME_SAMPLES, _SEED = 500, 0
 _WEIGHTS = Weights(angles="metric")  # what is asked of charts is their leak
 _SOLVER = GaussNewton(max_iterations=25, tolerance=5e-3)
@@ -48,10 +51,11 @@ class BoxFitter:
         self.basis = CubeBasis(plan.settings.degree, names, plan.cyclic_names, plan.fitted)
         cube = Box(np.zeros(len(names)), 1.0)
         self._training = np.vstack([sample_evenly(cube, _EVEN, _SEED), sample_heavily(cube, _HEAVY, _SEED)])
-        self._tests = sample_heavily(cube, _TESTS, _SEED + 1)
-        self._uniform = np.arange(_TESTS) < _TESTS - 2 * (_TESTS // 3)
+        self._tests = np.vstack([sample_evenly(cube, _UNIFORM, _SEED + 1), sample_heavily(cube, _JUDGES, _SEED + 1)])
+        self._objective: BasisObjective | None = None
+        self._uniform = np.arange(len(self._tests)) < _UNIFORM
 
-    def fit(self, box: Box) -> tuple[BoxChart | None, Array]:
+    def fit(self, box: Box) -> tuple[BoxChart | None, Mask]:
         """The chart of a box, and which of its test samples are clear of singular positions; no chart without any."""
         training, seen = self._samples(box, self._training)
         tests, clear = self._samples(box, self._tests)
@@ -66,11 +70,11 @@ class BoxFitter:
         """The test samples on the cube, (tests, n)."""
         return self._tests
 
-    def clear(self, box: Box) -> Array:
+    def clear(self, box: Box) -> Mask:
         """Which test samples are clear of singular positions, (tests,)."""
         return self._samples(box, self._tests)[1]
 
-    def _samples(self, box: Box, u: Array) -> tuple[Samples, Array]:
+    def _samples(self, box: Box, u: Array) -> tuple[Samples, Mask]:
         """Samples of the active joints at points of the cube, and which of these are clear of singular positions."""
         plan, active = self.plan, list(self.plan.active)
         q = np.repeat(box.centre[None], len(u), axis=0)
@@ -78,10 +82,10 @@ class BoxFitter:
         J = task_jacobians(plan.problem, q)
         scaled = J / plan.scale[:, None]
         squares = np.linalg.eigvalsh(scaled @ scaled.transpose(0, 2, 1))[:, 0]
-        clear = squares > plan.settings.least_singular_value**2
-        inverse = None
+        clear: Mask = squares > plan.settings.least_singular_value**2
+        inverse: Array | None = None
         if not plan.problem.metric.is_identity:
-            inverse = np.linalg.inv(metric_matrices(plan.problem.metric, q[clear]))
+            inverse = np.asarray(np.linalg.inv(metric_matrices(plan.problem.metric, q[clear])), dtype=float)
         return Samples(q[clear], J[clear], inverse).restricted_to(active), clear
 
     def _coefficients(self, box: Box, samples: Samples, u: Array) -> Array:
@@ -90,10 +94,13 @@ class BoxFitter:
         gradients = BoxGradients(self.basis.gradients, half_width, self._training, self._known)
         start = self._linear(box)
         at_cube = Samples(u, samples.task_jacobian, samples.metric_inverse)
-        objective = BasisObjective(
-            self.basis.family, at_cube, _WEIGHTS, start.ravel(), lambda count, seed: at_cube, gradients=gradients
-        )
-        result = _SOLVER.minimise(objective, start.ravel())
+        objective = self._objective
+        if objective is None:  # the first box builds the loss, others move it
+            family = self.basis.family
+            objective = self._objective = BasisObjective(
+                family, at_cube, _WEIGHTS, start.ravel(), lambda count, seed: at_cube, gradients=gradients
+            )
+        result = _SOLVER.minimise(objective.moved(gradients, at_cube, start.ravel()), start.ravel())
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         return np.asarray(result.theta.reshape(start.shape))
@@ -109,7 +116,7 @@ class BoxFitter:
         C[:, self.basis.linear_terms] = (covectors @ (left @ right)).T * box.half_width[active] / np.sqrt(3)
         return C
 
-    def _judged(self, box: Box, C: Array, tests: Samples, clear: Array) -> BoxChart:
+    def _judged(self, box: Box, C: Array, tests: Samples, clear: Mask) -> BoxChart:
         half_width = box.half_width[list(self.plan.active)]
         G = self._test_slopes[clear] / half_width[:, None]
         J = (G @ C.T).transpose(0, 2, 1)
@@ -131,6 +138,11 @@ class BoxFitter:
         )
 
     @cached_property
+    def free(self) -> Problem:
+        """The problem without joint limits, which boxes may leave whose images lie within."""
+        return without_limits(self.plan.problem)
+
+    @cached_property
     def _known(self) -> Array:
         return self.basis.gradients.at(self._training)
 
@@ -140,7 +152,7 @@ class BoxFitter:
 
     @cached_property
     def _psi_at_centre(self) -> Array:
-        return self.basis.values(np.zeros((1, len(self.plan.active))))[0]
+        return np.asarray(self.basis.values(np.zeros((1, len(self.plan.active))))[0])
 
     @cached_property
     def _frame(self) -> Array:

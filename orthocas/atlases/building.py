@@ -12,7 +12,7 @@ from orthocas.atlases.atlas_file import add_turns, read_stock
 from orthocas.atlases.build import Building, opened, workers
 from orthocas.atlases.index import Index
 from orthocas.atlases.plan import AtlasSettings, make_plan
-from orthocas.atlases.regions import JointRange, Region, surroundings
+from orthocas.atlases.regions import Region, joint_range_of, surroundings
 from orthocas.checks import as_number, as_path, require_at_least, require_count, require_kind
 from orthocas.errors import Interrupted, InvalidValueError
 from orthocas.minimising.watch import Monitor, Progress, silent
@@ -78,7 +78,9 @@ def build_atlas(
         require_at_least("time_limit", time_limit, 0)
     target = as_path("path", path).absolute()
     plan = make_plan(problem, asked, margin_deg)
-    area: Region = JointRange() if region is None else surroundings(region, radius, plan.joints, plan.problem.n)
+    area: Region = joint_range_of(plan.problem.domain, plan.joints)
+    if region is not None:
+        area = surroundings(region, radius, plan.joints, plan.problem.domain)
     stock = opened(target, plan, area, force)
     building = Building(target, plan, area, float(share), monitor)
     building.resume(stock)

@@ -1,12 +1,13 @@
 """Cells of an atlas: a tile, or a part of it after some halvings, each of one joint."""
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.atlases.lattice import Lattice
-from orthocas.checks import Array
+from orthocas.checks import Array, Indices
 
 
 @dataclass(frozen=True, order=True)
@@ -40,7 +41,7 @@ class Cell:
         return low[0], low[0] + width[0]
 
 
-def cell_borders(lattice: Lattice, tiles: Array, levels: Array, places: Array) -> tuple[Array, Array]:
+def cell_borders(lattice: Lattice, tiles: Indices, levels: NDArray[Any], places: NDArray[Any]) -> tuple[Array, Array]:
     """Lowest positions and widths of cells, (cells, k) each."""
     width = lattice.width / 2.0**levels
     return lattice.centres(tiles) - lattice.width / 2 + width * places, width

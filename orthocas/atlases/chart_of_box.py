@@ -10,15 +10,19 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import Box
+from orthocas.files.problem_parts import problem_from_data, problem_to_data
 from orthocas.parametrisations import JointSpace, Polynomial
 from orthocas.postures.clear_box import ClearBox
 from orthocas.problem import Problem
 
 
 def box_of(plan: Plan, cell: Cell) -> Box:
-    """The box of a cell: it reaches into its neighbours by the overlap, but not beyond the joint limits."""
+    """The box of a cell: it reaches into its neighbours by the overlap, perhaps beyond joint limits.
+
+    Of images of a box, only the one that is fitted may lie there.
+    """
     low, high = cell.borders(plan.lattice)
-    return clipped(plan, *widened(plan, low, high))
+    return plan.box_around(*widened(plan, low, high))
 
 
 def widened(plan: Plan, low: Array, high: Array) -> tuple[Array, Array]:
@@ -34,7 +38,7 @@ def clipped(plan: Plan, low: Array, high: Array) -> Box:
     return plan.box_around(np.maximum(low, robot.lower[joints]), np.minimum(high, robot.upper[joints]))
 
 
-def chart_of(plan: Plan, box: Box, numbers: Array, clear: float) -> Chart:
+def chart_of(plan: Plan, box: Box, numbers: Array, clear: float, problem: Problem) -> Chart:
     """The chart of a box from its numbers on the cube (fitted, 1 + K).
 
     Args:
@@ -42,8 +46,9 @@ def chart_of(plan: Plan, box: Box, numbers: Array, clear: float) -> Chart:
         box: the box.
         numbers: constants and coefficients.
         clear: share of its samples that are clear of singular positions. If it is not 1, the domain is a ClearBox.
+        problem: that of the plan, or `without_limits` of it for a box beyond them.
     """
-    base = plan.problem
+    base = problem
     domain = ClearBox(box, base.task, plan.settings.least_singular_value, plan.scale) if clear < 1 else box
     problem = Problem(base.robot, base.task, base.metric, domain, base.name)
     parametrisation = Polynomial(plan.settings.degree, plan.cyclic_names)
@@ -52,6 +57,13 @@ def chart_of(plan: Plan, box: Box, numbers: Array, clear: float) -> Chart:
         parametrisation, JointSpace.of(problem), plan.idle, numbers[:, 1:].ravel(), -numbers[:, 0], np.ones(r)
     )
     return Chart(problem, coordinates)
+
+
+def without_limits(problem: Problem) -> Problem:
+    """The same problem for an arm without joint limits."""
+    header, arrays = problem_to_data(problem)
+    free = {name: np.full(problem.n, side * np.inf) for name, side in (("robot_lower", -1), ("robot_upper", 1))}
+    return problem_from_data(header, {**arrays, **free})
 
 
 def moved(numbers: Array, terms: Array, shift: Array, scale: Array) -> Array:

@@ -73,8 +73,8 @@ class Coverage(Shown):
             "coverage": f"{self.share:.2%} of {len(self.q)} samples clear of singular positions have a chart",
             "charts": f"{self.charts} in {self.bytes / 2**20:.3g} MiB",
             "clear": f"{len(self.q) / self.drawn:.2%} of the region",
-            "leak": f"rms {leak['rms']:.2f}, p99 {leak['p99']:.2f} deg",
-            "conditioning": f"min {conditioning['min']:.3f}, p01 {conditioning['p01']:.3f}, mean {conditioning['mean']:.3f}",
+            "leak": ", ".join(f"{name} {value:.2f}" for name, value in leak.items()) + " deg",
+            "conditioning": ", ".join(f"{name} {value:.3f}" for name, value in conditioning.items()),
             "as asked": f"at {self.share_as_asked:.2%} of the samples leak and conditioning themselves are as asked",
             **{f"hole {share:.2%}": text for text, share in self.holes.items()},
         }
@@ -83,19 +83,20 @@ class Coverage(Shown):
         """Plain data for JSON."""
         known = np.isfinite(self.conditioning)
         leak, conditioning = self.leak_deg[known], self.conditioning[known]
-        empty = not known.any()
+        if not known.any():
+            leak = conditioning = np.array([np.nan])  # None in JSON
         return {
             "charts": self.charts,
             "bytes": self.bytes,
             "coverage": self.share,
             "leak_deg": {
-                "rms": None if empty else float(np.sqrt((leak**2).mean())),
-                "p99": None if empty else float(np.quantile(leak, 0.99)),
+                "rms": float(np.sqrt((leak**2).mean())),
+                "p99": float(np.quantile(leak, 0.99)),
             },
             "conditioning": {
-                "min": None if empty else float(conditioning.min()),
-                "p01": None if empty else float(np.quantile(conditioning, 0.01)),
-                "mean": None if empty else float(conditioning.mean()),
+                "min": float(conditioning.min()),
+                "p01": float(np.quantile(conditioning, 0.01)),
+                "mean": float(conditioning.mean()),
             },
         }
 
@@ -110,8 +111,8 @@ def evaluate_atlas(atlas: Atlas, samples: int = 100_000, seed: int = 1) -> Cover
         samples: number of samples of the region.
         seed: their seed.
 
-    Example:
-        >>> import orthocas as oc
+    Returns:
+        `Coverage`, with values at each sample that counts.
     """
     require_kind("atlas", atlas, Atlas)
     count, seed = require_count("samples", samples), require_count("seed", seed, least=0)
@@ -119,9 +120,12 @@ def evaluate_atlas(atlas: Atlas, samples: int = 100_000, seed: int = 1) -> Cover
     joints = list(plan.joints)
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
     drawn = np.random.default_rng((seed, 1)).uniform(low, high, (count, plan.problem.n))
-    drawn[:, joints] = atlas._stock.region.sample(low[joints], high[joints], count, seed)
+    drawn[:, joints] = atlas._stock.region.sample(count, seed)
     clear = np.concatenate(
-        [plan.singular_values(drawn[k : k + _PIECE]) > plan.settings.least_singular_value for k in range(0, count, _PIECE)]
+        [
+            plan.singular_values(drawn[k : k + _PIECE]) > plan.settings.least_singular_value
+            for k in range(0, count, _PIECE)
+        ]
     )
     q = drawn[clear]
     charts = atlas.chart_at(q)
@@ -163,5 +167,3 @@ def _quality(atlas: Atlas, q: Array, charts: Indices) -> tuple[Array, Array]:
         leak[rows] = np.degrees(np.sqrt((np.arcsin(np.minimum(sines, 1.0)) ** 2).mean(axis=1)))
         conditioning[rows] = smallest
     return leak, conditioning
-
-

@@ -15,7 +15,7 @@ from orthocas.parametrisations import JointSpace, Polynomial, ProductFamily
 
 @dataclass(frozen=True, eq=False)
 class CubeBasis:
-    """psi(u) on the cube. Compiled once, it serves boxes of all places and sizes: dpsi/dq_i = dpsi/du_i / half_width_i."""
+    """psi(u) on the cube. Compiled once, it serves all boxes: dpsi/dq_i = dpsi/du_i / half_width_i."""
 
     degree: int
     names: tuple[str, ...]  #: of the joints

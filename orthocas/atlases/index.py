@@ -40,11 +40,9 @@ class Index:
     @cached_property
     def orbits(self) -> Orbits:
         """The tiles of the region, and which is fitted for each."""
-        plan, domain = self.plan, self.plan.problem.domain
-        joints = list(plan.joints)
-        low, high = ((domain.centre + side * domain.half_width)[joints] for side in (-1, 1))
-        tiles = self.stock.region.tiles(plan.lattice, low, high)
-        return orbits(plan.lattice, tiles, plan.maps.of(plan.joints), domain.centre[joints])
+        plan = self.plan
+        tiles = self.stock.region.tiles(plan.lattice)
+        return orbits(plan.lattice, tiles, plan.maps.of(plan.joints), plan.problem.domain.centre[list(plan.joints)])
 
     @property
     def count(self) -> int:
@@ -160,9 +158,7 @@ class Index:
     def _boxes(self) -> tuple[Array, Array]:
         records = self.stock.records[self.stock.charts]
         low, width = cell_borders(self.plan.lattice, records["tile"], records["levels"], records["places"])
-        robot, joints = self.plan.problem.robot, list(self.plan.joints)
-        wide_low, wide_high = widened(self.plan, low, low + width)
-        return np.maximum(wide_low, robot.lower[joints]), np.minimum(wide_high, robot.upper[joints])
+        return widened(self.plan, low, low + width)
 
     @cached_property
     def _centres(self) -> Array:
@@ -248,4 +244,3 @@ class Index:
         tiles = self._tile_of_chart[self._by_tile]
         sizes = np.searchsorted(tiles, self.orbits.fitted, side="right") - self._begins
         return np.concatenate([[0], np.cumsum(sizes)])
-

@@ -1,14 +1,14 @@
-"""The work of an atlas in pieces that any executor can run: some cells, each fitted, judged and perhaps split (ours)."""
+"""The work of an atlas in pieces for any executor: some cells, each fitted, judged and perhaps split (ours)."""
 
 import pickle
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import lru_cache
 
 import numpy as np
 
-from orthocas.atlases.box_fit import BoxChart, BoxFitter
+from orthocas.atlases.box_fit import BoxChart, BoxFitter, Mask
 from orthocas.atlases.cells import Cell
 from orthocas.atlases.chart_of_box import box_of, chart_of
 from orthocas.atlases.plan import Plan
@@ -90,20 +90,20 @@ def _outcome(fitter: BoxFitter, cell: Cell, start: float) -> Result:
     plan, box = fitter.plan, box_of(fitter.plan, cell)
     centre_is_clear = plan.singular_values(box.centre[None])[0] > plan.settings.least_singular_value
     chart, clear = fitter.fit(box) if centre_is_clear else (None, fitter.clear(box))
-    share, last = float(clear.mean()), cell.depth >= plan.settings.splits
-    found = {"clear": share, "seconds": time.perf_counter() - start}
-    if not clear.any():
-        return Result(cell, Outcome.SINGULAR, **found)
-    if chart is None or share < _LEAST_CLEAR:
-        joint = _dividing(plan, fitter.tests, clear)
-        return Result(cell, Outcome.SINGULAR if last else Outcome.SPLIT, -1 if last else joint, **found)
-    quality = {"leak_deg": chart.leak_deg, "conditioning": chart.conditioning, **found}
-    if not _good(plan, chart):
-        joint = -1 if last else _helping(plan, chart)
-        return Result(cell, Outcome.POOR if last else Outcome.SPLIT, joint, **quality)
-    certified = _certified(plan, box, chart, share)
-    quality["seconds"] = time.perf_counter() - start
-    return Result(cell, Outcome.CHART, -1, chart.numbers, certified=certified, **quality)
+    last = cell.depth >= plan.settings.splits
+    found = Result(cell, Outcome.SINGULAR, clear=float(clear.mean()))
+    if chart is not None and found.clear >= _LEAST_CLEAR:
+        found = replace(found, leak_deg=chart.leak_deg, conditioning=chart.conditioning)
+        if _good(plan, chart):
+            certified = _certified(fitter, box, chart, found.clear)
+            found = replace(found, outcome=Outcome.CHART, numbers=chart.numbers, certified=certified)
+        elif last:
+            found = replace(found, outcome=Outcome.POOR)
+        else:
+            found = replace(found, outcome=Outcome.SPLIT, joint=_helping(plan, chart))
+    elif clear.any() and not last:
+        found = replace(found, outcome=Outcome.SPLIT, joint=_dividing(plan, fitter.tests, clear))
+    return replace(found, seconds=time.perf_counter() - start)
 
 
 def _good(plan: Plan, chart: BoxChart) -> bool:
@@ -111,19 +111,20 @@ def _good(plan: Plan, chart: BoxChart) -> bool:
     return chart.leak_deg <= asked.leak_deg and chart.conditioning >= asked.conditioning
 
 
-def _certified(plan: Plan, box: Box, chart: BoxChart, clear: float) -> bool:
+def _certified(fitter: BoxFitter, box: Box, chart: BoxChart, clear: float) -> bool:
     """Whether the chart is proved not to fold."""
+    plan = fitter.plan
     if not plan.settings.certify_seconds:
         return False
     try:
-        found = chart_of(plan, box, chart.numbers, clear)
+        found = chart_of(plan, box, chart.numbers, clear, fitter.free)
         return certify(found, time_limit=plan.settings.certify_seconds).proved
     except CertifyError:
         return False
 
 
 def _helping(plan: Plan, chart: BoxChart) -> int:
-    """The joint along which halves are better: what is missing grows fastest with its u^2, and halves have a quarter."""
+    """The joint along which halves gain most: what is missing grows fastest with its u^2, of which halves have less."""
     columns = [plan.active.index(joint) for joint in plan.joints]
     u = chart.u[:, columns]
     regressors = np.column_stack([np.ones(len(u)), u, u**2])
@@ -131,7 +132,7 @@ def _helping(plan: Plan, chart: BoxChart) -> int:
     return int(np.argmax(slopes[1 + len(columns) :]))
 
 
-def _dividing(plan: Plan, u: Array, clear: Array) -> int:
+def _dividing(plan: Plan, u: Array, clear: Mask) -> int:
     """The joint whose halves differ most in how much of them is clear of singular positions."""
     columns = [plan.active.index(joint) for joint in plan.joints]
     gaps = [abs(clear[u[:, i] < 0].mean() - clear[u[:, i] >= 0].mean()) for i in columns]

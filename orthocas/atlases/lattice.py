@@ -61,8 +61,8 @@ def make_lattice(low: Array, high: Array, endless: NDArray[np.bool_], widest: Ar
         widest: largest widths, (k,).
         maps: symmetries in these joints.
     """
-    shifted = (maps.shifts > 0).any(axis=0)
-    mirrored = (maps.signs < 0).any(axis=0)
+    shifted: NDArray[np.bool_] = np.any(maps.shifts > 0, axis=0)
+    mirrored: NDArray[np.bool_] = np.any(maps.signs < 0, axis=0)
     begins, widths, counts = low.copy(), np.zeros_like(low), np.zeros(len(low), dtype=np.int64)
     for i in range(len(low)):
         if shifted[i]:

@@ -38,8 +38,10 @@ def _workspace(coverage: Coverage) -> Figure:
     tool = coverage.tool
     edges = np.quantile(tool[:, 1], np.linspace(0, 1, _SLICES + 1)) if len(tool) else np.linspace(-1, 1, _SLICES + 1)
     extent = _extent(tool)
-    shown = [("least leak [deg]", coverage.leak_deg, np.fmin, "viridis_r", (0.0, 10.0))]
-    shown += [("largest conditioning", coverage.conditioning, np.fmax, "viridis", (0.0, 1.0))]
+    shown: list[tuple[str, Array, np.ufunc, str, tuple[float, float]]] = [
+        ("least leak [deg]", coverage.leak_deg, np.fmin, "viridis_r", (0.0, 10.0)),
+        ("largest conditioning", coverage.conditioning, np.fmax, "viridis", (0.0, 1.0)),
+    ]
     for row, (title, values, best, colours, limits) in enumerate(shown):
         for k in range(_SLICES):
             inside = (tool[:, 1] >= edges[k]) & (tool[:, 1] <= edges[k + 1])

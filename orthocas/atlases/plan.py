@@ -1,4 +1,4 @@
-"""What the boxes of an atlas share: the problem, the joints that boxes divide, tiles and symmetries, and what is asked."""
+"""What the boxes of an atlas share: problem, joints that boxes divide, tiles, symmetries, and what is asked for."""
 
 from dataclasses import dataclass
 
@@ -104,7 +104,7 @@ class Plan:
         """Relative singular values of the task at points (N, n), (N,)."""
         J = task_jacobians(self.problem, points) / self.scale[:, None]
         squares = np.linalg.eigvalsh(J @ J.transpose(0, 2, 1))[:, 0]
-        return np.sqrt(np.maximum(squares, 0.0))
+        return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
     def box_around(self, low: Array, high: Array) -> Box:
         """The box of all joints with these borders in the joints that boxes divide, (k,) each."""
@@ -167,7 +167,9 @@ def joint_range(robot: Robot, margin_deg: float) -> Box:
     empty = np.flatnonzero(low >= high)
     if empty.size:
         name = robot.joint_names[int(empty[0])]
-        raise DomainError(f"joint '{name}' has no range left with a margin of {margin_deg:g} deg, expected a smaller one")
+        raise DomainError(
+            f"joint '{name}' has no range left with a margin of {margin_deg:g} deg, expected a smaller one"
+        )
     free = endless & np.isinf(robot.lower) & np.isinf(robot.upper)
     return Box((low + high) / 2, (high - low) / 2, np.flatnonzero(free).tolist())
 

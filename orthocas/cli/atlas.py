@@ -46,7 +46,9 @@ def build(
     out: Annotated[Path, typer.Option("--out", help="Atlas file; if it exists, the build goes on from it.")],
     region: Annotated[
         str,
-        typer.Option("--region", metavar="limits|POSTURES.csv", help="The joint range, or the surroundings of postures."),
+        typer.Option(
+            "--region", metavar="limits|POSTURES.csv", help="The joint range, or the surroundings of postures."
+        ),
     ] = "limits",
     radius: Annotated[
         float, typer.Option("--radius", parser=number, help="Of the surroundings of postures [rad or m].")
@@ -167,5 +169,3 @@ def _report(found: Atlas, json: bool) -> None:
         print_json({"atlas": str(found.path), **found.as_dict()})
     else:
         print_rows({**found.facts(), "atlas file": str(found.path)})
-
-

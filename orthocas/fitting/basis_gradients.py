@@ -107,7 +107,7 @@ class BoxGradients(BasisGradients):
         self._cube, self._scale, self._shared, self._known = cube, 1 / half_width[:, None, None], shared, known
 
     @property
-    def terms_of_joints(self) -> NDArray[np.int_]:  # type: ignore[override]
+    def terms_of_joints(self) -> NDArray[np.int_]:
         """As on the cube."""
         return self._cube.terms_of_joints
 
