@@ -16,12 +16,13 @@ from orthocas.atlases.jobs import Outcome
 from orthocas.atlases.plan import AtlasSettings
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
-from orthocas.checks import Array, Indices, as_path, as_point_set, frozen_indices, require_count
+from orthocas.checks import Array, Indices, as_path, as_point, as_point_set, frozen_indices, require_count
 from orthocas.domains import Box
 from orthocas.errors import InvalidValueError
 from orthocas.problem import Problem
 from orthocas.showing import Shown, listed, number_list
 
+Turns = tuple[int, ...]  #: full turns of each joint that boxes divide
 _KEPT = 32  # charts that stay built
 
 
@@ -54,7 +55,7 @@ class Atlas(Shown):
     """
 
     _stock: Stock
-    _kept: "OrderedDict[int, Chart]" = field(default_factory=OrderedDict)
+    _kept: "OrderedDict[tuple[int, Turns], Chart]" = field(default_factory=OrderedDict)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -182,24 +183,26 @@ class Atlas(Shown):
         found[known] = self._evaluation.jacobian(points[known], numbers[known])
         return found[0] if single else found
 
-    def chart(self, number: int) -> Chart:
+    def chart(self, number: int, near: ArrayLike | None = None) -> Chart:
         """A chart as all of orthocas takes it: its domain is the box, less what lies beyond the joint limits.
+
+        Args:
+            number: the number of the chart.
+            near: a joint position (n,). Boxes repeat every full turn of joints that can turn so far; this tells which.
 
         Raises:
             InvalidValueError: if there is no such chart.
         """
-        number = require_count("number", number, least=0, most=len(self) - 1)
-        if number not in self._kept:
-            self._kept[number] = self._made(number)
+        number, turns = self._numbered(number, near)
+        if (number, turns) not in self._kept:
+            self._kept[number, turns] = self._made(number, turns)
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
-        return self._kept[number]
+        return self._kept[number, turns]
 
-    def box(self, number: int) -> Box:
-        """The box of a chart within the joint limits."""
-        number = require_count("number", number, least=0, most=len(self) - 1)
-        low, high = self._borders(number)
-        return clipped(self._stock.plan, low, high)
+    def box(self, number: int, near: ArrayLike | None = None) -> Box:
+        """The box of a chart within the joint limits; see `chart`."""
+        return clipped(self._stock.plan, *self._borders(*self._numbered(number, near)))
 
     def handed_over(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, number: int) -> tuple[Array, Array, Array]:
         """What a chart asks for at a desired motion of the joints: phi, its velocity and its acceleration, (n,) each.
@@ -207,13 +210,23 @@ class Atlas(Shown):
         A controller that changes to this chart goes on from there, so the posture asked for does not jump:
         phi = phi(q), dphi = J dq, ddphi = J ddq + dJ/dt dq.
         """
-        chart = self.chart(number)
+        chart = self.chart(number, q)
         (q0,), (v,), (a,) = (as_point_set(name, x, chart.n)[0] for name, x in (("q", q), ("dq", dq), ("ddq", ddq)))
         J = chart.jacobian(q0)
         bend = np.array(chart.function("second_derivative")(q0, v, v))[:, 0]
         return chart.phi(q0), J @ v, J @ a + bend
 
-    def _made(self, number: int) -> Chart:
+    def _numbered(self, number: int, near: ArrayLike | None) -> tuple[int, Turns]:
+        """The number of a chart, checked, and the full turns of its box towards a position."""
+        number = require_count("number", number, least=0, most=len(self) - 1)
+        plan = self._stock.plan
+        if near is None:
+            return number, (0,) * len(plan.joints)
+        q = as_point("near", near, plan.problem.n)[list(plan.joints)]
+        apart = (q - self._index.image_centres(np.array([number]))[0][0]) / (2 * np.pi)
+        return number, tuple(np.where(plan.lattice.endless, np.round(apart), 0.0).astype(int).tolist())
+
+    def _made(self, number: int, turns: Turns) -> Chart:
         plan, index, numbers = self._stock.plan, self._index, np.array([number])
         fitted = index.rows(numbers)[1]
         signs = index.map_signs(numbers)[0]
@@ -223,7 +236,7 @@ class Atlas(Shown):
         values = self._evaluation.turned(own[None], numbers)[0]
         if self._evaluation.turns is not None:
             values[:, 0] += self._evaluation.turns.constants[number]
-        low, high = self._borders(number)
+        low, high = self._borders(number, turns)
         box = clipped(plan, low, high)
         middle, half = (low + high) / 2, (high - low) / 2
         joints, columns = list(plan.joints), [plan.active.index(i) for i in plan.joints]
@@ -235,10 +248,10 @@ class Atlas(Shown):
         clear = float(self._stock.records["clear"][self._stock.charts[fitted[0]]])
         return chart_of(plan, box, values, clear, plan.problem)
 
-    def _borders(self, number: int) -> tuple[Array, Array]:
+    def _borders(self, number: int, turns: Turns) -> tuple[Array, Array]:
         """Borders of the box of a chart in the joints that boxes divide, also beyond the limits."""
         numbers = np.array([number])
-        centre = self._index.image_centres(numbers)[0][0]
+        centre = self._index.image_centres(numbers)[0][0] + 2 * np.pi * np.array(turns)
         half = self._index.box_half_widths[self._index.rows(numbers)[1]][0]
         return centre - half, centre + half
 

@@ -6,12 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.atlases.atlas import Atlas
+from orthocas.chart import Chart
 from orthocas.checks import Array, Indices, as_point, as_point_set, require_kind
-from orthocas.errors import PathError
-from orthocas.problem import task_jacobians
+from orthocas.errors import InverseError, PathError
 
-_TOLERANCE = 1e-12  # of a Newton step [rad] or [m]
-_ITERATIONS = 12
+_TOLERANCE = 1e-12  # of phi, relative to the sizes of its components
 _HALVINGS = 8  # of a step along the path that Newton's method cannot take
 
 
@@ -51,7 +50,7 @@ def follow_in_atlas(atlas: Atlas, x: ArrayLike, q_start: ArrayLike) -> AtlasMoti
     x_now = atlas.problem.task.batched(q[None])[0][0]
     rows: list[tuple[Array, int, Array]] = []
     for k, target in enumerate(targets):
-        q = _stepped(atlas, number, q, x_now, target, xi, _HALVINGS, k)
+        q = _stepped(atlas.chart(number, near=q), q, x_now, target, xi, _HALVINGS, k)
         x_now = target
         rows.append((q, number, xi))
         following = _required(atlas, q, number, k)
@@ -71,30 +70,13 @@ def _required(atlas: Atlas, q: Array, current: int, k: int) -> int:
     return number
 
 
-def _stepped(
-    atlas: Atlas, number: int, q: Array, x_now: Array, target: Array, xi: Array, halvings: int, k: int
-) -> Array:
+def _stepped(chart: Chart, q: Array, x_now: Array, target: Array, xi: Array, halvings: int, k: int) -> Array:
     """q with task value `target` and coordinates xi in a chart, by Newton's method, in halves if it fails."""
-    found = _newton(atlas, number, q, target, xi)
-    if found is not None:
-        return found
-    if not halvings:
-        raise PathError(f"row {k} of x cannot be reached in chart {number} with the posture held")
+    try:
+        return chart.inverse(np.concatenate([target, xi]), q_start=q, tolerance=_TOLERANCE)
+    except InverseError:
+        if not halvings:
+            raise PathError(f"row {k} of x cannot be reached with the posture held") from None
     middle = (x_now + target) / 2
-    halfway = _stepped(atlas, number, q, x_now, middle, xi, halvings - 1, k)
-    return _stepped(atlas, number, halfway, middle, target, xi, halvings - 1, k)
-
-
-def _newton(atlas: Atlas, number: int, q: Array, x: Array, xi: Array) -> Array | None:
-    """The solution near q; None if the steps do not become small."""
-    problem, chart = atlas.problem, np.array([number])
-    for _ in range(_ITERATIONS):
-        J = np.concatenate([task_jacobians(problem, q[None])[0], atlas.jacobian(q[None], chart)[0]])
-        miss = np.concatenate([problem.task.batched(q[None])[0][0] - x, atlas.xi(q[None], chart)[0] - xi])
-        step = np.linalg.solve(J, miss)
-        if not np.abs(step).max() < 0.5:
-            return None
-        q = q - step
-        if np.abs(step).max() < _TOLERANCE:
-            return q
-    return None
+    halfway = _stepped(chart, q, x_now, middle, xi, halvings - 1, k)
+    return _stepped(chart, halfway, middle, target, xi, halvings - 1, k)
