@@ -3,8 +3,8 @@
 import json
 import os
 import signal
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,19 @@ from programs import Run
 import orthocas as oc
 from orthocas import problems
 from orthocas.atlases.align import align
-from orthocas.atlases.atlas_file import Stock, add_results, header_of, read_stock
+from orthocas.atlases.atlas_file import ATLAS, Stock, add_results, header_of, plan_terms, read_stock
+from orthocas.atlases.cells import Cell
 from orthocas.atlases.chart_of_box import moved
 from orthocas.atlases.cube_basis import CubeBasis
 from orthocas.atlases.follow import follow_in_atlas
-from orthocas.atlases.jobs import Job, Outcome, Result, run_job
+from orthocas.atlases.jobs import Job, packed, run_job
+from orthocas.atlases.outcomes import Outcome, Result
 from orthocas.atlases.plan import make_plan
 from orthocas.atlases.processes import Processes
+from orthocas.atlases.regions import joint_range_of, read_postures
 from orthocas.checks import Array
-from orthocas.errors import AtlasFileError, InvalidValueError, OrthocasError, PathFileError
-from orthocas.samples import samples_at
+from orthocas.errors import AtlasFileError, InvalidValueError, PathFileError
+from orthocas.files.blocks import create
 
 ASKED = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.8, splits=5)
 
@@ -197,10 +200,8 @@ def test_damaged_and_foreign_files_raise_one_error(atlas: oc.Atlas, tmp_path: Pa
         bent = bytearray(content)
         bent[int(rng.integers(len(bent)))] ^= 1 << int(rng.integers(8))
         path.write_bytes(bent)
-        try:
-            assert np.isfinite(oc.Atlas.load(path).xi(q)).any()  # a bit that nobody reads here
-        except OrthocasError as error:
-            assert "mutant" in str(error)
+        with suppress(AtlasFileError):  # other errors, and values that are no numbers, are wrong
+            assert np.isfinite(oc.Atlas.load(path).xi(q)).any()
     for other in (b"", b"PK\x03\x04", content[:40], content[:1000], os.urandom(500)):
         path.write_bytes(other)
         with pytest.raises(AtlasFileError, match="mutant"):
@@ -217,40 +218,19 @@ def test_foreign_file_is_not_replaced(tmp_path: Path) -> None:
     assert path.read_text() == "mine"
 
 
-def test_opening_a_large_atlas_does_not_read_its_charts(tmp_path: Path) -> None:
-    """20,000 charts of 4 kB."""
-    plan = make_plan(planar(), oc.AtlasSettings(half_width=0.02, symmetric=False, degree=8), 5.0)
-    region = read_region(plan, tmp_path)
-    tiles = region.tiles[:20_000]
-    path = region.path
-    numbers = np.zeros((1, 1 + 45))
-    rows = [(-1, False, Result(region.cell(int(tile)), Outcome.CHART, numbers=numbers)) for tile in tiles]
-    add_results(path, plan, rows, 0)
-    stock = read_stock(path)
-    reads: list[int] = []
-    found = oc.Atlas(stock)
+def test_opening_a_large_atlas_reads_no_charts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """20,000 charts of an arm."""
+    plan = make_plan(planar(), oc.AtlasSettings(half_width=0.02, symmetric=False), 5.0)
+    region = joint_range_of(plan.problem.domain, plan.joints)
+    path = tmp_path / "large.orthocas-atlas"
+    create(path, header_of(plan, region), ATLAS)
+    numbers = np.zeros((plan.fitted, 1 + plan_terms(plan)))
+    cells = [Cell.whole(tile, len(plan.joints)) for tile in region.tiles(plan.lattice)[:20_000].tolist()]
+    add_results(path, plan, [(-1, False, Result(cell, Outcome.CHART, numbers=numbers)) for cell in cells], 0)
+    monkeypatch.setattr(Stock, "numbers", None)
+    found = oc.Atlas(read_stock(path))
     assert len(found) == 20_000
-    assert not reads
-    assert found.box(3).half_width[1] < 0.03
-
-
-class read_region:  # noqa: N801
-    """An empty file of a plan, and its tiles."""
-
-    def __init__(self, plan: Any, folder: Path) -> None:
-        from orthocas.atlases.atlas_file import ATLAS
-        from orthocas.atlases.regions import joint_range_of
-        from orthocas.files.blocks import create
-
-        self.path = folder / "large.orthocas-atlas"
-        region = joint_range_of(plan.problem.domain, plan.joints)
-        create(self.path, header_of(plan, region), ATLAS)
-        self.tiles, self._k = region.tiles(plan.lattice), len(plan.joints)
-
-    def cell(self, tile: int) -> Any:
-        from orthocas.atlases.cells import Cell
-
-        return Cell.whole(tile, self._k)
+    assert found.chart_at(found.box(3).centre) == 3
 
 
 class Deadly(Processes):
@@ -351,8 +331,6 @@ def test_command_line_builds_shows_and_evaluates(run: Run) -> None:
     ],
 )
 def test_bad_files_of_postures_are_named(tmp_path: Path, text: str, word: str) -> None:
-    from orthocas.atlases.regions import read_postures
-
     path = tmp_path / "path.csv"
     path.write_text(text)
     with pytest.raises(PathFileError, match=word):
@@ -360,9 +338,6 @@ def test_bad_files_of_postures_are_named(tmp_path: Path, text: str, word: str) -
 
 
 def test_jobs_are_independent_of_each_other(atlas: oc.Atlas) -> None:
-    from orthocas.atlases.cells import Cell
-    from orthocas.atlases.jobs import packed
-
     plan = packed(atlas._stock.plan)
     records = atlas._stock.records[:6]
     cells = [
@@ -371,8 +346,3 @@ def test_jobs_are_independent_of_each_other(atlas: oc.Atlas) -> None:
     for record, result in zip(reversed(list(records)), run_job(Job(plan, tuple(cells))), strict=True):
         assert result.outcome == record["outcome"]
         assert np.float32(result.leak_deg) == record["leak_deg"] or np.isnan(record["leak_deg"])
-
-
-def _unused() -> Iterator[None]:
-    samples_at
-    yield

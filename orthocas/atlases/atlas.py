@@ -12,7 +12,7 @@ from orthocas.atlases.atlas_file import Stock, read_stock, require_whole
 from orthocas.atlases.chart_of_box import chart_of, clipped, moved
 from orthocas.atlases.evaluation import Evaluation
 from orthocas.atlases.index import Index
-from orthocas.atlases.jobs import Outcome
+from orthocas.atlases.outcomes import Outcome
 from orthocas.atlases.plan import AtlasSettings
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.atlases.jobs import Outcome, Result
 from orthocas.atlases.lattice import Lattice
+from orthocas.atlases.outcomes import Outcome, Result
 from orthocas.atlases.plan import AtlasSettings, Plan
 from orthocas.atlases.regions import Region, Surroundings, joint_range_of
 from orthocas.atlases.symmetry import Symmetries

@@ -14,7 +14,8 @@ import numpy as np
 from orthocas.atlases.atlas_file import ATLAS, Stock, add_results, header_of, read_stock
 from orthocas.atlases.cells import Cell, cell_borders
 from orthocas.atlases.index import Index
-from orthocas.atlases.jobs import Job, Outcome, Result, packed, run_job
+from orthocas.atlases.jobs import Job, packed, run_job
+from orthocas.atlases.outcomes import Outcome, Result
 from orthocas.atlases.plan import Plan
 from orthocas.atlases.processes import Processes
 from orthocas.atlases.regions import Region

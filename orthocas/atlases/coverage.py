@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from orthocas.atlases.atlas import Atlas
-from orthocas.atlases.jobs import Outcome
+from orthocas.atlases.outcomes import Outcome
 from orthocas.checks import Array, Indices, require_count, require_kind
 from orthocas.judging.gradients import in_the_metric
 from orthocas.samples import samples_at

@@ -8,8 +8,8 @@ import numpy as np
 from orthocas.atlases.atlas_file import Stock
 from orthocas.atlases.cells import cell_borders
 from orthocas.atlases.chart_of_box import widened
-from orthocas.atlases.jobs import Outcome
 from orthocas.atlases.lattice import Orbits, orbits
+from orthocas.atlases.outcomes import Outcome
 from orthocas.atlases.plan import Plan
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, Indices

@@ -3,7 +3,6 @@
 import pickle
 import time
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from functools import lru_cache
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from orthocas.atlases.box_fit import BoxChart, BoxFitter, Mask
 from orthocas.atlases.cells import Cell
 from orthocas.atlases.chart_of_box import box_of, chart_of
+from orthocas.atlases.outcomes import Outcome, Result
 from orthocas.atlases.plan import Plan
 from orthocas.certifying.certify import certify
 from orthocas.checks import Array
@@ -18,31 +18,6 @@ from orthocas.domains import Box
 from orthocas.errors import CertifyError, OrthocasError
 
 _LEAST_CLEAR = 0.3  # share of the samples of a box that have to be clear of singular positions for a chart
-
-
-class Outcome(IntEnum):
-    """What became of a cell."""
-
-    CHART = 0  #: it has a chart of the quality asked for
-    SPLIT = 1  #: its halves are cells of their own
-    SINGULAR = 2  #: all or most of it is too near to singular positions
-    POOR = 3  #: no chart of the quality asked for, and no split is left
-    FAILED = 4  #: its workers died, or the fit raised an error
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """The outcome for one cell."""
-
-    cell: Cell
-    outcome: Outcome
-    joint: int = -1  #: which of the joints that boxes divide is split
-    numbers: Array | None = None  #: of the chart, (fitted, 1 + K), see `BoxChart`
-    leak_deg: float = float("nan")
-    conditioning: float = float("nan")
-    clear: float = 1.0  #: share of the samples that are clear of singular positions
-    certified: bool = False
-    seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
