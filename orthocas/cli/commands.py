@@ -19,8 +19,8 @@ COMMANDS = {
     "simulate": "Run a controller in a chart's coordinates; write the run, pictures, an animation and a report.",
     "follow": "Follow a tool path; write joint positions, velocities and accelerations on time stamps.",
     "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",
-    "atlas": "Build, evaluate and show atlases: charts that cover the joint range of an arm.",
     "export": "Write task, xi, phi and Jacobian of a chart as one Python module that needs the library only.",
+    "atlas": "Build, evaluate and show atlases: charts that cover the joint range of an arm.",
 }  #: names of the commands, modules of this package, and the first lines of their help
 
 
