@@ -290,6 +290,16 @@ def test_surroundings_of_postures_are_covered_and_little_else(tmp_path: Path) ->
     assert oc.evaluate_atlas(found, 2000).share == 1.0
 
 
+def test_charts_are_certified_if_asked_for(tmp_path: Path) -> None:
+    asked = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.8, certify_seconds=20.0)
+    with ThreadPoolExecutor(1) as executor:
+        region = [[0.0, 0.9, 0.9]]
+        found = oc.build_atlas(planar(), tmp_path / "a", asked, region=region, radius=0.01, executor=executor)
+    assert found.as_dict()["certified"] == found.fitted > 0
+    assert oc.certify(found.chart(found.chart_at(region[0]))).proved
+    assert oc.evaluate_atlas(found, 200).certified.all()
+
+
 def test_bad_arguments_are_named(tmp_path: Path) -> None:
     path = tmp_path / "arm.orthocas-atlas"
     with pytest.raises(InvalidValueError, match="share"):

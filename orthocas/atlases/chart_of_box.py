@@ -10,6 +10,7 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import Box
+from orthocas.files.json import plain
 from orthocas.files.problem_parts import problem_from_data, problem_to_data
 from orthocas.parametrisations import JointSpace, Polynomial
 from orthocas.postures.clear_box import ClearBox
@@ -63,7 +64,7 @@ def without_limits(problem: Problem) -> Problem:
     """The same problem for an arm without joint limits."""
     header, arrays = problem_to_data(problem)
     free = {name: np.full(problem.n, side * np.inf) for name, side in (("robot_lower", -1), ("robot_upper", 1))}
-    return problem_from_data(header, {**arrays, **free})
+    return problem_from_data(plain(header), {**arrays, **free})
 
 
 def moved(numbers: Array, terms: Array, shift: Array, scale: Array) -> Array:
