@@ -34,6 +34,10 @@ if TYPE_CHECKING:
         simulation,
         solvers,
     )
+    from orthocas.atlases.atlas import Atlas
+    from orthocas.atlases.building import build_atlas
+    from orthocas.atlases.coverage import Coverage, evaluate_atlas
+    from orthocas.atlases.plan import AtlasSettings
     from orthocas.certificates import Certificate
     from orthocas.certifying.certify import certified_box, certify
     from orthocas.certifying.check import check_certificate
@@ -69,12 +73,15 @@ __version__ = _VERSION
 __all__ = [
     "MLP",
     "SEW",
+    "Atlas",
+    "AtlasSettings",
     "Box",
     "Certificate",
     "Chart",
     "Circle",
     "ClearBox",
     "Comparison",
+    "Coverage",
     "Fit",
     "Fourier",
     "Given",
@@ -93,6 +100,7 @@ __all__ = [
     "Tracker",
     "TrackerStatus",
     "Weights",
+    "build_atlas",
     "certified_box",
     "certify",
     "check",
@@ -106,6 +114,7 @@ __all__ = [
     "distil",
     "errors",
     "evaluate",
+    "evaluate_atlas",
     "export",
     "fit",
     "follow",
@@ -134,6 +143,10 @@ __all__ = [
 
 # Everything is imported on first use: all of it takes half a second, and few programs need all.
 _HOMES = {
+    "orthocas.atlases.atlas": ["Atlas"],
+    "orthocas.atlases.building": ["build_atlas"],
+    "orthocas.atlases.coverage": ["Coverage", "evaluate_atlas"],
+    "orthocas.atlases.plan": ["AtlasSettings"],
     "orthocas.certificates": ["Certificate"],
     "orthocas.certifying.certify": ["certified_box", "certify"],
     "orthocas.certifying.check": ["check_certificate"],

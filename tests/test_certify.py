@@ -286,6 +286,15 @@ def test_a_dip_that_is_no_fold_is_certified() -> None:
     assert oc.certify(dipped(0.1, 0.1)).proved
 
 
+def test_a_chart_for_all_positions_of_a_cyclic_joint_is_certified() -> None:
+    known = problems.get("iiwa")
+    problem = oc.Problem(known.robot, known.task, domain=oc.Box(known.domain.centre, 0.15))
+    cyclic = oc.fit(problem, oc.Polynomial(2, cyclic=["A1"]), samples=300).chart
+    certificate = oc.certify(cyclic, time_limit=60)
+    assert certificate.proved
+    assert certificate.boxes < 500  # A1 is never halved: J does not depend on it
+
+
 def test_a_certified_box_of_a_folding_chart_holds_no_fold() -> None:
     arm = problems.get("planar_3r_xy")
     domain = oc.Box([0.6, 0.8, 0.8], 0.9)

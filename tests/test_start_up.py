@@ -75,8 +75,13 @@ def test_unknown_names_are_errors() -> None:
 
 
 def test_help_tells_the_first_lines_of_all_commands() -> None:
-    commands = {command.name: command for command in app_for(list(COMMANDS)).registered_commands}
-    assert list(commands) == list(COMMANDS)
+    app = app_for(list(COMMANDS))
+    commands = {command.name: command for command in app.registered_commands}
+    groups = {group.name: group for group in app.registered_groups}
+    assert [*commands, *groups] == list(COMMANDS)
+    for name, group in groups.items():
+        assert group.typer_instance is not None
+        assert group.typer_instance.info.help == COMMANDS[name]
     for name, command in commands.items():
         assert command.callback is not None
         assert (command.callback.__doc__ or "").splitlines()[0] == COMMANDS[name]

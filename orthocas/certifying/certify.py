@@ -1,6 +1,7 @@
 """Certify charts: prove with rigorous arithmetic that they do not fold, and where they are one-to-one (ours)."""
 
 import time
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from orthocas.domains import Box, Domain, contains, reach
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.files.chart_file import fingerprint
 from orthocas.minimising.watch import Monitor, Progress, silent
+from orthocas.parametrisations import CyclicParametrisation
 
 _SAMPLES = 20_000  # points where folds are looked for before the proof
 _INJECTIVE_BOXES = 500  # for each scale of the domain that is tried
@@ -74,6 +76,7 @@ def certify(
     limits = Limits(seconds=checked_options(chart, time_limit, executor))
     bound = checked_bound(chart, bound)
     rows = chart_rows(chart)
+    _require_independent(chart, rows.variables)
     judge = judge_of(chart, rows, bound)
     base = whole_domain(chart.problem.domain) if resume is None else _resumed(chart, bound, resume)
     search = Search(judge, base, limits, largest_first(base), executor)
@@ -159,8 +162,9 @@ def checked_bound(chart: Chart, bound: float) -> float:
 
 
 def whole_domain(domain: Domain) -> Subdivision:
-    """The domain, with the slack of its borders, as a box in one part."""
+    """The domain, with the slack of its borders, as a box in one part; unbounded joints have their half-width."""
     half = domain.half_width if domain.name == "torus" else reach(domain)
+    half = np.where(np.isfinite(half), half, domain.half_width)
     low, high = domain.centre - half, domain.centre + half
     return Subdivision.whole(np.nextafter(low, -np.inf), np.nextafter(high, np.inf))
 
@@ -176,6 +180,20 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
         np.array_equal(domain.low, certificate.regular.low) and np.array_equal(domain.high, certificate.regular.high)
     ):
         raise CertifyError("the certificate is void: it covers another domain")
+
+
+def _require_independent(chart: Chart, variables: Sequence[int]) -> None:
+    """Raise CertifyError if a proof for the half-width of an unbounded joint is none for all its positions.
+
+    It is one if J does not depend on the joint, or if the coordinates are linear in it and it makes a full turn.
+    """
+    problem, parametrisation = chart.problem, getattr(chart.coordinates, "parametrisation", None)
+    linear = parametrisation.cyclic if isinstance(parametrisation, CyclicParametrisation) else ()
+    for joint in getattr(problem.domain, "unbounded", ()):
+        name = problem.robot.joint_names[joint]
+        turning = not problem.robot.tree.prismatic[joint] and problem.domain.half_width[joint] >= np.pi
+        if joint in variables and not (name in linear and turning):
+            raise CertifyError(f"joint '{name}' is unbounded and J depends on it, expected bounds, or a cyclic joint")
 
 
 def _resumed(chart: Chart, bound: float, certificate: Certificate) -> Subdivision:

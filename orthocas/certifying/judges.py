@@ -47,7 +47,7 @@ class RegularityJudge:
         """Judge boxes between corners (boxes, n)."""
         with one_blas_thread():  # small products, and the same rounding everywhere
             J = self.rows(low, high)
-            return _joined([self._few(part) for part in _parts(J)], self.rows.variables)
+            return _joined([self._few(part) for part in _parts(J)], J.variables)
 
     def _few(self, J: TaylorModel) -> tuple[Array, ...]:
         turned, signs = in_singular_basis(J)
@@ -75,7 +75,7 @@ class InjectivityJudge:
         """Judge boxes between corners (boxes, n)."""
         with one_blas_thread():  # small products, and the same rounding everywhere
             J = self.rows(low, high)
-            return _joined([self._few(part) for part in _parts(J)], self.rows.variables)
+            return _joined([self._few(part) for part in _parts(J)], J.variables)
 
     def _few(self, J: TaylorModel) -> tuple[Array, ...]:
         boxes = J.remainder.shape[-1]

@@ -21,6 +21,7 @@ COMMANDS = {
     "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",
     "export": "Write task, xi, phi and Jacobian of a chart as one Python module that needs the library only.",
     "view": "Show a chart, a robot or a motion in the browser, until Ctrl-C.",
+    "atlas": "Build, evaluate and show atlases: charts that cover the joint range of an arm.",
 }  #: names of the commands, modules of this package, and the first lines of their help
 
 
@@ -36,7 +37,10 @@ def app_for(words: Sequence[str]) -> typer.Typer:
     )
     for name, summary in COMMANDS.items():
         command = getattr(import_module(f"orthocas.cli.{name}"), name) if name in words else _idle
-        app.command(name, help=None if name in words else summary)(command)
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name)
+        else:
+            app.command(name, help=None if name in words else summary)(command)
     return app
 
 

@@ -3,26 +3,23 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.tape import from_tape, require_tape, to_tape
 from orthocas.certificates import Certificate
-from orthocas.checks import require_count, require_known, require_text
+from orthocas.checks import require_count, require_text
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
-from orthocas.domains import Box, Domain, Torus, require_within_limits, sample_uniform
+from orthocas.domains import sample_uniform
 from orthocas.errors import ChartFileError, InvalidValueError, OrthocasError
 from orthocas.files.archive import Kind, read_archive, write_archive
 from orthocas.files.certificate_parts import certificate_from_data, certificate_to_data
 from orthocas.files.json import part
 from orthocas.files.npy import Stored, to_npy
+from orthocas.files.problem_parts import problem_from_data, problem_to_data
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
-from orthocas.metrics import Metric
 from orthocas.parametrisations import (
     MLP,
     Fourier,
@@ -32,10 +29,7 @@ from orthocas.parametrisations import (
     parametrisation_from_data,
     parametrisation_to_data,
 )
-from orthocas.postures.clear_box import CLEAR_BOX, ClearBox
 from orthocas.problem import Problem
-from orthocas.robots import KinematicTree, Robot
-from orthocas.tasks import Task
 
 CHART = Kind("chart", 1, ChartFileError)
 Notes = Mapping[str, str | float]
@@ -76,27 +70,9 @@ def fingerprint(problem: Problem, coordinates: CoordinateMap) -> str:
 
 def _content(problem: Problem, coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Header and arrays of a chart, without notes."""
-    tree = problem.robot.tree
-    numbers = {f.name: getattr(tree, f.name) for f in fields(tree)}
-    arrays = {f"robot_{name}": value for name, value in numbers.items() if isinstance(value, np.ndarray)}
-    domain = problem.domain
-    arrays |= {"domain_centre": domain.centre, "domain_half_width": domain.half_width}
-    arrays |= {"domain_row_scale": domain.scale} if isinstance(domain, ClearBox) else {}
-    description, numbers_of_coordinates = _coordinates_to_data(coordinates)
-    arrays |= numbers_of_coordinates
-    header = {
-        "robot": {name: value for name, value in numbers.items() if not isinstance(value, np.ndarray)},
-        "problem": {
-            "name": problem.name,
-            "task": _with_tape(problem.task.recipe, problem.task.function),
-            "metric": _with_tape(problem.metric.recipe, problem.metric.function),
-            "domain": domain.name,
-            **({"unbounded": list(domain.unbounded)} if isinstance(domain, Box) else {}),
-            **({"least_singular_value": domain.least_singular_value} if isinstance(domain, ClearBox) else {}),
-        },
-        "coordinates": description,
-    }
-    return header, arrays
+    header, arrays = problem_to_data(problem)
+    description, numbers = _coordinates_to_data(coordinates)
+    return {**header, "coordinates": description}, {**arrays, **numbers}
 
 
 def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certificate | None]:
@@ -107,8 +83,7 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
     """
     header, arrays = read_archive(path, CHART)
     try:
-        robot = Robot(_tree(part(header, "robot", dict), arrays))
-        problem = _problem(robot, part(header, "problem", dict), arrays)
+        problem = problem_from_data(header, arrays)
         coordinates = _coordinates(problem, part(header, "coordinates", dict), arrays)
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
@@ -194,68 +169,9 @@ def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str,
     )
 
 
-def _with_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:
-    """A task or metric as plain data. A custom one includes its expression."""
-    return {**recipe, "tape": to_tape(function)} if recipe["kind"] == "custom" else dict(recipe)
-
-
 def _idle(joints: list[int], n: int) -> tuple[int, ...]:
     """The idle joints, checked against the number of joints."""
     idle = tuple(require_count("idle joint", k, least=0) for k in joints)
     if len(set(idle)) != len(idle) or any(k >= n for k in idle):
         raise InvalidValueError("idle joints", str(idle)[:80], f"different indices below {n}")
     return idle
-
-
-def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTree:
-    names = part(data, "joint_names", list)
-    numbers: dict[str, Any] = {
-        name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
-    }
-    for name in ("effort_limits", "velocity_limits"):  # missing in older files
-        numbers.setdefault(name, np.full(len(names), np.inf))
-    texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
-    wanted, found = {field.name for field in fields(KinematicTree)}, {*texts, *numbers}
-    if wanted != found:
-        odd = f"with {sorted(found - wanted)} and without {sorted(wanted - found)}"
-        raise InvalidValueError("robot", odd, "the fields of a KinematicTree")
-    for name in ("joint_kinds", "parents"):
-        part(data, name, list)
-    return KinematicTree(**texts | numbers)
-
-
-def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
-    domain = _domain(robot.n, data, arrays)
-    task, metric = _task(robot, part(data, "task", dict)), _metric(robot, part(data, "metric", dict))
-    if data["domain"] == CLEAR_BOX and isinstance(domain, Box):
-        require_within_limits(robot, domain)  # before the task is evaluated there
-        scale = part(arrays, "domain_row_scale", np.ndarray)
-        domain = ClearBox(domain, task, part(data, "least_singular_value", float), scale)
-    return Problem(robot, task, metric, domain, part(data, "name", str))
-
-
-def _domain(n: int, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Domain:
-    """The box or torus of a file; for a ClearBox its box."""
-    kind = part(data, "domain", str)
-    require_known("domain", kind, ("box", "torus", CLEAR_BOX))
-    if kind == "torus":
-        return Torus(n)
-    unbounded = part(data, "unbounded", list) if "unbounded" in data else ()  # missing in older files
-    return Box(part(arrays, "domain_centre", np.ndarray), part(arrays, "domain_half_width", np.ndarray), unbounded)
-
-
-def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
-    if part(recipe, "kind", str) == "custom":
-        labels = part(recipe, "labels", list)
-        units = part(recipe, "units", list) if "units" in recipe else ()  # older files have none
-        require_tape(part(recipe, "tape", dict), robot.n)
-        return Task.custom(robot, part(recipe, "name", str), lambda q: from_tape(recipe["tape"], q), labels, units)
-    return Task.from_recipe(robot, recipe)
-
-
-def _metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:
-    if part(recipe, "kind", str) == "custom":
-        require_tape(part(recipe, "tape", dict), robot.n)
-        name = recipe.get("name", "custom")  # older files have no name
-        return Metric.custom(robot, name, lambda q: from_tape(recipe["tape"], q))
-    return Metric.from_spec(robot, recipe["matrix"] if recipe["kind"] == "constant" else recipe["kind"])

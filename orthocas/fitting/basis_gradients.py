@@ -88,3 +88,30 @@ class BasisGradients:
     @cached_property
     def _jacobian(self) -> ca.SX:
         return ca.jacobian(self._family.basis(self._q), self._q)
+
+
+class BoxGradients(BasisGradients):
+    """Those of a family on the cube [-1, 1]^n in the units of one box: d psi / dq_i = d psi / du_i / half_width_i.
+
+    Boxes share the compiled basis, and the gradients at points of the cube that all of them use.
+
+    Args:
+        cube: gradients on the cube.
+        half_width: of the box, (n,).
+        shared: points of the cube, (N, n); `at` recognises this array.
+        known: the result of `cube.at(shared)`.
+    """
+
+    def __init__(self, cube: BasisGradients, half_width: Array, shared: Array, known: Array) -> None:
+        super().__init__(cube._family, cube._n)
+        self._cube, self._scale, self._shared, self._known = cube, 1 / half_width[:, None, None], shared, known
+
+    @property
+    def terms_of_joints(self) -> NDArray[np.int_]:
+        """As on the cube."""
+        return self._cube.terms_of_joints
+
+    def at(self, points: Array) -> Array:
+        """The gradients at points of the cube (N, n), (B, n, W, c)."""
+        found: Array = (self._known if points is self._shared else self._cube.at(points)) * self._scale
+        return found

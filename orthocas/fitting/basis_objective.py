@@ -41,6 +41,7 @@ class BasisObjective:
         kept: the coefficients (r, K) that may differ from zero; theta holds only these. Default: all.
         exchanged: pairs of components whose sum and difference are coordinates, see `orthocas.fitting.mirror`. Then
             C and J_xi are those of the components.
+        gradients: gradients of the basis, if they are known already. Default: those of the family.
     """
 
     def __init__(
@@ -52,15 +53,19 @@ class BasisObjective:
         draw: Draw,
         kept: NDArray[np.bool_] | None = None,
         exchanged: Pairs = (),
+        gradients: BasisGradients | None = None,
     ) -> None:
         self.family, self.weights, self._draw = family, weights, draw
         self.r, self.K = family.outputs, family.width
         self.kept = np.ones((self.r, self.K), dtype=bool) if kept is None else kept
         m, self.n = samples.task_jacobian.shape[1:]
-        self._gradients = BasisGradients(family, self.n)
+        self._gradients = BasisGradients(family, self.n) if gradients is None else gradients
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name, exchanged)
+        self._begin(samples, start)
+
+    def _begin(self, samples: Samples, start: Array) -> None:
         self._put(samples)
-        oriented = self._loss.oriented or weights.folds > 0
+        oriented = self._loss.oriented or self.weights.folds > 0
         self._orientation = samples.orientation(self.coordinate_jacobians(start)) if oriented else None
         self._describe(samples)
 
@@ -150,6 +155,19 @@ class BasisObjective:
         other._loss = Loss.of(self._loss.sizes, weights, self._loss.exchanged)
         other._put(samples)
         other._describe(samples)
+        return other
+
+    def moved(self, gradients: BasisGradients, samples: Samples, start: Array) -> Self:
+        """The same loss of the same family on another box, without building it again.
+
+        Args:
+            gradients: gradients of the basis there.
+            samples: the samples.
+            start: parameters whose orientation the regularity term keeps.
+        """
+        other = copy(self)
+        other._gradients = gradients
+        other._begin(samples, start)
         return other
 
     @property

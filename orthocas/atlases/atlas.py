@@ -1,0 +1,284 @@
+"""Atlases: many charts that cover the joint range of a robot, in one file (ours)."""
+
+from collections import OrderedDict
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.atlases.atlas_file import Stock, read_stock, require_whole
+from orthocas.atlases.chart_of_box import chart_of, clipped, moved
+from orthocas.atlases.evaluation import Evaluation
+from orthocas.atlases.index import Index
+from orthocas.atlases.outcomes import Outcome
+from orthocas.atlases.plan import AtlasSettings
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.chart import Chart
+from orthocas.checks import Array, Indices, as_path, as_point, as_point_set, frozen_indices, require_count
+from orthocas.domains import Box
+from orthocas.errors import InvalidValueError
+from orthocas.problem import Problem
+from orthocas.showing import Shown, listed, number_list
+
+Turns = tuple[int, ...]  #: full turns of each joint that boxes divide
+_KEPT = 32  # charts that stay built
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Atlas(Shown):
+    """Charts of overlapping boxes that cover a region of joint space, opened from a file without reading them all.
+
+    Charts have numbers from 0 on. Neighbours have the same order and signs of coordinates. Charts that are images of
+    others in a symmetry of the arm count as charts of their own, but share the numbers in the file.
+
+    `build_atlas` builds one.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> with TemporaryDirectory() as folder:
+        ...     atlas = oc.build_atlas(
+        ...         problems.get("planar_3r_xy"),
+        ...         Path(folder) / "arm.orthocas-atlas",
+        ...         region=[[0.6, 0.8, 0.8]],
+        ...         radius=0.2,
+        ...         jobs=1,
+        ...     )
+        ...     number = atlas.chart_at([0.6, 0.8, 0.8])
+        ...     xi = atlas.xi([0.6, 0.8, 0.8])
+        >>> number >= 0, xi.shape
+        (True, (1,))
+    """
+
+    _stock: Stock
+    _kept: "OrderedDict[tuple[int, Turns], Chart]" = field(default_factory=OrderedDict)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Open an atlas file. Loading never runs code from the file.
+
+        Raises:
+            AtlasFileError: if the file is missing, truncated, foreign, damaged, or from a newer version.
+        """
+        return cls(require_whole(read_stock(as_path("path", path).absolute())))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self._stock,)
+
+    def __len__(self) -> int:
+        """Number of charts, images included."""
+        return self._index.count
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self._stock.path
+
+    @property
+    def problem(self) -> Problem:
+        """Robot, task and metric; its domain is the joint range that tiles were laid over."""
+        return self._stock.plan.problem
+
+    @property
+    def settings(self) -> AtlasSettings:
+        """What was asked of the charts."""
+        return self._stock.plan.settings
+
+    @property
+    def fitted(self) -> int:
+        """Number of charts that were fitted; the others are images."""
+        return len(self._stock.charts)
+
+    def facts(self) -> dict[str, str]:
+        """Charts, joints and what was asked of them."""
+        plan, names = self._stock.plan, self.problem.robot.joint_names
+        counts = " x ".join(str(count) for count in plan.lattice.counts.tolist())
+        asked = plan.settings
+        return {
+            "atlas": f"{len(self)} charts of {self.problem.heading}",
+            "fitted": f"{self.fitted} charts; {len(plan.maps)} symmetries, the identity included",
+            "task": self.problem.task.heading,
+            "metric": self.problem.metric.name,
+            "boxes": f"divide {listed(names[i] for i in plan.joints)}; {counts} tiles",
+            "half-widths": f"of tiles {number_list(plan.lattice.width / 2)}, halved at most {asked.splits} times",
+            "left out": f"cyclic {listed(names[i] for i in plan.cyclic) or 'none'}, "
+            f"idle {listed(names[i] for i in plan.idle) or 'none'}",
+            "asked": f"leak {asked.leak_deg:g} deg, conditioning {asked.conditioning:g}, "
+            f"relative singular value above {asked.least_singular_value:g}",
+            "file": f"{self._stock.contents.size / 2**20:.3g} MiB",
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        plan, names = self._stock.plan, self.problem.robot.joint_names
+        outcomes = np.bincount(self._stock.records["outcome"], minlength=len(Outcome))
+        return {
+            "charts": len(self),
+            "fitted": self.fitted,
+            "bytes": self._stock.contents.size,
+            "task": self.problem.task.name,
+            "metric": self.problem.metric.name,
+            "joints": [names[i] for i in plan.joints],
+            "cyclic_joints": [names[i] for i in plan.cyclic],
+            "idle_joints": [names[i] for i in plan.idle],
+            "symmetries": len(plan.maps),
+            "tiles": plan.lattice.counts.tolist(),
+            "tile_half_widths": (plan.lattice.width / 2).tolist(),
+            "settings": asdict(plan.settings),
+            "boxes": {outcome.name.lower(): int(outcomes[outcome]) for outcome in Outcome},
+            "certified": int((self._stock.records["certified"][self._stock.charts] > 0).sum()),
+            "fit_seconds": float(self._stock.records["seconds"].sum()),
+        }
+
+    def chart_at(self, q: ArrayLike, current: ArrayLike | None = None) -> Any:
+        """The number of the chart for joint positions (n,) or (N, n): an int, or (N,); -1 where there is none.
+
+        It is the chart whose cell holds q; near holes, a neighbour whose box reaches so far. With `current`, it stays
+        the current chart as long as its box holds q. So the chart does not change back and forth at a border.
+
+        Args:
+            q: joint positions [rad] or [m].
+            current: numbers of the charts used so far, one or (N,); -1 for none.
+
+        Raises:
+            ShapeError, InvalidValueError: if q has another number of joints or is not finite, or a number is no chart.
+        """
+        points, single = as_point_set("q", q, self.problem.n)
+        divided = np.ascontiguousarray(points[:, list(self._stock.plan.joints)])
+        if current is None:
+            found = self._index.find(divided)
+        else:
+            found = self._numbers("current", current, len(points), least=-1).copy()
+            known = np.flatnonzero(found >= 0)
+            known = known[self._index.in_boxes(divided[known], found[known])]
+            left = np.ones(len(points), dtype=bool)
+            left[known] = False
+            found[left] = self._index.find(divided[left])
+        return int(found[0]) if single else found
+
+    def xi(self, q: ArrayLike, charts: ArrayLike | None = None) -> Array:
+        """Extra coordinates, (r,) or (N, r), of joint positions (n,) or (N, n); NaN where there is no chart.
+
+        Args:
+            q: joint positions [rad] or [m].
+            charts: the charts to use, one or (N,). Default: `chart_at(q)`.
+        """
+        points, single = as_point_set("q", q, self.problem.n)
+        numbers = self._chosen(points, charts)
+        found = np.full((len(points), self.problem.r), np.nan)
+        known = numbers >= 0
+        found[known] = self._evaluation.xi(points[known], numbers[known])
+        return found[0] if single else found
+
+    def jacobian(self, q: ArrayLike, charts: ArrayLike | None = None) -> Array:
+        """J_xi = dxi/dq, (r, n) or (N, r, n), as `xi`."""
+        points, single = as_point_set("q", q, self.problem.n)
+        numbers = self._chosen(points, charts)
+        found = np.full((len(points), self.problem.r, self.problem.n), np.nan)
+        known = numbers >= 0
+        found[known] = self._evaluation.jacobian(points[known], numbers[known])
+        return found[0] if single else found
+
+    def chart(self, number: int, near: ArrayLike | None = None) -> Chart:
+        """A chart as all of orthocas takes it: its domain is the box, less what lies beyond the joint limits.
+
+        Args:
+            number: the number of the chart.
+            near: a joint position (n,). Boxes repeat every full turn of joints that can turn so far; this tells which.
+
+        Raises:
+            InvalidValueError: if there is no such chart.
+        """
+        number, turns = self._numbered(number, near)
+        if (number, turns) not in self._kept:
+            self._kept[number, turns] = self._made(number, turns)
+            while len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        return self._kept[number, turns]
+
+    def box(self, number: int, near: ArrayLike | None = None) -> Box:
+        """The box of a chart within the joint limits; see `chart`."""
+        return clipped(self._stock.plan, *self._borders(*self._numbered(number, near)))
+
+    def handed_over(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, number: int) -> tuple[Array, Array, Array]:
+        """What a chart asks for at a desired motion of the joints: phi, its velocity and its acceleration, (n,) each.
+
+        A controller that changes to this chart goes on from there, so the posture asked for does not jump:
+        phi = phi(q), dphi = J dq, ddphi = J ddq + dJ/dt dq.
+        """
+        chart = self.chart(number, q)
+        (q0,), (v,), (a,) = (as_point_set(name, x, chart.n)[0] for name, x in (("q", q), ("dq", dq), ("ddq", ddq)))
+        J = chart.jacobian(q0)
+        bend = np.array(chart.function("second_derivative")(q0, v, v))[:, 0]
+        return chart.phi(q0), J @ v, J @ a + bend
+
+    def _numbered(self, number: int, near: ArrayLike | None) -> tuple[int, Turns]:
+        """The number of a chart, checked, and the full turns of its box towards a position."""
+        number = require_count("number", number, least=0, most=len(self) - 1)
+        plan = self._stock.plan
+        if near is None:
+            return number, (0,) * len(plan.joints)
+        q = as_point("near", near, plan.problem.n)[list(plan.joints)]
+        apart = (q - self._index.image_centres(np.array([number]))[0][0]) / (2 * np.pi)
+        return number, tuple(np.where(plan.lattice.endless, np.round(apart), 0.0).astype(int).tolist())
+
+    def _made(self, number: int, turns: Turns) -> Chart:
+        plan, index, numbers = self._stock.plan, self._index, np.array([number])
+        fitted = index.rows(numbers)[1]
+        signs = index.map_signs(numbers)[0]
+        own = self._evaluation.numbers(fitted)[0] * np.append(
+            1.0, np.prod(signs**self._evaluation.basis.exponents, axis=1)
+        )
+        values = self._evaluation.turned(own[None], numbers)[0]
+        if self._evaluation.turns is not None:
+            values[:, 0] += self._evaluation.turns.constants[number]
+        low, high = self._borders(number, turns)
+        box = clipped(plan, low, high)
+        middle, half = (low + high) / 2, (high - low) / 2
+        joints, columns = list(plan.joints), [plan.active.index(i) for i in plan.joints]
+        shift, scale = np.zeros(len(plan.active)), np.ones(len(plan.active))
+        shift[columns] = (box.centre[joints] - middle) / half
+        scale[columns] = box.half_width[joints] / half
+        if shift.any() or (scale != 1).any():
+            values = moved(values, self._evaluation.basis.exponents.astype(int), shift, scale)
+        clear = float(self._stock.records["clear"][self._stock.charts[fitted[0]]])
+        return chart_of(plan, box, values, clear, plan.problem)
+
+    def _borders(self, number: int, turns: Turns) -> tuple[Array, Array]:
+        """Borders of the box of a chart in the joints that boxes divide, also beyond the limits."""
+        numbers = np.array([number])
+        centre = self._index.image_centres(numbers)[0][0] + 2 * np.pi * np.array(turns)
+        half = self._index.box_half_widths[self._index.rows(numbers)[1]][0]
+        return centre - half, centre + half
+
+    def _chosen(self, points: Array, charts: ArrayLike | None) -> Indices:
+        if charts is None:
+            return self._index.find(np.ascontiguousarray(points[:, list(self._stock.plan.joints)]))
+        return self._numbers("charts", charts, len(points), least=-1)
+
+    def _numbers(self, name: str, value: ArrayLike, count: int, least: int) -> Indices:
+        given = np.broadcast_to(np.asarray(value), (count,))
+        shifted = frozen_indices(name, given - least, (count,), len(self) - least)
+        return shifted + least
+
+    @cached_property
+    def _index(self) -> Index:
+        return Index(self._stock)
+
+    @cached_property
+    def _evaluation(self) -> Evaluation:
+        turns = self._stock.turns
+        if turns is not None and len(turns.order) != self._index.count:
+            turns = None  # of an unfinished build
+        return Evaluation(self._index, turns)
+
+
+def require_atlas(name: str, value: object) -> Atlas:
+    """Return an atlas; raises InvalidValueError for anything else."""
+    if not isinstance(value, Atlas):
+        raise InvalidValueError(name, f"a {type(value).__name__}", "an Atlas")
+    return value

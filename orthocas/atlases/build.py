@@ -1,0 +1,214 @@
+"""Build an atlas: run the jobs of all cells, split what is not good enough, append results to the file (ours)."""
+
+import hashlib
+import random
+import time
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from orthocas.atlases.atlas_file import ATLAS, Stock, add_results, header_of, read_stock
+from orthocas.atlases.cells import Cell, cell_borders
+from orthocas.atlases.index import Index
+from orthocas.atlases.jobs import Job, packed, run_job
+from orthocas.atlases.outcomes import Outcome, Result
+from orthocas.atlases.plan import Plan
+from orthocas.atlases.processes import Processes
+from orthocas.atlases.regions import Region
+from orthocas.casadi_tools.batch import THREADS
+from orthocas.errors import AtlasFileError
+from orthocas.files.blocks import begins, create, cut_rest, text_of
+from orthocas.minimising.watch import Monitor, Progress
+
+_BATCH = 4  # cells in a job
+_AHEAD = 3  # jobs in flight for each worker
+_IN_FLIGHT = 64  # jobs in flight of an executor that somebody gives
+_FLUSH = 2.0  # seconds between blocks of the file
+_ATTEMPTS = 3  # of a cell whose worker dies
+_SEED = 0
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A cell to fit: one that was halved is its parent."""
+
+    cell: Cell
+    parent: int  #: row of the parent's record, -1 for a tile
+    upper: bool
+    attempts: int = 0
+
+
+@dataclass(eq=False)
+class Building:
+    """A build in progress."""
+
+    path: Path
+    plan: Plan
+    region: Region
+    share: float
+    monitor: Monitor
+    waiting: list[Wanted] = field(default_factory=list)  #: the last one is next
+    rows: int = 0
+    charts: int = 0
+    tiles: int = 0
+    begun: set[int] = field(default_factory=set)  #: tiles that are not finished
+    _results: list[tuple[int, bool, Result]] = field(default_factory=list)
+    _open: dict[int, int] = field(default_factory=dict)  #: cells of a tile that wait or run
+    _start: float = field(default_factory=time.monotonic)
+    _flushed: float = field(default_factory=time.monotonic)
+
+    def resume(self, stock: Stock) -> None:
+        """Find the cells that the file does not have yet."""
+        self.rows, self.charts = len(stock.records), len(stock.charts)
+        index = Index(stock)
+        fitted = sorted(set(index.orbits.fitted.tolist()))
+        random.Random(_SEED).shuffle(fitted)
+        fitted = fitted[: int(np.ceil(self.share * len(fitted)))]
+        self.tiles = len(fitted)
+        known, k = set(stock.records["tile"].tolist()), len(self.plan.joints)
+        self._images = _images(index)
+        self.waiting = [Wanted(Cell.whole(tile, k), -1, False) for tile in reversed(fitted) if tile not in known]
+        self.waiting += list(_unfinished(stock, index, set(fitted), self._wanted_halves))
+        for wanted in self.waiting:
+            self._open[wanted.cell.tile] = self._open.get(wanted.cell.tile, 0) + 1
+        self._before = self.tiles - len(self._open)
+
+    def run(self, executor: Executor, in_flight: int, plan: bytes | None, until: float) -> None:
+        """Run jobs until nothing is left to do, or until a time. What is done by then is in the file."""
+        running: dict[Future[list[Result]], list[Wanted]] = {}
+        try:
+            while (self.waiting and time.monotonic() < until) or running:
+                while self.waiting and len(running) < in_flight and time.monotonic() < until:
+                    batch = [self.waiting.pop() for _ in range(min(_BATCH, len(self.waiting)))]
+                    running[executor.submit(run_job, Job(plan, tuple(wanted.cell for wanted in batch)))] = batch
+                done = wait(running, timeout=_FLUSH, return_when=FIRST_COMPLETED).done
+                for future in done:
+                    self._take(future, running.pop(future))
+                if time.monotonic() > self._flushed + _FLUSH:
+                    self.flush()
+        finally:
+            for future in running:
+                future.cancel()
+            self.flush()
+
+    def flush(self) -> None:
+        """Append what came since the last time to the file."""
+        self._flushed = time.monotonic()
+        if self._results:
+            charts = sum(result.numbers is not None for _, _, result in self._results)
+            add_results(self.path, self.plan, self._results, self.charts)
+            self.charts += charts
+            self._results = []
+        self._report()
+
+    def _take(self, future: "Future[list[Result]]", batch: list[Wanted]) -> None:
+        """Keep the results of a job; cells of a worker that died run again."""
+        error = future.exception()
+        if error is None:
+            for wanted, result in zip(batch, future.result(), strict=True):
+                self._keep(wanted, result)
+            return
+        for wanted in batch:
+            if wanted.attempts + 1 < _ATTEMPTS:
+                self.waiting.append(Wanted(wanted.cell, wanted.parent, wanted.upper, wanted.attempts + 1))
+            elif isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":
+                self._keep(wanted, Result(wanted.cell, Outcome.FAILED))
+            else:
+                raise error
+
+    def _keep(self, wanted: Wanted, result: Result) -> None:
+        row, tile = self.rows, wanted.cell.tile
+        self._results.append((wanted.parent, wanted.upper, result))
+        self.rows += 1
+        halves = list(self._wanted_halves(row, result.cell, result.joint)) if result.outcome == Outcome.SPLIT else []
+        self.waiting += halves
+        self._open[tile] += len(halves) - 1
+        if not self._open[tile]:
+            del self._open[tile]
+
+    def _wanted_halves(self, row: int, cell: Cell, joint: int) -> Iterator[Wanted]:
+        """The halves of a cell that the region touches."""
+        for upper, half in enumerate(cell.halves(joint)):
+            if self._touched(half):
+                yield Wanted(half, row, bool(upper))
+
+    def _touched(self, cell: Cell) -> bool:
+        """Whether the region touches one of the images of a cell."""
+        lattice = self.plan.lattice
+        low, width = cell_borders(lattice, np.array([cell.tile]), np.array([cell.levels]), np.array([cell.places]))
+        own = lattice.centres(np.array([cell.tile]))[0]
+        centres, signs = self._images[cell.tile]
+        middle = centres + signs * (low[0] + width[0] / 2 - own)
+        return bool(self.region.touches(middle - width / 2, middle + width / 2).any())
+
+    def _report(self) -> None:
+        finished = self.tiles - len(self._open)
+        seconds, gained = time.monotonic() - self._start, finished - self._before
+        left = f", {_duration(seconds * (self.tiles - finished) / gained)} left" if gained > 0 else ""
+        detail = f"{finished} of {self.tiles} tiles, {self.charts} charts fitted{left}"
+        self.monitor(Progress("atlas", finished / max(self.tiles, 1), detail))
+
+
+def opened(path: Path, plan: Plan, region: Region, force: bool) -> Stock:
+    """The file of a plan, a new one or one to go on with.
+
+    Raises:
+        AtlasFileError: if it cannot be written, or is the file of another plan.
+    """
+    header = header_of(plan, region)
+    if force or not begins(path, ATLAS):
+        create(path, header, ATLAS, force)
+        return read_stock(path)
+    stock = read_stock(path)
+    if hashlib.sha256(text_of(header)).digest() != stock.contents.digest:
+        raise AtlasFileError(
+            f"cannot write {path}: it is an atlas of another problem, region or settings, "
+            "expected the same ones, another name, or force (--force) to replace it"
+        )
+    cut_rest(path, stock.contents, ATLAS)
+    return stock
+
+
+@contextmanager
+def workers(executor: Executor | None, jobs: int | None, plan: Plan) -> Iterator[tuple[Executor, int, bytes | None]]:
+    """What runs the jobs: the executor that is given, or processes of this machine; how many jobs; and their plan."""
+    content = packed(plan)
+    if executor is not None:
+        yield executor, _IN_FLIGHT, content
+        return
+    size = THREADS if jobs is None else jobs
+    own = Processes(size, content)
+    try:
+        yield own, _AHEAD * size, None
+    finally:
+        own.shutdown()
+
+
+def _images(index: Index) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """For every fitted tile, centres and signs of the tiles that are images of it."""
+    found: dict[int, list[int]] = {}
+    for row, tile in enumerate(index.orbits.fitted.tolist()):
+        found.setdefault(tile, []).append(row)
+    return {tile: (index._centres[rows], index._signs[rows]) for tile, rows in found.items()}
+
+
+def _unfinished(stock: Stock, index: Index, tiles: set[int], halves: object) -> Iterator[Wanted]:
+    """Halves of cells that have no record yet."""
+    records = stock.records
+    for row in np.flatnonzero((records["outcome"] == Outcome.SPLIT) & (index._children < 0).any(axis=1)).tolist():
+        record = records[row]
+        cell = Cell(int(record["tile"]), tuple(record["levels"].tolist()), tuple(record["places"].tolist()))
+        if cell.tile in tiles:
+            for wanted in halves(row, cell, int(record["joint"])):  # type: ignore[operator]
+                if index._children[row, int(wanted.upper)] < 0:
+                    yield wanted
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"

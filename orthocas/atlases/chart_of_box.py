@@ -1,0 +1,90 @@
+"""From numbers in an atlas to boxes and charts as the rest of orthocas knows them (ours)."""
+
+from functools import reduce
+
+import numpy as np
+
+from orthocas.atlases.cells import Cell
+from orthocas.atlases.plan import Plan
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.coordinates.fitted import Coordinates
+from orthocas.domains import Box
+from orthocas.files.json import plain
+from orthocas.files.problem_parts import problem_from_data, problem_to_data
+from orthocas.parametrisations import JointSpace, Polynomial
+from orthocas.postures.clear_box import ClearBox
+from orthocas.problem import Problem
+
+
+def box_of(plan: Plan, cell: Cell) -> Box:
+    """The box of a cell: it reaches into its neighbours by the overlap, perhaps beyond joint limits.
+
+    Of images of a box, only the one that is fitted may lie there.
+    """
+    low, high = cell.borders(plan.lattice)
+    return plan.box_around(*widened(plan, low, high))
+
+
+def widened(plan: Plan, low: Array, high: Array) -> tuple[Array, Array]:
+    """Borders of boxes for those of cells, (k,) or (cells, k)."""
+    room = plan.settings.overlap * (high - low) / 2
+    return low - room, high + room
+
+
+def clipped(plan: Plan, low: Array, high: Array) -> Box:
+    """The part of a box within the joint limits."""
+    joints = list(plan.joints)
+    robot = plan.problem.robot
+    return plan.box_around(np.maximum(low, robot.lower[joints]), np.minimum(high, robot.upper[joints]))
+
+
+def chart_of(plan: Plan, box: Box, numbers: Array, clear: float, problem: Problem) -> Chart:
+    """The chart of a box from its numbers on the cube (fitted, 1 + K).
+
+    Args:
+        plan: plan of the atlas.
+        box: the box.
+        numbers: constants and coefficients.
+        clear: share of its samples that are clear of singular positions. If it is not 1, the domain is a ClearBox.
+        problem: that of the plan, or `without_limits` of it for a box beyond them.
+    """
+    base = problem
+    domain = ClearBox(box, base.task, plan.settings.least_singular_value, plan.scale) if clear < 1 else box
+    problem = Problem(base.robot, base.task, base.metric, domain, base.name)
+    parametrisation = Polynomial(plan.settings.degree, plan.cyclic_names)
+    r = plan.fitted
+    coordinates = Coordinates(
+        parametrisation, JointSpace.of(problem), plan.idle, numbers[:, 1:].ravel(), -numbers[:, 0], np.ones(r)
+    )
+    return Chart(problem, coordinates)
+
+
+def without_limits(problem: Problem) -> Problem:
+    """The same problem for an arm without joint limits."""
+    header, arrays = problem_to_data(problem)
+    free = {name: np.full(problem.n, side * np.inf) for name, side in (("robot_lower", -1), ("robot_upper", 1))}
+    return problem_from_data(plain(header), {**arrays, **free})
+
+
+def moved(numbers: Array, terms: Array, shift: Array, scale: Array) -> Array:
+    """Numbers of the same functions on another box: u of the first is shift + scale u of the second, (n,) each.
+
+    A polynomial of degree d on one box is one of degree d on any other, so nothing changes but rounding.
+    """
+    degree, n = int(terms.max()), terms.shape[1]
+    tensor = np.zeros((len(numbers), *(degree + 1,) * n))
+    tensor[(slice(None), *np.zeros(n, dtype=int))] = numbers[:, 0]
+    tensor[(slice(None), *terms.T)] = numbers[:, 1:]
+    tables = [_table(degree, a, b) for a, b in zip(shift, scale, strict=True)]
+    tensor = reduce(lambda T, i: np.moveaxis(np.tensordot(T, tables[i], (1 + i, 0)), -1, 1 + i), range(n), tensor)
+    return np.column_stack([tensor[(slice(None), *np.zeros(n, dtype=int))], tensor[(slice(None), *terms.T)]])
+
+
+def _table(degree: int, a: float, b: float) -> Array:
+    """M with p_k(a + b v) = sum_l M[k, l] p_l(v), where p_k = sqrt(2 k + 1) P_k: exact Gauss quadrature."""
+    v, weights = np.polynomial.legendre.leggauss(degree + 1)
+    sizes = np.sqrt(2 * np.arange(degree + 1) + 1)
+    here = np.polynomial.legendre.legvander(v, degree) * sizes
+    there = np.polynomial.legendre.legvander(a + b * v, degree) * sizes
+    return np.asarray((there * weights[:, None]).T @ here / 2)

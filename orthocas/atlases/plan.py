@@ -1,0 +1,188 @@
+"""What the boxes of an atlas share: problem, joints that boxes divide, tiles, symmetries, and what is asked for."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthocas.atlases.lattice import Lattice, make_lattice
+from orthocas.atlases.symmetry import Symmetries, find_symmetries, identity_only
+from orthocas.checks import Array, as_number, require_count, require_kind
+from orthocas.domains import Box, sample_uniform
+from orthocas.errors import DomainError, InvalidValueError
+from orthocas.fitting.idle_joints import idle_joints
+from orthocas.parametrisations.cyclic_joints import cyclic_joints, over_cyclic_joints
+from orthocas.postures.row_scale import row_scale
+from orthocas.problem import Problem, task_jacobians
+from orthocas.robots import Robot
+from orthocas.robots.tree import PRISMATIC_ROOM
+from orthocas.samples import sample_problem
+
+_PRISMATIC_MARGIN = 0.02  # of the range of a prismatic joint
+_SCALE_SAMPLES, _FIRST_SAMPLES, _SEED = 2000, 200, 0
+_MOST_SPLITS = 16  # addresses of boxes in files have as many bits
+_MOST_TILES = 10**12
+
+
+@dataclass(frozen=True)
+class AtlasSettings:
+    """What is asked of the charts of an atlas.
+
+    Args:
+        degree: degree of the polynomials.
+        leak_deg: largest leak of a chart, root mean square over its box and coordinates without idle joints [deg].
+        conditioning: least conditioning of a chart at samples of its box, many near faces and corners.
+        least_singular_value: relative singular value of the task that charts keep away from; see `orthocas.ClearBox`.
+            Rows of J_x are scaled over the whole region.
+        half_width: largest half-width of boxes [rad]; prismatic joints have a quarter of it [m].
+        overlap: how far a box reaches into its neighbours, as a share of its half-widths.
+        splits: how often a tile may be halved.
+        symmetric: fit one of several boxes that are images of each other.
+        certify_seconds: time limit for the proof that a chart does not fold; 0 for no proofs.
+    """
+
+    degree: int = 3
+    leak_deg: float = 5.0
+    conditioning: float = 0.3
+    least_singular_value: float = 0.1
+    half_width: float = 0.5
+    overlap: float = 0.1
+    splits: int = 10
+    symmetric: bool = True
+    certify_seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_count("degree", self.degree, most=8)
+        require_count("splits", self.splits, least=0, most=_MOST_SPLITS)
+        require_kind("symmetric", self.symmetric, bool)
+        for name, least, most in (
+            ("leak_deg", 0.0, 90.0),
+            ("conditioning", 0.0, 1.0),
+            ("least_singular_value", 0.0, 1.0),
+            ("half_width", 0.0, np.pi),
+            ("overlap", 0.0, 1.0),
+        ):
+            value = as_number(name, getattr(self, name))
+            if not least < value < most:
+                raise InvalidValueError(name, value, f"a number between {least:g} and {most:g}")
+        if not 0 <= as_number("certify_seconds", self.certify_seconds) < np.inf:
+            raise InvalidValueError("certify_seconds", self.certify_seconds, "a finite number >= 0")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All that determines the boxes of an atlas and their charts."""
+
+    problem: Problem  #: its domain is the whole region, with all positions of cyclic joints
+    settings: AtlasSettings
+    idle: tuple[int, ...]  #: joints that are coordinates themselves
+    cyclic: tuple[int, ...]  #: joints in which coordinates are linear
+    lattice: Lattice  #: of the other joints
+    maps: Symmetries  #: of all joints but the idle ones
+    scale: Array  #: of the rows of J_x, (m,)
+
+    @property
+    def active(self) -> tuple[int, ...]:
+        """The joints that fitted coordinates depend on."""
+        return tuple(i for i in range(self.problem.n) if i not in self.idle)
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """The joints that boxes divide."""
+        return tuple(i for i in self.active if i not in self.cyclic)
+
+    @property
+    def fitted(self) -> int:
+        """Number of coordinates to fit."""
+        return self.problem.r - len(self.idle)
+
+    @property
+    def cyclic_names(self) -> tuple[str, ...]:
+        """Names of the cyclic joints."""
+        return tuple(self.problem.robot.joint_names[i] for i in self.cyclic)
+
+    def singular_values(self, points: Array) -> Array:
+        """Relative singular values of the task at points (N, n), (N,)."""
+        J = task_jacobians(self.problem, points) / self.scale[:, None]
+        squares = np.linalg.eigvalsh(J @ J.transpose(0, 2, 1))[:, 0]
+        return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+
+    def box_around(self, low: Array, high: Array) -> Box:
+        """The box of all joints with these borders in the joints that boxes divide, (k,) each."""
+        domain = self.problem.domain
+        centre, half_width = domain.centre.copy(), domain.half_width.copy()
+        joints = list(self.joints)
+        centre[joints], half_width[joints] = (low + high) / 2, (high - low) / 2
+        unbounded = [i for i in getattr(domain, "unbounded", ()) if i not in self.joints]
+        return Box(centre, half_width, unbounded)
+
+
+def make_plan(problem: Problem, settings: AtlasSettings, margin_deg: float) -> Plan:
+    """The plan for the whole joint range of a problem's robot.
+
+    Args:
+        problem: robot, task and metric; its domain does not matter.
+        settings: what is asked of the charts.
+        margin_deg: distance to the joint limits [deg]; for prismatic joints it is 2 % of their range.
+
+    Raises:
+        DomainError: if a joint has no range left.
+        InvalidValueError: if boxes would divide no joint, or too many tiles would be needed.
+    """
+    require_kind("problem", problem, Problem)
+    region = joint_range(problem.robot, margin_deg)
+    problem = Problem(problem.robot, problem.task, problem.metric, region, problem.name)
+    names = problem.robot.joint_names
+    cyclic_names = cyclic_joints(problem)
+    problem = over_cyclic_joints(problem, cyclic_names)
+    idle = tuple(idle_joints(problem, sample_problem(problem, _FIRST_SAMPLES, _SEED))[-problem.r :])
+    cyclic = tuple(names.index(name) for name in cyclic_names)
+    active = tuple(i for i in range(problem.n) if i not in idle)
+    joints = tuple(i for i in active if i not in cyclic)
+    if not joints or problem.r == len(idle):
+        raise InvalidValueError("problem", f"one whose chart holds everywhere ({problem.name})", "one for oc.fit")
+    maps = find_symmetries(problem, active, cyclic) if settings.symmetric else identity_only(active)
+    points = sample_uniform(problem.domain, _SCALE_SAMPLES, _SEED)
+    scale = row_scale(task_jacobians(problem, points), problem.task.units)
+    return Plan(problem, settings, idle, cyclic, _lattice(problem, region, joints, maps, settings), maps, scale)
+
+
+def joint_range(robot: Robot, margin_deg: float) -> Box:
+    """The box of all joint positions farther than a margin from the limits. Endless joints have a full turn.
+
+    Raises:
+        DomainError: if a joint has no range left.
+    """
+    margin = np.radians(as_number("margin_deg", margin_deg))
+    if not 0 <= margin < np.pi:
+        raise InvalidValueError("margin_deg", margin_deg, "an angle from 0 to below 180 degrees")
+    prismatic = np.array(robot.tree.prismatic)
+    missing = np.isinf(robot.lower) | np.isinf(robot.upper)
+    middle = robot.tree.middle
+    low = np.where(missing, middle - PRISMATIC_ROOM, robot.lower)
+    high = np.where(missing, middle + PRISMATIC_ROOM, robot.upper)
+    room = np.where(prismatic, _PRISMATIC_MARGIN * (high - low), margin) * ~missing
+    low, high = low + room, high - room
+    endless = ~prismatic & (missing | (robot.upper - robot.lower >= 2 * np.pi))
+    low[endless], high[endless] = -np.pi, np.pi
+    empty = np.flatnonzero(low >= high)
+    if empty.size:
+        name = robot.joint_names[int(empty[0])]
+        raise DomainError(
+            f"joint '{name}' has no range left with a margin of {margin_deg:g} deg, expected a smaller one"
+        )
+    free = endless & np.isinf(robot.lower) & np.isinf(robot.upper)
+    return Box((low + high) / 2, (high - low) / 2, np.flatnonzero(free).tolist())
+
+
+def _lattice(
+    problem: Problem, region: Box, joints: tuple[int, ...], maps: Symmetries, settings: AtlasSettings
+) -> Lattice:
+    chosen = list(joints)
+    low, high = (region.centre - region.half_width)[chosen], (region.centre + region.half_width)[chosen]
+    prismatic = np.array(problem.robot.tree.prismatic)[chosen]
+    widest = np.where(prismatic, settings.half_width / 4, settings.half_width) * 2
+    endless = ~prismatic & (high - low >= 2 * np.pi - 1e-9)
+    lattice = make_lattice(low, high, endless, widest, maps.of(joints))
+    if lattice.counts.astype(float).prod() > _MOST_TILES:
+        raise InvalidValueError("half_width", settings.half_width, "a larger number: there would be too many tiles")
+    return lattice

@@ -1,0 +1,184 @@
+"""Regions of joint space that an atlas covers: the joint range, or the neighbourhood of some postures (ours)."""
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.atlases.lattice import Lattice
+from orthocas.checks import Array, Indices, as_float_array, as_number, frozen_array
+from orthocas.domains import Domain
+from orthocas.errors import InvalidValueError, PathFileError
+from orthocas.robots import Robot
+
+_LARGEST_FILE = 2**26  # bytes
+_SLACK = 1e-9  # [rad] or [m]
+_MOST_TILES = 2_000_000  # in the joint range; more would take days
+
+
+class Region(Protocol):
+    """What an atlas needs to know of a region, in the joints that boxes divide."""
+
+    @property
+    def low(self) -> Array:
+        """Lowest positions, (k,)."""
+        ...
+
+    @property
+    def high(self) -> Array:
+        """Highest positions, (k,)."""
+        ...
+
+    def tiles(self, lattice: Lattice) -> Indices:
+        """The tiles that the region touches, ascending."""
+        ...
+
+    def touches(self, low: Array, high: Array) -> NDArray[np.bool_]:
+        """Whether the region touches boxes with these borders (boxes, k), (boxes,)."""
+        ...
+
+    def sample(self, samples: int, seed: int) -> Array:
+        """Random points of the region, (samples, k)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class JointRange:
+    """All positions between the joint limits, less a margin."""
+
+    low: Array
+    high: Array
+
+    def tiles(self, lattice: Lattice) -> Indices:
+        """All tiles that reach into the range."""
+        if lattice.size > _MOST_TILES:
+            raise InvalidValueError(
+                "region", f"one of {lattice.size} boxes", "wider boxes, or the surroundings of postures"
+            )
+        tiles = np.arange(lattice.size)
+        centres = lattice.centres(tiles)
+        return tiles[self.touches(centres - lattice.width / 2, centres + lattice.width / 2)]
+
+    def touches(self, low: Array, high: Array) -> NDArray[np.bool_]:
+        """Whether boxes reach into the range."""
+        return np.asarray(((high > self.low + _SLACK) & (low < self.high - _SLACK)).all(axis=1))
+
+    def sample(self, samples: int, seed: int) -> Array:
+        """Uniform points."""
+        return np.random.default_rng(seed).uniform(self.low, self.high, (samples, len(self.low)))
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """All positions that differ from one of some postures by at most `radius` in every joint."""
+
+    low: Array
+    high: Array
+    postures: Array  #: in the joints that boxes divide, (N, k)
+    radius: float
+
+    def tiles(self, lattice: Lattice) -> Indices:
+        """All tiles that a posture or one of the corners and faces around it lies in."""
+        found: set[int] = set()
+        reach = np.ceil(self.radius / lattice.width).astype(int)
+        steps = np.stack(np.meshgrid(*(np.arange(-k, k + 1) for k in reach), indexing="ij"), -1).reshape(-1, len(reach))
+        for step in steps:
+            offset = np.clip(step * lattice.width, -self.radius, self.radius)
+            points = np.clip(self.postures + offset, self.low, self.high)
+            found |= set(lattice.tiles(lattice.wrapped(points)).tolist())
+        return np.array(sorted(found - {-1}), dtype=np.int64)
+
+    def touches(self, low: Array, high: Array) -> NDArray[np.bool_]:
+        """Whether some posture is within the radius of each box."""
+        touched = np.zeros(len(low), dtype=bool)
+        for k, (a, b) in enumerate(zip(low, high, strict=True)):
+            near = (self.postures >= a - self.radius) & (self.postures <= b + self.radius)
+            touched[k] = bool(near.all(axis=1).any())
+        return touched
+
+    def sample(self, samples: int, seed: int) -> Array:
+        """Uniform points around postures drawn at random."""
+        rng = np.random.default_rng(seed)
+        chosen = self.postures[rng.integers(len(self.postures), size=samples)]
+        points: Array = np.clip(chosen + rng.uniform(-self.radius, self.radius, chosen.shape), self.low, self.high)
+        return points
+
+
+def joint_range_of(domain: Domain, joints: tuple[int, ...]) -> JointRange:
+    """The range that a domain has in some joints."""
+    chosen = list(joints)
+    return JointRange(*((domain.centre + side * domain.half_width)[chosen] for side in (-1, 1)))
+
+
+def surroundings(postures: object, radius: float, joints: tuple[int, ...], domain: Domain) -> Surroundings:
+    """The surroundings of postures (N, n) [rad] or [m], within the range of a domain.
+
+    Raises:
+        ShapeError, InvalidValueError: if the postures are not finite (N, n), or the radius is no positive number.
+    """
+    given = frozen_array("postures", as_float_array("postures", postures), (None, len(domain.centre)))
+    if not len(given):
+        raise InvalidValueError("postures", "empty", "at least one")
+    size = as_number("radius", radius)
+    if not 0 < size < np.pi:
+        raise InvalidValueError("radius", radius, "a positive number below pi")
+    whole = joint_range_of(domain, joints)
+    return Surroundings(whole.low, whole.high, given[:, list(joints)], size)
+
+
+def read_postures(path: Path, robot: Robot) -> Array:
+    """Postures (N, n) of a CSV file: a header with the names of joints in any order, and one posture a line.
+
+    Columns of other names, such as those of time and velocities, are left alone.
+
+    Raises:
+        PathFileError: names the file, the line, and what is wrong there.
+    """
+    rows = _rows(path)
+    header = [cell.strip() for cell in rows[0][1]]
+    missing = [name for name in robot.joint_names if header.count(name) != 1]
+    if missing:
+        raise PathFileError(
+            f"postures file {path}: line 1 has {header.count(missing[0])} columns '{missing[0]}', expected 1"
+        )
+    columns = [header.index(name) for name in robot.joint_names]
+    return np.array([_numbers(path, line, cells, columns, len(header)) for line, cells in rows[1:]])
+
+
+def _rows(path: Path) -> list[tuple[int, list[str]]]:
+    """The lines that are not empty, with their numbers."""
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(_LARGEST_FILE + 1)
+        reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except OSError as error:
+        raise PathFileError(f"postures file {path}: cannot be read, {error.strerror}") from None
+    except (ValueError, csv.Error) as error:  # also bytes that are no text
+        raise PathFileError(f"postures file {path}: no CSV text, {str(error)[:60]}") from None
+    if len(content) > _LARGEST_FILE or len(rows) < 2:
+        came = "it is too large" if len(content) > _LARGEST_FILE else "it has no posture after the header"
+        raise PathFileError(
+            f"postures file {path}: {came}, expected a header and up to {_LARGEST_FILE / 2**20:.0f} MiB"
+        )
+    return rows
+
+
+def _numbers(path: Path, line: int, cells: list[str], columns: list[int], width: int) -> list[float]:
+    if len(cells) != width:
+        raise PathFileError(
+            f"postures file {path}: line {line} has {len(cells)} cells, expected {width} as in the header"
+        )
+    try:
+        found = [float("nan" if "_" in cells[i] else cells[i]) for i in columns]
+    except ValueError:
+        found = [np.nan]
+    if not np.isfinite(found).all():
+        raise PathFileError(
+            f"postures file {path}: line {line} has a cell that is no finite number, expected joint positions"
+        )
+    return found
