@@ -66,5 +66,5 @@ class CubeBasis:
         return ColumnFunction(ca.Function("cube_basis", [u], [ca.densify(self.family.basis(u))]))
 
     def _make_values(self) -> BlockFunction:
-        run = self._columns.on_one_block(reused=True)
+        run = self._columns.on_one_block()
         return lambda columns: run(columns)[0]

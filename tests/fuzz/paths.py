@@ -68,7 +68,7 @@ def use(path: Path) -> None:
 
 def use_log(path: Path) -> None:
     """Read a log; its numbers have to be usable."""
-    log = read_joint_log(path, _chart())
+    log = read_joint_log(path, public_objects.linear())
     assert len(log.times) == len(log.q) == len(log.desired) >= 2
     assert log.q.shape[1] == log.desired.shape[1] == 3
     assert np.isfinite(log.q).all()
