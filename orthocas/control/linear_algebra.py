@@ -22,16 +22,16 @@ def spd_inverse(matrix: Expression) -> tuple[Any, Any]:
     code does not grow with k.
     """
     k = matrix.shape[0]
-    if isinstance(matrix, ca.MX) and k > 1:
-        return _swept(k)(matrix)
     if k == 1:
         return 1 / matrix, matrix
+    if isinstance(matrix, ca.MX):
+        inverse, determinant = _swept(k)(matrix)
+        return inverse, determinant
     D, LT, order = ca.ldl(matrix, False)
-    inverse = ca.ldl_solve(ca.SX.eye(k), D, LT, order)
-    determinant = ca.SX(1)
+    volume = ca.SX(1)
     for i in range(k):
-        determinant *= D[i]
-    return _symmetric(inverse), determinant
+        volume *= D[i]
+    return _symmetric(ca.ldl_solve(ca.SX.eye(k), D, LT, order)), volume
 
 
 @cache
