@@ -15,6 +15,7 @@ from orthocas.codegen.generated import GeneratedC
 from orthocas.codegen.interface import filled, template_values
 from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
+from orthocas.codegen.rows import names_of_files, rows_files
 from orthocas.codegen.supervision import supervision_kernels
 from orthocas.control import Controller, Safety
 from orthocas.control.controller import require_controller
@@ -42,6 +43,7 @@ def generate_c(
     force: bool = False,
     safety: Safety | None = None,
     single_precision: bool = False,
+    rows: bool = False,
 ) -> GeneratedC:
     """Write C99 for a chart, the robot's dynamics, the inverse map, and a controller.
 
@@ -58,11 +60,13 @@ def generate_c(
         safety: settings of the supervised law; default `Safety.of(controller)`.
         single_precision: whether numbers are `float` instead of `double`, for processors that compute in single
             precision only.
+        rows: also write NAME_rows.c and NAME_rows.h with NAME_phi_rows, phi of many joint positions, for vector
+            instructions. Not for large networks.
 
     Raises:
         NoExpressionError: if the chart is grown; `orthocas.distil` turns it into a chart with a closed expression.
-        InvalidValueError: if the name is not a C identifier, the controller belongs to another chart, or the folder has
-            a file of the same name that was not generated.
+        InvalidValueError: if the name is not a C identifier, the controller belongs to another chart, the chart has
+            too many operations for rows, or the folder has a file of the same name that was not generated.
         ArchiveError: if the folder is not writable, or a file there is a symbolic link.
         CompileError: if this version of CasADi generates C of an unexpected form.
 
@@ -85,10 +89,14 @@ def generate_c(
     precision = SINGLE if single_precision else DOUBLE
     kernels = generate_kernels(_functions(chart, controller, precision), f"{name}_kernel")
     stack_bytes = _stack_bytes(kernels, chart.n, 0 if controller is None else len(controller.labels), precision.size)
-    values = template_values(chart, controller, safety, name, kernels, stack_bytes, precision)
+    values = template_values(chart, controller, safety, name, kernels, stack_bytes, precision) | names_of_files(
+        name, rows
+    )
     names = {"robot.h": f"{name}.h", "robot.c": f"{name}.c", "pkgconfig.pc": f"{name}.pc.in"}
     contents = {names.get(template, template): filled(template, values) for template in _TEMPLATES}
     contents |= {file: precision.code(contents[file]) for file in (f"{name}.h", f"{name}.c")}
+    if rows:
+        contents |= rows_files(chart, name, values, precision)
     folder = as_path("out", out)
     try:
         _require_free(folder, name, contents, force)

@@ -25,13 +25,13 @@ def spd_inverse(matrix: Expression) -> tuple[Any, Any]:
     if k == 1:
         return 1 / matrix, matrix
     if isinstance(matrix, ca.MX):
-        inverse, determinant = _swept(k).call([matrix])
+        inverse, determinant = _swept(k)(matrix)
         return inverse, determinant
     D, LT, order = ca.ldl(matrix, False)
-    product = ca.SX(1)
+    volume = ca.SX(1)
     for i in range(k):
-        product *= D[i]
-    return _symmetric(ca.ldl_solve(ca.SX.eye(k), D, LT, order)), product
+        volume *= D[i]
+    return _symmetric(ca.ldl_solve(ca.SX.eye(k), D, LT, order)), volume
 
 
 @cache
