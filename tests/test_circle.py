@@ -1,5 +1,6 @@
 """Circle-valued coordinates: smooth around closed leaves, in fits, inverse maps, control laws and simulation."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -139,7 +140,15 @@ def test_chart_file_keeps_the_circle(around: oc.Chart, tmp_path: Path) -> None:
 
 
 def test_consumers_without_circles_refuse_in_one_line(around: oc.Chart, tmp_path: Path) -> None:
-    for call in (lambda: oc.generate_c(around, tmp_path), lambda: oc.follow(around, [[1.5], [1.6]], velocity_limits=1)):
+    whole = around.problem
+    bounded = oc.Problem(whole.robot, whole.task, whole.metric, oc.Box([0.0, 1.2], [1.0, 0.4]))
+    calls = (
+        lambda: oc.generate_c(around, tmp_path),
+        lambda: oc.compile_inverse(around, tmp_path),
+        lambda: oc.follow(around, [[1.5], [1.6]], velocity_limits=1),
+        lambda: oc.certify(replace(around, problem=bounded)),
+    )
+    for call in calls:
         with pytest.raises(InvalidValueError, match=r"chart is one with circle-valued coordinates \(xi1\)"):
             call()
 

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 import orthocas as oc
 from orthocas.parametrisations import JointSpace
-from orthocas.reproduce import FIGURES, Drawing
+from orthocas.reproduce import FIGURES, ChosenFit, Drawing
 from orthocas.reproduce.fig29 import unfolded
 from orthocas.reproduce.pose_map import joints, pose, pose_jacobian
 
@@ -89,6 +89,19 @@ def test_arm_has_the_angles_of_the_paper(drawings: dict[str, Drawing]) -> None:
     assert n["mutual_std_deg"] < 3.44
     assert abs(n["task_mean_deg"] - 90) < 0.5
     assert abs(n["mutual_mean_deg"] - 90) < 1  # 90.40 in the paper
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_networks_draw_the_figures_of_fits_with_the_same_facts(seed: int) -> None:
+    """What is asserted of polynomials in Figs. 20 and 23, with small networks from two starts."""
+    chosen = ChosenFit(oc.MLP((16, 16)), seed)
+    draw = {name: FIGURES[name].draw_fit for name in ("fig20", "fig23")}
+    angles, loop = (dict(recipe(True, chosen).numbers) for recipe in draw.values() if recipe is not None)
+    assert angles["involutive_std_deg"] < 0.5 * angles["non_involutive_std_deg"]
+    assert 3 < angles["non_involutive_std_deg"] < 5
+    assert loop["largest_joint_motion_rad"] > 0.5
+    assert max(value for key, value in loop.items() if key.startswith("coupling")) < 0.02  # 0.05 for linear coordinates
+    assert loop["share_not_ok"] == 0
 
 
 def test_weights_of_the_appendix_make_the_map_harmonic(drawings: dict[str, Drawing]) -> None:

@@ -17,6 +17,7 @@ from orthocas.certifying.taylor import TaylorModel, stacked
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
+from orthocas.coordinates.turns import require_no_turns
 from orthocas.errors import CertifyError
 from orthocas.parametrisations.mlp import MLPFamily
 from orthocas.parametrisations.product_basis import ProductFamily
@@ -81,10 +82,12 @@ def chart_rows(chart: Chart) -> ChartRows:
 
     Raises:
         CertifyError: if the chart is grown, or uses operations without proven bounds.
+        InvalidValueError: if it is circle-valued.
     """
     coordinates = chart.coordinates
     if not isinstance(coordinates, Coordinates):
         raise CertifyError(f"a chart with {coordinates.label} coordinates has no expression, expected a fitted chart")
+    require_no_turns(chart.labels, chart.turns, "a proof")  # being one-to-one up to whole turns is another question
     if not np.all(coordinates.scale != 0):
         raise CertifyError("a coordinate is scaled by 0, so it is constant, expected coordinates that vary")
     active = tuple(coordinates.active)
