@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from orthocas.problem import Problem, check
     from orthocas.quality import Report, evaluate
     from orthocas.robots import Robot
+    from orthocas.showing.progress import progress
     from orthocas.simulation import simulate
     from orthocas.singularities import jumps, singular_points
     from orthocas.tasks import Task
@@ -120,6 +121,7 @@ __all__ = [
     "parametrisations",
     "plotting",
     "problems",
+    "progress",
     "register_loss_term",
     "register_parametrisation",
     "simulate",
@@ -160,6 +162,7 @@ _HOMES = {
     "orthocas.quality": ["Report", "evaluate"],
     "orthocas.robots": ["Robot"],
     "orthocas.simulation": ["simulate"],
+    "orthocas.showing.progress": ["progress"],
     "orthocas.singularities": ["jumps", "singular_points"],
     "orthocas.tasks": ["Task"],
     "orthocas.viewing.view": ["view"],

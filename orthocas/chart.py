@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Self, TypeVar, overload
 
 import casadi as ca
 import numpy as np
@@ -47,6 +48,9 @@ from orthocas.problem import Problem, task_jacobians, task_sizes
 from orthocas.reaching.intervals import XiRange, xi_range
 from orthocas.reaching.self_motion import SelfMotion, self_motion
 from orthocas.showing import Shown, listed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "inverse")
@@ -271,6 +275,18 @@ class Chart(Shown):
             (False, 3, 0.0)
         """
         return self_motion(self, q, step, samples)
+
+    def plot(self) -> "Figure":
+        """The arm along each coordinate, as far as it reaches from the centre of the domain, with the task held.
+
+        Returns:
+            A matplotlib figure with one panel for each coordinate, which notebooks show.
+
+        Raises:
+            InvalidValueError: if the chart is not finite at the centre of the domain.
+        """
+        figure: Figure = import_module("orthocas.plotting").self_motion_figure(self, reach=None)
+        return figure
 
     def inverse(self, phi: ArrayLike, q_start: ArrayLike | None = None, tolerance: float = 1e-9) -> Array:
         """Solve phi(q) = phi for q: fitted charts by Newton's method with line search, grown ones along the flow.

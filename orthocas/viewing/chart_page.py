@@ -7,10 +7,10 @@ import numpy as np
 
 from orthocas.chart import Chart
 from orthocas.errors import OrthocasError
+from orthocas.reaching.fan import Fan, fan_along
 from orthocas.viewing.arm import GHOSTS, Arm, Ghosts
 from orthocas.viewing.loop import Loop
 from orthocas.viewing.panel import ChartPanel
-from orthocas.viewing.reach import Fan, fan_along
 from orthocas.viewing.session import Session
 from orthocas.viewing.stick_arm import Look, chain_length
 from orthocas.viewing.window import place_camera, place_floor
