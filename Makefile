@@ -36,7 +36,7 @@ bench: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -e '.[test]'
+	$(BIN)/python -m pip install --quiet -e '.[test,view]'
 	touch $@
 
 build/site: $(INSTALLED) $(shell find orthocas problems solvers -type f -not -path '*/__pycache__/*')

@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from orthocas.problem import Problem, check
     from orthocas.quality import Report, evaluate
     from orthocas.robots import Robot
+    from orthocas.showing.progress import progress
     from orthocas.simulation import simulate, simulate_many
     from orthocas.singularities import jumps, singular_points
     from orthocas.tasks import Task
@@ -130,6 +131,7 @@ __all__ = [
     "parametrisations",
     "plotting",
     "problems",
+    "progress",
     "register_loss_term",
     "register_parametrisation",
     "simulate",
@@ -174,6 +176,7 @@ _HOMES = {
     "orthocas.problem": ["Problem", "check"],
     "orthocas.quality": ["Report", "evaluate"],
     "orthocas.robots": ["Robot"],
+    "orthocas.showing.progress": ["progress"],
     "orthocas.simulation": ["simulate", "simulate_many"],
     "orthocas.singularities": ["jumps", "singular_points"],
     "orthocas.tasks": ["Task"],

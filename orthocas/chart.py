@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from numpy.typing import ArrayLike
 
@@ -20,6 +21,9 @@ from orthocas.problem import Problem
 from orthocas.reaching.intervals import XiRange, xi_range
 from orthocas.reaching.self_motion import SelfMotion, self_motion
 from orthocas.showing import Shown, listed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -164,6 +168,18 @@ class Chart(InverseMethods, Shown):
             (False, 3, 0.0)
         """
         return self_motion(self, q, step, samples)
+
+    def plot(self) -> "Figure":
+        """The arm along each coordinate, as far as it reaches from the centre of the domain, with the task held.
+
+        Returns:
+            A matplotlib figure with one panel for each coordinate, which notebooks show.
+
+        Raises:
+            InvalidValueError: if the chart is not finite at the centre of the domain.
+        """
+        figure: Figure = import_module("orthocas.plotting").self_motion_figure(self, reach=None)
+        return figure
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Write a self-contained chart file. It replaces a chart file of that name, and with `force` any other file.

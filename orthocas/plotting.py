@@ -12,6 +12,8 @@ from orthocas.checks import Array, require_at_least, require_count, require_kind
 from orthocas.comparing.figures import convergence_figure, front_figure
 from orthocas.judging.statistics import AngleStatistics, LeakStatistics
 from orthocas.quality import Report
+from orthocas.reaching.fan import fan_along
+from orthocas.showing.picture import Picture
 from orthocas.simulation.figure import trajectory_figure
 
 __all__ = ["convergence_figure", "front_figure", "quality_figure", "self_motion_figure", "trajectory_figure"]
@@ -23,7 +25,7 @@ _TASK, _EXTRA, _LEAK = "#1f5fa8", "#d95f02", "#5a9e6f"
 def quality_figure(report: Report) -> Figure:
     """Histograms of task and mutual angles [deg], as in [AS2023] Figs. 20 and 27, and of leaks (ours)."""
     require_kind("report", report, Report)
-    figure = Figure(figsize=(12.0, 3.4), layout="constrained")
+    figure = Picture(figsize=(12.0, 3.4), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     _draw_angles(left, report.task_angle, _TASK, r"task angle $\angle(\mathrm{d}\xi_j, \nabla_A h_i)$")
     _draw_angles(middle, report.mutual_angle, _EXTRA, r"mutual angle $\angle(\mathrm{d}\xi_i, \mathrm{d}\xi_j)$")
@@ -33,24 +35,23 @@ def quality_figure(report: Report) -> Figure:
     return figure
 
 
-def self_motion_figure(chart: Chart, postures: int = 9, reach: float = 0.4) -> Figure:
+def self_motion_figure(chart: Chart, postures: int = 9, reach: float | None = 0.4) -> Figure:
     """The self-motions of the arm: each panel sweeps one coordinate and holds the task and the others.
 
     Args:
         chart: the chart; the sweep starts at the centre of its domain.
         postures: number of postures per panel.
-        reach: largest value of the swept coordinate.
+        reach: largest value of the swept coordinate. None: as far as it reaches on either side.
 
     Raises:
         InverseError: if a posture of the sweep cannot be reached.
     """
     require_kind("chart", chart, Chart)
     require_count("postures", postures, most=_MOST_POSTURES)
-    require_at_least("reach", reach, 0)
-    reach = float(reach)
-    figure = Figure(figsize=(3.0 * chart.r, 3.6), layout="constrained")
-    values = np.linspace(-reach, reach, postures)
-    sweeps = [_sweep(chart, j, values) for j in range(chart.r)]
+    if reach is not None:
+        require_at_least("reach", reach, 0)
+    figure = Picture(figsize=(3.0 * chart.r, 3.6), layout="constrained")
+    sweeps = [_sweep(chart, j, postures, reach) for j in range(chart.r)]
     everything = chart.problem.robot.joint_points(np.concatenate(sweeps)).reshape(-1, 3)
     colours = mpl.colormaps["viridis"](np.linspace(0.1, 0.9, postures))
     for j, sweep in enumerate(sweeps):
@@ -58,7 +59,8 @@ def self_motion_figure(chart: Chart, postures: int = 9, reach: float = 0.4) -> F
         for points, colour in zip(chart.problem.robot.joint_points(sweep), colours, strict=True):
             panel.plot(*points.T, "-o", color=colour, markersize=2.5, linewidth=1.5)
         moved = np.abs(chart.task(sweep) - chart.task(chart.problem.domain.centre)).max()
-        panel.set_title(rf"$\xi_{j + 1}$ from {-reach:g} to {reach:g}" + f"\ntask moves {_bound(moved)}", fontsize=10)
+        low, high = chart.xi(sweep[[0, -1]])[:, j]
+        panel.set_title(rf"$\xi_{j + 1}$ from {low:.3g} to {high:.3g}" + f"\ntask moves {_bound(moved)}", fontsize=10)
         _equal_axes(panel, everything)
     return figure
 
@@ -84,10 +86,15 @@ def _draw_leaks(axes: Axes, leak: LeakStatistics) -> None:
     axes.grid(alpha=0.3)
 
 
-def _sweep(chart: Chart, j: int, values: Array) -> Array:
+def _sweep(chart: Chart, j: int, postures: int, reach: float | None) -> Array:
     """Joint positions along xi_j with all else held. Each is solved from its neighbour, from the middle outwards."""
     centre = chart.problem.domain.centre
     base = chart.phi(centre)
+    if reach is None:
+        fan = fan_along(chart, centre, j)
+        shown: Array = fan.q[np.abs(fan.arc_length[:, None] - fan.places(postures)).argmin(axis=0)]
+        return shown
+    values = np.linspace(-float(reach), float(reach), postures)
     found = np.empty((len(values), chart.n))
     middle = int(np.argmin(np.abs(values)))
     for order in (range(middle, len(values)), range(middle - 1, -1, -1)):

@@ -1,7 +1,8 @@
 """The quality of a chart on its domain: angles and conditioning ([AS2023] Figs. 20 and 27), leaks and folds (ours)."""
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +19,9 @@ from orthocas.judging.statistics import Angles, AngleStatistics, LeakStatistics
 from orthocas.samples import samples_at
 from orthocas.showing import Shown, listed
 from orthocas.worst_points import WorstPoints, worst_points
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
 SAMPLES, SEED = 100_000, 1  #: of an evaluation by default
@@ -67,6 +71,11 @@ class Report(Shown):
     def degenerate(self) -> bool:
         """Whether coordinates are nearly parallel to each other or to the task gradients on over 1 % of the domain."""
         return self.conditioning.p01 < DEGENERATE
+
+    def plot(self) -> "Figure":
+        """Histograms of angles and leaks, as a matplotlib figure; see `orthocas.plotting.quality_figure`."""
+        figure: Figure = import_module("orthocas.plotting").quality_figure(self)
+        return figure
 
     def facts(self) -> dict[str, str]:
         """Angles, conditioning, lengths, and the faults of the chart if there are any."""

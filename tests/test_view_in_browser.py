@@ -1,5 +1,6 @@
 """Views in a real browser: what a person sees and moves, by the page's own numbers."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ import pinocchio as pin
 import pytest
 from browser import PROGRAM, Page, browser
 from PIL import Image
+from programs import Run, python
 
 import orthocas as oc
 from orthocas.fitting.fit import Fit
@@ -19,7 +21,6 @@ from orthocas.viewing import cyclic_motions, export_page
 
 pytestmark = [
     pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'"),
-    pytest.mark.skipif(PROGRAM is None, reason="no chromium: apt-get install chromium"),
     pytest.mark.slow,
 ]
 NUMBERS = "Object.fromEntries([...document.querySelectorAll('[data-oc]')].map(b => [b.dataset.oc, +b.dataset.value]))"
@@ -28,6 +29,9 @@ SLIDERS = "document.querySelectorAll('.mantine-Slider-root')"
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """The tab of a browser, which all tests of this file share."""
+    if PROGRAM is None:
+        pytest.skip("no chromium: apt-get install chromium")
     with browser(tmp_path_factory.mktemp("profile")) as tab:
         yield tab
 
@@ -136,3 +140,16 @@ def test_the_command_line_serves_until_ctrl_c(page: Page, tmp_path: Path) -> Non
         assert process.wait(20) == 130
         assert process.stderr is not None
         assert process.stderr.read() == "orthocas: interrupted\n"
+
+
+def test_blocks_of_the_page_on_views_run(run: Run, tmp_path: Path) -> None:
+    text = (Path(__file__).parent.parent / "docs" / "view.md").read_text()
+    code = "\n".join(re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL))
+    printed = python(f"{code}\nchart.save('arm.orthocas')", tmp_path).splitlines()
+    assert printed == ["True"]
+    assert (tmp_path / "motion.png").exists()
+    lines = "\n".join(re.findall(r"```sh\n(.*?)```", text, flags=re.DOTALL)).splitlines()
+    (export,) = [line for line in lines if "--export" in line]
+    code_, out, err = run(*export.split()[1:])
+    assert (code_, err) == (0, "")
+    assert out.startswith("page  page.html\nsize ")

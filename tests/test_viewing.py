@@ -31,13 +31,13 @@ from orthocas.errors import (
     ViewError,
 )
 from orthocas.fitting.fit import Fit
+from orthocas.reaching.fan import fan_along
 from orthocas.robots.files import lock_off_chain, read_urdf
 from orthocas.viewing import Motion, cyclic_motions, export_page, window
 from orthocas.viewing.body_poses import BodyPoses
 from orthocas.viewing.loop import Loop
 from orthocas.viewing.motion import read_joint_motion, read_run
 from orthocas.viewing.panel import ChartPanel, PlayerPanel, RobotPanel
-from orthocas.viewing.reach import fan_along
 from orthocas.viewing.session import Session
 from orthocas.viewing.solids import ball, block, capsule, drum
 from orthocas.viewing.stick_arm import stick_arm

@@ -12,6 +12,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from orthocas.comparing.cells import CellResult
 from orthocas.comparing.report import Comparison, Summary
+from orthocas.showing.picture import Picture
 
 Colour = tuple[float, float, float, float]
 _HUES = {"linear": "Greys", "polynomial": "Blues", "fourier": "Greens", "mlp": "Oranges", "sew": "Purples"}
@@ -27,7 +28,7 @@ def front_figure(comparison: Comparison) -> Figure:
     there is no mutual angle, so the axis shows the 1 % quantile of the conditioning.
     """
     summaries = [summary for summary in comparison.summaries() if summary.failed < summary.seeds]
-    figure = Figure(figsize=(9.6, max(4.6, 1.2 + 0.21 * len(summaries))), layout="constrained")
+    figure = Picture(figsize=(9.6, max(4.6, 1.2 + 0.21 * len(summaries))), layout="constrained")
     axes = figure.add_subplot()
     good = [result for result in comparison.results if not result.failed]
     single = all(math.isnan(result.mutual_std_deg) for result in good)
@@ -56,7 +57,7 @@ def front_figure(comparison: Comparison) -> Figure:
 
 def convergence_figure(comparison: Comparison) -> Figure:
     """Training loss over time, one line per fit. Jumps are new stages with other samples and more parameters."""
-    figure = Figure(figsize=(8.6, 4.6), layout="constrained")
+    figure = Picture(figsize=(8.6, 4.6), layout="constrained")
     axes = figure.add_subplot()
     drawn = [result for result in comparison.results if result.history]
     colours, styles = _colours(drawn), dict(zip(_names(drawn, "solver"), _STYLES * 3, strict=False))

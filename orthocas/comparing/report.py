@@ -5,14 +5,18 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from importlib import import_module
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orthocas.comparing.cells import CellResult
 from orthocas.files.atomic import published
 from orthocas.files.json import plain, to_json
 from orthocas.showing import Shown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,11 @@ class Comparison(Shown):
             "comparison": f"{len(self.results)} fits, {failed} failed{ended}",
             **{f"{s.parametrisation}, {s.solver}": _in_words(s) for s in self.summaries()},
         }
+
+    def plot(self) -> "Figure":
+        """Errors of all fits over what they cost, as a matplotlib figure; see `orthocas.plotting.front_figure`."""
+        figure: Figure = import_module("orthocas.comparing.figures").front_figure(self)
+        return figure
 
     def rows(self) -> list[list[str]]:
         """The rows of a readable table, with the header first."""

@@ -3,7 +3,9 @@
 import csv
 import io
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +14,9 @@ from orthocas.errors import PathFileError
 from orthocas.files.atomic import published, require_writable
 from orthocas.files.ours import require_replaceable
 from orthocas.showing import Shown, listed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _HEAD = "time_s"  # first column of our files
 
@@ -75,6 +80,11 @@ class JointMotion(Shown):
             "task": f"relative singular value at least {kept.singular_value:.3g}",
             **({"obstacles": f"{kept.distance:.3g} m away: {kept.distance_pair}"} if kept.distance_pair else {}),
         }
+
+    def plot(self) -> "Figure":
+        """Joints, speeds, task values and coordinates over time, as a matplotlib figure."""
+        figure: Figure = import_module("orthocas.following.figure").motion_figure(self)
+        return figure
 
     def save_csv(self, path: str | Path, force: bool = False) -> None:
         """Write a CSV file: time_s, then q, dq and ddq of each joint, task values, and coordinates.

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from orthocas.checks import Array
 from orthocas.control.status import FROM_THE_LAW, ControlStatus
 from orthocas.problem import Problem
+from orthocas.showing.picture import Picture
 from orthocas.simulation.trajectory import Trajectory
 
 ACTUAL, FALLBACK = "#3d85c6", "#d62728"
@@ -34,7 +35,7 @@ def trajectory_figure(trajectory: Trajectory, units: Mapping[str, str] | None = 
         units: units of the quantities by label, see `units_of`; quantities without an entry are shown without a unit.
     """
     k = len(trajectory.labels)
-    figure = Figure(figsize=(10.5, max(5.4, 1.05 * k + 0.9)), layout="constrained")
+    figure = Picture(figsize=(10.5, max(5.4, 1.05 * k + 0.9)), layout="constrained")
     halves: Any = figure.subfigures(1, 2)
     left, right = halves
     units = units or {}

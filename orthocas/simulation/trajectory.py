@@ -4,8 +4,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import scipy
@@ -19,6 +20,9 @@ from orthocas.files.json import part
 from orthocas.files.ours import is_numpy_archive, require_replaceable
 from orthocas.showing import Shown, listed, number_list
 from orthocas.simulation.run_file import read_run_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _VERSION = 1
 _ARRAYS = {  #: array fields and their units
@@ -132,6 +136,15 @@ class Trajectory(Shown):
         if self.catches:
             facts["caught"] = listed(f"at {time:.4g} s ({cause.words})" for time, cause in self.catches)
         return facts if np.isnan(self.storage).any() else facts | {"storage rise": f"{self.storage_rise:.3g} J"}
+
+    def plot(self, units: Mapping[str, str] | None = None) -> "Figure":
+        """Quantities, joints and commands over time, as a matplotlib figure.
+
+        Args:
+            units: units of the quantities by label, as `orthocas.simulation.figure.units_of(problem)` has them.
+        """
+        figure: Figure = import_module("orthocas.simulation.figure").trajectory_figure(self, units)
+        return figure
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Write an NPZ file with all arrays, names and units. The file appears whole or not at all.

@@ -7,10 +7,10 @@ import numpy as np
 
 from orthocas.chart import Chart
 from orthocas.errors import OrthocasError
+from orthocas.reaching.fan import Fan, fan_along
 from orthocas.viewing.arm import GHOSTS, Arm, Ghosts
 from orthocas.viewing.loop import Loop
 from orthocas.viewing.panel import ChartPanel
-from orthocas.viewing.reach import Fan, fan_along
 from orthocas.viewing.session import Session
 from orthocas.viewing.stick_arm import Look, chain_length
 from orthocas.viewing.window import place_camera, place_floor
@@ -30,7 +30,7 @@ class ChartPage:
         self._server, self._chart = server, chart
         self._panel = ChartPanel(chart)
         self._loop = Loop(self._settle, self._failed)
-        self._gesture = self._dragging = False
+        self._gesture = self._dragging = self._sweeping = False
         self._fans: list[Fan] = []
         robot = chart.problem.robot
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
@@ -138,7 +138,7 @@ class ChartPage:
 
     def _wish(self, values: dict[str, float]) -> None:
         """Move towards what the user wishes, as the first or a later part of a gesture."""
-        self._loop.animate(None)
+        self._rest()
         self._begin()
         self.session.wish(values)
         self.session.follow()
@@ -151,21 +151,23 @@ class ChartPage:
             self._gesture = True
 
     def _go_home(self) -> None:
-        self._loop.animate(None)
+        self._rest()
         self.session.go_home()
         self._show()
 
     def _undone(self) -> None:
-        self._loop.animate(None)
+        self._rest()
         self.session.undo()
         self._show()
 
     def _swept(self) -> None:
-        """Move the chosen coordinate to its ends and back, until something else is wished for."""
+        """Move the chosen coordinate to its ends and back, until something else is wished for; or end that."""
         fan = self._fan()
-        if fan is None:
+        if self._sweeping or fan is None:
+            self._rest()
             return
         self._begin()
+        self._sweeping, self._sweep.label = True, "Stop"
         middle, half = (fan.xi[-1] + fan.xi[0]) / 2, _CALM * (fan.xi[-1] - fan.xi[0]) / 2
         here = float(self.session.readings.xi[self._chart.labels.index(fan.label) - self._chart.m])
         phase = np.arcsin(np.clip((here - middle) / max(half, 1e-9), -1, 1))
@@ -177,6 +179,11 @@ class ChartPage:
             return True
 
         self._loop.animate(tick)
+
+    def _rest(self) -> None:
+        """End a sweep."""
+        self._loop.animate(None)
+        self._sweeping, self._sweep.label = False, "Sweep"
 
     def _show(self, moved: Any = ()) -> None:
         """Draw the arm and the readings, and move the sliders that the user does not hold."""

@@ -7,11 +7,11 @@ import numpy as np
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
+from orthocas.reaching.fan import Fan, fan_along
 from orthocas.robots import Robot
 from orthocas.viewing.arm import GHOSTS, Arm, Ghosts
 from orthocas.viewing.motion import Motion
 from orthocas.viewing.player import Stage, few
-from orthocas.viewing.reach import Fan, fan_along
 from orthocas.viewing.stick_arm import Look, chain_length
 from orthocas.viewing.window import LOCAL, close_window, open_window, place_camera, place_floor, up_of
 
