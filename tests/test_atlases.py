@@ -3,6 +3,9 @@
 import json
 import os
 import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -252,6 +255,35 @@ def test_work_of_killed_processes_runs_again(atlas: oc.Atlas, tmp_path: Path, mo
     monkeypatch.setattr("orthocas.atlases.build.Processes", Deadly)
     found = oc.build_atlas(planar(), tmp_path / "arm.orthocas-atlas", ASKED, jobs=1)
     assert Deadly.kills == 3
+    assert cells_of(found._stock) == cells_of(atlas._stock)
+
+
+@pytest.mark.slow
+def test_build_goes_on_after_its_process_was_killed(atlas: oc.Atlas, tmp_path: Path) -> None:
+    path = tmp_path / "arm.orthocas-atlas"
+    code = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "import orthocas.atlases.build as build, test_atlases as tests, pathlib\n"
+        f"build._FLUSH = 0.0; tests.built(pathlib.Path({str(path)!r}))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    while process.poll() is None and not (path.exists() and path.stat().st_size > 9000):
+        time.sleep(0.001)
+    process.kill()
+    process.wait()
+    before = len(read_stock(path).records)
+    assert 0 < before < len(atlas._stock.records)
+    assert cells_of(built(path)._stock) == cells_of(atlas._stock)
+
+
+@pytest.mark.slow
+def test_workers_of_dask_need_no_shared_disk(atlas: oc.Atlas, tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None) as client,
+        client.get_executor() as executor,
+    ):
+        found = oc.build_atlas(planar(), tmp_path / "arm.orthocas-atlas", ASKED, executor=executor)
     assert cells_of(found._stock) == cells_of(atlas._stock)
 
 
