@@ -44,9 +44,9 @@ class AtlasSettings:
     leak_deg: float = 5.0
     conditioning: float = 0.3
     least_singular_value: float = 0.1
-    half_width: float = 0.5
+    half_width: float = 1.1
     overlap: float = 0.1
-    splits: int = 10
+    splits: int = 14
     symmetric: bool = True
     certify_seconds: float = 0.0
 
