@@ -1,6 +1,7 @@
 """One of every public object, small and quick to build, and the numbers that tell whether two of them are equal."""
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from functools import cache, singledispatch
@@ -152,6 +153,21 @@ def generated_c() -> Any:
 
 
 @cache
+def atlas() -> oc.Atlas:
+    """Two joints of a planar arm around one posture. Its file lasts as long as this process."""
+    known = problems.get("planar_3r_xy")
+    problem = oc.Problem(known.robot, known.task, domain=known.domain)
+    asked = oc.AtlasSettings(degree=2, leak_deg=8.0, half_width=0.5, splits=4)
+    _folders.append(TemporaryDirectory())
+    path = Path(_folders[-1].name) / "arm.orthocas-atlas"
+    with ThreadPoolExecutor(1) as executor:
+        return oc.build_atlas(problem, path, asked, region=[[0.0, 0.9, 0.9]], radius=0.3, executor=executor)
+
+
+_folders: list[TemporaryDirectory[str]] = []
+
+
+@cache
 def certificate() -> oc.Certificate:
     return oc.certify(fitted().chart)
 
@@ -203,6 +219,9 @@ CONTROLLERS: dict[str, Callable[[], Controller]] = {
 OBJECTS: dict[str, Callable[[], Any]] = {
     **CHARTS,
     **CONTROLLERS,
+    "atlas": atlas,
+    "settings of an atlas": oc.AtlasSettings,
+    "coverage": lambda: oc.evaluate_atlas(atlas(), 200),
     "certificate": certificate,
     "fit": fitted,
     "robot": lambda: planar().robot,
@@ -313,6 +332,12 @@ def _of_chart(chart: oc.Chart) -> Iterator[Any]:
     yield chart.inverse(phi[known], q[known] + 1e-3)
     if not isinstance(chart, oc.GrownChart):
         yield from (np.asarray(chart.function(name)(q[0])) for name in ("xi", "phi", "jacobian"))
+
+
+@_numbers.register
+def _of_atlas(atlas: oc.Atlas) -> Iterator[Any]:
+    q = np.array([[0.0, 0.9, 0.9], [1.0, 0.7, 1.1], [0.0, -2.0, 0.9]])
+    yield from (atlas.chart_at(q), atlas.xi(q), atlas.jacobian(q), atlas.chart(0).xi(q[0]), str(atlas.as_dict()))
 
 
 @_numbers.register

@@ -3,6 +3,9 @@
 import json
 import os
 import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -255,6 +258,35 @@ def test_work_of_killed_processes_runs_again(atlas: oc.Atlas, tmp_path: Path, mo
     assert cells_of(found._stock) == cells_of(atlas._stock)
 
 
+@pytest.mark.slow
+def test_build_goes_on_after_its_process_was_killed(atlas: oc.Atlas, tmp_path: Path) -> None:
+    path = tmp_path / "arm.orthocas-atlas"
+    code = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "import orthocas.atlases.build as build, test_atlases as tests, pathlib\n"
+        f"build._FLUSH = 0.0; tests.built(pathlib.Path({str(path)!r}))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    while process.poll() is None and not (path.exists() and path.stat().st_size > 9000):
+        time.sleep(0.001)
+    process.kill()
+    process.wait()
+    before = len(read_stock(path).records)
+    assert 0 < before < len(atlas._stock.records)
+    assert cells_of(built(path)._stock) == cells_of(atlas._stock)
+
+
+@pytest.mark.slow
+def test_workers_of_dask_need_no_shared_disk(atlas: oc.Atlas, tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None) as client,
+        client.get_executor() as executor,
+    ):
+        found = oc.build_atlas(planar(), tmp_path / "arm.orthocas-atlas", ASKED, executor=executor)
+    assert cells_of(found._stock) == cells_of(atlas._stock)
+
+
 def test_posture_is_asked_for_without_a_jump_where_charts_change(atlas: oc.Atlas) -> None:
     start = np.array([0.3, 0.5, 1.4])
     number = atlas.chart_at(start)
@@ -291,7 +323,7 @@ def test_surroundings_of_postures_are_covered_and_little_else(tmp_path: Path) ->
 
 
 def test_charts_are_certified_if_asked_for(tmp_path: Path) -> None:
-    asked = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.8, certify_seconds=20.0)
+    asked = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.3, certify_seconds=20.0)
     with ThreadPoolExecutor(1) as executor:
         region = [[0.0, 0.9, 0.9]]
         found = oc.build_atlas(planar(), tmp_path / "a", asked, region=region, radius=0.01, executor=executor)

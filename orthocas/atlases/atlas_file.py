@@ -255,14 +255,22 @@ def _records(path: Path, plan: Plan, contents: Contents) -> tuple[Records, Indic
 
 
 def _require_tree(path: Path, plan: Plan, records: Records) -> None:
-    """Raise AtlasFileError unless every cell comes after the cell that it is a half of, and indices make sense."""
-    rows = np.arange(len(records))
-    parent, tile = records["parent"], records["tile"]
+    """Raise AtlasFileError unless all cells are tiles, or halves of cells that came before and were split."""
+    rows, k = np.arange(len(records)), len(plan.joints)
+    parent, tile, joint = (records[name].astype(np.int64) for name in ("parent", "tile", "joint"))
     sound = (parent >= -1) & (parent < rows) & (tile >= 0) & (tile < plan.lattice.size)
-    sound &= records["joint"] < len(plan.joints)
-    inner = parent >= 0
-    sound[inner] &= records["outcome"][parent[inner]] == Outcome.SPLIT
-    sound &= (records["outcome"] != Outcome.SPLIT) | (records["joint"] >= 0)
+    sound &= (joint >= -(records["outcome"] != Outcome.SPLIT).astype(int)) & (joint < k) & (records["upper"] <= 1)
+    inner = np.flatnonzero(sound & (parent >= 0))
+    above = records[parent[inner]]
+    levels, places = (above[name].astype(np.int64) for name in ("levels", "places"))
+    halved = above["joint"].astype(int)[:, None] == np.arange(k)
+    same = (records["levels"][inner] == levels + halved) & (
+        records["places"][inner] == np.where(halved, 2 * places + records["upper"][inner, None], places)
+    )
+    sound[inner] &= (above["outcome"] == Outcome.SPLIT) & (tile[inner] == above["tile"]) & same.all(axis=1)
+    outer = parent < 0
+    sound[outer] &= ~records["levels"][outer].any(axis=1) & ~records["places"][outer].any(axis=1)
+    sound &= records["levels"].sum(axis=1, dtype=np.int64) <= plan.settings.splits
     if not sound.all():
         raise AtlasFileError(f"{path} is damaged: record {int(np.argmin(sound))} of its cells makes no sense")
 

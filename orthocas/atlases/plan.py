@@ -6,7 +6,7 @@ import numpy as np
 
 from orthocas.atlases.lattice import Lattice, make_lattice
 from orthocas.atlases.symmetry import Symmetries, find_symmetries, identity_only
-from orthocas.checks import Array, as_number, require_count, require_kind
+from orthocas.checks import Array, as_number, require_at_least, require_count, require_kind
 from orthocas.domains import Box, sample_uniform
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.idle_joints import idle_joints
@@ -44,15 +44,15 @@ class AtlasSettings:
     leak_deg: float = 5.0
     conditioning: float = 0.3
     least_singular_value: float = 0.1
-    half_width: float = 0.5
+    half_width: float = 1.1
     overlap: float = 0.1
-    splits: int = 10
+    splits: int = 14
     symmetric: bool = True
     certify_seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        require_count("degree", self.degree, most=8)
-        require_count("splits", self.splits, least=0, most=_MOST_SPLITS)
+        object.__setattr__(self, "degree", require_count("degree", self.degree, most=8))
+        object.__setattr__(self, "splits", require_count("splits", self.splits, least=0, most=_MOST_SPLITS))
         require_kind("symmetric", self.symmetric, bool)
         for name, least, most in (
             ("leak_deg", 0.0, 90.0),
@@ -64,8 +64,9 @@ class AtlasSettings:
             value = as_number(name, getattr(self, name))
             if not least < value < most:
                 raise InvalidValueError(name, value, f"a number between {least:g} and {most:g}")
-        if not 0 <= as_number("certify_seconds", self.certify_seconds) < np.inf:
-            raise InvalidValueError("certify_seconds", self.certify_seconds, "a finite number >= 0")
+            object.__setattr__(self, name, value)
+        require_at_least("certify_seconds", self.certify_seconds, 0)
+        object.__setattr__(self, "certify_seconds", as_number("certify_seconds", self.certify_seconds))
 
 
 @dataclass(frozen=True, eq=False)

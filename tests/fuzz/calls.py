@@ -11,7 +11,18 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from public_objects import circle, clear, fitted, impedance, joint_motion, link_distances, planar, steps, trajectory
+from public_objects import (
+    atlas,
+    circle,
+    clear,
+    fitted,
+    impedance,
+    joint_motion,
+    link_distances,
+    planar,
+    steps,
+    trajectory,
+)
 
 import orthocas as oc
 from fuzz.child import Finding, run, verdict
@@ -163,6 +174,12 @@ def _physics() -> dict[str, Call]:
     payload, wall = simulation.Payload(1.0), simulation.Wall([9.0, 0, 0], [-1.0, 0, 0])
     options = {"stops": True, "effort_limits": True, "payload": payload, "wall": wall, "timestep": 1e-3}
     return {
+        "AtlasSettings": (oc.AtlasSettings, {"degree": 3, "leak_deg": 5.0, "half_width": 0.5, "splits": 4}),
+        "atlas.chart_at": (atlas().chart_at, {"q": q, "current": 0}),
+        "atlas.xi": (atlas().xi, {"q": q, "charts": 0}),
+        "atlas.chart": (atlas().chart, {"number": 0, "near": q}),
+        "atlas.handed_over": (atlas().handed_over, {"q": q, "dq": q, "ddq": q, "number": 0}),
+        "evaluate_atlas": (oc.evaluate_atlas, {"atlas": atlas(), "samples": 20, "seed": 0}),
         "Stops": (lambda **given: _stopped(robot, simulation.Stops(**given)), {"stiffness": 1e4, "damping": [1.0] * 3}),
         "Payload": (simulation.Payload, {"mass": 1.0, "centre": q, "inertia": np.eye(3)}),
         "Wall": (simulation.Wall, {"point": q, "normal": q, "tip_radius": 0.1, "size": 1.0, "time_constant": 0.01}),

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from fuzz import signals
+from fuzz.atlases import atlases
 from fuzz.calls import calls
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
@@ -14,6 +15,7 @@ from fuzz.runs import runs
 from fuzz.steps import steps
 
 CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
+    "atlases": atlases,
     "calls": calls,
     "charts": charts,
     "checkpoints": checkpoints,

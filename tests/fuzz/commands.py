@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from public_objects import circle, fitted, joint_motion
+from public_objects import atlas, circle, fitted, joint_motion
 
 from fuzz.child import Finding, run
 from fuzz.robots import text_of, urdf_chain
@@ -133,6 +133,8 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},
         (*_LAW_OPTIONS, *_RUN_OPTIONS),
     ),
+    "atlas info": (("arm.orthocas-atlas", *_FILES), {}, ()),
+    "atlas evaluate": (("arm.orthocas-atlas", *_FILES), {"--samples": "20"}, ("--seed",)),
     "export": (_FILES, {"--to": "numpy", "--out": "module.py"}, ()),
     "follow": (
         _FILES,
@@ -203,6 +205,7 @@ def _files() -> Path:
     chart = fitted().chart
     chart.save(folder / "chart.orthocas")
     circle().save(folder / "grown.orthocas")
+    shutil.copy(atlas().path, folder)
     (folder / "cut.orthocas").write_bytes((folder / "chart.orthocas").read_bytes()[:500])
     start = [round(float(value), 3) for value in chart.problem.domain.centre]
     steps = [{"time": 0.1, "move": {"x": 0.01}}]
