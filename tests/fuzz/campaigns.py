@@ -8,6 +8,7 @@ from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
 from fuzz.commands import commands
+from fuzz.motions import motions
 from fuzz.paths import paths
 from fuzz.robots import robots
 from fuzz.runs import runs
@@ -18,6 +19,7 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "charts": charts,
     "checkpoints": checkpoints,
     "commands": commands,
+    "motions": motions,
     "paths": paths,
     "robots": robots,
     "runs": runs,
