@@ -3,6 +3,7 @@
 import pytest
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
+from fuzz.motions import motions
 from fuzz.paths import logs, paths
 from fuzz.runs import runs
 from fuzz.steps import steps
@@ -16,6 +17,11 @@ def test_mutated_charts_are_usable_or_refused_in_one_line() -> None:
 @pytest.mark.slow
 def test_mutated_checkpoints_are_resumed_or_refused_in_one_line() -> None:
     assert checkpoints(60) == []
+
+
+@pytest.mark.slow
+def test_mutated_motions_are_usable_or_refused_in_one_line() -> None:
+    assert motions(100) == []
 
 
 @pytest.mark.slow

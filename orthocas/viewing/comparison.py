@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from orthocas.chart import Chart
-from orthocas.checks import Array, as_point_set, require_count
+from orthocas.checks import Array, as_point_set, require_count, require_kind
 from orthocas.errors import InvalidValueError, PathError
 from orthocas.inverting import TrackerStatus
 from orthocas.viewing.motion import Motion
@@ -36,6 +36,7 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
         PathError: if the path is not closed, or leaves the domain with constant xi.
         NoExpressionError: for grown charts.
     """
+    require_kind("chart", chart, Chart)
     require_count("cycles", cycles, most=_MOST_CYCLES)
     times, shares = _timing(cycles)
     start = chart.problem.domain.centre

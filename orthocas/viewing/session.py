@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.chart import Chart
-from orthocas.checks import Array, as_point, require_known
+from orthocas.checks import Array, as_number, as_point, require_kind, require_known
 from orthocas.errors import InvalidValueError
 from orthocas.inverting import TrackerStatus
 from orthocas.reaching.stops import Walls
@@ -35,6 +35,7 @@ class Session:
     """
 
     def __init__(self, chart: Chart, q: Array | None = None) -> None:
+        require_kind("chart", chart, Chart)
         home = chart.problem.domain.centre if q is None else as_point("q", q, chart.n)
         self.chart, self.home = chart, home
         self._tracker = chart.tracker(home)
@@ -64,11 +65,15 @@ class Session:
         Raises:
             UnknownNameError, InvalidValueError: if there is no such component, or a value is not finite.
         """
+        require_kind("values", values, Mapping)
+        wished = self._wished.copy()
         for label, value in values.items():
-            require_known("component of phi", label, self.chart.labels)
-            if not np.isfinite(value):
+            require_known("component of phi", str(label), self.chart.labels)
+            number = as_number(f"wish for {label}", value)
+            if not np.isfinite(number):
                 raise InvalidValueError(f"wish for {label}", value, "a finite number")
-            self._wished[self.chart.labels.index(label)] = value
+            wished[self.chart.labels.index(label)] = number
+        self._wished = wished
 
     def follow(self, most_steps: int = _MOST_STEPS) -> bool:
         """Move towards the wish. Returns whether q has moved; afterwards the wish is met, given up, or still ahead."""

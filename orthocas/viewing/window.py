@@ -71,7 +71,8 @@ def require_free(host: str, port: int) -> None:
     if not isinstance(host, str) or not host:
         raise InvalidValueError("host", repr(host)[:80], "an address of this machine, such as 127.0.0.1")
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        numeric = 0 if host == "localhost" else socket.AI_NUMERICHOST  # no questions to other machines
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=numeric)[0]
     except (OSError, UnicodeError):
         raise ViewError(f"host is {host[:80]!r}, expected an address of this machine, such as {LOCAL}") from None
     with socket.socket(family, kind, protocol) as trial:

@@ -27,9 +27,10 @@ from public_objects import (
 import orthocas as oc
 from fuzz.child import Finding, run, verdict
 from fuzz.words import NAMES, NUMBERS, Rng, pick
-from orthocas import control, parametrisations, plotting, problems, simulation, solvers
+from orthocas import control, parametrisations, plotting, problems, simulation, solvers, viewing
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
+from orthocas.viewing.session import Session
 
 Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments that it takes
 
@@ -165,7 +166,7 @@ def _objects() -> dict[str, Any]:
 @cache
 def good_calls() -> dict[str, Call]:
     """What can be called, with arguments that work and take little time."""
-    return {**_makers(), **_functions(), **_methods(), **_control(), **_physics(), **_supervised()}
+    return {**_makers(), **_functions(), **_methods(), **_control(), **_physics(), **_supervised(), **_views()}
 
 
 def _physics() -> dict[str, Call]:
@@ -188,6 +189,23 @@ def _physics() -> dict[str, Call]:
         "plant.reset": (lambda **given: _plant(robot).reset(**given), {"q": q, "dq": q}),
         "plant.push": (lambda **given: _plant(robot).push(**given), {"force": q, "link": 1, "point": q}),
         "plant.step": (lambda **given: _plant(robot).step(**given), {"torque": q, "seconds": 0.01, "loads": q}),
+    }
+
+
+def _views() -> dict[str, Call]:
+    """What opens pages, and what stands behind them."""
+    chart, q = fitted().chart, planar().domain.centre
+    x = chart.task(q)
+    session = Session(chart)
+    return {
+        "view": (
+            lambda **given: oc.view(**given).close(),
+            {"shown": chart, "host": "127.0.0.1", "port": 0},
+        ),
+        "cyclic_motions": (viewing.cyclic_motions, {"chart": chart, "path": [x, x + 0.05, x], "cycles": 1}),
+        "Session": (Session, {"chart": chart, "q": q}),
+        "session.wish": (session.wish, {"values": {"xi1": 0.1}}),
+        "chart.plot": (lambda postures: plotting.self_motion_figure(chart, postures, None), {"postures": 3}),
     }
 
 

@@ -9,6 +9,7 @@ from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
 from fuzz.commands import commands
+from fuzz.motions import motions
 from fuzz.paths import logs, paths
 from fuzz.robots import robots
 from fuzz.runs import runs
@@ -21,6 +22,7 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "checkpoints": checkpoints,
     "commands": commands,
     "logs": logs,
+    "motions": motions,
     "paths": paths,
     "robots": robots,
     "runs": runs,

@@ -1,0 +1,61 @@
+"""Campaign of files of joint motions: what is read moves the robot, or the error names the file and what is wrong."""
+
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from public_objects import joint_motion, planar
+
+from fuzz.child import Finding, run
+from fuzz.mutants import TEXTS, Rng, flipped, pick
+from fuzz.sealed_files import judged
+from orthocas.viewing.motion import read_joint_motion
+
+_CELLS = ("0", "nan", "-1e999", "1e300", "", " ", "a", '"1"', '"1', "1_0", "0x10", "time_s", "q1", "d_q1", *TEXTS)
+
+
+def motions(count: int) -> list[Finding]:
+    """Judge so many mutants."""
+    return run("motions", judge, range(count))
+
+
+def judge(seed: int) -> str | None:
+    """What is wrong with the treatment of a mutant."""
+    return judged(_mutant, use, seed)
+
+
+def use(path: Path) -> None:
+    """Read a motion; it has to have a joint position at every time."""
+    motion = read_joint_motion(path, planar().robot)
+    assert motion.values.shape == (len(motion.times), len(motion.labels))
+    for seconds in (0.0, motion.duration / 2, 1e9):
+        assert np.isfinite(motion.at(seconds)).all()
+        assert 0 <= motion.index(seconds) < len(motion.times)
+
+
+@cache
+def _text() -> str:
+    with TemporaryDirectory() as folder:
+        joint_motion().save_csv(Path(folder, "q.csv"))
+        return Path(folder, "q.csv").read_text()
+
+
+def _mutant(rng: Rng) -> bytes:
+    table = [line.split(",") for line in _text().splitlines()[: int(rng.integers(2, 9))]]
+    for _ in range(int(rng.integers(0, 3))):
+        row = table[0] if rng.random() < 0.3 else table[int(rng.integers(len(table)))]
+        k = int(rng.integers(len(row)))
+        row[k : k + int(rng.integers(2))] = [pick(rng, _CELLS)] * int(rng.integers(2))
+    content = "\n".join(",".join(row) for row in table).encode(errors="surrogatepass")
+    odd = (
+        flipped(rng, content),
+        content[: int(rng.integers(len(content)))],
+        content.replace(b",", b";"),
+        content.decode(errors="replace").encode("utf-16"),
+        b"\n" * 10**6,
+        bytes(10**5),
+        content + b"\n" + b"1," * 10**6,
+        b"",
+    )
+    return content if rng.random() < 0.7 else bytes(odd[int(rng.integers(len(odd)))])

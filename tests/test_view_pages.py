@@ -1,0 +1,100 @@
+"""Pages on a server that nobody looks at: what their buttons, handles and exports do."""
+
+import asyncio
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from public_objects import clear, cyclic, fitted, joint_motion, trajectory
+
+import orthocas as oc
+from orthocas.errors import ArchiveError, ViewError
+from orthocas.viewing import cyclic_motions, export_page
+
+pytestmark = [
+    pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'"),
+    pytest.mark.slow,
+]
+
+
+def wait(condition: Callable[[], bool]) -> None:
+    """Wait until the thread of a page has done something."""
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def press(button: Any) -> None:
+    """What viser does when somebody clicks."""
+    asyncio.run(button._impl.update_cb[0](SimpleNamespace(client=object(), target=button)))
+
+
+@pytest.mark.parametrize("build", [lambda: fitted().chart, cyclic, clear])
+def test_handle_sweep_undo_and_home(build: Callable[[], oc.Chart]) -> None:
+    chart = build()
+    robot = chart.problem.robot
+    with oc.view(chart, port=0) as view:
+        page = view._page
+        session, home = page.session, page.session.home
+        page._handle.position = tuple(robot.tip_position(home) + 0.02)
+        for phase in ("start", "update", "end"):
+            asyncio.run(page._handle._impl_aux.update_cb[0](SimpleNamespace(target=page._handle, phase=phase)))
+        wait(lambda: not page._undo.disabled and not page._gesture)
+        np.testing.assert_allclose(chart.task(session.q) - chart.task(home), 0.02, atol=1e-9)
+        np.testing.assert_allclose(chart.xi(session.q), chart.xi(home), atol=1e-9)
+        np.testing.assert_allclose(page._handle.position, robot.tip_position(session.q), atol=1e-9)
+        before = session.q
+        press(page._sweep)
+        wait(lambda: bool(np.abs(session.q - before).max() > 0.02))
+        press(page._sweep)
+        wait(lambda: page._sweep.label == "Sweep" and not page._gesture)
+        assert np.abs(chart.task(session.q) - chart.task(before)).max() < 1e-9
+        press(page._undo)
+        wait(lambda: bool((session.q == before).all()))
+        press(page._undo)
+        wait(lambda: bool((session.q == home).all()))
+        values = dict(zip(chart.labels, chart.phi(home).tolist(), strict=True))
+        wait(lambda: all(abs(page._sliders[label].value - value) < 6e-4 for label, value in values.items()))
+
+
+def test_a_taken_port_is_named_and_a_closed_one_is_free() -> None:
+    robot = fitted().chart.problem.robot
+    with oc.view(robot, port=0) as view:
+        port = int(view.url.rpartition(":")[2])
+        with pytest.raises(ViewError, match=f"port {port} of 127.0.0.1 is taken"):
+            oc.view(robot, port=port)
+        assert view.url in view._repr_html_()
+        assert view._server.request_share_url() is None  # nothing goes to other machines
+    oc.view(robot, port=port).close()
+
+
+def test_motions_play_and_stop() -> None:
+    run = trajectory()
+    with oc.view(run, robot=fitted().chart, port=0) as view:
+        page = view._page
+        press(page._play)
+        wait(lambda: page._now > 0.1)
+        press(page._play)
+        wait(lambda: page._play.label == "Play")
+        page._loop.ask("jump", lambda: page._jump(float(run.times[-1])))
+        wait(lambda: page._now == run.times[-1])
+        assert f'data-value="{float(run.q[-1, 0])!r}"' in page._readings.content
+
+
+def test_pages_are_written_whole_and_replace_only_their_own(tmp_path: Path) -> None:
+    chart, path = fitted().chart, tmp_path / "page.html"
+    motions = cyclic_motions(chart, cycles=1)
+    for shown, robot in ((joint_motion(), chart), (motions, chart), (chart.problem.robot, None)):
+        export_page(shown, path, robot=robot)
+        assert b"__VISER_EMBED_DATA__" in path.read_bytes()
+        assert path.stat().st_size < 2 * 2**20
+    path.write_text("mine")
+    with pytest.raises(ArchiveError, match="orthocas did not write the file"):
+        export_page(chart, path)
+    assert path.read_text() == "mine"
