@@ -323,7 +323,7 @@ def test_surroundings_of_postures_are_covered_and_little_else(tmp_path: Path) ->
 
 
 def test_charts_are_certified_if_asked_for(tmp_path: Path) -> None:
-    asked = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.3, certify_seconds=20.0)
+    asked = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.2, certify_seconds=20.0)
     with ThreadPoolExecutor(1) as executor:
         region = [[0.0, 0.9, 0.9]]
         found = oc.build_atlas(planar(), tmp_path / "a", asked, region=region, radius=0.01, executor=executor)

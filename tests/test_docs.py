@@ -3,6 +3,7 @@
 import re
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -67,6 +68,13 @@ def test_python_blocks_of_the_page_on_domains_run(tmp_path: Path) -> None:
     assert printed[0].startswith("DomainSuggestion: half-width 3.142")
     assert printed[-2] == "('q1',) True"
     assert 0.81 < float(printed[-1]) < 0.84  # the share of the box that is clear
+
+
+@pytest.mark.slow
+def test_python_block_of_the_page_on_atlases_runs(tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "atlas.md").read_text(), flags=re.DOTALL)
+    (tmp_path / "program.py").write_text(code)  # processes start by importing it
+    assert output_of(sys.executable, "program.py", folder=tmp_path).splitlines() == ["('x', 'y', 'xi1') (1,)", "1.0"]
 
 
 @pytest.mark.slow

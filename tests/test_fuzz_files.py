@@ -1,12 +1,18 @@
 """A quick part of the campaigns of files: hundreds of mutants a kind. `make fuzz` runs as many as you like."""
 
 import pytest
+from fuzz.atlases import atlases
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.motions import motions
 from fuzz.paths import logs, paths
 from fuzz.runs import runs
 from fuzz.steps import steps
+
+
+@pytest.mark.slow
+def test_mutated_atlases_are_usable_or_refused_in_one_line() -> None:
+    assert atlases(100) == []
 
 
 @pytest.mark.slow

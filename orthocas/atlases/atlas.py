@@ -16,9 +16,17 @@ from orthocas.atlases.outcomes import Outcome
 from orthocas.atlases.plan import AtlasSettings
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
-from orthocas.checks import Array, Indices, as_path, as_point, as_point_set, frozen_indices, require_count
+from orthocas.checks import (
+    Array,
+    Indices,
+    as_float_array,
+    as_path,
+    as_point,
+    as_point_set,
+    require_count,
+)
 from orthocas.domains import Box
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.problem import Problem
 from orthocas.showing import Shown, listed, number_list
 
@@ -152,7 +160,7 @@ class Atlas(Shown):
         if current is None:
             found = self._index.find(divided)
         else:
-            found = self._numbers("current", current, len(points), least=-1).copy()
+            found = self._numbers("current", current, len(points)).copy()
             known = np.flatnonzero(found >= 0)
             known = known[self._index.in_boxes(divided[known], found[known])]
             left = np.ones(len(points), dtype=bool)
@@ -258,12 +266,17 @@ class Atlas(Shown):
     def _chosen(self, points: Array, charts: ArrayLike | None) -> Indices:
         if charts is None:
             return self._index.find(np.ascontiguousarray(points[:, list(self._stock.plan.joints)]))
-        return self._numbers("charts", charts, len(points), least=-1)
+        return self._numbers("charts", charts, len(points))
 
-    def _numbers(self, name: str, value: ArrayLike, count: int, least: int) -> Indices:
-        given = np.broadcast_to(np.asarray(value), (count,))
-        shifted = frozen_indices(name, given - least, (count,), len(self) - least)
-        return shifted + least
+    def _numbers(self, name: str, value: ArrayLike, count: int) -> Indices:
+        """Numbers of charts, or -1 for none, (count,); one number counts for all positions."""
+        given = as_float_array(name, value)
+        if given.ndim > 1 or given.size not in (1, count):
+            raise ShapeError(name, given.shape, (count,))
+        wrong = given[~((given >= -1) & (given < len(self)) & (given == np.floor(given)))]
+        if wrong.size:
+            raise InvalidValueError(name, wrong.flat[0], f"whole numbers from 0 to {len(self) - 1}, or -1 for no chart")
+        return np.broadcast_to(given, (count,)).astype(np.int64)
 
     @cached_property
     def _index(self) -> Index:
@@ -275,10 +288,3 @@ class Atlas(Shown):
         if turns is not None and len(turns.order) != self._index.count:
             turns = None  # of an unfinished build
         return Evaluation(self._index, turns)
-
-
-def require_atlas(name: str, value: object) -> Atlas:
-    """Return an atlas; raises InvalidValueError for anything else."""
-    if not isinstance(value, Atlas):
-        raise InvalidValueError(name, f"a {type(value).__name__}", "an Atlas")
-    return value
