@@ -367,9 +367,9 @@ def test_command_line_builds_shows_and_evaluates(run: Run) -> None:
     ("text", "word"),
     [
         ("q1,q2\n0,0\n", "q3"),
-        ("q1,q2,q3\n", "no posture"),
+        ("q1,q2,q3\n", "0 postures"),
         ("q1,q2,q3\n0,x,0\n", "line 2"),
-        ("q1,q2,q3\n0,0\n", "2 cells"),
+        ("q1,q2,q3\n0,0\n", "2 numbers"),
     ],
 )
 def test_bad_files_of_postures_are_named(tmp_path: Path, text: str, word: str) -> None:

@@ -232,12 +232,12 @@ def test_runs_and_paths_are_played_from_their_files(tmp_path: Path) -> None:
 
 
 BROKEN = {
-    "": "0 instants after the header",
+    "": "it has 0 instants after the header",
     "time_s,q1,q2\n0,1,2\n1,1,2\n": "column 'q3' is missing",
     "time_s,q1,q2,q3\n0,1,2,3\n0,1,2,3\n": "time_s does not increase",
-    "time_s,q1,q2,q3\n0,1,2,3\n1,1,2\n": "line 3: expected 4 finite numbers",
-    "time_s,q1,q2,q3\n0,1,2,nan\n1,1,2,3\n": "line 2: expected 4 finite numbers",
-    "time_s,q1,q1,q3\n0,1,2,3\n1,1,2,3\n": "a column comes twice",
+    "time_s,q1,q2,q3\n0,1,2,3\n1,1,2\n": "line 3: 3 numbers, expected 4 as in the header",
+    "time_s,q1,q2,q3\n0,1,2,nan\n1,1,2,3\n": "line 2: q3 is 'nan', expected a number",
+    "time_s,q1,q1,q3\n0,1,2,3\n1,1,2,3\n": "column 'q1' comes twice",
 }
 
 

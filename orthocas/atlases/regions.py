@@ -1,7 +1,5 @@
 """Regions of joint space that an atlas covers: the joint range, or the neighbourhood of some postures (ours)."""
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -12,10 +10,11 @@ from numpy.typing import NDArray
 from orthocas.atlases.lattice import Lattice
 from orthocas.checks import Array, Indices, as_float_array, as_number, frozen_array
 from orthocas.domains import Domain
-from orthocas.errors import InvalidValueError, PathFileError
+from orthocas.errors import InvalidValueError
+from orthocas.files.csv_table import places, read_table
 from orthocas.robots import Robot
 
-_LARGEST_FILE = 2**26  # bytes
+_MOST_POSTURES = 1_000_000
 _SLACK = 1e-9  # [rad] or [m]
 _MOST_TILES = 2_000_000  # in the joint range; more would take days
 
@@ -138,47 +137,6 @@ def read_postures(path: Path, robot: Robot) -> Array:
     Raises:
         PathFileError: names the file, the line, and what is wrong there.
     """
-    rows = _rows(path)
-    header = [cell.strip() for cell in rows[0][1]]
-    missing = [name for name in robot.joint_names if header.count(name) != 1]
-    if missing:
-        raise PathFileError(
-            f"postures file {path}: line 1 has {header.count(missing[0])} columns '{missing[0]}', expected 1"
-        )
-    columns = [header.index(name) for name in robot.joint_names]
-    return np.array([_numbers(path, line, cells, columns, len(header)) for line, cells in rows[1:]])
-
-
-def _rows(path: Path) -> list[tuple[int, list[str]]]:
-    """The lines that are not empty, with their numbers."""
-    try:
-        with path.open("rb") as stream:
-            content = stream.read(_LARGEST_FILE + 1)
-        reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
-        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except OSError as error:
-        raise PathFileError(f"postures file {path}: cannot be read, {error.strerror}") from None
-    except (ValueError, csv.Error) as error:  # also bytes that are no text
-        raise PathFileError(f"postures file {path}: no CSV text, {str(error)[:60]}") from None
-    if len(content) > _LARGEST_FILE or len(rows) < 2:
-        came = "it is too large" if len(content) > _LARGEST_FILE else "it has no posture after the header"
-        raise PathFileError(
-            f"postures file {path}: {came}, expected a header and up to {_LARGEST_FILE / 2**20:.0f} MiB"
-        )
-    return rows
-
-
-def _numbers(path: Path, line: int, cells: list[str], columns: list[int], width: int) -> list[float]:
-    if len(cells) != width:
-        raise PathFileError(
-            f"postures file {path}: line {line} has {len(cells)} cells, expected {width} as in the header"
-        )
-    try:
-        found = [float("nan" if "_" in cells[i] else cells[i]) for i in columns]
-    except ValueError:
-        found = [np.nan]
-    if not np.isfinite(found).all():
-        raise PathFileError(
-            f"postures file {path}: line {line} has a cell that is no finite number, expected joint positions"
-        )
-    return found
+    return read_table(
+        path, "postures file", "postures", _MOST_POSTURES, lambda names: places(names, robot.joint_names), least=1
+    )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
-from orthocas.files.csv_table import LONGEST, read_table
+from orthocas.files.csv_table import LONGEST, places, read_table
 from orthocas.following.splines import MOST_WAYPOINTS
 
 
@@ -27,9 +27,4 @@ def _columns(names: Sequence[str], chart: Chart) -> list[int]:
         if name not in chart.labels:
             known = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
             raise ValueError(f"line 1: unknown column {name[:LONGEST]!r}, expected {known}")
-        if names.count(name) > 1:
-            raise ValueError(f"line 1: column {name!r} comes twice")
-    for name in wanted:
-        if name not in names:
-            raise ValueError(f"line 1: column {name!r} is missing, expected {', '.join(wanted)}")
-    return [names.index(name) for name in wanted]
+    return places(names, wanted)

@@ -9,7 +9,7 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.errors import PathFileError
-from orthocas.files.csv_table import LONGEST, read_table
+from orthocas.files.csv_table import LONGEST, places, read_table
 
 _TIME, _WANTED = "time_s", "desired_"
 _MOST = 1_000_000
@@ -61,9 +61,4 @@ def _columns(names: Sequence[str], chart: Chart) -> tuple[list[int], list[str]]:
         if name not in {*needed, *unused, *(_WANTED + label for label in chart.labels)}:
             known = f"{', '.join(needed)}, and {_WANTED}{chart.labels[0]} and so on if they are known"
             raise ValueError(f"line 1: unknown column {name[:LONGEST]!r}, expected {known}")
-        if names.count(name) > 1:
-            raise ValueError(f"line 1: column {name!r} comes twice")
-    for name in needed:
-        if name not in names:
-            raise ValueError(f"line 1: column {name!r} is missing, expected {', '.join(needed)}")
-    return [names.index(name) for name in (*needed, *(_WANTED + label for label in desired))], desired
+    return places(names, (*needed, *(_WANTED + label for label in desired))), desired

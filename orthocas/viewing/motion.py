@@ -1,6 +1,6 @@
 """Motions to play: runs of `orthocas simulate`, joint motions of `orthocas follow`, and their files."""
 
-import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from orthocas.checks import Array, frozen_array
 from orthocas.errors import InvalidValueError, PathFileError
+from orthocas.files.csv_table import places, read_table
 from orthocas.following.joint_motion import JointMotion
 from orthocas.robots import Robot
 from orthocas.simulation.trajectory import Trajectory
 
-_LARGEST_FILE = 2**28  # bytes
+_MOST_INSTANTS = 1_000_000
 _TIME = "time_s"
 
 
@@ -86,10 +87,14 @@ def read_joint_motion(path: Path, robot: Robot) -> Motion:
     Raises:
         PathFileError: names the file, and what is wrong there.
     """
-    header, table = _table(path)
-    lost = [name for name in (_TIME, *robot.joint_names) if name not in header]
-    if lost:
-        raise PathFileError(f"motion file {path}: column '{lost[0]}' is missing, expected time_s and all joints")
+    header: list[str] = []
+
+    def columns(names: Sequence[str]) -> list[int]:
+        places(names, (_TIME, *robot.joint_names))
+        header.extend(names)
+        return places(names, names)
+
+    table = read_table(path, "motion file", "instants", _MOST_INSTANTS, columns)
     rates = {f"{order}_{name}" for order in ("d", "dd") for name in robot.joint_names}
     labels = tuple(name for name in header if name not in {_TIME, *robot.joint_names, *rates})
     times, q, values = (
@@ -98,35 +103,4 @@ def read_joint_motion(path: Path, robot: Robot) -> Motion:
     if (np.diff(times[:, 0]) <= 0).any():
         raise PathFileError(f"motion file {path}: time_s does not increase in every line")
     arrays = (frozen_array("a column", part, (None, None)) for part in (q, values))
-    return Motion(path.stem, times[:, 0], next(arrays), labels, next(arrays))
-
-
-def _table(path: Path) -> tuple[list[str], Array]:
-    """Names of the columns, and at least two rows of finite numbers."""
-    try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise PathFileError(f"motion file {path}: larger than {_LARGEST_FILE / 2**20:.0f} MiB")
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = [(k, row) for k, row in enumerate(csv.reader(stream, strict=True), 1) if any(row)]
-    except OSError as error:
-        raise PathFileError(f"motion file {path}: cannot be read, {error.strerror}") from None
-    except (ValueError, csv.Error) as error:
-        raise PathFileError(f"motion file {path}: no CSV text, {str(error)[:60]}") from None
-    if len(rows) < 3:
-        raise PathFileError(
-            f"motion file {path}: {max(len(rows) - 1, 0)} instants after the header, expected at least 2"
-        )
-    header = [cell.strip() for cell in rows[0][1]]
-    if len(set(header)) < len(header):
-        raise PathFileError(f"motion file {path}: a column comes twice")
-    return header, np.array([_numbers(path, line, row, len(header)) for line, row in rows[1:]])
-
-
-def _numbers(path: Path, line: int, row: list[str], count: int) -> list[float]:
-    try:
-        values = [float(cell) for cell in row]
-    except ValueError:
-        values = []
-    if len(values) != count or not np.isfinite(values).all():
-        raise PathFileError(f"motion file {path}, line {line}: expected {count} finite numbers")
-    return values
+    return Motion(Path(path).stem, times[:, 0], next(arrays), labels, next(arrays))
