@@ -36,6 +36,7 @@ SCRIPTS = (
     "metric_loss",
     "against_torch",
     "paper_network",
+    "figures_with_networks",
 )
 
 if __name__ == "__main__":
