@@ -45,6 +45,7 @@ SCRIPTS = (
     "metric_loss",
     "against_torch",
     "paper_network",
+    "figures_with_networks",
 )
 #: those without a small case
 WHOLE = frozenset({"dynamics", "start_up", "command", "batches", "choices", "compiled_loss", "against_torch"})

@@ -40,6 +40,14 @@ def test_idle_joint_is_split_off_as_an_exact_coordinate(iiwa_fit: Fit) -> None:
     np.testing.assert_array_equal(chart.jacobian(q)[:, 3:6, 6], 0)
 
 
+def test_idle_joint_can_be_left_to_the_fit(iiwa: oc.Problem) -> None:
+    """As the paper's network has it: all four coordinates are fitted, and all seven joints enter."""
+    solver = solvers.LBFGS(max_iterations=2)
+    fit = oc.fit(iiwa, oc.MLP((6, 5), raw=True), solver, samples=100, split_idle=False, weights=(1000, 1))
+    assert fit.idle_joints == ()
+    assert fit.chart.coordinates.size == 7 * 6 + 6 + 6 * 5 + 5 + 5 * 4 + 4
+
+
 def test_coordinates_are_shifted_and_scaled(iiwa_fit: Fit) -> None:
     chart = iiwa_fit.chart
     np.testing.assert_allclose(chart.xi(chart.problem.domain.centre), 0, atol=1e-12)

@@ -10,7 +10,7 @@ from orthocas.problem import Problem
 from orthocas.reproduce.paper_loss import PAPER_LOSS
 from orthocas.solvers import LBFGS
 
-_FEW, _SHORT = 600, 150  # samples and iterations of a network in quick figures
+_FEW, _SHORT = 1000, 300  # samples and iterations of a network in quick figures
 
 
 @dataclass(frozen=True)
