@@ -1,11 +1,15 @@
 """A million joint positions: time per row of phi, xi and the Jacobian of a chart, and of the modules it exports.
 
+The C is that of `generate_c(..., rows=True)`, compiled for this processor.
+
 Rows of PyTorch and JAX appear where they are installed. Every figure is the best of three runs.
 
     python benchmarks/batches.py [ROWS]
 """
 
+import ctypes
 import importlib.util
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -19,6 +23,7 @@ import numpy as np
 import orthocas as oc
 from orthocas import problems
 from orthocas.checks import Array
+from orthocas.codegen.library import compilers
 from orthocas.domains import sample_uniform
 
 NAMES = ("xi", "phi", "jacobian")
@@ -59,7 +64,18 @@ def functions(chart: oc.Chart, points: Array, folder: Path) -> dict[str, dict[st
         found |= of_torch(exported(chart, "torch", folder), points)
     if importlib.util.find_spec("jax"):
         found["JAX, jit, float64"] = of_jax(exported(chart, "jax", folder), points)
-    return found
+    return found | of_c(chart, points, folder)
+
+
+def of_c(chart: oc.Chart, points: Array, folder: Path) -> dict[str, dict[str, Callable[[], Any]]]:
+    """Rows of phi in generated C, in one thread."""
+    generated, library = oc.generate_c(chart, folder / "c", name="arm", rows=True), folder / "c" / "rows.so"
+    sources = [str(generated.folder / file) for file in ("arm.c", "arm_rows.c")]
+    flags = ["-O3", "-march=native", "-fPIC", "-shared"]
+    subprocess.run([compilers()[0], *flags, "-o", str(library), *sources, "-lm"], check=True)
+    run, phi = ctypes.CDLL(str(library)).arm_phi_rows, np.empty_like(points)
+    pointers = [ctypes.c_void_p(array.ctypes.data) for array in (points, phi)]
+    return {"C, one thread": {"phi": lambda: run(ctypes.c_long(len(points)), *pointers)}}
 
 
 def of_torch(arm: ModuleType, points: Array) -> dict[str, dict[str, Callable[[], Any]]]:
@@ -88,7 +104,9 @@ def main(rows: int = 1_000_000) -> list[str]:
     table = [f"| {rows} rows, degree 4, [us a row] | xi | phi | Jacobian |", "| --- | --- | --- | --- |"]
     with TemporaryDirectory() as folder:
         for name, calls in functions(chart, points, Path(folder)).items():
-            figures = " | ".join(f"{best(calls[function]) / rows * 1e6:.2f}" for function in NAMES)
+            figures = " | ".join(
+                f"{best(calls[function]) / rows * 1e6:.2f}" if function in calls else "-" for function in NAMES
+            )
             table.append(f"| {name} | {figures} |")
     return table
 
