@@ -73,9 +73,12 @@ def of_c(chart: oc.Chart, points: Array, folder: Path) -> dict[str, dict[str, Ca
     sources = [str(generated.folder / file) for file in ("arm.c", "arm_rows.c")]
     flags = ["-O3", "-march=native", "-fPIC", "-shared"]
     subprocess.run([compilers()[0], *flags, "-o", str(library), *sources, "-lm"], check=True)
-    run, phi = ctypes.CDLL(str(library)).arm_phi_rows, np.empty_like(points)
-    pointers = [ctypes.c_void_p(array.ctypes.data) for array in (points, phi)]
-    return {"C, one thread": {"phi": lambda: run(ctypes.c_long(len(points)), *pointers)}}
+    run, arrays = ctypes.CDLL(str(library)).arm_phi_rows, (points, np.empty_like(points))
+
+    def phi() -> None:
+        run(ctypes.c_long(len(points)), *(ctypes.c_void_p(array.ctypes.data) for array in arrays))
+
+    return {"C, one thread": {"phi": phi}}
 
 
 def of_torch(arm: ModuleType, points: Array) -> dict[str, dict[str, Callable[[], Any]]]:

@@ -32,12 +32,12 @@ def test_mutated_motions_are_usable_or_refused_in_one_line() -> None:
 
 @pytest.mark.slow
 def test_mutated_paths_are_usable_or_refused_in_one_line() -> None:
-    assert paths(300) == []
+    assert paths(120) == []
 
 
 @pytest.mark.slow
 def test_mutated_joint_logs_are_usable_or_refused_in_one_line() -> None:
-    assert logs(200) == []
+    assert logs(100) == []
 
 
 @pytest.mark.slow

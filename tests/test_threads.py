@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from programs import needs_c
 from public_objects import (
+    atlas,
     circle,
     disk,
     fitted,
@@ -27,6 +28,7 @@ from public_objects import (
 )
 
 import orthocas as oc
+from orthocas.atlases import atlas as atlas_module
 from orthocas.casadi_tools.batch import Batched
 from orthocas.casadi_tools.blas_graph import NumpyGraph
 from orthocas.casadi_tools.cached import cached_property
@@ -83,18 +85,32 @@ def calls_of_law(law: Controller) -> list[Call]:
     return [command]
 
 
+def calls_of_atlas(atlas: oc.Atlas) -> list[Call]:
+    """An atlas at positions in different charts."""
+    q = np.array([0.0, 0.9, 0.9]) + np.random.default_rng(8).uniform(-0.25, 0.25, (12, 3))
+    charts = atlas.chart_at(q)
+    return [
+        lambda k: atlas.chart_at(q[k % 12 :]),
+        lambda k: atlas.xi(q[k % 12 :]),
+        lambda k: atlas.jacobian(q[k % 12]),
+        lambda k: atlas.chart(int(charts[k % 12]), q[k % 12]).phi(q[k % 12]),
+    ]
+
+
 SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 10,000 calls
     "polynomial": (lambda: calls_of_chart(copy.deepcopy(fitted().chart)), 4800),
     "network": (lambda: calls_of_chart(copy.deepcopy(network())), 2400),
     "circle": (lambda: calls_of_chart(copy.deepcopy(circle())), 120),
     "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 80),
+    "atlas": (lambda: calls_of_atlas(copy.deepcopy(atlas())), 800),
     "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 2600),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SERIES)
-def test_threads_share(name: str) -> None:
+def test_threads_share(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(atlas_module, "_KEPT", 2)  # charts of an atlas that stay built
     build, count = SERIES[name]
     calls = build()
     expected = [calls[k % len(calls)](k) for k in range(12 * len(calls))]  # after that they repeat

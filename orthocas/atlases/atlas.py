@@ -31,7 +31,7 @@ from orthocas.problem import Problem
 from orthocas.showing import Shown, listed, number_list
 
 Turns = tuple[int, ...]  #: full turns of each joint that boxes divide
-_KEPT = 32  # charts that stay built
+_KEPT = 32  # charts that stay built, the last ones
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -201,12 +201,13 @@ class Atlas(Shown):
         Raises:
             InvalidValueError: if there is no such chart.
         """
-        number, turns = self._numbered(number, near)
-        if (number, turns) not in self._kept:
-            self._kept[number, turns] = self._made(number, turns)
+        which = self._numbered(number, near)
+        chart = self._kept.get(which)
+        if chart is None:  # other threads may make it as well, or throw it out
+            chart = self._kept[which] = self._made(*which)
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
-        return self._kept[number, turns]
+        return chart
 
     def box(self, number: int, near: ArrayLike | None = None) -> Box:
         """The box of a chart within the joint limits; see `chart`."""

@@ -193,18 +193,18 @@ def _images(index: Index) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     found: dict[int, list[int]] = {}
     for row, tile in enumerate(index.orbits.fitted.tolist()):
         found.setdefault(tile, []).append(row)
-    return {tile: (index._centres[rows], index._signs[rows]) for tile, rows in found.items()}
+    return {tile: (index.centres[rows], index.signs[rows]) for tile, rows in found.items()}
 
 
 def _unfinished(stock: Stock, index: Index, tiles: set[int], halves: object) -> Iterator[Wanted]:
     """Halves of cells that have no record yet."""
     records = stock.records
-    for row in np.flatnonzero((records["outcome"] == Outcome.SPLIT) & (index._children < 0).any(axis=1)).tolist():
+    for row in np.flatnonzero((records["outcome"] == Outcome.SPLIT) & (index.children < 0).any(axis=1)).tolist():
         record = records[row]
         cell = Cell(int(record["tile"]), tuple(record["levels"].tolist()), tuple(record["places"].tolist()))
         if cell.tile in tiles:
             for wanted in halves(row, cell, int(record["joint"])):  # type: ignore[operator]
-                if index._children[row, int(wanted.upper)] < 0:
+                if index.children[row, int(wanted.upper)] < 0:
                     yield wanted
 
 

@@ -57,7 +57,7 @@ class Index:
         rows = np.searchsorted(found.tiles, tiles)
         rows = np.minimum(rows, len(found.tiles) - 1)
         rows = np.where(found.tiles[rows] == tiles, rows, _NONE)
-        return Placed(rows, (inside - self._centres[rows]) * self._signs[rows] + self._fitted_centres[rows])
+        return Placed(rows, (inside - self.centres[rows]) * self.signs[rows] + self._fitted_centres[rows])
 
     def nodes(self, placed: Placed) -> Indices:
         """The record of the smallest cell of every position; -1 for those outside, and where nothing is built, (N,)."""
@@ -67,7 +67,7 @@ class Index:
         while waiting.size:
             now = node[waiting]
             upper = placed.points[waiting, self._joint[now]] >= self._threshold[now]
-            node[waiting] = self._children[now, upper.astype(int)]
+            node[waiting] = self.children[now, upper.astype(int)]
             waiting = waiting[node[waiting] >= 0]
             waiting = waiting[self._split[node[waiting]]]
         return node
@@ -107,7 +107,7 @@ class Index:
     def on_cube(self, points: Array, charts: Indices) -> Array:
         """u of positions (N, k) in the boxes of given charts."""
         tile, fitted = self.rows(charts)
-        centres, signs = self._centres[tile], self._signs[tile]
+        centres, signs = self.centres[tile], self.signs[tile]
         apart = points - centres
         turns = np.where(self.plan.lattice.endless, np.round(apart / (2 * np.pi)), 0.0)
         moved = (apart - 2 * np.pi * turns) * signs + self._fitted_centres[tile]
@@ -116,8 +116,8 @@ class Index:
     def image_centres(self, charts: Indices) -> tuple[Array, Array]:
         """Centres and signs of the boxes of charts, in the joints that boxes divide, (charts, k) each."""
         tile, fitted = self.rows(charts)
-        signs = self._signs[tile]
-        return (self.box_centres[fitted] - self._fitted_centres[tile]) * signs + self._centres[tile], signs
+        signs = self.signs[tile]
+        return (self.box_centres[fitted] - self._fitted_centres[tile]) * signs + self.centres[tile], signs
 
     def map_signs(self, charts: Indices) -> Array:
         """Signs of the maps of charts for all active joints, (charts, active)."""
@@ -161,7 +161,8 @@ class Index:
         return widened(self.plan, low, low + width)
 
     @cached_property
-    def _centres(self) -> Array:
+    def centres(self) -> Array:
+        """Centres of the tiles, those of images included, (tiles, k)."""
         return self.plan.lattice.centres(self.orbits.tiles)
 
     @cached_property
@@ -169,7 +170,8 @@ class Index:
         return self.plan.lattice.centres(self.orbits.fitted)
 
     @cached_property
-    def _signs(self) -> Array:
+    def signs(self) -> Array:
+        """Signs of the joints in the map that brings a tile from the one that is fitted, (tiles, k)."""
         return np.asarray(self.plan.maps.of(self.plan.joints).signs[self.orbits.maps])
 
     @cached_property
@@ -200,7 +202,7 @@ class Index:
         return np.asarray((low + width / 2)[np.arange(len(records)), np.maximum(self._joint, 0)])
 
     @cached_property
-    def _children(self) -> Indices:
+    def children(self) -> Indices:
         """Records of both halves of every cell, -1 if there is none, (cells, 2)."""
         records = self.stock.records
         found = np.full((len(records), 2), _NONE)
