@@ -18,6 +18,18 @@ _LARGEST = 1e300  # of finite constants
 Tape = dict[str, Any]
 Entry = TypeVar("Entry", ca.SX, ca.MX)
 
+ARITHMETIC = {
+    "neg": "-{0}",
+    "sq": "{0} * {0}",
+    "twice": "2.0 * {0}",
+    "inv": "1.0 / {0}",
+    "assign": "{0}",
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+}  #: operations that Python and C write alike
+
 _UNARY: dict[str, Callable[[Any], Any]] = {
     "neg": lambda a: -a,
     "exp": ca.exp,

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.scalar_code import scalar_code
-from orthocas.casadi_tools.tape import to_tape
+from orthocas.casadi_tools.tape import ARITHMETIC, to_tape
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.interface import filled
@@ -22,15 +22,7 @@ _LOCALS = 4096  # bytes of stack for other variables
 _MOST = 20_000  # operations; beyond, compilers take minutes
 
 _OPERATIONS = {
-    "neg": "-{0}",
-    "sq": "{0} * {0}",
-    "twice": "2.0 * {0}",
-    "inv": "1.0 / {0}",
-    "assign": "{0}",
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "div": "{0} / {1}",
+    **ARITHMETIC,
     "constpow": "pow({0}, {1})",
     "lt": "{0} < {1} ? 1.0 : 0.0",
     "le": "{0} <= {1} ? 1.0 : 0.0",

@@ -4,7 +4,7 @@ from typing import Any
 
 import casadi as ca
 
-from orthocas.casadi_tools.tape import Tape, to_tape
+from orthocas.casadi_tools.tape import ARITHMETIC, Tape, to_tape
 
 _FUNCTIONS = {
     name: name
@@ -23,15 +23,7 @@ _FUNCTIONS = {
     "fabs": "abs",
 }  # names in NumPy, which PyTorch and JAX share
 _OPERATORS = {
-    "neg": "-{0}",
-    "sq": "{0} * {0}",
-    "twice": "2.0 * {0}",
-    "inv": "1.0 / {0}",
-    "assign": "{0}",
-    "add": "{0} + {1}",
-    "sub": "{0} - {1}",
-    "mul": "{0} * {1}",
-    "div": "{0} / {1}",
+    **ARITHMETIC,
     "pow": "{0} ** {1}",
     "constpow": "{0} ** {1}",
 }

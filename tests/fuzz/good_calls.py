@@ -1,0 +1,414 @@
+"""Calls of the public functions, classes and methods that work, for the campaign that changes their arguments."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from public_objects import (
+    atlas,
+    circle,
+    clear,
+    fitted,
+    impedance,
+    joint_motion,
+    link_distances,
+    planar,
+    steps,
+    trajectory,
+)
+
+import orthocas as oc
+from orthocas import control, parametrisations, plotting, problems, simulation, solvers, viewing
+from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
+from orthocas.errors import CompileError
+from orthocas.viewing.session import Session
+
+Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments that it takes
+
+
+@cache
+def good_calls() -> dict[str, Call]:
+    """What can be called, with arguments that work and take little time."""
+    return {**_makers(), **_functions(), **_methods(), **_control(), **_physics(), **_supervised(), **_views()}
+
+
+def _physics() -> dict[str, Call]:
+    """MuJoCo as plant."""
+    robot, q = planar().robot, np.array([0.3, 0.4, 0.5])
+    payload, wall = simulation.Payload(1.0), simulation.Wall([9.0, 0, 0], [-1.0, 0, 0])
+    options = {"stops": True, "effort_limits": True, "payload": payload, "wall": wall, "timestep": 1e-3}
+    return {
+        "AtlasSettings": (oc.AtlasSettings, {"degree": 3, "leak_deg": 5.0, "half_width": 0.5, "splits": 4}),
+        "atlas.chart_at": (atlas().chart_at, {"q": q, "current": 0}),
+        "atlas.xi": (atlas().xi, {"q": q, "charts": 0}),
+        "atlas.chart": (atlas().chart, {"number": 0, "near": q}),
+        "atlas.handed_over": (atlas().handed_over, {"q": q, "dq": q, "ddq": q, "number": 0}),
+        "evaluate_atlas": (oc.evaluate_atlas, {"atlas": atlas(), "samples": 20, "seed": 0}),
+        "Stops": (lambda **given: _stopped(robot, simulation.Stops(**given)), {"stiffness": 1e4, "damping": [1.0] * 3}),
+        "Payload": (simulation.Payload, {"mass": 1.0, "centre": q, "inertia": np.eye(3)}),
+        "Wall": (simulation.Wall, {"point": q, "normal": q, "tip_radius": 0.1, "size": 1.0, "time_constant": 0.01}),
+        "MuJoCo": (simulation.MuJoCo, {"robot": robot, **options}),
+        "MuJoCoPlant": (simulation.MuJoCoPlant, {"robot": robot, "friction": simulation.Friction(0.1, 0.1), **options}),
+        "plant.reset": (lambda **given: _plant(robot).reset(**given), {"q": q, "dq": q}),
+        "plant.push": (lambda **given: _plant(robot).push(**given), {"force": q, "link": 1, "point": q}),
+        "plant.step": (lambda **given: _plant(robot).step(**given), {"torque": q, "seconds": 0.01, "loads": q}),
+    }
+
+
+def _views() -> dict[str, Call]:
+    """What opens pages, and what stands behind them."""
+    chart, q = fitted().chart, planar().domain.centre
+    x = chart.task(q)
+    session = Session(chart)
+    return {
+        "view": (
+            lambda **given: oc.view(**given).close(),
+            {"shown": chart, "host": "127.0.0.1", "port": 0},
+        ),
+        "cyclic_motions": (viewing.cyclic_motions, {"chart": chart, "path": [x, x + 0.05, x], "cycles": 1}),
+        "Session": (Session, {"chart": chart, "q": q}),
+        "session.wish": (session.wish, {"values": {"xi1": 0.1}}),
+        "chart.plot": (lambda postures: plotting.self_motion_figure(chart, postures, None), {"postures": 3}),
+    }
+
+
+def _supervised() -> dict[str, Call]:
+    """The supervised law of a compiled library, if there is a compiler."""
+    law = impedance()
+    with TemporaryDirectory() as folder:
+        try:
+            path = compile_shared(oc.generate_c(law.chart, folder, law, "arm"), Path(folder), ("-O0",))
+        except CompileError:
+            return {}
+        library = CompiledLibrary(path, "arm", 3)
+        library.check()  # it is loaded before its file goes
+    q, reference = law.problem.domain.centre, np.zeros(9)
+    supervisor = Supervisor(library, law)
+    return {
+        "supervisor": (Supervisor, {"library": library, "controller": law, "safety": control.Safety.of(law)}),
+        "supervisor.start": (supervisor.start, {"q": q, "command": q}),
+        "supervisor.take_over": (supervisor.take_over, {"q": q, "command": q}),
+        "supervisor.step": (supervisor.step, {"q": q, "dq": q, "reference": reference, "period": 1e-3}),
+    }
+
+
+def _stopped(robot: oc.Robot, stops: simulation.Stops) -> ca.SX:
+    return stops.torque(robot.tree, ca.SX.sym("q", 3), ca.SX.sym("dq", 3))
+
+
+def _plant(robot: oc.Robot) -> simulation.MuJoCoPlant:
+    return simulation.MuJoCoPlant(robot)
+
+
+def _makers() -> dict[str, Call]:
+    robot, problem, q = planar().robot, planar(), np.array([0.3, 0.4, 0.5])
+    column = ca.vertcat
+    return {
+        "Robot.planar": (oc.Robot.planar, {"lengths": [1.0, 1.0], "masses": [1.0, 2.0]}),
+        "Robot.from_urdf": (oc.Robot.from_urdf, {"path": "no.urdf", "tip": "a", "locked": {"a": 1.0}, "tool": q}),
+        "Robot.from_mjcf": (oc.Robot.from_mjcf, {"path": "no.xml", "tip": "a", "locked": {"a": 1.0}, "tool": q}),
+        "Robot.from_file": (oc.Robot.from_file, {"path": "no.xml", "tip": None}),
+        "Robot.from_model": (oc.Robot.from_model, {"model": None, "tip": "tip", "locked": {}}),
+        "Robot": (oc.Robot, {"tree": robot.tree, "homes": {"a": q}}),
+        "Box": (oc.Box, {"centre": q, "half_width": 0.3, "unbounded": [0]}),
+        "Box.from_limits": (oc.Box.from_limits, {"lower": -q, "upper": q}),
+        "Torus": (oc.Torus, {"n": 3}),
+        "Polynomial": (oc.Polynomial, {"degree": 2, "cyclic": ["q1"]}),
+        "Fourier": (oc.Fourier, {"degree": 2, "cyclic": "auto"}),
+        "MLP": (oc.MLP, {"hidden": (3, 3), "raw": True}),
+        "Circle": (oc.Circle, {"pairs": oc.Fourier(1)}),
+        "SEW": (oc.SEW, {"kind": "stereographic"}),
+        "Linear": (oc.Linear, {"base": (0.1, 0.2, 0.3), "normals": "orthonormal"}),
+        "Given.from_function": (
+            oc.Given.from_function,
+            {"name": "g", "n": 3, "function": lambda q: column(q[0], q[1])},
+        ),
+        "Metric.from_spec": (oc.Metric.from_spec, {"robot": robot, "spec": np.eye(3)}),
+        "Metric.custom": (oc.Metric.custom, {"robot": robot, "name": "m", "function": lambda q: ca.diag(2 + q**2)}),
+        "Problem": (
+            oc.Problem,
+            {"robot": robot, "task": problem.task, "metric": "inertia", "domain": problem.domain, "name": "p"},
+        ),
+        "Chart": (oc.Chart, {"problem": problem, "coordinates": fitted().chart.coordinates, "notes": {"a": 1.0}}),
+        "GrownChart": (oc.GrownChart, {"problem": circle().problem, "coordinates": circle().coordinates, "notes": {}}),
+        "Weights": (
+            oc.Weights,
+            {"task": 1.0, "regularity": 1.0, "length": 1.0, "folds": 1.0, "extra": {}, "angles": "paper"},
+        ),
+        "Task.position": (oc.Task.position, {"robot": robot, "axes": "x"}),
+        "Task.polar": (oc.Task.polar, {"robot": robot}),
+        "Task.orientation": (oc.Task.orientation, {"robot": robot, "reference": np.eye(3)}),
+        "Task.pose": (oc.Task.pose, {"robot": robot, "reference": np.eye(3)}),
+        "Task.axis": (oc.Task.axis, {"robot": robot, "axis": "z", "reference": q}),
+        "Task.position_and_axis": (oc.Task.position_and_axis, {"robot": robot, "axis": "z", "reference": q}),
+        "Task.named": (oc.Task.named, {"robot": robot, "kind": "position:x", "q_reference": q}),
+        "Task.custom": (
+            oc.Task.custom,
+            {"robot": robot, "name": "t", "function": lambda q: q[0], "labels": ["a"], "units": ["m"]},
+        ),
+        **{
+            f"{kind.__name__}": (kind, {"max_iterations": 5, "tolerance": 1e-3})
+            for kind in (solvers.GaussNewton, solvers.LBFGS, solvers.Ipopt, solvers.GradientFlow)
+        },
+        "Adam": (solvers.Adam, {"epochs": 2, "steps": 3, "batch": 20, "learning_rate": 1e-3}),
+    }
+
+
+def _functions() -> dict[str, Call]:
+    problem, chart, q = planar(), fitted().chart, np.array([0.3, 0.4, 0.5])
+    symbol = ca.SX.sym("q", 3)
+    box = {"problem": problem, "parametrisation": oc.Polynomial(1)}
+    return {
+        "fit": (
+            oc.fit,
+            {
+                **box,
+                "solver": solvers.GaussNewton(3),
+                "weights": (10, 1, 1),
+                "samples": 50,
+                "seed": 0,
+                "checkpoint": None,
+            },
+        ),
+        "bounded fit": (oc.fit, {**box, "solver": None, "samples": 50, "max_mutual_deg": None}),
+        "certify": (oc.certify, {"chart": chart, "bound": 0.0, "time_limit": 0.0, "executor": None, "resume": None}),
+        "certified_box": (oc.certified_box, {"chart": chart, "bound": 0.0, "time_limit": 5.0, "executor": None}),
+        "check_certificate": (oc.check_certificate, {"chart": chart, "certificate": None, "executor": None}),
+        "check": (oc.check, {"problem": problem, "samples": 50, "seed": 1}),
+        "contains": (oc.contains, {"domain": problem.domain, "q": q}),
+        "cyclic_joints": (oc.cyclic_joints, {"problem": problem}),
+        "suggest_domain": (
+            oc.suggest_domain,
+            {
+                "robot": problem.robot,
+                "task": problem.task,
+                "home": q,
+                "metric": "euclidean",
+                "leak_deg": 5.0,
+                "conditioning": 0.3,
+                "parametrisation": oc.Polynomial(1),
+                "seed": 0,
+            },
+        ),
+        "default_box": (oc.default_box, {"robot": problem.robot, "centre": q, "half_width": 0.2}),
+        "distil": (
+            oc.distil,
+            {"chart": circle(), "parametrisation": oc.Polynomial(1), "solver": None, "samples": 30, "seed": 0},
+        ),
+        "evaluate": (oc.evaluate, {"chart": chart, "samples": 50, "seed": 1}),
+        "evaluate points": (oc.evaluate, {"chart": chart, "samples": None, "seed": None, "points": [q, q]}),
+        "export": (oc.export, {"chart": chart, "to": "numpy", "path": "module.py", "force": False}),
+        "generate_c": (oc.generate_c, {"chart": chart, "out": "c", "controller": impedance(), "name": "arm"}),
+        "generate_c with settings": (
+            oc.generate_c,
+            {"chart": chart, "out": "c", "controller": impedance(), "safety": control.Safety.of(impedance())},
+        ),
+        "grow": (
+            oc.grow,
+            {"problem": problems.get("planar_2r"), "level": 1.0, "leaf": None, "origin": [1.0, 0.0], "cells": None},
+        ),
+        "grow linear": (oc.grow, {"problem": planar("euclidean"), "leaf": "linear", "level": 0.5, "region": None}),
+        "involutivity": (oc.involutivity, {"problem": problem, "samples": 30, "seed": 1}),
+        "jumps": (oc.jumps, {"chart": circle(), "radius": 0.02}),
+        "lie_bracket": (oc.lie_bracket, {"f": symbol, "g": symbol**2, "q": symbol}),
+        "load": (oc.load, {"path": "no.orthocas"}),
+        "Chart.load": (oc.Chart.load, {"path": "no.orthocas"}),
+        "loss": (oc.loss, {**box, "weights": (1, 1), "samples": 20, "seed": 0, "start": None}),
+        "compare": (
+            oc.compare,
+            {"problem": problem, "parametrisations": [], "solvers": None, "seeds": 1, "samples": 50, "held_out": 50},
+        ),
+        "singular_points": (oc.singular_points, {"problem": problems.get("planar_2r"), "seed": 0}),
+        "register_parametrisation": (
+            oc.register_parametrisation,
+            {"name": "polynomial", "kind": oc.MLP, "parse": None},
+        ),
+        "register_loss_term": (oc.register_loss_term, {"term": None}),
+        "parse": (parametrisations.parse_parametrisation, {"label": "polynomial:2"}),
+        "from data": (parametrisations.parametrisation_from_data, {"data": {"name": "polynomial", "degree": 2}}),
+        "to data": (parametrisations.parametrisation_to_data, {"parametrisation": oc.Polynomial(2)}),
+        "solvers.get": (solvers.get, {"name": "lbfgs"}),
+        "problems.get": (problems.get, {"name": "planar_2r"}),
+        "self_motion_figure": (plotting.self_motion_figure, {"chart": chart, "postures": 2, "reach": 0.1}),
+        "quality_figure": (plotting.quality_figure, {"report": None}),
+    }
+
+
+def _methods() -> dict[str, Call]:
+    robot, chart, grown, q = planar().robot, fitted().chart, circle(), np.array([0.3, 0.4, 0.5])
+    phi = chart.phi(q)
+    states = {
+        **{name: {"q": q} for name in ("mass_matrix", "gravity", "tip_position", "tip_rotation", "tip_jacobian")},
+        "joint_points": {"q": q},
+        "bias": {"q": q, "dq": q},
+        "inverse_dynamics": {"q": q, "dq": q, "ddq": q},
+        "forward_dynamics": {"q": q, "dq": q, "tau": q},
+        "coriolis_product": {"q": q, "v": q, "w": q},
+        "with_scaled_masses": {"factor": q},
+        "with_tool": {"tool": q},
+        "home": {"name": "h"},
+        "function": {"name": "bias"},
+    }
+    evaluations = ("xi", "task", "phi", "jacobian")
+    return {
+        **{f"robot.{name}": (getattr(robot, name), arguments) for name, arguments in states.items()},
+        **{f"chart.{name}": (getattr(chart, name), {"q": q}) for name in evaluations},
+        **{f"grown.{name}": (getattr(grown, name), {"q": q[:2]}) for name in evaluations},
+        "chart.quality": (chart.quality, {"q": q}),
+        "grown.quality": (grown.quality, {"q": [q[:2], q[:2]]}),
+        "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "tolerance": 1e-9}),
+        "chart.solve": (chart.solve, {"phi": phi, "q_start": q, "tolerance": 1e-9, "inside": True}),
+        "chart.solutions": (chart.solutions, {"phi": phi, "tolerance": 1e-9}),
+        "chart.tracker": (chart.tracker, {"q0": planar().domain.centre, "largest_step": 0.1}),
+        "tracker.step": (chart.tracker(planar().domain.centre).step, {"phi": phi}),
+        "tracker.reset": (chart.tracker(planar().domain.centre).reset, {"q": q}),
+        "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
+        "follow": (
+            oc.follow,
+            {
+                "chart": clear(),
+                "tool_path": clear().task([q, q + 0.05, q]),
+                "xi": "hold",
+                "q_start": q,
+                "period": 0.05,
+                "velocity_limits": 1.0,
+                "acceleration_limits": 2.0,
+                "obstacles": [oc.obstacles.Sphere([9.0, 0, 0], 0.1)],
+                "link_radius": 0.1,
+                "clearance": 0.01,
+            },
+        ),
+        "follow by objective": (
+            oc.follow,
+            {"chart": chart, "tool_path": chart.task([q, q + 0.05]), "xi": "objective", "velocity_limits": 1.0},
+        ),
+        "motion.save_csv": (joint_motion().save_csv, {"path": "motion.csv"}),
+        "Sphere": (oc.obstacles.Sphere, {"centre": q, "radius": 0.1}),
+        "Capsule": (oc.obstacles.Capsule, {"start": q, "end": -q, "radius": 0.1}),
+        "Plane": (oc.obstacles.Plane, {"normal": q, "point": q}),
+        "LinkDistances": (oc.obstacles.LinkDistances, {"robot": robot, "obstacles": [], "radius": 0.1}),
+        "distances": (link_distances(), {"q": q}),
+        "chart.xi_range": (chart.xi_range, {"q": q}),
+        "chart.self_motion": (chart.self_motion, {"q": q, "samples": 20}),
+        "curve of self_motion": (clear().self_motion, {"q": clear().problem.domain.centre, "step": 0.1}),
+        "chart.function": (chart.function, {"name": "phi"}),
+        "chart.save": (chart.save, {"path": "chart.orthocas"}),
+        "run.save": (trajectory().save, {"path": "run.npz"}),
+        "run.load": (simulation.Trajectory.load, {"path": "run.npz"}),
+        "box.contains": (planar().domain.contains, {"q": q}),
+        "task.with_reference_at": (oc.Task.axis(robot).with_reference_at, {"q": q}),
+        "check_damping": (impedance().check_damping, {"samples": 10}),
+    }
+
+
+def _control() -> dict[str, Call]:
+    chart, problem, reference, law = fitted().chart, planar(), steps(), impedance()
+    centre = planar().domain.centre
+    gains = {"chart": chart, "stiffness": 50.0, "damping_ratio": 0.7, "coupling": "coupled", "damping": "square_root"}
+    changes = [(0.1, {"x": 0.5})]
+    return {
+        "Impedance": (control.Impedance, {**gains, "limit": None}),
+        "Impedance with a free coordinate": (
+            control.Impedance,
+            {
+                "chart": chart,
+                "stiffness": [0.0, 50.0, 50.0],
+                "damping_stiffness": 50.0,
+                "model": control.RunTimeModel(payload=1.0),
+            },
+        ),
+        "RunTimeModel": (
+            control.RunTimeModel,
+            {"source": "own", "gravity": "law", "payload": [1.0, 0, 0, 0.1], "wrench": [0.0] * 6, "extra_torque": 0.1},
+        ),
+        "with_payload": (problem.robot.with_payload, {"payload": [1.0, 0, 0, 0, 1, 0, 0, 1, 0, 1]}),
+        "modes": (law.modes, {"q": centre}),
+        "Safety.of": (
+            control.Safety.of,
+            {"controller": law, "fade_in": 0.1, "command_rate": 100.0, "error_limit": [0.1, 0.1, 0.1], "hold_ticks": 5},
+        ),
+        "PDPlus": (control.PDPlus, {**gains, "limit": [1.0, 2.0, 3.0]}),
+        "Kinematic": (control.Kinematic, {"chart": chart, "feedback": 1.0, "limit": None}),
+        "Projector": (
+            control.Projector,
+            {
+                "problem": problem,
+                "stiffness": 1.0,
+                "posture_stiffness": 1.0,
+                "damping_ratio": 0.7,
+                "limit": None,
+                "second": chart,
+                "second_force": 1.0,
+                "feed_forward": False,
+            },
+        ),
+        "KinematicProjector": (
+            control.KinematicProjector,
+            {"problem": problem, "feedback": 1.0, "posture_feedback": 1.0, "limit": None, "second": chart},
+        ),
+        "Reference.steps": (
+            control.Reference.steps,
+            {"labels": ("x", "y"), "start": [0.0, 0.0], "changes": changes, "duration": 0.5, "natural_frequency": 6.0},
+        ),
+        "Reference.through": (
+            control.Reference.through,
+            {"labels": ("x", "y"), "times": [0.0, 1.0, 2.0], "points": [[0.0, 1.0], [1.0, 1.0], [2.0, 0.0]]},
+        ),
+        "reference.sample": (reference.sample, {"times": np.array([0.1, 0.2])}),
+        "joint_path": (control.joint_path, {"chart": chart, "reference": reference, "q_start": centre}),
+        "posture_reference": (control.posture_reference, {"chart": chart, "reference": reference, "q_start": centre}),
+        "matched_stiffness": (control.matched_stiffness, {"chart": chart}),
+        "matched_posture_stiffness": (control.matched_posture_stiffness, {"problem": problem}),
+        "law_of": (control.law_of, {"name": "impedance"}),
+        "control.register": (control.register, {"law": None}),
+        "Push": (
+            simulation.Push,
+            {
+                "start": 0.1,
+                "duration": 0.1,
+                "force": [1.0, 0, 0],
+                "torque": [0.0, 0, 0],
+                "link": 1,
+                "point": [0.1, 0, 0],
+            },
+        ),
+        "Friction": (simulation.Friction, {"viscous": [1.0, 1, 1], "coulomb": 0.1}),
+        "Noise": (simulation.Noise, {"position": 0.1, "velocity": 0.1, "seed": 0}),
+        "simulate": (
+            oc.simulate,
+            {"controller": law, "reference": reference, "q_start": centre, "step": 0.1, "pushes": (), "friction": None}
+            | {"stops": None},
+        ),
+        "simulate in MuJoCo": (
+            oc.simulate,
+            {"controller": law, "reference": reference, "q_start": centre, "control_rate": 50.0, "plant": "mujoco"}
+            | {"pushes": [simulation.Push(0.1, 0.1, [1.0, 0, 0], link=1)], "friction": simulation.Friction(0.1, 0.1)},
+        ),
+        "simulate sampled": (
+            oc.simulate,
+            {"controller": law, "reference": reference, "q_start": centre, "control_rate": 50.0, "dq_start": centre * 0}
+            | {"noise": None, "plant": None, "compiled": False},
+        ),
+        "simulate_many": (
+            oc.simulate_many,
+            {"controller": law, "reference": reference, "q_start": centre, "changes": [{"step": 0.1}]}
+            | {"executor": None, "control_rate": 50.0},
+        ),
+        "simulate supervised": (
+            oc.simulate,
+            {"controller": law, "reference": reference, "q_start": centre, "control_rate": 50.0, "resume_after": 1.0}
+            | {"safety": control.Safety.of(law)},
+        ),
+        "coupling_index": (
+            simulation.coupling_index,
+            {"chart": chart, "reference": reference, "trajectory": trajectory()},
+        ),
+        "task_acceleration_breakdown": (
+            simulation.task_acceleration_breakdown,
+            {"chart": chart, "trajectory": trajectory()},
+        ),
+    }
