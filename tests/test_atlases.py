@@ -30,7 +30,7 @@ from orthocas.atlases.processes import Processes
 from orthocas.atlases.regions import joint_range_of, read_postures
 from orthocas.checks import Array
 from orthocas.errors import AtlasFileError, InvalidValueError, PathFileError
-from orthocas.files.blocks import create
+from orthocas.files.blocks import create, owned
 
 ASKED = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.8, splits=5)
 
@@ -192,6 +192,18 @@ def test_build_goes_on_after_a_process_died_while_it_wrote(atlas: oc.Atlas, tmp_
 def test_file_of_other_settings_is_not_gone_on_with(atlas: oc.Atlas) -> None:
     with pytest.raises(AtlasFileError, match="another problem, region or settings"):
         oc.build_atlas(planar(), atlas.path, oc.AtlasSettings())
+
+
+def test_two_processes_never_build_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "arm.orthocas-atlas"
+    built(path, share=0.3)
+    before = path.read_bytes()
+    with owned(path, ATLAS):
+        for force in (False, True):
+            with pytest.raises(AtlasFileError, match="another process is adding to it"):
+                built(path, force=force)
+    assert path.read_bytes() == before
+    assert len(built(path)) > 0
 
 
 def test_damaged_and_foreign_files_raise_one_error(atlas: oc.Atlas, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from orthocas.atlases.processes import Processes
 from orthocas.atlases.regions import Region
 from orthocas.casadi_tools.batch import THREADS
 from orthocas.errors import AtlasFileError
-from orthocas.files.blocks import begins, create, cut_rest, text_of
+from orthocas.files.blocks import begins, create, cut_rest, owned, text_of
 from orthocas.minimising.watch import Monitor, Progress
 
 _BATCH = 4  # cells in a job
@@ -153,24 +153,29 @@ class Building:
         self.monitor(Progress("atlas", finished / max(self.tiles, 1), detail))
 
 
-def opened(path: Path, plan: Plan, region: Region, force: bool) -> Stock:
-    """The file of a plan, a new one or one to go on with.
+@contextmanager
+def opened(path: Path, plan: Plan, region: Region, force: bool) -> Iterator[Stock]:
+    """The file of a plan, a new one or one to go on with, for this process alone.
 
     Raises:
-        AtlasFileError: if it cannot be written, or is the file of another plan.
+        AtlasFileError: if it cannot be written, is the file of another plan, or another process writes it.
     """
     header = header_of(plan, region)
-    if force or not begins(path, ATLAS):
+    if not begins(path, ATLAS):
         create(path, header, ATLAS, force)
-        return read_stock(path)
+    elif force:
+        with owned(path, ATLAS):
+            create(path, header, ATLAS, force)
     stock = read_stock(path)
     if hashlib.sha256(text_of(header)).digest() != stock.contents.digest:
         raise AtlasFileError(
             f"cannot write {path}: it is an atlas of another problem, region or settings, "
             "expected the same ones, another name, or force (--force) to replace it"
         )
-    cut_rest(path, stock.contents, ATLAS)
-    return stock
+    with owned(path, ATLAS):
+        stock = read_stock(path)  # another process may have gone on meanwhile
+        cut_rest(path, stock.contents, ATLAS)
+        yield stock
 
 
 @contextmanager

@@ -81,18 +81,18 @@ def build_atlas(
     area: Region = joint_range_of(plan.problem.domain, plan.joints)
     if region is not None:
         area = surroundings(region, radius, plan.joints, plan.problem.domain)
-    stock = opened(target, plan, area, force)
-    building = Building(target, plan, area, float(share), monitor)
-    building.resume(stock)
+    size = None if jobs is None else require_count("jobs", jobs)
     until = float("inf") if time_limit is None else time.monotonic() + time_limit
-    try:
-        if building.waiting:
-            size = None if jobs is None else require_count("jobs", jobs)
-            with workers(executor, size, plan) as (shared, in_flight, content):
-                building.run(shared, in_flight, content, until)
-    except KeyboardInterrupt:
-        raise Interrupted(_aligned(target, silent)) from None
-    return _aligned(target, monitor)
+    with opened(target, plan, area, force) as stock:
+        building = Building(target, plan, area, float(share), monitor)
+        building.resume(stock)
+        try:
+            if building.waiting:
+                with workers(executor, size, plan) as (shared, in_flight, content):
+                    building.run(shared, in_flight, content, until)
+        except KeyboardInterrupt:
+            raise Interrupted(_aligned(target, silent)) from None
+        return _aligned(target, monitor)
 
 
 def _aligned(path: Path, monitor: Monitor) -> Atlas:

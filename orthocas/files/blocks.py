@@ -15,7 +15,8 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,11 @@ from orthocas.errors import ArchiveError
 from orthocas.files.atomic import published, require_writable
 from orthocas.files.json import from_strict_json
 from orthocas.files.ours import require_replaceable
+
+try:
+    import fcntl
+except ImportError:  # Windows: nothing keeps a second process away there
+    fcntl = None  # type: ignore[assignment]
 
 _PREFIX = struct.Struct("<16sQ32s")
 _BLOCK = struct.Struct("<4sIQQ")
@@ -113,6 +119,26 @@ def append(path: Path, tag: bytes, head: bytes, body: bytes, kind: BlockKind) ->
             os.fsync(stream.fileno())
     except OSError as error:
         raise kind.error(f"cannot write {path}: {error.strerror}") from None
+
+
+@contextmanager
+def owned(path: Path, kind: BlockKind) -> Iterator[None]:
+    """Be the only process that appends to a file. The system ends this with the process, however it dies.
+
+    Raises:
+        ArchiveError: the kind's own, if another process has it, or it cannot be opened.
+    """
+    try:
+        stream = path.open("r+b")
+    except OSError as error:
+        raise kind.error(f"cannot write {path}: {error.strerror}") from None
+    with stream:
+        try:
+            if fcntl is not None:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise kind.error(f"cannot write {path}: another process is adding to it") from None
+        yield
 
 
 def cut_rest(path: Path, contents: Contents, kind: BlockKind) -> None:
