@@ -344,6 +344,18 @@ def test_charts_are_certified_if_asked_for(tmp_path: Path) -> None:
     assert oc.evaluate_atlas(found, 200).certified.all()
 
 
+def test_boxes_without_a_proof_are_halved(tmp_path: Path) -> None:
+    """No proof is found in a microsecond, so every box is halved as often as it may be."""
+    asked = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.2, splits=1, certify_seconds=1e-6)
+    with ThreadPoolExecutor(1) as executor:
+        region = [[0.0, 0.9, 0.9]]
+        found = oc.build_atlas(planar(), tmp_path / "a", asked, region=region, radius=0.01, executor=executor)
+    assert found.as_dict()["certified"] == 0
+    assert found.fitted > 0
+    outcomes = found._stock.records["outcome"]
+    assert (outcomes == Outcome.SPLIT).sum() * 2 == (outcomes == Outcome.CHART).sum()
+
+
 def test_bad_arguments_are_named(tmp_path: Path) -> None:
     path = tmp_path / "arm.orthocas-atlas"
     with pytest.raises(InvalidValueError, match="share"):

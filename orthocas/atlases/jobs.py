@@ -69,8 +69,9 @@ def _outcome(fitter: BoxFitter, cell: Cell, start: float) -> Result:
     found = Result(cell, Outcome.SINGULAR, clear=float(clear.mean()))
     if chart is not None and found.clear >= _LEAST_CLEAR:
         found = replace(found, leak_deg=chart.leak_deg, conditioning=chart.conditioning)
-        if _good(plan, chart):
-            certified = _certified(fitter, box, chart, found.clear)
+        good = _good(plan, chart)
+        certified = good and _certified(fitter, box, chart, found.clear)
+        if good and (certified or last or not plan.settings.certify_seconds):
             found = replace(found, outcome=Outcome.CHART, numbers=chart.numbers, certified=certified)
         elif last:
             found = replace(found, outcome=Outcome.POOR)
