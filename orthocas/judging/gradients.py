@@ -15,7 +15,7 @@ from orthocas.problem import Problem, task_jacobians
 from orthocas.samples import Samples, samples_at
 
 _CHUNK = 40_000  # joint positions evaluated at once
-_PIECE = 2500  # of these, judged by a thread at once
+_PIECE = 5000  # of these, judged by a thread at once
 _SMALLEST_PIVOT = 1e-14  # keeps singular samples finite
 _LONGEST = 1e100  # squares of longer gradients overflow: they have no value
 
