@@ -1,7 +1,7 @@
 """`orthocas atlas`: build, evaluate and show charts that cover the joint range of an arm."""
 
 from concurrent.futures import Executor
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -160,8 +160,8 @@ def info(file: AtlasPath, json: AsJson = False) -> None:
     _report(Atlas.load(file), json)
 
 
-def _executor(scheduler: str | None) -> nullcontext[Executor | None]:
-    return nullcontext() if scheduler is None else scheduler_executor(scheduler)  # type: ignore[return-value]
+def _executor(scheduler: str | None) -> AbstractContextManager[Executor | None]:
+    return nullcontext() if scheduler is None else scheduler_executor(scheduler)
 
 
 def _report(found: Atlas, json: bool) -> None:
