@@ -2,13 +2,15 @@
 
 import os
 from collections.abc import Collection
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocas.errors import InvalidValueError, MemoryNeedError, ShapeError, UnknownNameError
+from orthocas.errors import InvalidValueError, MemoryNeedError, MissingExtraError, ShapeError, UnknownNameError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -16,6 +18,14 @@ Indices = NDArray[np.int64]
 _LONGEST_TEXT = 500  # characters of a name
 _REAL = "biuf"  # NumPy's kinds of numbers: bool, int, unsigned, float
 _NO_NUMBER = (str, bytes, complex, type(None))  # rejected although NumPy converts them
+
+
+def of_extra(package: str, feature: str, extra: str) -> ModuleType:
+    """A package that only one feature needs; raise MissingExtraError if it is not installed."""
+    try:
+        return import_module(package)
+    except ModuleNotFoundError:
+        raise MissingExtraError(feature, package, extra) from None
 
 
 def require_shape(name: str, got: tuple[int, ...], want: tuple[int | None, ...]) -> None:

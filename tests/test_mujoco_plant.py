@@ -10,9 +10,10 @@ from conftest import ROBOTS, arm, pinocchio_position
 from scipy.integrate import solve_ivp
 
 import orthocas as oc
+from orthocas import checks
 from orthocas.checks import Array
 from orthocas.errors import InvalidValueError, MissingExtraError, ShapeError, SimulationError
-from orthocas.simulation import Friction, MuJoCoPlant, Payload, Wall, mujoco_model
+from orthocas.simulation import Friction, MuJoCoPlant, Payload, Wall
 
 pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[sim] is not installed")
 
@@ -269,7 +270,7 @@ def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch
     def missing(name: str) -> None:
         raise ModuleNotFoundError(name)
 
-    monkeypatch.setattr(mujoco_model, "import_module", missing)
+    monkeypatch.setattr(checks, "import_module", missing)
     with pytest.raises(MissingExtraError, match=r"MuJoCo as plant needs .* pip install 'orthocas\[sim\]'"):
         MuJoCoPlant(plant.robot)
 

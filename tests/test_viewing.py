@@ -19,7 +19,7 @@ from programs import Run
 from public_objects import circle, clear, cyclic, fitted, joint_motion, trajectory
 
 import orthocas as oc
-from orthocas import problems
+from orthocas import checks, problems
 from orthocas.errors import (
     InvalidValueError,
     MissingExtraError,
@@ -356,7 +356,7 @@ def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ModuleNotFoundError(name)
 
-    monkeypatch.setattr(window, "import_module", missing)
+    monkeypatch.setattr(checks, "import_module", missing)
     with pytest.raises(MissingExtraError, match=re.escape("pip install 'orthocas[view]'")):
         oc.view(fitted().chart, port=0)
 

@@ -1,13 +1,12 @@
 """A MuJoCo model of a robot, made from the numbers of its kinematic tree, so that it needs no robot file."""
 
-from importlib import import_module
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from orthocas.checks import Array
-from orthocas.errors import MissingExtraError, RobotError
+from orthocas.checks import Array, of_extra
+from orthocas.errors import RobotError
 from orthocas.robots import KinematicTree
 from orthocas.robots.spatial import rotation_z_to
 from orthocas.simulation.mujoco_scene import MuJoCo, Payload, Wall
@@ -26,10 +25,7 @@ def mujoco() -> ModuleType:
     Raises:
         MissingExtraError: if it is not installed.
     """
-    try:
-        return import_module("mujoco")
-    except ModuleNotFoundError:
-        raise MissingExtraError("MuJoCo as plant", "mujoco", "sim") from None
+    return of_extra("mujoco", "MuJoCo as plant", "sim")
 
 
 def body_name(i: int) -> str:

@@ -5,14 +5,13 @@ import errno
 import io
 import ipaddress
 import socket
-from importlib import import_module
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from orthocas.checks import Array, require_count
-from orthocas.errors import InvalidValueError, MissingExtraError, ViewError
+from orthocas.checks import Array, of_extra, require_count
+from orthocas.errors import InvalidValueError, ViewError
 from orthocas.robots import Robot
 from orthocas.viewing.stick_arm import chain_length
 
@@ -29,10 +28,7 @@ def viser() -> ModuleType:
     Raises:
         MissingExtraError: if it is not installed.
     """
-    try:
-        return import_module("viser")
-    except ModuleNotFoundError:
-        raise MissingExtraError("a view in the browser", "viser", "view") from None
+    return of_extra("viser", "a view in the browser", "view")
 
 
 def open_window(host: str, port: int, title: str) -> Any:
