@@ -107,7 +107,7 @@ def test_degree_that_misses_the_bound_does_not_stop_the_next(planar_x: oc.Proble
 
 
 def test_bad_bounds_are_refused(planar_x: oc.Problem, planar_xy: oc.Problem) -> None:
-    for bound in (0.0, -1.0, 90.0, float("nan")):
+    for bound in (0.0, 1e-320, -1.0, 90.0, float("nan")):
         with pytest.raises(InvalidValueError, match="max_mutual_deg"):
             oc.fit(planar_x, oc.Polynomial(1), max_mutual_deg=bound)
     with pytest.raises(InvalidValueError, match="two or more coordinates"):

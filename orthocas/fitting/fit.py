@@ -122,8 +122,8 @@ def fit(
         samples: number of samples. Default: grows with the number of parameters.
         seed: seed of the samples and of random starts.
         monitor: called with progress.
-        max_mutual_deg: bound on the root mean square deviation of mutual angles from 90 degrees over the samples [deg].
-            With a bound, Ipopt minimises the task term, and lambda2 is not used.
+        max_mutual_deg: bound on the root mean square deviation of mutual angles from 90 degrees over the samples [deg],
+            at least 1e-6. With a bound, Ipopt minimises the task term, and lambda2 is not used.
         checkpoint: a file that keeps the state of a long fit. If it exists, the fit resumes from it.
         align_to: a chart of the same robot that defines order and signs of the coordinates, for a refit. By default,
             coordinates that move the first joints come first, and each moves its main joint in the positive direction.

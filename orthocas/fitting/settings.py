@@ -17,6 +17,7 @@ from orthocas.samples import sample_problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt
 
 _TELLTALE = (20, (0, 1000))  # number and seed of the samples that identify a problem
+_LEAST_BOUND = 1e-6  # deg; rounding hides smaller angles
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,8 @@ def require_solver(value: object) -> None:
 def _require_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> None:
     if parametrisation.closed_form is not None:
         raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", "a parametrisation to fit")
-    if not 0 < as_number("max_mutual_deg", max_mutual_deg) < 90:
-        raise InvalidValueError("max_mutual_deg", max_mutual_deg, "an angle between 0 and 90 degrees")
+    if not _LEAST_BOUND <= as_number("max_mutual_deg", max_mutual_deg) < 90:
+        raise InvalidValueError("max_mutual_deg", max_mutual_deg, f"an angle from {_LEAST_BOUND:g} to below 90 degrees")
 
 
 def _digest(problem: Problem) -> str:
