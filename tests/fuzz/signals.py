@@ -49,6 +49,7 @@ _CONTROLLED = ("--controller", "pd_plus", "--out", "out")
 _PATH = "x\n0.85\n0.9\n0.95\n0.9\n0.85\n"
 _CHOSEN = ("--xi", "objective", "--velocity-limit", "0.2", "--period", "0.002")
 _SMALL_GRID = ("--param", "linear", "--param", "polynomial:2", "--jobs", "2", "--held-out", "500", "--samples", "200")
+_TILES = ("--half-width", "0.9", "--splits", "1", "--degree", "2", "--leak-deg", "20", "--workers", "2")
 COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is a program of a user
     "info": ("info", "planar_3r_x"),
     "fit": ("fit", "planar_3r_x", "--param", "polynomial:4", "--samples", "2000", "--out", "out/c.orthocas", "--json"),
@@ -59,6 +60,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is
     "simulate": ("simulate", "chart.orthocas", *_CONTROLLED, "--steps", "steps.json"),
     "follow": ("follow", "chart.orthocas", "path.csv", *_CHOSEN, "--out", "out/q.csv", "--json"),
     "codegen": ("codegen", "chart.orthocas", *_CONTROLLED, "--check"),
+    "atlas": ("atlas", "build", "planar_3r_x", *_TILES, "--out", "out/a.orthocas-atlas", "--json"),
+    "view": ("view", "chart.orthocas", "--export", "out/page.html"),
     "reproduce": ("reproduce", "fig20", "--quick", "--out", "out"),
     "loop": ("-c", _LOOP),
 }
@@ -68,7 +71,7 @@ _PYTHON_BEGINS = (  # what Python says of Ctrl-C before it reads a line of ours
     "Error processing line 1 of",
     "Exception ignored in: <function _get_module_lock",
 )
-_MEASURED = ("seconds", "control_tick_us", "history")  # keys of what differs from run to run
+_MEASURED = ("seconds", "fit_seconds", "control_tick_us", "history", "atlas", "bytes")  # keys of what differs
 
 
 def campaign(count: int) -> list[Finding]:
@@ -264,8 +267,20 @@ def _read_pdf(path: Path) -> None:
         raise ValueError("no whole PDF")
 
 
+def _read_atlas(atlas: oc.Atlas) -> None:
+    for k in range(len(atlas)):
+        atlas.chart(k)
+
+
+def _read_page(path: Path) -> None:
+    if "</html>" not in path.read_text()[-100:]:
+        raise ValueError("no whole page")
+
+
 _READERS: dict[str, Callable[[Path], object]] = {
     ".orthocas": oc.load,
+    ".orthocas-atlas": lambda path: _read_atlas(oc.Atlas.load(path)),
+    ".html": _read_page,
     ".npz": Trajectory.load,
     ".json": lambda path: json.loads(path.read_text()),
     ".png": _read_picture,
