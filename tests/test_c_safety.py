@@ -112,13 +112,13 @@ def test_valgrind_finds_nothing(pd_plus: Generated, tmp_path: Path) -> None:
 
 
 def test_calls_take_no_more_stack_than_the_header_says(iiwa: oc.Problem, clang: str, tmp_path: Path) -> None:
-    """Measured on a painted stack, for what needs most, by two compilers, with and without optimisation."""
+    """Measured on a painted stack, for what needs most, by gcc without optimisation and clang with it."""
     problem = with_metric(iiwa, "inertia")
     polynomial = oc.fit(problem, oc.Polynomial(2)).chart
     network = oc.fit(problem, oc.MLP((40, 30)), samples=300, solver=oc.solvers.LBFGS(max_iterations=3)).chart
     for law in (PDPlus(polynomial, 50.0), PDPlus(network, 50.0)):
         generated = oc.generate_c(law.chart, tmp_path, law, "arm")
-        for compiler, flag in ((compilers()[0], "-O0"), (compilers()[0], "-O2"), (clang, "-O2")):
+        for compiler, flag in ((compilers()[0], "-O0"), (clang, "-O2")):
             program = built(generated, "stack_use.c", tmp_path, flag, compiler=compiler)
             printed = subprocess.run([str(program)], capture_output=True, text=True, check=True).stdout
             used = [int(word) for word in printed.split()]
