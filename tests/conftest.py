@@ -135,3 +135,17 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureF
         return int(stop.value.code or 0), out, err
 
     return call
+
+
+_ONE_JOINT = """<robot name="r"><link name="base"/>
+<link name="a"><inertial><mass value="{mass}"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+<joint name="{joint}" type="{kind}"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
+<limit lower="{lower}" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
+
+def one_joint(folder: Path, mass: str = "1", joint: str = "j", kind: str = "revolute", lower: str = "-1") -> Path:
+    """The URDF of an arm of one joint."""
+    path = folder / "arm.urdf"
+    path.write_text(_ONE_JOINT.format(mass=mass, joint=joint, kind=kind, lower=lower))
+    return path

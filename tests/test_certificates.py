@@ -1,0 +1,156 @@
+"""Certificates are kept, checked, resumed and void when anything changes; the command."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from certified_charts import certified, chart
+from public_objects import planar
+from typer.testing import CliRunner
+
+import orthocas as oc
+from orthocas.certificates import Subdivision
+from orthocas.certificates.subdivision import OPEN, PROVED
+from orthocas.cli.commands import app_for
+from orthocas.coordinates.fitted import Coordinates
+from orthocas.errors import CertifyError, ChartFileError, Interrupted, InvalidValueError
+from orthocas.minimising.watch import Progress
+
+
+def test_a_certificate_is_void_when_one_coefficient_changes(tmp_path: Path) -> None:
+    known = replace(chart(), certificate=certified())
+    coordinates = known.coordinates
+    assert isinstance(coordinates, Coordinates)
+    theta = coordinates.theta.copy()
+    theta[3] = np.nextafter(theta[3], np.inf)
+    with pytest.raises(CertifyError, match="void"):
+        replace(known, coordinates=replace(coordinates, theta=theta))
+    changed = replace(known, coordinates=replace(coordinates, theta=theta), certificate=None)
+    with pytest.raises(CertifyError, match="void"):
+        oc.check_certificate(changed, certified())
+    replace(known, notes={"new": "note"}).save(tmp_path / "a.chart")  # notes are no part of the proof
+    assert oc.load(tmp_path / "a.chart").certificate is not None
+
+
+def test_files_keep_certificates(tmp_path: Path) -> None:
+    replace(chart(), certificate=certified()).save(tmp_path / "a.chart")
+    again = oc.load(tmp_path / "a.chart")
+    assert again.certificate is not None
+    assert again.certificate.facts() == certified().facts()
+    assert oc.check_certificate(again)
+
+
+def test_a_forged_certificate_does_not_hold() -> None:
+    known = certified()
+    whole = Subdivision(known.regular.low, known.regular.high, np.array([PROVED], dtype=np.uint8))
+    wide = chart(0.4)
+    honest = certified(0.4)
+    forged = replace(honest, regular=Subdivision(honest.regular.low, honest.regular.high, whole.codes))
+    assert not oc.check_certificate(wide, forged)
+    other = replace(honest, regular=known.regular)
+    with pytest.raises(CertifyError, match="another domain"):
+        oc.check_certificate(wide, other)
+    with pytest.raises(CertifyError, match="method"):
+        oc.check_certificate(wide, replace(honest, method="guess/1"))
+    too_good = replace(honest, conditioning=0.99)
+    assert not oc.check_certificate(wide, too_good)
+
+
+@pytest.mark.parametrize("codes", [[0], [0, PROVED], [PROVED, PROVED], [7, PROVED, PROVED], []])
+def test_bytes_that_are_no_tree_are_refused(codes: list[int]) -> None:
+    with pytest.raises(InvalidValueError, match="codes"):
+        Subdivision(np.zeros(2), np.ones(2), np.array(codes, dtype=np.uint8))
+
+
+def test_parts_cover_the_box_exactly() -> None:
+    parts = certified().regular
+    low, high = parts.leaves(PROVED)
+    assert ((high - low) / (parts.high - parts.low)).prod(axis=1).sum() == pytest.approx(1, abs=1e-12)
+    tree = Subdivision(np.zeros(2), np.ones(2), np.array([0, PROVED, 1, OPEN, PROVED], dtype=np.uint8))
+    assert tree.share == 0.75
+    assert tree.leaves(OPEN)[0].tolist() == [[0.5, 0.0]]
+    assert tree.leaves(OPEN)[1].tolist() == [[1.0, 0.5]]
+
+
+def test_an_unfinished_proof_is_resumed() -> None:
+    wide = chart(0.3)
+    begun = oc.certify(wide, time_limit=0)
+    assert not begun.proved
+    assert begun.regular.open_count > 0
+    assert oc.certify(wide, resume=begun).proved
+    with pytest.raises(CertifyError, match="resume"):
+        oc.certify(wide, 0.1, resume=begun)
+
+
+def test_ctrl_c_returns_what_is_proved_so_far() -> None:
+    def stop(progress: Progress) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as stopped:
+        oc.certify(chart(0.3), monitor=stop)
+    result = stopped.value.result
+    assert isinstance(result, oc.Certificate)
+    assert oc.certify(chart(0.3), resume=result).proved
+
+
+def test_an_executor_finds_the_same_parts() -> None:
+    with ThreadPoolExecutor(2) as executor:
+        shared = oc.certify(chart(), executor=executor)
+        assert oc.check_certificate(chart(), shared, executor=executor)
+    assert shared.regular.codes.tolist() == certified().regular.codes.tolist()
+
+
+def command(*words: Any) -> Any:
+    return CliRunner().invoke(app_for(list(map(str, words))), [str(word) for word in words])
+
+
+def test_the_command_certifies_checks_and_shows(tmp_path: Path) -> None:
+    path = tmp_path / "a.chart"
+    chart().save(path)
+    done = command("certify", path, "--json")
+    assert done.exit_code == 0
+    found = json.loads(done.stdout)
+    assert found["proved"] is True
+    assert found["share"] == 1
+    assert {"bound", "boxes", "seconds", "conditioning"} <= found.keys()
+    assert command("certify", path, "--check").exit_code == 0
+    assert "no fold everywhere" in command("certify", path, "--check").stdout
+    assert json.loads(command("info", path, "--json").stdout)["certificate"]["proved"] is True
+    oc.generate_c(oc.load(path), tmp_path / "c", name="arm")
+    assert "no fold everywhere on the domain (taylor-3/1" in (tmp_path / "c" / "arm.h").read_text()
+
+
+def test_the_command_fails_for_a_chart_that_folds(tmp_path: Path) -> None:
+    path = tmp_path / "a.chart"
+    oc.fit(planar(), oc.Linear()).chart.save(path)
+    done = command("certify", path)
+    assert done.exit_code == 1
+    assert "refuted, the chart folds" in done.stdout
+
+
+def test_a_damaged_certificate_is_a_damaged_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = replace(chart(), certificate=certified())
+    monkeypatch.setitem(certified().regular.__dict__, "codes", np.array([3, PROVED], dtype=np.uint8))
+    known.save(tmp_path / "a.chart")
+    with pytest.raises(ChartFileError, match="codes"):
+        oc.load(tmp_path / "a.chart")
+
+
+def test_dask_shares_the_work() -> None:
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None) as client,
+        client.get_executor() as executor,
+    ):
+        assert oc.certify(chart(), executor=executor).regular.codes.tolist() == certified().regular.codes.tolist()
+
+
+def test_the_command_names_a_missing_scheduler(tmp_path: Path) -> None:
+    chart().save(tmp_path / "a.chart")
+    done = command("certify", tmp_path / "a.chart", "--scheduler", "tcp://127.0.0.1:1")
+    assert done.exit_code != 0
+    assert isinstance(done.exception, CertifyError)
