@@ -13,7 +13,7 @@ import pytest
 from charts import with_metric
 from matplotlib.figure import Figure
 from PIL import Image
-from programs import Run
+from programs import Run, needs_c
 from scipy.linalg import eigvalsh
 
 import orthocas as oc
@@ -184,6 +184,15 @@ def test_a_wrong_model_friction_and_noise_cost_accuracy(run: Run) -> None:
     assert first > 1e3 * exact
 
 
+@needs_c
+@pytest.mark.slow
+@pytest.mark.usefixtures("blank")
+def test_compiled_runs_are_the_same(run: Run) -> None:
+    plain, compiled = (report_of(run, "pd_plus", "--mass-factor", "1.1", *words) for words in ((), ("--compiled",)))
+    for name in ("tracking_error", "largest_command"):
+        assert compiled[name] == pytest.approx(plain[name], rel=1e-4)
+
+
 @pytest.mark.usefixtures("blank")
 def test_points_and_pushes(run: Run) -> None:
     points = {"points": [{"time": 1, "move": {"x": 0.1}}, {"time": 2, "move": {"xi1": 0.05}}]}
@@ -247,6 +256,10 @@ def test_mujoco_is_another_plant(run: Run) -> None:
         (("pd_plus", "--plant", "bullet"), "unknown plant 'bullet', known: cvodes, mujoco"),
         (("pd_plus", "--plant", "mujoco"), "--plant is mujoco, expected --rate as well, because MuJoCo"),
         (("kinematic", "--plant", "mujoco", "--rate", "100"), "expected no MuJoCo with a velocity controller"),
+        (
+            ("pd_plus", "--compiled", "--plant", "mujoco", "--rate", "100"),
+            "compiled is True, expected False with MuJoCo",
+        ),
         (("pd_plus", "--mass-factor", "0"), "factor is 0.0, expected numbers > 0"),
         (("pd_plus", "--animation", "webp"), "unknown animation format 'webp', known: gif, mp4"),
         (("pd_plus", "--out", "no/out"), "folder no does not exist"),

@@ -75,6 +75,9 @@ def simulate(
         bool,
         typer.Option("--supervised", help="Run the supervised law of the generated C (needs --rate and a C compiler)."),
     ] = False,
+    compiled: Annotated[
+        bool, typer.Option("--compiled", help="Compile law and robot first: for long runs; needs a C compiler.")
+    ] = False,
     mass_factor: Annotated[
         float | None,
         typer.Option("--mass-factor", parser=number, help="True masses divided by those of the controller's model."),
@@ -114,6 +117,7 @@ def simulate(
         "friction": None if friction is None else Friction(*_pair("--friction", friction)),
         "noise": _noise(law, noise, seed, rate),
         "safety": Safety.of(law) if supervised else None,
+        "compiled": compiled,
     }
     begin = time.perf_counter()
     with terminal_monitor() as monitor:
