@@ -23,7 +23,9 @@ TASK_KINDS = (
     "position:AXES",
     "polar",
     "orientation",
+    "orientation:AXIS",
     "pose",
+    "pose:AXIS",
     "axis",
     "axis:AXIS",
     "position+axis",
@@ -75,21 +77,34 @@ class Task(Shown):
         )
 
     @classmethod
-    def orientation(cls, robot: Robot, reference: ArrayLike | None = None) -> Self:
-        """Orientation of the tip, x = 2 sin(angle / 2) axis of the rotation from a reference to the tip, (3,).
+    def orientation(cls, robot: Robot, reference: ArrayLike | None = None, axis: str | None = None) -> Self:
+        """Orientation of the tip relative to a reference, (3,): a rotation vector, or tilt and turn of an axis.
 
-        Near the reference, x is the rotation vector [rad]. It is smooth except half a turn away from the reference.
+        By default x = 2 sin(angle / 2) axis of the rotation from the reference to the tip. Near the reference, it is
+        the rotation vector [rad]. It is smooth except half a turn away from the reference.
+
+        With `axis`, the first two components are those of the task `axis`, and the third is the tip's turn about that
+        axis in (-pi, pi] [rad], after the shortest rotation that tilts the axis. A last joint along the axis then moves
+        the third component only, by its own angle. This suits flanges with little inertia about their axis. x is smooth
+        unless the axis tilts by half a turn; the turn jumps at half a turn.
 
         Args:
             robot: the robot.
             reference: reference rotation (3, 3) in the world. Default: the tip's at the centre of the problem's domain.
+            axis: "x", "y" or "z" of the tip frame; None for the rotation vector.
+
+        Example:
+            >>> import orthocas as oc
+            >>> robot = oc.problems.get("iiwa").robot
+            >>> oc.Task.orientation(robot, axis="z").labels
+            ('tilt_x', 'tilt_y', 'turn_z')
         """
-        return cls._turned(robot, TipTurn(False, None), reference)
+        return cls._turned(robot, TipTurn(False, True, axis), reference)
 
     @classmethod
-    def pose(cls, robot: Robot, reference: ArrayLike | None = None) -> Self:
+    def pose(cls, robot: Robot, reference: ArrayLike | None = None, axis: str | None = None) -> Self:
         """Position [m] and orientation of the tip, (6,); see `position` and `orientation`."""
-        return cls._turned(robot, TipTurn(True, None), reference)
+        return cls._turned(robot, TipTurn(True, True, axis), reference)
 
     @classmethod
     def axis(cls, robot: Robot, axis: str = "z", reference: ArrayLike | None = None) -> Self:
@@ -109,14 +124,14 @@ class Task(Shown):
             Lambert's azimuthal equal-area map of the sphere of directions.
         """
         require_kind("axis", axis, str)
-        turn = TipTurn(False, axis)
+        turn = TipTurn(False, False, axis)
         return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis))
 
     @classmethod
     def position_and_axis(cls, robot: Robot, axis: str = "z", reference: ArrayLike | None = None) -> Self:
         """Position [m] and direction of one axis of the tip, (5,); see `position` and `axis`."""
         require_kind("axis", axis, str)
-        turn = TipTurn(True, axis)
+        turn = TipTurn(True, False, axis)
         return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis))
 
     @classmethod
@@ -169,7 +184,7 @@ class Task(Shown):
 
     @classmethod
     def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> Self:
-        """A task by its short name: position, position:xy, polar, orientation, pose, axis, axis:x, position+axis.
+        """A task by its short name: position, position:xy, polar, orientation, pose, pose:z, axis:x, position+axis.
 
         Args:
             robot: the robot.

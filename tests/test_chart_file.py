@@ -66,7 +66,7 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", ["orientation", "axis:x", "position+axis:z"])
+@pytest.mark.parametrize("kind", ["orientation", "pose:z", "axis:x", "position+axis:z"])
 def test_tasks_with_a_reference_come_back_with_it(kind: str, iiwa: oc.Problem, tmp_path: Path) -> None:
     problem = oc.Problem(iiwa.robot, oc.Task.named(iiwa.robot, kind), domain=iiwa.domain)
     chart = oc.fit(problem, oc.Polynomial(1), samples=100).chart

@@ -111,9 +111,11 @@ def test_a_mode_is_unstable_beyond_its_delay(planar_chart: oc.Chart) -> None:
         assert largest_real_part(0.98 * delay) < 0 < largest_real_part(1.02 * delay)
 
 
-def test_default_gains_hold_an_arm_whose_masses_are_off() -> None:
+@pytest.mark.parametrize("kind", ["position", "pose:z"])
+def test_default_gains_hold_an_arm_whose_masses_are_off(kind: str) -> None:
     """Static solution of J^T K e = 0.2 g on the plant with 1.2 times the mass: sag up to 20 mm, inside the domain."""
-    problem = oc.problems.get("iiwa")
+    arm = oc.problems.get("iiwa")
+    problem = oc.Problem(arm.robot, oc.Task.named(arm.robot, kind), "euclidean", arm.domain)
     chart = oc.fit(problem, oc.Polynomial(3), weights=(1000, 30, 150, 1)).chart
     law, plant = PDPlus.on_chart(chart), problem.robot.with_scaled_masses(1.2)
     rng = np.random.default_rng(5)

@@ -110,7 +110,7 @@ def test_undisturbed_it_follows_like_the_law_alone(law: PDPlus, chart: oc.Chart)
     reference = Reference.steps(law.labels, start, [(0.5, {"x": start[0] + 0.03})], 2.5)
     run = simulate(law, reference, q, control_rate=RATE, safety=Safety.of(law))
     alone = simulate(law, reference, q, control_rate=RATE)
-    np.testing.assert_allclose(run.q, alone.q, atol=2e-4)  # apart from the first 0.2 s, in which the law fades in
+    np.testing.assert_allclose(run.q, alone.q, atol=2e-4)  # apart from the first 0.02 s, in which the law fades in
     assert {*run.status} <= {ControlStatus.OK, ControlStatus.SATURATED}
 
 

@@ -16,7 +16,10 @@ Q = np.array([0.3, 0.7, -0.4, -1.0, 0.5, 0.9, 0.2])
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])  # of the Panda: its hand points down
 
 
-KINDS = ["position", "position:xz", "polar", "orientation", "pose", "axis", "axis:x", "axis:y", "position+axis"]
+KINDS = [
+    *("position", "position:xz", "polar", "orientation", "orientation:x", "pose", "pose:y", "pose:z"),
+    *("axis", "axis:x", "axis:y", "position+axis"),
+]
 
 
 def panda() -> oc.Robot:
@@ -73,6 +76,25 @@ def test_axis_task_is_the_angular_velocity_across_the_axis_at_the_reference() ->
     np.testing.assert_allclose(np.array(task.jacobian_function(Q)), [turning[1], -turning[0]], atol=1e-12)
 
 
+@pytest.mark.parametrize("name", "xyz")
+def test_turn_about_an_axis_is_what_the_shortest_tilt_of_that_axis_leaves(name: str) -> None:
+    """Tilt the axis by the rotation across both directions, then turn about it: that is the tip's rotation."""
+    robot, k = iiwa_robot(), "xyz".index(name)
+    reference = robot.tip_rotation(Q + 0.4)
+    task = oc.Task.orientation(robot, reference, name)
+    np.testing.assert_array_equal(task.labels[:2], oc.Task.axis(robot, name).labels)
+    for q in np.random.default_rng(6).uniform(-2, 2, (50, 7)):
+        rotation = reference.T @ robot.tip_rotation(q)
+        unit, direction = np.eye(3)[k], rotation[:, k]
+        across = np.cross(unit, direction)
+        tilt = pin.exp3(across / np.linalg.norm(across) * np.arccos(direction[k]))
+        x = np.array(task.function(q)).ravel()
+        np.testing.assert_allclose(tilt @ pin.exp3(x[2] * unit), rotation, atol=1e-9)
+        np.testing.assert_allclose(x[:2], np.delete(direction, k) * np.sqrt(2 / (1 + direction[k])), atol=1e-12)
+    about_z = np.array(oc.Task.pose(robot, reference, "z").jacobian_function(Q))[:, 6]
+    np.testing.assert_allclose(about_z, [0, 0, 0, 0, 0, 1], atol=1e-12)  # joint 7 turns about the flange's z axis
+
+
 @pytest.mark.parametrize(("kind", "rank"), [("axis:x", 2), ("axis:z", 2), ("position+axis:y", 5), ("position+axis", 5)])
 def test_axis_tasks_have_full_rank_and_turn_smoothly(kind: str, rank: int) -> None:
     robot = panda()
@@ -95,7 +117,8 @@ def test_hand_that_points_down_gets_its_reference_from_the_domain() -> None:
     way = READY + np.linspace(-1, 1, 2000)[:, None] * np.full(7, 0.2)
     from_identity = oc.Task.orientation(robot, np.eye(3)).batched(way)[0]
     assert np.abs(np.diff(from_identity, axis=0)).max() > 3.9  # through the half turn, from 2 to -2
-    for task, at in ((oc.Task.orientation(robot), 0), (oc.Task.pose(robot), 3), (oc.Task.axis(robot), 0)):
+    for kind, at in (("orientation", 0), ("pose", 3), ("pose:z", 3), ("axis", 0)):
+        task = oc.Task.named(robot, kind)
         bound = oc.Problem(robot, task, domain=box).task
         assert task.lacks_reference
         assert not bound.lacks_reference
@@ -120,6 +143,8 @@ def test_units_follow_the_kind_of_task() -> None:
     assert oc.Task.pose(robot).units == ("m",) * 3 + ("rad",) * 3
     assert oc.Task.position_and_axis(robot, "y").labels == ("x", "y", "z", "tilt_x", "tilt_z")
     assert oc.Task.position_and_axis(robot, "y").units == ("m",) * 3 + ("rad",) * 2
+    assert oc.Task.pose(robot, axis="y").labels == ("x", "y", "z", "tilt_x", "tilt_z", "turn_y")
+    assert oc.Task.pose(robot, axis="y").units == ("m",) * 3 + ("rad",) * 3
     assert oc.Task.custom(robot, "a", lambda q: q[:2]).units == ("", "")
     assert oc.Task.custom(robot, "a", lambda q: q[:2], units=("rad", "")).units == ("rad", "")
 
@@ -159,8 +184,9 @@ def test_bad_tasks_are_refused() -> None:
     with pytest.raises(UnknownNameError, match="unknown axis of the tip 'w', known: x, y, z"):
         oc.Task.named(robot, "position+axis:w")
     for axis in ("", "xy"):
-        with pytest.raises(UnknownNameError, match="axis of the tip"):
-            oc.Task.axis(robot, axis)
+        for build in (oc.Task.axis, oc.Task.pose):
+            with pytest.raises(UnknownNameError, match="axis of the tip"):
+                build(robot, axis=axis)
     with pytest.raises(InvalidValueError, match="a direction other than zero"):
         oc.Task.axis(robot, "z", [0, 0, 0])
     with pytest.raises(ShapeError, match="reference"):

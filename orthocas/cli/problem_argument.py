@@ -30,7 +30,9 @@ ToolText = Annotated[
 ]
 TaskName = Annotated[
     str | None,
-    typer.Option("--task", help="Task: position, position:xy, polar, orientation, pose, axis:z or position+axis:z."),
+    typer.Option(
+        "--task", help="Task: position, position:xy, polar, orientation, pose, pose:z, axis or position+axis."
+    ),
 ]
 MetricName = Annotated[str | None, typer.Option("--metric", help="Metric: euclidean or inertia.")]
 CentreText = Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')]

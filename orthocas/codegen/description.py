@@ -19,6 +19,10 @@ _TILT = (
     "tilt of the tip's {axis} axis from the reference direction, near it in [rad]. The frame of that direction in the\n"
     " *   world, row by row: "
 )
+_TURN = (
+    "tilt of the tip's {axis} axis from that of the reference, near it in [rad], and turn about it [rad].\n"
+    " *   The reference, row by row: "
+)
 
 
 def description_values(chart: Chart) -> dict[str, str]:
@@ -55,7 +59,7 @@ def _orientation(task: Task) -> str:
     if turn is None or "reference" not in task.recipe:
         return ""
     first = turn.labels[3 if turn.with_position else 0]
-    convention = _ORIENTATION if turn.axis is None else _TILT.format(axis=turn.axis)
+    convention = _ORIENTATION if turn.axis is None else (_TURN if turn.whole else _TILT).format(axis=turn.axis)
     return f"\n *   {first}, ...: {convention}{_row(np.ravel(task.recipe['reference']))}"
 
 

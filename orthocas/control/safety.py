@@ -105,7 +105,7 @@ class Safety:
             "near_margin": 0.06,
             "catch_margin": 0.01,
             "return_margin": 0.1,
-            "fade_in": 0.2,
+            "fade_in": 0.02,
             "fade_out": 0.03,
             "return_speed": _RETURN,
             "error_limit": 0.15 * span,

@@ -37,6 +37,16 @@ def tilt(R: ca.SX, axis: int) -> ca.SX:
     return d[[k for k in range(3) if k != axis]] * ca.sqrt(2 / (1 + d[axis]))
 
 
+def turn_about(R: ca.SX, axis: int) -> ca.SX:
+    """Angle of a rotation matrix about one of its own axes, after the shortest rotation that tilts that axis.
+
+    R = S T, where S takes e_axis to R e_axis about an axis across both, and T turns about e_axis by the angle
+    atan2(R_ji - R_ij, R_ii + R_jj) in (-pi, pi], with (i, j, axis) in cyclic order. Singular where S is half a turn.
+    """
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    return ca.atan2(R[j, i] - R[i, j], R[i, i] + R[j, j])
+
+
 def constant(values: Array) -> ca.SX:
     """A constant whose zeros are structural, so that products with them vanish."""
     return ca.SX(ca.sparsify(ca.DM(values)))

@@ -9,9 +9,15 @@ from numpy.typing import ArrayLike
 
 from orthocas.checks import Array, frozen_array, require_known
 from orthocas.errors import InvalidValueError
-from orthocas.robots.spatial import half_angle_vector, rotation_z_to, tilt
+from orthocas.robots.spatial import half_angle_vector, rotation_z_to, tilt, turn_about
 
 _AXES = ("x", "y", "z")
+_KINDS = {  # whether the position comes first, and whether the whole orientation counts
+    "orientation": (False, True),
+    "pose": (True, True),
+    "axis": (False, False),
+    "position+axis": (True, False),
+}
 
 
 @dataclass(frozen=True)
@@ -19,7 +25,8 @@ class TipTurn:
     """The tip's rotation from a reference. For pose-like tasks its position comes first."""
 
     with_position: bool
-    axis: str | None  #: axis of the tip to compare: "x", "y" or "z"; None for the whole orientation
+    whole: bool  #: the whole orientation, or only the direction of one axis
+    axis: str | None = None  #: of the tip: "x", "y" or "z"; None for a rotation vector
 
     def __post_init__(self) -> None:
         if self.axis is not None:
@@ -27,23 +34,25 @@ class TipTurn:
 
     @classmethod
     def of_kind(cls, kind: str) -> Self | None:
-        """Build from a task's kind: orientation, pose, axis, axis:x, position+axis, .... None for other kinds."""
+        """Build from a task's kind: orientation, pose:z, axis, axis:x, position+axis, .... None for other kinds."""
         what, _, axis = kind.partition(":")
-        if what in ("axis", "position+axis"):
-            return cls(what != "axis", axis or "z")
-        return cls(kind == "pose", None) if kind in ("orientation", "pose") else None
+        if what not in _KINDS:
+            return None
+        with_position, whole = _KINDS[what]
+        return cls(with_position, whole, axis or (None if whole else "z"))
 
     @property
     def kind(self) -> str:
         """The full name of the kind."""
-        if self.axis is None:
-            return "pose" if self.with_position else "orientation"
-        return f"{'position+' if self.with_position else ''}axis:{self.axis}"
+        what = next(name for name, parts in _KINDS.items() if parts == (self.with_position, self.whole))
+        return f"{what}:{self.axis}" if self.axis else what
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of the components."""
-        turns = tuple(f"tilt_{a}" for a in _AXES if a != self.axis) if self.axis else ("rx", "ry", "rz")
+        tilts = tuple(f"tilt_{a}" for a in _AXES if a != self.axis)
+        whole = (*tilts, f"turn_{self.axis}") if self.axis else ("rx", "ry", "rz")
+        turns = whole if self.whole else tilts
         return (*_AXES, *turns) if self.with_position else turns
 
     @property
@@ -53,8 +62,11 @@ class TipTurn:
 
     def components(self, turned: ca.SX, position: ca.SX) -> ca.SX:
         """The task value x, from the tip's rotation in the reference frame (3, 3) and its position (3, 1)."""
-        x = tilt(turned, _AXES.index(self.axis)) if self.axis else half_angle_vector(turned)
-        return ca.vertcat(position, x) if self.with_position else x
+        turns = half_angle_vector(turned) if self.axis is None else self._about_axis(turned, _AXES.index(self.axis))
+        return ca.vertcat(position, turns) if self.with_position else turns
+
+    def _about_axis(self, turned: ca.SX, axis: int) -> ca.SX:
+        return ca.vertcat(tilt(turned, axis), *([turn_about(turned, axis)] if self.whole else []))
 
 
 def frame_along(direction: ArrayLike, axis: str) -> Array:

@@ -67,7 +67,7 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--out", "--checkpoint"), ("out", "out/x/y", ".", "", "chart.orthocas", "/dev/null/x", "x" * 300)),
     **dict.fromkeys(("--coupling", "--damping", "--animation"), ("coupled", "square_root", "none", "mp5", "")),
     "--second": ("joints", "xi", "x2", ""),
-    "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose", "position:xx", "position+axis", ""),
+    "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose:z", "position:xx", "position+axis", ""),
     "--metric": ("euclidean", "inertia", "identity"),
     "--param": _WORDS,
     "--log": ("path.csv", "nothing.csv", "steps.json", ""),
