@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     )
     from orthocas.atlases.atlas import Atlas
     from orthocas.atlases.building import build_atlas
+    from orthocas.atlases.corridor_problem import corridor_problem
     from orthocas.atlases.coverage import Coverage, evaluate_atlas
     from orthocas.atlases.plan import AtlasSettings
     from orthocas.certificates import Certificate
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from orthocas.parametrisations import MLP, SEW, Circle, Fourier, Given, Linear, Polynomial, cyclic_joints
     from orthocas.parametrisations import register as register_parametrisation
     from orthocas.postures.clear_box import ClearBox
+    from orthocas.postures.corridor import Corridor
     from orthocas.postures.suggest import suggest_domain
     from orthocas.problem import Problem, check
     from orthocas.quality import Report, evaluate
@@ -82,6 +84,7 @@ __all__ = [
     "Circle",
     "ClearBox",
     "Comparison",
+    "Corridor",
     "Coverage",
     "Fit",
     "Fourier",
@@ -110,6 +113,7 @@ __all__ = [
     "compile_inverse",
     "contains",
     "control",
+    "corridor_problem",
     "cyclic_joints",
     "default_box",
     "distil",
@@ -147,6 +151,7 @@ __all__ = [
 _HOMES = {
     "orthocas.atlases.atlas": ["Atlas"],
     "orthocas.atlases.building": ["build_atlas"],
+    "orthocas.atlases.corridor_problem": ["corridor_problem"],
     "orthocas.atlases.coverage": ["Coverage", "evaluate_atlas"],
     "orthocas.atlases.plan": ["AtlasSettings"],
     "orthocas.certificates": ["Certificate"],
@@ -172,6 +177,7 @@ _HOMES = {
         "register as register_parametrisation",
     ],
     "orthocas.postures.clear_box": ["ClearBox"],
+    "orthocas.postures.corridor": ["Corridor"],
     "orthocas.postures.suggest": ["suggest_domain"],
     "orthocas.problem": ["Problem", "check"],
     "orthocas.quality": ["Report", "evaluate"],

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, Self, runtime_checkable
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -50,6 +51,38 @@ class Domain(Protocol):
 
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie in the domain: a bool, or (N,)."""
+        ...
+
+
+@runtime_checkable
+class SelfDrawing(Protocol):
+    """A domain that is a small part of its box, and draws points itself."""
+
+    def draw(self, rng: np.random.Generator, count: int, power: float) -> Array:
+        """At most `count` points (M, n): uniform for power 1, nearer to the border for smaller powers."""
+        ...
+
+
+@runtime_checkable
+class Conditioned(Protocol):
+    """A part of a box with a condition: `ClearBox` and `Corridor`."""
+
+    @property
+    def heading(self) -> str:
+        """The condition in one line."""
+        ...
+
+    @property
+    def pivots(self) -> ca.Function:
+        """q (n, 1) -> numbers that are all positive just at those points of the box where the condition holds."""
+        ...
+
+    def within(self, box: "Box") -> "Box":
+        """The same condition on another box."""
+        ...
+
+    def told(self, q: Array) -> str:
+        """What is wrong with a position (n,) of the box where the condition does not hold."""
         ...
 
 
@@ -152,7 +185,7 @@ class Torus:
 def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
     """Draw points uniformly from the domain, (samples, n)."""
     rng = _generator(domain, samples, seed)
-    return _inside(domain, samples, lambda count: _scaled(domain, rng.uniform(-1.0, 1.0, (count, len(domain.centre)))))
+    return _inside(domain, samples, lambda count: _drawn(domain, rng, count, 1.0))
 
 
 def sample_heavily(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
@@ -165,12 +198,11 @@ def sample_heavily(domain: Domain, samples: int, seed: int | tuple[int, ...]) ->
     """
     rng, third = _generator(domain, samples, seed), samples // 3
 
-    def draw(count: int, power: float) -> Array:
-        u = rng.uniform(-1.0, 1.0, (count, len(domain.centre)))
-        return _scaled(domain, np.sign(u) * np.abs(u) ** power)
-
     sizes = (samples - 2 * third, third, third)
-    parts = [_inside(domain, size, partial(draw, power=power)) for size, power in zip(sizes, _POWERS, strict=True)]
+    parts = [
+        _inside(domain, size, partial(_drawn, domain, rng, power=power))
+        for size, power in zip(sizes, _POWERS, strict=True)
+    ]
     return np.vstack(parts)
 
 
@@ -179,11 +211,13 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
 
     They follow the additive recurrence frac(shift + k alpha), alpha_j = g^-j, with g the root of g^(n+1) = g + 1 and a
     random shift. Each point is uniformly distributed, and every part of the sequence is even. Means over the domain
-    converge faster than with independent points.
+    converge faster than with independent points. Domains that draw points themselves get independent ones.
 
     Source:
         M. Roberts, docs/references.md [R2018]. The use for training is ours.
     """
+    if isinstance(domain, SelfDrawing):
+        return sample_uniform(domain, samples, seed)
     rng, n = _generator(domain, samples, seed), len(domain.centre)
     g = 1.5
     for _ in range(64):
@@ -291,6 +325,14 @@ def _generator(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> np.
         require_count("seed", part, least=0)
     require_memory(f"{samples} samples", 32.0 * samples * len(domain.centre))
     return np.random.default_rng(seed)
+
+
+def _drawn(domain: Domain, rng: np.random.Generator, count: int, power: float) -> Array:
+    """Points of the box around the domain with distances |u|^power half-widths from the centre; see `SelfDrawing`."""
+    if isinstance(domain, SelfDrawing):
+        return domain.draw(rng, count, power)
+    u = rng.uniform(-1.0, 1.0, (count, len(domain.centre)))
+    return _scaled(domain, np.sign(u) * np.abs(u) ** power)
 
 
 def _scaled(domain: Domain, u: Array) -> Array:

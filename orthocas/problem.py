@@ -9,6 +9,7 @@ from orthocas.domains import Domain, require_within_limits, sample_uniform
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
 from orthocas.metrics import Metric, MetricSpec, metric_matrices
 from orthocas.postures.clear_box import ClearBox, clear_domain
+from orthocas.postures.corridor import Corridor
 from orthocas.postures.regular_box import regular_box
 from orthocas.postures.row_scale import row_scale
 from orthocas.robots import Robot
@@ -111,6 +112,7 @@ class Problem(Shown):
             "metric": self.metric.name,
             "domain": f"{domain.name}, half-width {number_list(domain.half_width)}{self._endless}",
             **({"clear": domain.heading} if isinstance(domain, ClearBox) else {}),
+            **({"corridor": domain.heading} if isinstance(domain, Corridor) else {}),
             "centre": number_list(domain.centre),
             "robot": self.robot.heading,
         }

@@ -237,6 +237,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "box": lambda: planar().domain,
     "unbounded box": lambda: cyclic().problem.domain,
     "clear box": lambda: clear().problem.domain,
+    "corridor": lambda: oc.Corridor(oc.Box([0.0, 0.9], 0.8), [[0.0, 0.5], [0.3, 1.2]], [np.inf, 0.2]),
     "clear part of a domain": lambda: ClearPart(0.1, 0.95),
     "torus": lambda: oc.Torus(3),
     "suggestion of a domain": suggestion,

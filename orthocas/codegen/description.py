@@ -5,9 +5,8 @@ import numpy as np
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.words import words
-from orthocas.domains import Domain, borders
+from orthocas.domains import Conditioned, Domain, borders
 from orthocas.files.chart_file import fingerprint
-from orthocas.postures.clear_box import ClearBox
 from orthocas.robots.tip_turn import TipTurn
 from orthocas.tasks import Task
 
@@ -87,7 +86,7 @@ def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
 
 
 def _clear_line(domain: Domain) -> str:
-    """The condition of a ClearBox."""
-    if not isinstance(domain, ClearBox):
+    """The condition of a domain that has one."""
+    if not isinstance(domain, Conditioned):
         return ""
     return f"\n *   and the {domain.heading},\n *   or else the status is OUTSIDE_DOMAIN"

@@ -20,9 +20,9 @@ from orthocas.codegen.supervision import supervision_kernels
 from orthocas.control import Controller, Safety
 from orthocas.control.controller import require_controller
 from orthocas.coordinates.turns import require_no_turns
+from orthocas.domains import Conditioned
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.files.atomic import output_folder, published, require_writable
-from orthocas.postures.clear_box import ClearBox
 
 _LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/test_c_safety.py)
 _TAKEN = (  # names of C headers and libraries
@@ -117,7 +117,7 @@ def _functions(chart: Chart, controller: Controller | None, precision: Precision
     ]
     domain = chart.problem.domain
     require_no_turns(chart.labels, chart.turns, "generated C")
-    if isinstance(domain, ClearBox):
+    if isinstance(domain, Conditioned):
         found.append(scalar_code(ca.Function("pivots", [q], [domain.pivots(q)])))
     if controller is not None:
         graph = precision.graph(controller)

@@ -18,8 +18,7 @@ from orthocas.codegen.precision import Precision, bounds_inside
 from orthocas.codegen.supervision import supervision_values
 from orthocas.codegen.words import words
 from orthocas.control import Controller, Safety
-from orthocas.domains import Domain, contains, reach
-from orthocas.postures.clear_box import ClearBox
+from orthocas.domains import Conditioned, Domain, contains, reach
 from orthocas.version import VERSION
 
 _MAX_EVALUATIONS = 100  # largest number of chart evaluations in one call of the inverse map
@@ -87,10 +86,14 @@ def _title(chart: Chart, controller: Controller | None) -> str:
 
 
 def _clear_values(domain: Domain, values: Mapping[str, str]) -> dict[str, str]:
-    """The test of a ClearBox, and its call; for other domains there is none."""
-    if not isinstance(domain, ClearBox):
+    """The test of a condition of the domain, and its call; for other domains there is none."""
+    if not isinstance(domain, Conditioned):
         return {"is_clear": "1", "clear_c": ""}
-    return {"is_clear": "is_clear(q)", "clear_c": filled("clear.c", values)}
+    condition = {
+        "pivots": str(domain.pivots.size1_out(0)),
+        "condition": "\n * ".join(words([domain.heading])),
+    }
+    return {"is_clear": "is_clear(q)", "clear_c": filled("clear.c", {**values, **condition})}
 
 
 def _somewhere(domain: Domain) -> Array:

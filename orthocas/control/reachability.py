@@ -6,10 +6,9 @@ from numpy.typing import ArrayLike
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_point, require_kind
 from orthocas.control.reference import Reference
-from orthocas.domains import borders, contains
+from orthocas.domains import Conditioned, borders, contains
 from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError
 from orthocas.inverting import Tracker, TrackerStatus
-from orthocas.postures.clear_box import ClearBox
 from orthocas.reaching.intervals import too_far
 
 
@@ -76,8 +75,8 @@ class _Follower:
 
 def _outside(chart: Chart, q: Array) -> str:
     domain = chart.problem.domain
-    if isinstance(domain, ClearBox) and not domain.is_clear(q[None])[0]:
-        return f"the task {domain.told(q)}"
+    if isinstance(domain, Conditioned) and not np.all(np.asarray(domain.pivots(q)) > 0):
+        return domain.told(q)
     low, high = borders(domain)
     i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))
     low, high = low[i], high[i]

@@ -5,8 +5,7 @@ from enum import IntEnum
 import casadi as ca
 import numpy as np
 
-from orthocas.domains import Domain, reach
-from orthocas.postures.clear_box import ClearBox
+from orthocas.domains import Conditioned, Domain, reach
 
 LARGEST = 1e100  #: larger numbers count as not finite, because their squares may overflow
 GUARD = "guard"  #: name of the guard's function
@@ -90,8 +89,8 @@ def _cut(command: ca.SX, limit: ca.SX, keep_direction: bool) -> ca.SX:
 
 
 def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
-    """Whether q (n, 1) lies in the domain: between its borders and, in a ClearBox, clear of singular positions."""
-    clear = ca.logic_all(domain.pivots(q) > 0) if isinstance(domain, ClearBox) else ca.SX(1)
+    """Whether q (n, 1) lies in the domain: between its borders, and where its condition holds, if it has one."""
+    clear = ca.logic_all(domain.pivots(q) > 0) if isinstance(domain, Conditioned) else ca.SX(1)
     return ca.logic_and(_is_between_borders(domain, q), clear)
 
 

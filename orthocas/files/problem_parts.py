@@ -15,6 +15,7 @@ from orthocas.files.json import part
 from orthocas.files.npy import Stored
 from orthocas.metrics import Metric
 from orthocas.postures.clear_box import CLEAR_BOX, ClearBox
+from orthocas.postures.corridor import CORRIDOR, Corridor
 from orthocas.problem import Problem
 from orthocas.robots import KinematicTree, Robot
 from orthocas.tasks import Task
@@ -28,6 +29,8 @@ def problem_to_data(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]
     domain = problem.domain
     arrays |= {"domain_centre": domain.centre, "domain_half_width": domain.half_width}
     arrays |= {"domain_row_scale": domain.scale} if isinstance(domain, ClearBox) else {}
+    if isinstance(domain, Corridor):
+        arrays |= {"domain_postures": domain.postures, "domain_radius": domain.radius}
     header = {
         "robot": {name: value for name, value in numbers.items() if not isinstance(value, np.ndarray)},
         "problem": {
@@ -81,13 +84,15 @@ def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]
         require_within_limits(robot, domain)  # before the task is evaluated there
         scale = part(arrays, "domain_row_scale", np.ndarray)
         domain = ClearBox(domain, task, part(data, "least_singular_value", float), scale)
+    if data["domain"] == CORRIDOR and isinstance(domain, Box):
+        domain = Corridor(domain, *(part(arrays, f"domain_{name}", np.ndarray) for name in ("postures", "radius")))
     return Problem(robot, task, metric, domain, part(data, "name", str))
 
 
 def _domain(n: int, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Domain:
-    """The box or torus of a file; for a ClearBox its box."""
+    """The box or torus of a file; for a ClearBox or a Corridor its box."""
     kind = part(data, "domain", str)
-    require_known("domain", kind, ("box", "torus", CLEAR_BOX))
+    require_known("domain", kind, ("box", "torus", CLEAR_BOX, CORRIDOR))
     if kind == "torus":
         return Torus(n)
     unbounded = part(data, "unbounded", list) if "unbounded" in data else ()  # missing in older files

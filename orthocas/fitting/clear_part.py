@@ -7,6 +7,7 @@ import numpy as np
 from orthocas.domains import Box
 from orthocas.errors import DomainError
 from orthocas.postures.clear_box import ClearBox
+from orthocas.postures.corridor import Corridor
 from orthocas.problem import Problem, ProblemCheck
 from orthocas.worst_points import WorstPoints
 
@@ -39,7 +40,7 @@ def clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints | None)
     """
     domain = problem.domain
     folded = np.zeros((0, problem.n)) if worst is None else worst.below(0.0)
-    if not isinstance(domain, Box) or not (len(folded) or check.singular_samples):
+    if not isinstance(domain, Box) or isinstance(domain, Corridor) or not (len(folded) or check.singular_samples):
         return None
     try:
         measured = domain if isinstance(domain, ClearBox) else ClearBox(domain, problem.task, _ANY)

@@ -12,6 +12,7 @@ from orthocas.fitting.loss import WeightNumbers, Weights
 from orthocas.minimising.solver import Solver
 from orthocas.parametrisations import Parametrisation, Polynomial
 from orthocas.postures.clear_box import ClearBox
+from orthocas.postures.corridor import Corridor
 from orthocas.problem import Problem
 from orthocas.samples import sample_problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt
@@ -124,4 +125,5 @@ def _digest(problem: Problem) -> str:
     parts += [] if samples.metric_inverse is None else [samples.metric_inverse]
     domain = problem.domain
     parts += [np.append(domain.scale, domain.least_singular_value)] if isinstance(domain, ClearBox) else []
+    parts += [domain.postures, domain.radius] if isinstance(domain, Corridor) else []
     return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]

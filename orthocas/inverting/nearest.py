@@ -20,7 +20,7 @@ from orthocas.casadi_tools.batch import evaluate_columns
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.coordinates.turns import shortest
-from orthocas.domains import borders
+from orthocas.domains import Conditioned, borders
 from orthocas.inverting.newton import PhiMap, largest
 from orthocas.postures.clear_box import ClearBox
 from orthocas.problem import Problem
@@ -73,6 +73,9 @@ class Nearest:
             pivots = domain.pivots(q) / domain.least_singular_value**2
             constraints += [_CLEAR - _products(pivots)]  # the pivots themselves have poles
             upper = np.zeros(m + m)
+        elif isinstance(domain, Conditioned):
+            constraints += [-domain.pivots(q)]
+            upper = np.zeros(m + domain.pivots.size1_out(0))
         lower = np.where(np.arange(len(upper)) < m, 0.0, -np.inf)
         equations: dict[str, Any] = {
             "x": q,

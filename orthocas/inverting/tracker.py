@@ -9,11 +9,10 @@ from numpy.typing import ArrayLike
 
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.checks import Array, as_float_array, as_point, require_shape
-from orthocas.domains import Domain, contains, reach
+from orthocas.domains import Conditioned, Domain, contains, reach
 from orthocas.errors import InvalidValueError
 from orthocas.inverting.newton import GOAL
 from orthocas.inverting.point import REFRESHES, Bound, PointFunctions, PointSolver
-from orthocas.postures.clear_box import ClearBox
 from orthocas.showing import Shown, number_list
 
 _ROUNDED = 1e-9  # error up to which only rounding may have stopped the decrease
@@ -163,6 +162,6 @@ def _guard(domain: Domain, limit: Array) -> ca.Function:
     """q before, q -> the largest change relative to its limit, and a number > 0 outside the domain."""
     before, q = (ca.MX.sym(name, len(limit)) for name in ("before", "q"))
     outside = ca.mmax(ca.fabs(q - ca.DM(domain.centre)) - ca.DM(reach(domain)))
-    if isinstance(domain, ClearBox):
+    if isinstance(domain, Conditioned):
         outside = ca.fmax(outside, ca.if_else(ca.mmin(domain.pivots(q)) > 0, -1, 1))
     return dense_function("guard", [before, q], [ca.vertcat(ca.norm_inf((q - before) / ca.DM(limit)), outside)])

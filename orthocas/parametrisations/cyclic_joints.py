@@ -3,8 +3,7 @@
 import numpy as np
 
 from orthocas.checks import Array, require_kind
-from orthocas.domains import Box, sample_uniform
-from orthocas.postures.clear_box import ClearBox
+from orthocas.domains import Box, Conditioned, sample_uniform
 from orthocas.problem import NEAR_SINGULAR, Problem, relative_singular_values
 
 _SAMPLES, _POSITIONS = 24, 6  # joint positions, and other positions of one joint at each of them
@@ -58,7 +57,7 @@ def over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
         else:
             centre[k] = (low + high) / 2
     wider = Box(centre, half_width, sorted(unbounded))
-    wider = domain.within(wider) if isinstance(domain, ClearBox) else wider
+    wider = domain.within(wider) if isinstance(domain, Conditioned) else wider
     return Problem(robot, problem.task, problem.metric, wider, problem.name)
 
 

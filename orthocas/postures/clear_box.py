@@ -66,7 +66,7 @@ class ClearBox(Box):
         for field, value in (("name", CLEAR_BOX), ("task", task), ("least_singular_value", bound), ("scale", sizes)):
             object.__setattr__(self, field, value)
         if not self.is_clear(self.centre[None])[0]:
-            raise DomainError(f"the centre of the domain {self.told(self.centre)}")
+            raise DomainError(f"the centre of the domain {self._value_told(self.centre)}")
 
     @property
     def heading(self) -> str:
@@ -76,6 +76,9 @@ class ClearBox(Box):
 
     def told(self, q: Array) -> str:
         """What is wrong with a position (n,) that is not clear."""
+        return f"the task {self._value_told(q)}"
+
+    def _value_told(self, q: Array) -> str:
         bound = f"expected one above least_singular_value = {self.least_singular_value:g}"
         return f"has a relative singular value of {self.singular_values(q):.3g}, {bound}"
 
@@ -140,7 +143,7 @@ def clear_domain(domain: Domain, task: Task, least_singular_value: float | None)
         DomainError: if the centre is not clear.
     """
     if least_singular_value is not None:
-        if not isinstance(domain, Box):
+        if not isinstance(domain, Box) or domain.name not in ("box", CLEAR_BOX):
             raise InvalidValueError("least_singular_value", least_singular_value, f"none with a {domain.name}")
         return ClearBox(domain, task, least_singular_value)
     if isinstance(domain, ClearBox) and domain.task is not task:
