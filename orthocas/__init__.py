@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from orthocas.atlases.atlas import Atlas
     from orthocas.atlases.building import build_atlas
     from orthocas.atlases.coverage import Coverage, evaluate_atlas
+    from orthocas.atlases.part import AtlasPart
     from orthocas.atlases.plan import AtlasSettings
     from orthocas.certificates import Certificate
     from orthocas.certifying.certify import certified_box, certify
@@ -75,6 +76,7 @@ __all__ = [
     "MLP",
     "SEW",
     "Atlas",
+    "AtlasPart",
     "AtlasSettings",
     "Box",
     "Certificate",
@@ -148,6 +150,7 @@ _HOMES = {
     "orthocas.atlases.atlas": ["Atlas"],
     "orthocas.atlases.building": ["build_atlas"],
     "orthocas.atlases.coverage": ["Coverage", "evaluate_atlas"],
+    "orthocas.atlases.part": ["AtlasPart"],
     "orthocas.atlases.plan": ["AtlasSettings"],
     "orthocas.certificates": ["Certificate"],
     "orthocas.certifying.certify": ["certified_box", "certify"],
