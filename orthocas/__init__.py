@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from orthocas.atlases.building import build_atlas
     from orthocas.atlases.corridor_problem import corridor_problem
     from orthocas.atlases.coverage import Coverage, evaluate_atlas
+    from orthocas.atlases.part import AtlasPart
     from orthocas.atlases.plan import AtlasSettings
     from orthocas.certificates import Certificate
     from orthocas.certifying.certify import certified_box, certify
@@ -77,6 +78,7 @@ __all__ = [
     "MLP",
     "SEW",
     "Atlas",
+    "AtlasPart",
     "AtlasSettings",
     "Box",
     "Certificate",
@@ -153,6 +155,7 @@ _HOMES = {
     "orthocas.atlases.building": ["build_atlas"],
     "orthocas.atlases.corridor_problem": ["corridor_problem"],
     "orthocas.atlases.coverage": ["Coverage", "evaluate_atlas"],
+    "orthocas.atlases.part": ["AtlasPart"],
     "orthocas.atlases.plan": ["AtlasSettings"],
     "orthocas.certificates": ["Certificate"],
     "orthocas.certifying.certify": ["certified_box", "certify"],

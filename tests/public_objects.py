@@ -220,6 +220,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     **CHARTS,
     **CONTROLLERS,
     "atlas": atlas,
+    "part of an atlas": lambda: oc.AtlasPart.whole(atlas()),
     "settings of an atlas": oc.AtlasSettings,
     "coverage": lambda: oc.evaluate_atlas(atlas(), 200),
     "certificate": certificate,
@@ -339,6 +340,11 @@ def _of_chart(chart: oc.Chart) -> Iterator[Any]:
 def _of_atlas(atlas: oc.Atlas) -> Iterator[Any]:
     q = np.array([[0.0, 0.9, 0.9], [1.0, 0.7, 1.1], [0.0, -2.0, 0.9]])
     yield from (atlas.chart_at(q), atlas.xi(q), atlas.jacobian(q), atlas.chart(0).xi(q[0]), str(atlas.as_dict()))
+
+
+@_numbers.register
+def _of_part(part: oc.AtlasPart) -> Iterator[Any]:
+    yield from (part.charts, str(part))
 
 
 @_numbers.register

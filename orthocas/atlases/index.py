@@ -61,12 +61,12 @@ class Index:
 
     def nodes(self, placed: Placed) -> Indices:
         """The record of the smallest cell of every position; -1 for those outside, and where nothing is built, (N,)."""
-        node = np.where(placed.tile >= 0, self._roots[placed.tile], _NONE)
+        node = np.where(placed.tile >= 0, self.roots[placed.tile], _NONE)
         waiting = np.flatnonzero(node >= 0)
         waiting = waiting[self._split[node[waiting]]]
         while waiting.size:
             now = node[waiting]
-            upper = placed.points[waiting, self._joint[now]] >= self._threshold[now]
+            upper = placed.points[waiting, self._joint[now]] >= self.thresholds[now]
             node[waiting] = self.children[now, upper.astype(int)]
             waiting = waiting[node[waiting] >= 0]
             waiting = waiting[self._split[node[waiting]]]
@@ -175,7 +175,7 @@ class Index:
         return np.asarray(self.plan.maps.of(self.plan.joints).signs[self.orbits.maps])
 
     @cached_property
-    def _roots(self) -> Indices:
+    def roots(self) -> Indices:
         """Record of the fitted tile of every tile, -1 if it is not built."""
         records = self.stock.records
         whole = np.flatnonzero(records["parent"] < 0)
@@ -195,7 +195,7 @@ class Index:
         return self.stock.records["joint"].astype(np.int64)
 
     @cached_property
-    def _threshold(self) -> Array:
+    def thresholds(self) -> Array:
         """Middle of every cell in the joint that is halved."""
         records = self.stock.records
         low, width = cell_borders(self.plan.lattice, records["tile"], records["levels"], records["places"])

@@ -12,9 +12,10 @@ from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.threads import in_threads
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind
-from orthocas.codegen.generate import generate_c
+from orthocas.codegen.chart_source import ChartSource
 from orthocas.codegen.kept_libraries import kept_library, loaded, template
 from orthocas.codegen.library import STRICT
+from orthocas.codegen.library_files import write_library
 from orthocas.files.drafts import draft_folder
 from orthocas.inverting import Attempt, Newton, Solutions
 from orthocas.inverting.newton import SUSPICIOUS
@@ -97,7 +98,7 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     """
     require_kind("chart", chart, Chart)
     with draft_folder() as drafts:
-        generate_c(chart, drafts, name="arm")
+        write_library(ChartSource(chart), drafts, name="arm")
         sources = {name: (drafts / name).read_text(encoding="utf-8") for name in ("arm.h", "arm.c")}
     sources[_ROWS] = template(_ROWS)
     return CompiledInverse(chart, kept_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))

@@ -25,8 +25,8 @@ _TURN = (
 
 
 def description_values(chart: Chart) -> dict[str, str]:
-    """Values of the placeholders that describe the chart and its robot."""
-    tree, domain = chart.problem.robot.tree, chart.problem.domain
+    """Values of the placeholders that describe robot, frames and coordinates."""
+    tree = chart.problem.robot.tree
     limits = [f"{low:.6g} to {high:.6g}" for low, high in zip(tree.lower, tree.upper, strict=True)]
     slides = ["m" if sliding else "rad" for sliding in tree.prismatic]
     joints = zip(words(tree.joint_names), slides, limits, tree.velocity_limits, tree.effort_limits, strict=True)
@@ -41,10 +41,21 @@ def description_values(chart: Chart) -> dict[str, str]:
         "extra_labels": ", ".join(words(chart.labels[chart.m :])),
         "tip": words([tree.tip_name])[0],
         "gravity": _row(tree.gravity),
-        "domain_lines": _domain_lines(words(tree.joint_names), *borders(domain)) + _clear_line(domain),
+    }
+
+
+def chart_values(chart: Chart) -> dict[str, str]:
+    """Values of the placeholders that describe the domain of one chart, and what is proved of it."""
+    return {
+        "domain_lines": domain_lines(chart.problem.domain, words(chart.problem.robot.joint_names)),
         "certificate": _certificate(chart),
         "fingerprint": fingerprint(chart.problem, chart.coordinates),
     }
+
+
+def domain_lines(domain: Domain, names: list[str]) -> str:
+    """The borders of a domain, joint by joint, and its condition on singular values."""
+    return _border_lines(names, *borders(domain)) + clear_line(domain)
 
 
 def _with_units(task: Task) -> list[str]:
@@ -76,7 +87,7 @@ def _certificate(chart: Chart) -> str:
     return "none" if known is None else f"{known.heading} ({known.method}, chart {known.fingerprint[:16]})"
 
 
-def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
+def _border_lines(names: list[str], lower: Array, upper: Array) -> str:
     if np.isinf(lower).all():
         return " *   all joint positions"
     ranges = [
@@ -85,7 +96,7 @@ def _domain_lines(names: list[str], lower: Array, upper: Array) -> str:
     return "\n".join(f" *   {name}: {range_}" for name, range_ in zip(names, ranges, strict=True))
 
 
-def _clear_line(domain: Domain) -> str:
+def clear_line(domain: Domain) -> str:
     """The condition of a domain that has one."""
     if not isinstance(domain, Conditioned):
         return ""

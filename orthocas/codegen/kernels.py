@@ -1,7 +1,9 @@
 """CasADi functions as C code to embed in our files: static, free of warnings, without CasADi's own interface."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
@@ -21,24 +23,35 @@ class Kernels:
     code: str
     work: dict[str, tuple[int, int, int, int]]  #: lengths of arg, res, iw and w that a call needs, by function name
 
+    def sizes(self) -> dict[str, str]:
+        """Values of the placeholders for these lengths: NAME_arg, NAME_res, NAME_iw and NAME_w."""
+        return {
+            f"{kernel}_{word}": str(max(1, size))
+            for kernel, sizes in self.work.items()
+            for word, size in zip(("arg", "res", "iw", "w"), sizes, strict=True)
+        }
+
     def array_bytes(self, name: str, number_size: int) -> int:
         """Size of the work arrays that a call of a function needs, with numbers of a size, in bytes."""
         arg, res, iw, w = self.work[name]
         return 8 * (arg + res) + number_size * w + 4 * iw
 
 
-def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
+def generate_kernels(
+    functions: list[ca.Function], prefix: str, own_code: Mapping[str, str] = MappingProxyType({})
+) -> Kernels:
     """Generate C99 for functions. Shared code appears once, and unused code is left out.
 
     Args:
         functions: functions with different names.
         prefix: prefix of every C name that the code defines.
+        own_code: C bodies for functions by name, instead of those that CasADi writes; all functions hand `mem` on.
     """
     generator = ca.CodeGenerator("kernels.c", _OPTIONS)
     for function in functions:
         generator.add(function)
     items, doubles = compacted(_definitions(_with_products_of_known_sizes(generator.dump())), functions)
-    items = with_own_code(items, functions)
+    items = with_own_code(items, functions, own_code)
     names = [function.name() for function in functions]
     code = "\n\n".join(_without_warnings(items[name]) for name in _needed(items, names))
     code = re.sub(r"\bcasadi_inf\b", "INFINITY", re.sub(r"\bcasadi_nan\b", "NAN", code))

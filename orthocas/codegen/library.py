@@ -61,16 +61,29 @@ class CompiledLibrary:
     name: str
     n: int
     single_precision: bool = False
+    r: int = 0  #: number of extra coordinates, for the functions that only libraries of an atlas have
 
     @property
     def precision(self) -> Precision:
         """The number type of the library."""
         return SINGLE if self.single_precision else DOUBLE
 
-    def chart(self, q: Array) -> tuple[Array, Array, int]:
-        """phi (n,), J (n, n), status."""
+    def chart(self, q: Array, *which: int) -> tuple[Array, Array, int]:
+        """phi (n,), J (n, n), status. Libraries of an atlas take the number of the chart last, here and below."""
         phi, J = self._zeros(self.n), self._zeros(self.n, self.n)
-        return phi, J, self._call("chart", [q], [phi, J])
+        return phi, J, self._call("chart", [q], [phi, J], which)
+
+    def chart_at(self, q: Array, current: int = -1) -> int:
+        """Of an atlas: the number of the chart for q, or -1."""
+        point = self.numbers(q)
+        require_shape("q", point.shape, (self.n,))
+        return int(self.function("chart_at")(point.ctypes.data_as(ctypes.c_void_p), current))
+
+    def xi(self, q: Array, which: int) -> tuple[Array, Array, int]:
+        """Of an atlas: xi (r,), J_xi (r, n) of a chart, status."""
+        xi, J = self._zeros(self.r), self._zeros(self.r, self.n)
+        self._call("xi", [q], [xi], (which,))
+        return xi, J, self._call("jacobian", [q], [J], (which,))
 
     def check(self) -> float:
         """Largest relative difference that the library finds between itself and the numbers it was generated with."""
@@ -78,25 +91,25 @@ class CompiledLibrary:
         run.restype = self.precision.c_type
         return float(run())
 
-    def curvature(self, q: Array, dq: Array, v: Array) -> tuple[Array, int]:
+    def curvature(self, q: Array, dq: Array, v: Array, *which: int) -> tuple[Array, int]:
         """dJ/dt v (n,), status."""
         curvature = self._zeros(self.n)
-        return curvature, self._call("chart_curvature", [q, dq, v], [curvature])
+        return curvature, self._call("chart_curvature", [q, dq, v], [curvature], which)
 
-    def inverse(self, phi: Array, q_start: Array) -> tuple[Array, int]:
+    def inverse(self, phi: Array, q_start: Array, *which: int) -> tuple[Array, int]:
         """q (n,), status."""
         q = self._zeros(self.n)
-        return q, self._call("inverse", [phi, q_start], [q])
+        return q, self._call("inverse", [phi, q_start], [q], which)
 
     def dynamics(self, q: Array, dq: Array) -> tuple[Array, Array, Array, int]:
         """M (n, n), bias (n,), gravity (n,), status."""
         M, bias, gravity = self._zeros(self.n, self.n), self._zeros(self.n), self._zeros(self.n)
         return M, bias, gravity, self._call("dynamics", [q, dq], [M, bias, gravity])
 
-    def control(self, q: Array, dq: Array, reference: Array, gains: Array) -> tuple[Array, int]:
+    def control(self, q: Array, dq: Array, reference: Array, gains: Array, *which: int) -> tuple[Array, int]:
         """Command (n,), status. Reference (3 k,) and gains hold the numbers of the C structs in order."""
         command = self._zeros(self.n)
-        return command, self._call("control", [q, dq, reference, gains], [command])
+        return command, self._call("control", [q, dq, reference, gains], [command], which)
 
     def low_pass(self, reference: Array, target: Array, omega: float, zeta: float, period: float) -> None:
         """Move a reference (3 k,) by one step of the low pass towards a target (k,)."""
@@ -146,12 +159,12 @@ class CompiledLibrary:
     def _c(self) -> ctypes.CDLL:
         return ctypes.CDLL(str(self.path))
 
-    def _call(self, function: str, inputs: list[Array], outputs: list[Array]) -> int:
+    def _call(self, function: str, inputs: list[Array], outputs: list[Array], which: tuple[int, ...] = ()) -> int:
         run = getattr(self._c, f"{self.name}_{function}")
         arrays = [self.numbers(array) for array in inputs] + outputs
-        for array in arrays[:2]:  # q and dq, or q and an output; C would read beyond the end of a short array
+        for array in arrays[: len(inputs)][:2]:  # q and dq; C would read beyond the end of a short array
             require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
-        return int(run(*(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
+        return int(run(*map(int, which), *(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
 
 
 def gain_numbers(controller: Controller) -> Array:

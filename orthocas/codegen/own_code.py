@@ -1,19 +1,31 @@
-"""C code by hand for functions whose graphs CasADi turns into slow loops: inverses of large matrices (ours)."""
+"""C code by hand for functions whose graphs CasADi turns into slow loops, and for those that read tables (ours)."""
+
+import re
+from collections.abc import Mapping
 
 import casadi as ca
 
 from orthocas.codegen.work_arrays import in_order_of_generation
 from orthocas.control.linear_algebra import LARGE_INVERSE
 
+_HAND_ON = re.compile(r"(?<=\(arg1, res1, iw, w), 0\)")
 
-def with_own_code(blocks: dict[str, str], functions: list[ca.Function]) -> dict[str, str]:
-    """C code by name, with that of inverses replaced; arguments are those of `work_arrays.compacted`."""
-    changed = dict(blocks)
+
+def with_own_code(blocks: dict[str, str], functions: list[ca.Function], bodies: Mapping[str, str]) -> dict[str, str]:
+    """C code by name, with that of inverses and of functions with given bodies replaced.
+
+    Args:
+        blocks: as in `work_arrays.compacted`.
+        functions: as in `work_arrays.compacted`.
+        bodies: C bodies by name of the function. If there are any, calls hand `mem` on.
+    """
+    changed = {name: _HAND_ON.sub(", mem)", block) for name, block in blocks.items()} if bodies else dict(blocks)
     for number, function in enumerate(in_order_of_generation(functions)):
-        if function.name() == LARGE_INVERSE:
+        own = _INVERSE.replace("SIZE", str(function.size1_in(0))) if function.name() == LARGE_INVERSE else None
+        body = bodies.get(function.name(), own)
+        if body is not None:
             name = f"casadi_f{number}"
-            head = blocks[name].split("{", 1)[0]
-            changed[name] = head + _INVERSE.replace("SIZE", str(function.size1_in(0)))
+            changed[name] = blocks[name].split("{", 1)[0] + body
     return changed
 
 

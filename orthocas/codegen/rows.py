@@ -10,7 +10,7 @@ from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.casadi_tools.tape import ARITHMETIC, to_tape
 from orthocas.chart import Chart
 from orthocas.checks import Array
-from orthocas.codegen.interface import filled
+from orthocas.codegen.filling import filled
 from orthocas.codegen.numbers import numbers
 from orthocas.codegen.precision import DOUBLE, Precision
 from orthocas.coordinates.fitted import Coordinates

@@ -10,8 +10,9 @@ import numpy as np
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.chart import Chart
 from orthocas.checks import Array
-from orthocas.codegen.generate import generate_c
+from orthocas.codegen.chart_source import ChartSource
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
+from orthocas.codegen.library_files import write_library
 from orthocas.control import Controller, PDPlus
 from orthocas.domains import contains
 from orthocas.errors import CompileError
@@ -40,7 +41,7 @@ def control_tick(chart: Chart) -> float:
     with draft_folder() as folder:
         with deferred():  # CasADi may lose Ctrl-C while it builds functions
             law = PDPlus(chart, 50.0, coupling="decoupled")
-            generated = generate_c(chart, folder, law, "tick")
+            generated = write_library(ChartSource(chart), folder, law, "tick")
         library = CompiledLibrary(compile_shared(generated, folder), "tick", chart.n)
         about = time_ticks([(law, library)], 200)[0].median
         calls = int(np.clip(_MICROSECONDS / about, 1_000, 100_000))

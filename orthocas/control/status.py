@@ -69,7 +69,9 @@ def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> 
     cut = _cut(chosen, limit, keep_direction)
     saturated = ca.logic_and(from_law, ca.logic_not(ca.logic_all(ca.fabs(chosen) <= limit)))
     status = ca.if_else(saturated, float(ControlStatus.SATURATED), status)
-    return ca.Function(GUARD, [command, fallback, limit, q, inputs, volume, smallest], [cut, status])
+    given = [command, fallback, limit, q, inputs, volume, smallest]
+    names = ["command", "fallback", "limit", "q", "inputs", "volume", "smallest"]
+    return ca.Function(GUARD, given, [cut, status], names, ["cut", "status"])
 
 
 def _chosen(from_law: ca.SX, command: ca.SX, fallback: ca.SX) -> ca.SX:

@@ -1,0 +1,97 @@
+"""Generated C of one chart: its box, and the functions as CasADi writes them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar
+
+import casadi as ca
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.codegen.description import chart_values
+from orthocas.codegen.filling import filled
+from orthocas.codegen.numbers import numbers
+from orthocas.codegen.precision import Precision, bounds_inside
+from orthocas.codegen.words import words
+from orthocas.control import Controller
+from orthocas.domains import Conditioned, Domain, contains, reach
+from orthocas.errors import InvalidValueError
+
+
+@dataclass(frozen=True, eq=False)
+class ChartSource:
+    """One chart."""
+
+    chart: Chart
+    own_code: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    title: ClassVar[str] = "chart"
+
+    @property
+    def condition(self) -> Conditioned | None:
+        """The domain, if it has a condition."""
+        domain = self.chart.problem.domain
+        return domain if isinstance(domain, Conditioned) else None
+
+    @property
+    def somewhere(self) -> Array:
+        """A joint position of the domain between its centre and a corner, (n,)."""
+        return position_within(self.chart.problem.domain)
+
+    def law(self, controller: Controller) -> Controller:
+        """The law as it is."""
+        if (controller.chart or self.chart) is not self.chart or controller.problem is not self.chart.problem:
+            raise InvalidValueError("controller", f"a {controller.name} of another chart", "a controller of this chart")
+        return controller
+
+    def graph(self, graph: ca.Function) -> ca.Function:
+        """The graph as it is."""
+        return graph
+
+    def stack_bytes(self, size: int) -> int:
+        """None."""
+        return 0
+
+    def values(self, known: Mapping[str, str], precision: Precision) -> dict[str, str]:
+        """The domain as a box, and no number of a chart in any function."""
+        domain = self.chart.problem.domain
+        lowest, highest = bounds_inside(domain, precision)
+        values = {
+            **chart_values(self.chart),
+            "domain_lower": numbers(lowest),
+            "domain_upper": numbers(highest),
+            "domain_centre": numbers(domain.centre),
+            "domain_reach": numbers(reach(domain)),
+            "is_clear": "1" if self.condition is None else "is_clear(q)",
+            "mem": "0",
+            "dynamics_status": "inside(q) ? {NAME}_OK : {NAME}_OUTSIDE_DOMAIN".format(**known),
+            **dict.fromkeys(("which", "that", "check_that", "require_chart", "tables_c", "atlas_functions_h"), ""),
+        }
+        everything = {**known, **values}
+        values["clear_c"] = "" if self.condition is None else condition_code(self.condition, everything)
+        everything["clear_c"] = values["clear_c"]
+        for place, template in _PARTS.items():
+            values[place] = filled(template, everything)
+        return values
+
+
+def condition_code(domain: Conditioned, values: Mapping[str, str]) -> str:
+    """The test of the condition of a domain."""
+    condition = {"pivots": str(domain.pivots.size1_out(0)), "condition": "\n * ".join(words([domain.heading]))}
+    return filled("clear.c", {**values, **condition})
+
+
+def position_within(domain: Domain) -> Array:
+    """A joint position of a domain between its centre and a corner, (n,)."""
+    shares = [0.5**k for k in range(1, 20) if contains(domain, domain.centre + 0.5**k * domain.half_width)]
+    return np.round(domain.centre + (shares[0] if shares else 0.0) * domain.half_width, 3)
+
+
+_PARTS = {
+    "about_chart": "about_box.h",
+    "about_md": "about_box.md",
+    "domain_h": "box.h",
+    "domain_c": "bounds.c",
+    "inside_c": "box.c",
+}

@@ -1,0 +1,10 @@
+"""Templates of generated files with their placeholders filled in."""
+
+from collections.abc import Mapping
+from importlib.resources import files
+from string import Template
+
+
+def filled(template: str, values: Mapping[str, str]) -> str:
+    """A template of `templates/` with its placeholders filled in."""
+    return Template((files("orthocas.codegen") / "templates" / f"{template}.in").read_text()).substitute(values)

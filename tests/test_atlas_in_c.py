@@ -1,0 +1,158 @@
+"""An atlas in C: the chart that Python finds, its values, small tables, and nothing that traps."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from charts import with_metric
+from programs import built, needs_c, output_of
+
+import orthocas as oc
+from orthocas.checks import Array
+from orthocas.codegen import CompiledLibrary, GeneratedC, compile_shared
+from orthocas.control import ControlStatus
+from orthocas.errors import InvalidValueError
+
+pytestmark = needs_c
+
+ASKED = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.6, splits=4)
+WAY = np.linspace([0.6, 2.6, 0.9], [0.6, 3.6, -0.9], 40)  # through half a turn of the second joint
+
+
+@pytest.fixture(scope="module")
+def atlas(planar_x: oc.Problem, tmp_path_factory: pytest.TempPathFactory) -> oc.Atlas:
+    """Charts around a way that leads through several of them, and through full turns of a joint."""
+    path = tmp_path_factory.mktemp("atlas") / "arm.orthocas-atlas"
+    with ThreadPoolExecutor(1) as executor:
+        return oc.build_atlas(with_metric(planar_x, "inertia"), path, ASKED, region=WAY, radius=0.5, executor=executor)
+
+
+@pytest.fixture(scope="module")
+def whole(atlas: oc.Atlas, tmp_path_factory: pytest.TempPathFactory) -> GeneratedC:
+    return oc.generate_c(atlas, tmp_path_factory.mktemp("whole"), name="arm")
+
+
+@pytest.fixture(scope="module")
+def library(whole: GeneratedC) -> CompiledLibrary:
+    return CompiledLibrary(compile_shared(whole, whole.folder), "arm", 3, r=2)
+
+
+@pytest.fixture(scope="module")
+def positions(atlas: oc.Atlas) -> Array:
+    """Positions around the way, and on borders of cells and of boxes."""
+    rng = np.random.default_rng(5)
+    somewhere = WAY[rng.integers(len(WAY), size=2500)] + rng.uniform(-0.7, 0.7, (2500, 3))
+    somewhere += 2 * np.pi * rng.integers(-1, 2, somewhere.shape)
+    return np.vstack([somewhere, *(on_borders(atlas, number, rng) for number in range(len(atlas)))])
+
+
+def on_borders(atlas: oc.Atlas, number: int, rng: np.random.Generator) -> Array:
+    """Positions of a box with one joint or all on a border of the box or of its cell, (20, n)."""
+    box, shares = atlas.box(number), rng.uniform(-1, 1, (20, 3))
+    cell = 1 / (1 + ASKED.overlap)
+    for row in range(20):
+        shares[row, rng.integers(3, size=1 + 2 * (row % 2))] = rng.choice([-1.0, -cell, cell, 1.0])
+    return np.asarray(box.centre + box.half_width * shares)
+
+
+def holds(atlas: oc.Atlas, number: int, q: Array) -> bool:
+    box = atlas.box(number, near=q)
+    return bool((np.abs(q - box.centre) <= box.half_width * (1 + 1e-9)).all())
+
+
+def test_chart_in_c_is_the_one_that_python_finds(atlas: oc.Atlas, library: CompiledLibrary, positions: Array) -> None:
+    """On borders both may be right: rounding decides."""
+    assert len(atlas) > 10
+    rng = np.random.default_rng(2)
+    for current in (np.full(len(positions), -1), rng.integers(-1, len(atlas), len(positions))):
+        wanted = atlas.chart_at(positions, current)
+        found = np.array([library.chart_at(*pair) for pair in zip(positions, current.tolist(), strict=True)])
+        assert (found[:2500] == wanted[:2500]).all()
+        for row in np.flatnonzero(found != wanted):
+            assert all(number < 0 or holds(atlas, number, positions[row]) for number in (found[row], wanted[row]))
+        assert (found != wanted).mean() < 0.01
+    assert (wanted[:2500] >= 0).mean() > 0.5
+    assert (wanted[:2500] < 0).sum() > 100
+
+
+def test_values_in_c_are_those_of_python(atlas: oc.Atlas, library: CompiledLibrary, positions: Array) -> None:
+    charts = atlas.chart_at(positions)
+    q, charts = positions[charts >= 0], charts[charts >= 0]
+    assert len(q) > 2000
+    xi, J = atlas.xi(q, charts), atlas.jacobian(q, charts)
+    found = [library.xi(point, int(chart)) for point, chart in zip(q, charts, strict=True)]
+    assert {row[2] for row in found} == {ControlStatus.OK}
+    scale = np.abs(J).max(axis=(1, 2))
+    assert (np.abs(np.array([row[0] for row in found]) - xi).max(axis=1) <= 1e-12 * np.abs(xi).max()).all()
+    assert (np.abs(np.array([row[1] for row in found]) - J).max(axis=(1, 2)) <= 1e-12 * scale).all()
+
+
+def test_functions_of_the_chart_in_c_are_those_of_the_single_charts(
+    atlas: oc.Atlas, library: CompiledLibrary, positions: Array
+) -> None:
+    numbers = atlas.chart_at(positions[:400])
+    v, w = np.random.default_rng(1).normal(size=(2, 3))
+    seen = set()
+    for q, number in zip(positions[:400], numbers.tolist(), strict=True):
+        if number < 0 or number in seen:
+            continue
+        seen.add(number)
+        chart = atlas.chart(number, near=q)
+        phi, J, status = library.chart(q, number)
+        assert status == ControlStatus.OK
+        assert np.abs(phi - chart.phi(q)).max() < 1e-12
+        assert np.abs(J - chart.jacobian(q)).max() < 1e-12
+        bend = chart.function("second_derivative")(q, v, w).full()[:, 0]
+        assert np.abs(library.curvature(q, v, w, number)[0] - bend).max() < 1e-11
+        back, status = library.inverse(phi, q + 0.01, number)
+        assert status == ControlStatus.OK
+        assert np.abs(back - q).max() < 1e-8
+    assert len(seen) > 10
+    assert library.check() < 1e-12
+
+
+@pytest.mark.slow
+def test_hostile_numbers_give_statuses_under_sanitizers(whole: GeneratedC, tmp_path: Path) -> None:
+    flags = ("-DCALLS=200000", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    assert int(output_of(built(whole, "atlas_calls.c", tmp_path, *flags))) > 1000
+
+
+def test_fused_products_change_values_by_rounding_only(
+    whole: GeneratedC, library: CompiledLibrary, atlas: oc.Atlas, positions: Array, tmp_path: Path
+) -> None:
+    """Processors with fused multiply-add round once where others round twice, if the compiler may."""
+    fused = CompiledLibrary(
+        compile_shared(whole, tmp_path, ("-O2", "-march=native", "-ffp-contract=fast")), "arm", 3, r=2
+    )
+    for q in positions[::7]:
+        chart = library.chart_at(q)
+        other = fused.chart_at(q, chart)
+        if other != chart:
+            assert all(number < 0 or holds(atlas, number, q) for number in (chart, other))
+        elif chart >= 0:
+            assert np.abs(fused.xi(q, chart)[1] - library.xi(q, chart)[1]).max() < 1e-12
+
+
+def test_part_has_the_charts_of_a_way_with_their_images(atlas: oc.Atlas, tmp_path: Path) -> None:
+    way = WAY[:15]
+    part = oc.AtlasPart.along(atlas, way, radius=0.05)
+    on_the_way = set(atlas.chart_at(way).tolist())
+    assert on_the_way <= set(part.charts.tolist())
+    assert len(part) < len(atlas)
+    generated = oc.generate_c(part, tmp_path, name="arm")
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3, r=2)
+    for q in way:
+        assert part.charts[library.chart_at(q)] == atlas.chart_at(q)
+    far = [library.chart_at(q) for q in WAY[25:]]
+    assert max(far) == -1  # not in the part
+    assert f"#define ARM_CHARTS {len(part)}\n" in (tmp_path / "arm.h").read_text()
+
+
+def test_charts_of_another_atlas_are_refused(atlas: oc.Atlas) -> None:
+    with pytest.raises(InvalidValueError, match="charts"):
+        oc.AtlasPart(atlas, [len(atlas)])
+    with pytest.raises(InvalidValueError, match="at least one chart of the atlas"):
+        oc.AtlasPart(atlas, [])
+    with pytest.raises(InvalidValueError, match=r"q\[0\] is .*, expected a position with a chart"):
+        oc.AtlasPart.along(atlas, [[0.6, 0.5, 0.9]])
