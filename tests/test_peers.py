@@ -3,6 +3,8 @@
 from argparse import Namespace
 
 import numpy as np
+import peer_arms
+import peer_methods
 import pytest
 import redundancy_peers
 
@@ -10,11 +12,11 @@ import redundancy_peers
 @pytest.mark.slow
 @pytest.mark.parametrize("task", redundancy_peers.TASKS)
 def test_charts_close_circles_and_come_back_where_the_pseudo_inverse_drifts(task: str) -> None:
-    arm = redundancy_peers.Arm("iiwa", task)
+    arm = peer_arms.Arm("iiwa", task)
     found = {}
-    for name, build in redundancy_peers.methods(arm):
+    for name, build in peer_methods.methods(arm):
         if name in ("chart", "stereographic SEW", "pseudo-inverse"):
-            line = redundancy_peers.row(name, build(), arm, Namespace(circles=2, lines=1, targets=3))
+            line = redundancy_peers.row(name, build(), arm, Namespace(circles=2, lines=1, targets=3, peer_targets=3))
             found[name] = [float(cell.split()[0]) for cell in line.strip("| ").split("|")[1:]]
     drift, error, reached, left = (
         dict(zip(found, column, strict=True)) for column in list(zip(*found.values(), strict=True))[:4]
@@ -29,7 +31,7 @@ def test_charts_close_circles_and_come_back_where_the_pseudo_inverse_drifts(task
 
 
 def test_the_model_of_the_peers_is_that_of_the_chart() -> None:
-    arm = redundancy_peers.Arm("panda", "pose")
+    arm = peer_arms.Arm("panda", "pose")
     q = arm.home + 0.1 * np.sin(np.arange(7))
     target = arm.target(q)
     assert np.abs(arm.error(q, target.placement)).max() < 1e-12
