@@ -47,8 +47,8 @@ def row(name: str, task: str, settings: oc.AtlasSettings, share: float, jobs: in
         )
         seconds = time.perf_counter() - start
         found, data = oc.evaluate_atlas(atlas, 20_000), atlas.as_dict()
-    records = atlas._stock.records
-    tiles = len(set(atlas._index.orbits.fitted.tolist()))
+    records = atlas.stock.records
+    tiles = len(set(atlas.index.orbits.fitted.tolist()))
     done = int((records["parent"] < 0).sum())
     whole = tiles / done
     built = found.outcome != 5

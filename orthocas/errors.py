@@ -215,5 +215,9 @@ class NoExpressionError(OrthocasError, TypeError):
     """A chart has no closed-form CasADi expression."""
 
 
+class SchedulerError(OrthocasError, RuntimeError):
+    """Dask is not installed, or its scheduler does not answer."""
+
+
 class CertifyError(OrthocasError, ValueError):
     """A chart cannot be certified, or a stored certificate does not belong to it."""

@@ -132,7 +132,7 @@ def test_charts_are_as_good_as_asked_for(atlas: oc.Atlas) -> None:
 
 
 def test_neighbours_are_aligned(atlas: oc.Atlas) -> None:
-    found = align(atlas._index)
+    found = align(atlas.index)
     assert found.meetings > 20
     assert found.consistent > 0.9
     assert found.left <= 1.3 * found.jump
@@ -176,7 +176,7 @@ def test_build_in_parts_gives_the_same_cells(atlas: oc.Atlas, tmp_path: Path) ->
     first = built(path, share=0.3)
     assert 0 < len(first) < len(atlas)
     again = built(path)
-    assert cells_of(again._stock) == cells_of(atlas._stock)
+    assert cells_of(again.stock) == cells_of(atlas.stock)
 
 
 def test_build_goes_on_after_a_process_died_while_it_wrote(atlas: oc.Atlas, tmp_path: Path) -> None:
@@ -186,7 +186,7 @@ def test_build_goes_on_after_a_process_died_while_it_wrote(atlas: oc.Atlas, tmp_
         path.write_bytes(content[:cut])
         with pytest.raises(AtlasFileError, match="truncated"):
             oc.Atlas.load(path)
-        assert cells_of(built(path)._stock) == cells_of(atlas._stock)
+        assert cells_of(built(path).stock) == cells_of(atlas.stock)
 
 
 def test_file_of_other_settings_is_not_gone_on_with(atlas: oc.Atlas) -> None:
@@ -267,7 +267,7 @@ def test_work_of_killed_processes_runs_again(atlas: oc.Atlas, tmp_path: Path, mo
     monkeypatch.setattr("orthocas.atlases.build.Processes", Deadly)
     found = oc.build_atlas(planar(), tmp_path / "arm.orthocas-atlas", ASKED, jobs=1)
     assert Deadly.kills == 3
-    assert cells_of(found._stock) == cells_of(atlas._stock)
+    assert cells_of(found.stock) == cells_of(atlas.stock)
 
 
 @pytest.mark.slow
@@ -284,8 +284,8 @@ def test_build_goes_on_after_its_process_was_killed(atlas: oc.Atlas, tmp_path: P
     process.kill()
     process.wait()
     before = len(read_stock(path).records)
-    assert 0 < before < len(atlas._stock.records)
-    assert cells_of(built(path)._stock) == cells_of(atlas._stock)
+    assert 0 < before < len(atlas.stock.records)
+    assert cells_of(built(path).stock) == cells_of(atlas.stock)
 
 
 @pytest.mark.slow
@@ -296,7 +296,7 @@ def test_workers_of_dask_need_no_shared_disk(atlas: oc.Atlas, tmp_path: Path) ->
         client.get_executor() as executor,
     ):
         found = oc.build_atlas(planar(), tmp_path / "arm.orthocas-atlas", ASKED, executor=executor)
-    assert cells_of(found._stock) == cells_of(atlas._stock)
+    assert cells_of(found.stock) == cells_of(atlas.stock)
 
 
 def test_posture_is_asked_for_without_a_jump_where_charts_change(atlas: oc.Atlas) -> None:
@@ -352,7 +352,7 @@ def test_boxes_without_a_proof_are_halved(tmp_path: Path) -> None:
         found = oc.build_atlas(planar(), tmp_path / "a", asked, region=region, radius=0.01, executor=executor)
     assert found.as_dict()["certified"] == 0
     assert found.fitted > 0
-    records = found._stock.records
+    records = found.stock.records
     assert (records["outcome"][records["levels"].sum(axis=1) == 0] == Outcome.SPLIT).all()
     assert (records["outcome"][records["levels"].sum(axis=1) == 1] == Outcome.CHART).all()
 
@@ -405,8 +405,8 @@ def test_bad_files_of_postures_are_named(tmp_path: Path, text: str, word: str) -
 
 
 def test_jobs_are_independent_of_each_other(atlas: oc.Atlas) -> None:
-    plan = packed(atlas._stock.plan)
-    records = atlas._stock.records[:6]
+    plan = packed(atlas.plan)
+    records = atlas.stock.records[:6]
     cells = [
         Cell(int(r["tile"]), tuple(r["levels"].tolist()), tuple(r["places"].tolist())) for r in reversed(list(records))
     ]

@@ -17,7 +17,7 @@ from orthocas.certificates import Subdivision
 from orthocas.certificates.subdivision import OPEN, PROVED
 from orthocas.cli.commands import app_for
 from orthocas.coordinates.fitted import Coordinates
-from orthocas.errors import CertifyError, ChartFileError, Interrupted, InvalidValueError
+from orthocas.errors import CertifyError, ChartFileError, Interrupted, InvalidValueError, SchedulerError
 from orthocas.minimising.watch import Progress
 
 
@@ -153,4 +153,4 @@ def test_the_command_names_a_missing_scheduler(tmp_path: Path) -> None:
     chart().save(tmp_path / "a.chart")
     done = command("certify", tmp_path / "a.chart", "--scheduler", "tcp://127.0.0.1:1")
     assert done.exit_code != 0
-    assert isinstance(done.exception, CertifyError)
+    assert isinstance(done.exception, SchedulerError)

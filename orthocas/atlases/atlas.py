@@ -13,7 +13,7 @@ from orthocas.atlases.chart_of_box import chart_of, clipped, moved
 from orthocas.atlases.evaluation import Evaluation
 from orthocas.atlases.index import Index
 from orthocas.atlases.outcomes import Outcome
-from orthocas.atlases.plan import AtlasSettings
+from orthocas.atlases.plan import AtlasSettings, Plan
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
 from orthocas.checks import (
@@ -85,6 +85,21 @@ class Atlas(Shown):
     def path(self) -> Path:
         """The file."""
         return self._stock.path
+
+    @property
+    def stock(self) -> Stock:
+        """What the file holds, for the other modules of atlases."""
+        return self._stock
+
+    @property
+    def plan(self) -> Plan:
+        """What the boxes share."""
+        return self._stock.plan
+
+    @property
+    def index(self) -> Index:
+        """The search for charts."""
+        return self._index
 
     @property
     def problem(self) -> Problem:

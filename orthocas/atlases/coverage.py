@@ -116,11 +116,11 @@ def evaluate_atlas(atlas: Atlas, samples: int = 100_000, seed: int = 1) -> Cover
     """
     require_kind("atlas", atlas, Atlas)
     count, seed = require_count("samples", samples), require_count("seed", seed, least=0)
-    plan, domain = atlas._stock.plan, atlas.problem.domain
+    plan, domain = atlas.plan, atlas.problem.domain
     joints = list(plan.joints)
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
     drawn = np.random.default_rng((seed, 1)).uniform(low, high, (count, plan.problem.n))
-    drawn[:, joints] = atlas._stock.region.sample(count, seed)
+    drawn[:, joints] = atlas.stock.region.sample(count, seed)
     clear = np.concatenate(
         [
             plan.singular_values(drawn[k : k + _PIECE]) > plan.settings.least_singular_value
@@ -130,22 +130,22 @@ def evaluate_atlas(atlas: Atlas, samples: int = 100_000, seed: int = 1) -> Cover
     q = drawn[clear]
     charts = atlas.chart_at(q)
     leak, conditioning = _quality(atlas, q, charts)
-    records = atlas._stock.records
+    records = atlas.stock.records
     proved = np.zeros(len(q), dtype=bool)
     inside = charts >= 0
-    fitted = atlas._stock.charts[atlas._index.rows(charts[inside])[1]]
+    fitted = atlas.stock.charts[atlas.index.rows(charts[inside])[1]]
     proved[inside] = records["certified"][fitted] > 0
     asked = plan.settings
     return Coverage(
         len(atlas),
-        atlas._stock.contents.size,
+        atlas.stock.contents.size,
         count,
         q,
         charts,
         proved,
         leak,
         conditioning,
-        atlas._index.outcomes(q[:, joints]),
+        atlas.index.outcomes(q[:, joints]),
         np.asarray(plan.problem.robot.tip_position(q)),
         plan.problem.robot.joint_names,
         (low, high),
@@ -155,7 +155,7 @@ def evaluate_atlas(atlas: Atlas, samples: int = 100_000, seed: int = 1) -> Cover
 
 def _quality(atlas: Atlas, q: Array, charts: Indices) -> tuple[Array, Array]:
     """Leak [deg], root mean square over fitted coordinates, and conditioning at each position; NaN without a chart."""
-    plan = atlas._stock.plan
+    plan = atlas.plan
     leak, conditioning = np.full(len(q), np.nan), np.full(len(q), np.nan)
     active = list(plan.active)
     inside = np.flatnonzero(charts >= 0)

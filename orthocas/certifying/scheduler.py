@@ -5,7 +5,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from importlib import import_module
 
-from orthocas.errors import CertifyError
+from orthocas.errors import SchedulerError
 
 
 @contextmanager
@@ -13,16 +13,16 @@ def scheduler_executor(address: str) -> Iterator[Executor]:
     """An executor that runs on the workers of a Dask scheduler.
 
     Raises:
-        CertifyError: if Dask is not installed, or the scheduler does not answer.
+        SchedulerError: if Dask is not installed, or the scheduler does not answer.
     """
     try:
         distributed = import_module("distributed")
     except ImportError:
-        raise CertifyError("a scheduler needs Dask, expected the extra: pip install 'orthocas[dask]'") from None
+        raise SchedulerError("a scheduler needs Dask, expected the extra: pip install 'orthocas[dask]'") from None
     try:
         client = distributed.Client(address, timeout="10s")
     except (OSError, ValueError, TimeoutError) as error:
-        raise CertifyError(f"the scheduler {address} does not answer: {error}") from None
+        raise SchedulerError(f"the scheduler {address} does not answer: {error}") from None
     with client:
         executor: Executor = client.get_executor()
         yield executor

@@ -51,13 +51,13 @@ def run_physics(
     def tick(k: int) -> Array:
         q, dq = np.split(np.concatenate([plant.q, plant.dq]) + errors[k], 2)
         sent = law(q, dq, wanted[k])
-        plant.step(sent[: loop.n], 1 / rate, _push(plant, loop.loads, shares[k]))
+        plant.step(sent[: loop.n], 1 / rate, apply_pushes(plant, loop.loads, shares[k]))
         return np.concatenate([plant.q, plant.dq, sent])
 
     yield from pieces(tick, times, 1 / rate, 2 * loop.n)
 
 
-def _push(plant: MuJoCoPlant, loads: Loads, shares: Array) -> Array | None:
+def apply_pushes(plant: MuJoCoPlant, loads: Loads, shares: Array) -> Array | None:
     """Apply the forces of the pushes for a tick of which they last a share each. Returns their joint torques (n,)."""
     plant.release()
     if not shares.any():

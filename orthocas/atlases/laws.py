@@ -1,0 +1,173 @@
+"""Control laws on atlases: laws of charts with hand-overs, and an impedance whose potential is blended (ours)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.atlases.asked_posture import AskedPosture
+from orthocas.atlases.atlas import Atlas
+from orthocas.atlases.blend import Blend
+from orthocas.casadi_tools.cached import cached_property
+from orthocas.chart import Chart
+from orthocas.checks import Array, require_kind
+from orthocas.control.controller import Controller
+from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
+from orthocas.control.status import ControlStatus
+from orthocas.errors import InvalidValueError
+
+_LAWS = 16  # built for charts, the last ones
+
+
+@dataclass(frozen=True)
+class Command:
+    """What a law says at one instant."""
+
+    torque: Array  #: (n,) [N m] or [N]
+    status: int  #: `ControlStatus`
+    storage: float  #: energy of robot and springs as the law sees it [J]
+    dissipated: float  #: power of its damping [W]
+
+
+class AtlasLaw(Protocol):
+    """A torque law that follows a posture through the charts of an atlas."""
+
+    @property
+    def atlas(self) -> Atlas:
+        """The atlas."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Short name."""
+        ...
+
+    def command(self, q: Array, dq: Array, asked: AskedPosture) -> Command:
+        """The torque for a state and the posture asked for, whose chart is that of q."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class HandedOver:
+    """A law of charts, for example `lambda chart: oc.control.PDPlus(chart, 60.0)`, in the chart of the moment.
+
+    References are mapped with velocity and acceleration at hand-overs. The torque changes there by the difference of
+    the springs' shapes, which is as small as the tracking error. V jumps by the difference of the springs' energies.
+
+    Args:
+        atlas: the atlas.
+        law: builds the law of a chart. Gains refer to the coordinates of the chart.
+    """
+
+    atlas: Atlas
+    law: Callable[[Chart], Controller]
+    _built: dict[int, Controller] = field(default_factory=dict, repr=False)
+
+    @property
+    def name(self) -> str:
+        """The name of the law of charts."""
+        return next(iter(self._built.values())).name if self._built else "law of charts"
+
+    def command(self, q: Array, dq: Array, asked: AskedPosture) -> Command:
+        """The torque of the law of the chart."""
+        law = self._of(asked)
+        inputs = (q, dq, *asked.phi, *law.gains.values())
+        torque, status = law.function.call([*inputs])
+        storage, power = (0.0, 0.0) if law.energy is None else (float(v) for v in law.energy.call([*inputs]))
+        return Command(np.array(torque).ravel(), int(status), storage, power)
+
+    def _of(self, asked: AskedPosture) -> Controller:
+        if asked.number not in self._built:
+            law = self.law(asked.chart)
+            if law.command != "torque":
+                raise InvalidValueError("law", f"one that commands {law.command}", "a torque law")
+            while len(self._built) >= _LAWS:
+                self._built.pop(next(iter(self._built)))
+            self._built[asked.number] = law
+        return self._built[asked.number]
+
+
+@dataclass(frozen=True, eq=False)
+class BlendedImpedance:
+    """tau = g - J_x^T K_x e_x - sum_k (w_k J_k^T K e_k + V_k grad w_k) - D dq on overlapping charts k.
+
+    The potential V(q) = 1/2 e_x^T K_x e_x + sum_k w_k(q) V_k(q), with V_k = 1/2 e_k^T K e_k, e_k = xi_k(q) - xi_k(q_d)
+    and the weights of `Blend`, is a function of q alone, so the loop is passive for a posture q_d at rest: the energy
+    1/2 dq^T M dq + V changes by -dq^T D dq. D = 2 zeta (M # S), with S = J_x^T K_x J_x + sum_k w_k J_k^T K J_k and the
+    geometric mean #, is symmetric and positive semi-definite everywhere. There is no hand-over: the torque is a smooth
+    function of q.
+
+    Args:
+        atlas: the atlas.
+        stiffness: of the task, then of xi, (n,), > 0 [N/m, J]; every chart has the same.
+        damping_ratio: zeta >= 0.
+        limit: largest torque of each joint; default the effort limits of the robot.
+    """
+
+    atlas: Atlas
+    stiffness: Array
+    damping_ratio: float
+    limit: Array
+
+    name = "blended_impedance"
+
+    def __init__(
+        self, atlas: Atlas, stiffness: ArrayLike, damping_ratio: float = 0.7, limit: ArrayLike | None = None
+    ) -> None:
+        require_kind("atlas", atlas, Atlas)
+        for name, value in {
+            "atlas": atlas,
+            "stiffness": positive_gains("stiffness", stiffness, atlas.problem.n),
+            "damping_ratio": float(non_negative_gains("damping_ratio", damping_ratio, 1)[0]),
+            "limit": command_limit("limit", limit, atlas.problem.robot.effort_limits),
+        }.items():
+            object.__setattr__(self, name, value)
+
+    def command(self, q: Array, dq: Array, asked: AskedPosture) -> Command:
+        """The torque; its spring is that of `potential`."""
+        robot = self.atlas.problem.robot
+        V, slope, S = self.potential(q, asked.q, asked.number)
+        M = np.array(robot.mass_matrix(q))
+        D = 2 * self.damping_ratio * _geometric_mean(M, S)
+        wanted = np.array(robot.gravity(q)).ravel() - slope - D @ dq
+        torque = np.clip(wanted, -self.limit, self.limit)
+        status = ControlStatus.OK if np.array_equal(torque, wanted) else ControlStatus.SATURATED
+        return Command(torque, int(status), float(V + dq @ M @ dq / 2), float(dq @ D @ dq))
+
+    def potential(self, q: Array, q_asked: Array, near: int) -> tuple[float, Array, Array]:
+        """V [J], dV/dq (n,), and the stiffness of the joints S (n, n), at a position.
+
+        Args:
+            q: the position (n,).
+            q_asked: where V is zero, (n,).
+            near: a chart whose box holds q.
+        """
+        problem = self.atlas.problem
+        m, n = problem.m, problem.n
+        charts, weights, rises = self._blend.at(q, near)
+        K_x, K = self.stiffness[:m], self.stiffness[m:]
+        both = np.stack([q, q_asked])
+        e = np.subtract(*problem.task.batched(both)[0])
+        J_x = problem.task.batched_jacobian(q[None])[0].reshape(m, n)
+        k = len(charts)
+        xi = self.atlas.xi(np.repeat(both, k, axis=0), np.tile(charts, 2))
+        errors, J = xi[:k] - xi[k:], self.atlas.jacobian(np.tile(q, (k, 1)), charts)
+        energies = (errors**2 @ K) / 2
+        V = (e**2 @ K_x) / 2 + weights @ energies
+        slope = J_x.T @ (K_x * e) + np.einsum("k,kri,kr->i", weights, J, K * errors) + energies @ rises
+        S = (J_x.T * K_x) @ J_x + np.einsum("k,kri,r,krj->ij", weights, J, K, J)
+        return float(V), slope, S
+
+    @cached_property
+    def _blend(self) -> Blend:
+        return Blend(self.atlas.index)
+
+
+def _geometric_mean(A: Array, B: Array) -> Array:
+    """A # B = A^1/2 (A^-1/2 B A^-1/2)^1/2 A^1/2 of SPD matrices; for B semi-definite, too."""
+    values, vectors = np.linalg.eigh(A)
+    root, back = ((vectors * values**power) @ vectors.T for power in (0.5, -0.5))
+    inner, turned = np.linalg.eigh(back @ B @ back)
+    return np.asarray(root @ (turned * np.sqrt(inner.clip(0))) @ turned.T @ root)
