@@ -43,9 +43,10 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     fronts = {degree: [judged(degree, value) for value in lambda2] for degree in degrees}
     regular = [judged(degrees[-1], 30.0, value) for value in lambda3]
     figure = Figure(figsize=(10.5, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    _draw_fronts(figure, left, lambda2, fronts)
-    _draw_regularity(right, degrees[-1], lambda3, regular)
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.6, 1))
+    _draw_fronts(figure, figure.add_subplot(grid[:, 0]), lambda2, fronts)
+    upper = figure.add_subplot(grid[0, 1])
+    _draw_regularity(upper, figure.add_subplot(grid[1, 1], sharex=upper), degrees[-1], lambda3, regular)
     figure.savefig(out / "front.png", dpi=150)
     first = fronts[degrees[0]]
     return {
@@ -81,26 +82,22 @@ def _draw_fronts(figure: Figure, axes: Axes, lambda2: tuple[float, ...], fronts:
     axes.grid(alpha=0.3)
 
 
-def _draw_regularity(axes: Axes, degree: int, lambda3: tuple[float, ...], reports: list[Report]) -> None:
+def _draw_regularity(upper: Axes, lower: Axes, degree: int, lambda3: tuple[float, ...], reports: list[Report]) -> None:
+    """The conditioning above, and the task angle that it costs below."""
     places = np.arange(len(lambda3))
-    axes.plot(places, [r.conditioning.p01 for r in reports], "o-", color="#1f5fa8", label="conditioning, 1 % quantile")
-    axes.plot(places, [r.conditioning.min for r in reports], "s-", color="#7570b3", label="conditioning, minimum")
-    axes.set_xticks(places, [f"{v:g}\n{r.folded_samples}" for v, r in zip(lambda3, reports, strict=True)])
-    axes.set_xlabel(r"$\lambda_3$, with the number of folded samples below")
-    axes.set_ylabel("conditioning")
-    axes.set_ylim(0, 1)
-    axes.set_title(rf"price of a chart without folds, degree {degree}, $\lambda_2 = 30$", fontsize=10)
-    other = axes.twinx()
-    other.plot(
-        places, [r.task_angle.std for r in reports], "^--", color="#d95f02", label="task angle, std [deg] (right)"
+    upper.plot(places, [r.conditioning.p01 for r in reports], "o-", color="#1f5fa8", label="1 % quantile")
+    upper.plot(places, [r.conditioning.min for r in reports], "s-", color="#7570b3", label="minimum")
+    upper.set(ylabel="conditioning", ylim=(0, 1))
+    upper.set_title(rf"price of a chart without folds, degree {degree}, $\lambda_2 = 30$", fontsize=10)
+    upper.legend(fontsize=8, loc="center left")
+    upper.tick_params(labelbottom=False)
+    lower.plot(places, [r.task_angle.std for r in reports], "^-", color="#d95f02")
+    lower.set_xticks(places, [f"{v:g}\n{r.folded_samples}" for v, r in zip(lambda3, reports, strict=True)])
+    lower.set(
+        xlabel=r"$\lambda_3$, with the number of folded samples below", ylabel="task angle,\nstd [deg]", ylim=(0, None)
     )
-    other.set_ylabel("task angle, std [deg]")
-    other.set_ylim(0, None)
-    handles = [*axes.get_lines(), *other.get_lines()]
-    axes.legend(
-        handles, [str(h.get_label()) for h in handles], fontsize=8, loc="lower left", bbox_to_anchor=(0.02, 0.15)
-    )
-    axes.grid(alpha=0.3)
+    for axes in (upper, lower):
+        axes.grid(alpha=0.3)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,9 @@ STEPS = (
 )
 HELD = 16.5  # [s] until this time, the hand is to stay at rest
 RATE = 1000.0  # [Hz]
+OF_XI = ("#d94801", "#1b7837", "#c51b7d", "#c9a000")  # no colour means two things
+OF_JOINTS = ("#000000", "#4d4d4d", "#999999", "#762a83", "#af8dc3", "#8c510a", "#d8b365")
+HAND_COLOUR, ELBOW_COLOUR = "#1f5fa8", "#5ec4d4"
 ELBOW = 4  # of `Robot.joint_points`: the origin of joint 4
 
 
@@ -89,19 +92,19 @@ def figure(chart: oc.Chart, runs: dict[str, Trajectory]) -> Figure:
     picture = Figure(figsize=(8.0, 7.2), layout="constrained")
     rows = picture.subplots(3, 1, sharex=True)
     run = runs["decoupled"]
-    for k in range(chart.m, chart.n):
-        (line,) = rows[0].plot(run.times, run.value[:, k], label=rf"$\xi_{k - chart.m + 1}$")
-        rows[0].plot(run.times, run.reference[:, k], "--", color=line.get_color(), linewidth=0.8)
+    for k, colour in zip(range(chart.m, chart.n), OF_XI, strict=True):
+        rows[0].plot(run.times, run.value[:, k], color=colour, label=rf"$\xi_{k - chart.m + 1}$")
+        rows[0].plot(run.times, run.reference[:, k], "--", color=colour, linewidth=0.8)
     rows[0].set_ylabel("extra coordinates [rad]\n(dashed: desired)")
     for (name, each), style in zip(runs.items(), ("-", "--"), strict=True):
         hand, elbow = displacements(chart.problem.robot, each)
-        rows[1].semilogy(each.times, 1e3 * elbow + 1e-4, style, color="#d95f02", label=f"elbow, {name}")
-        rows[1].semilogy(each.times, 1e3 * hand + 1e-4, style, color="#1f5fa8", label=f"hand, {name}")
+        rows[1].semilogy(each.times, 1e3 * elbow + 1e-4, style, color=ELBOW_COLOUR, label=f"elbow, {name}")
+        rows[1].semilogy(each.times, 1e3 * hand + 1e-4, style, color=HAND_COLOUR, label=f"hand, {name}")
     rows[1].set_ylabel("distance from start [mm]")
     rows[1].set_ylim(1e-3, 1e3)
     rows[1].axvspan(HELD, run.times[-1], color="0.9", label="step in x")
-    for k, joint in enumerate(chart.problem.robot.joint_names):
-        rows[2].plot(run.times, run.command[:, k], label=joint.removeprefix("panda_"))
+    for torque, joint, colour in zip(run.command.T, chart.problem.robot.joint_names, OF_JOINTS, strict=True):
+        rows[2].plot(run.times, torque, color=colour, label=joint.removeprefix("panda_"))
     rows[2].set(ylabel="torque [N m], decoupled", xlabel="time [s]", xlim=(0, run.times[-1]))
     for axes in rows:
         axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))

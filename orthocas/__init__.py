@@ -24,6 +24,7 @@ if not (_Path(__file__).parent / "problems").is_dir():
 
 if TYPE_CHECKING:
     from orthocas import (
+        charts,
         control,
         errors,
         following,
@@ -109,6 +110,7 @@ __all__ = [
     "build_atlas",
     "certified_box",
     "certify",
+    "charts",
     "check",
     "check_certificate",
     "compare",

@@ -43,8 +43,14 @@ def main() -> None:
         command = str(folder / "venv" / "bin" / "orthocas")
         run(command, "fit", "iiwa", "--param", "polynomial:2", "--out", "a.orthocas", cwd=folder)
         sys.stdout.write(run(command, "evaluate", "a.orthocas", "--samples", "5000", cwd=folder))
+        run(command, "charts", "panda-position", "--out", "panda.orthocas", cwd=folder)
         names = run(python, "-m", "zipfile", "-l", str(wheel), cwd=folder)
-        for wanted in ("orthocas/problems/data/iiwa7_r800.urdf", "orthocas/py.typed", "orthocas/solvers/lbfgs.py"):
+        for wanted in (
+            "orthocas/problems/data/iiwa7_r800.urdf",
+            "orthocas/py.typed",
+            "orthocas/solvers/lbfgs.py",
+            "charts/licences/MPL-2.0.txt",
+        ):
             assert wanted in names, wanted
     sys.stdout.write("wheel check passed\n")
 

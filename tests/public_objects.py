@@ -224,6 +224,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "settings of an atlas": oc.AtlasSettings,
     "coverage": lambda: oc.evaluate_atlas(atlas(), 200),
     "certificate": certificate,
+    "card of a ready chart": lambda: oc.charts.card("ur5-position"),
     "fit": fitted,
     "robot": lambda: planar().robot,
     "task": lambda: planar().task,

@@ -69,7 +69,9 @@ class CellResult:
     conditioning_mean: float = float("nan")
     folded_samples: int = 0
     control_tick_us: float = float("nan")  #: a tick of decoupled PD+ as generated C; NaN if not measured
-    history: tuple[tuple[float, float], ...] = ()  #: seconds and training loss during the fit
+    history: tuple[
+        tuple[float, float], ...
+    ] = ()  #: seconds since the start of the fit, and training loss, in its last stage
 
     @property
     def failed(self) -> bool:
@@ -80,11 +82,15 @@ class CellResult:
 def run_cell(cell: Cell) -> CellResult:
     """Fit and evaluate. An error becomes part of the result."""
     history: list[tuple[float, float]] = []
+    stages: list[str] = []
     start = time.perf_counter()
 
     def record(progress: Progress) -> None:
         if _cancelled():
             raise KeyboardInterrupt
+        if progress.stage not in stages:
+            stages.append(progress.stage)
+            history.clear()
         if math.isfinite(progress.value):
             history.append((time.perf_counter() - start, progress.value))
 

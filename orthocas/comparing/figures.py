@@ -17,18 +17,20 @@ from orthocas.showing.picture import Picture
 Colour = tuple[float, float, float, float]
 _HUES = {"linear": "Greys", "polynomial": "Blues", "fourier": "Greens", "mlp": "Oranges", "sew": "Purples"}
 _MARKERS = "osD^vPX*"
+_ASIDE, _WIDE, _HIGH = 16.0, 110.0, 13.0  # of labels: distance from the point, and room [pt]
 _STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)))
 
 
 def front_figure(comparison: Comparison) -> Figure:
     """Task angle against mutual angle of all fits. Fits further down and left are better.
 
-    The colour shows the parametrisation, the marker the solver, and the size the number of parameters. Labels beside
-    the plot give both names and the seconds; lines connect them to the medians over seeds. With one extra coordinate
-    there is no mutual angle, so the axis shows the 1 % quantile of the conditioning.
+    The colour shows the parametrisation, the marker the solver, and the size the number of parameters. Each
+    parametrisation has one label, at its least task angle. A grey line connects the fits that no other one beats in
+    both directions (medians over seeds). With one extra coordinate there is no mutual angle, so the axis shows the 1 %
+    quantile of the conditioning.
     """
     summaries = [summary for summary in comparison.summaries() if summary.failed < summary.seeds]
-    figure = Picture(figsize=(9.6, max(4.6, 1.2 + 0.21 * len(summaries))), layout="constrained")
+    figure = Picture(figsize=(8.6, 5.2), layout="constrained")
     axes = figure.add_subplot()
     good = [result for result in comparison.results if not result.failed]
     single = all(math.isnan(result.mutual_std_deg) for result in good)
@@ -47,24 +49,25 @@ def front_figure(comparison: Comparison) -> Figure:
     axes.set_xlabel("task angle, standard deviation [deg]")
     axes.set_ylabel("conditioning, 1 % quantile (1 is best)" if single else "mutual angle, standard deviation [deg]")
     _scale(axes, [r.task_std_deg for r in good], [] if single else [r.mutual_std_deg for r in good])
-    _label(axes, summaries, single, colours)
+    _draw_front(axes, summaries, single)
     handles = [Line2D([], [], marker=m, linestyle="", color="0.4", label=name) for name, m in markers.items()]
     axes.legend(handles=handles, fontsize=8)
     axes.set_title(f"{_problem(comparison)}: held-out quality; size is the number of parameters", fontsize=10)
     axes.grid(alpha=0.3, which="both")
+    _label(axes, summaries, single, colours)
     return figure
 
 
 def convergence_figure(comparison: Comparison) -> Figure:
-    """Training loss over time, one line per fit. Jumps are new stages with other samples and more parameters."""
-    figure = Picture(figsize=(8.6, 4.6), layout="constrained")
+    """Training loss over time, one line per fit, from the beginning of its last stage: that of all its parameters."""
+    figure = Picture(figsize=(8.6, 5.2), layout="constrained")
     axes = figure.add_subplot()
     drawn = [result for result in comparison.results if result.history]
     colours, styles = _colours(drawn), dict(zip(_names(drawn, "solver"), _STYLES * 3, strict=False))
     for result in drawn:
         seconds, loss = zip(*result.history, strict=True)
         colour = colours[result.parametrisation]
-        axes.plot(seconds, loss, color=colour, linestyle=styles[result.solver], linewidth=1.4, alpha=0.8)
+        axes.plot(seconds, loss, color=colour, linestyle=styles[result.solver], linewidth=1.2, alpha=0.75)
         axes.plot(seconds[-1], loss[-1], ".", color=colour)
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -100,27 +103,45 @@ def _size(parameters: int) -> float:
     return 30 + 25 * math.log10(1 + parameters)
 
 
+def _place(summary: Summary, single: bool) -> tuple[float, float]:
+    """Where a summary lies in the picture."""
+    return summary.task_std_deg, summary.conditioning_p01 if single else summary.mutual_std_deg
+
+
+def _draw_front(axes: Axes, summaries: Sequence[Summary], single: bool) -> None:
+    """Connect the points that no other one beats in both directions; summaries have the least task angle first."""
+    front: list[tuple[float, float]] = []
+    for summary in summaries:
+        x, y = _place(summary, single)
+        if not front or (y > front[-1][1] if single else y < front[-1][1]):
+            front.append((x, y))
+    axes.plot(*zip(*front, strict=True), color="0.6", linewidth=1.0, zorder=0)
+
+
 def _label(axes: Axes, summaries: Sequence[Summary], single: bool, colours: Mapping[str, Colour]) -> None:
-    """Write names and seconds in a column beside the axes, in the order of the points, with lines to them."""
-    places = {(s.parametrisation, s.solver): s.conditioning_p01 if single else s.mutual_std_deg for s in summaries}
-    ordered = sorted(summaries, key=lambda s: (-places[s.parametrisation, s.solver], s.task_std_deg))
-    for k, summary in enumerate(ordered):
+    """Write each parametrisation once, beside its least task angle; labels that would touch move up."""
+    best: dict[str, Summary] = {}
+    for summary in summaries:
+        best.setdefault(summary.parametrisation, summary)
+    axes.margins(x=0.12)
+    axes.figure.draw_without_rendering()  # type: ignore[union-attr]  # so that places in points are known
+    scale = 72 / axes.figure.dpi
+    places = {name: scale * axes.transData.transform(_place(summary, single)) for name, summary in best.items()}
+    used: list[tuple[float, float]] = []
+    for name, (x, y) in sorted(places.items(), key=lambda entry: entry[1][1]):
+        height = y
+        while any(abs(x - other) < _WIDE and abs(height - taken) < _HIGH for other, taken in used):
+            height += 1.0
+        used.append((x, height))
         axes.annotate(
-            f"{summary.parametrisation}, {summary.solver}: {summary.seconds:.2g} s",
-            (summary.task_std_deg, places[summary.parametrisation, summary.solver]),
-            xytext=(1.04, 1 - (k + 0.5) / len(ordered)),
-            textcoords="axes fraction",
-            fontsize=7.5,
-            color=colours[summary.parametrisation],
+            name,
+            _place(best[name], single),
+            xytext=(_ASIDE, height - y),
+            textcoords="offset points",
+            fontsize=9,
+            color=colours[name],
             verticalalignment="center",
-            arrowprops={
-                "arrowstyle": "-",
-                "relpos": (0, 0.5),
-                "shrinkA": 1,
-                "color": colours[summary.parametrisation],
-                "linewidth": 0.5,
-                "alpha": 0.6,
-            },
+            arrowprops={"arrowstyle": "-", "color": colours[name], "linewidth": 0.7, "relpos": (0, 0.5)},
         )
 
 

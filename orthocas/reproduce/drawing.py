@@ -25,8 +25,7 @@ class Drawing:
 def save(drawing: Drawing, name: str, out: str | Path, force: bool = False) -> list[Path]:
     """Write `<name><suffix>.png`, `<name>_<suffix>.stl` and `<name>.json`. Each file appears whole or not at all.
 
-    Figures without 3-D axes are also written as vector graphics, `<name><suffix>.pdf`. In 3-D these files would be
-    large, with hairlines between triangles.
+    Beside each picture, `<name><suffix>.pdf` holds vector graphics. Surfaces in 3-D are pixels there too.
 
     Args:
         drawing: the drawing to write.
@@ -47,8 +46,7 @@ def save(drawing: Drawing, name: str, out: str | Path, force: bool = False) -> l
     writers: dict[str, Callable[[Path], object]] = {}
     for suffix, figure in drawing.figures.items():
         writers[f"{name}{suffix}.png"] = partial(figure.savefig, dpi=DPI)
-        if not any(axes.name == "3d" for axes in figure.axes):
-            writers[f"{name}{suffix}.pdf"] = partial(figure.savefig, dpi=DPI, metadata={"CreationDate": None})
+        writers[f"{name}{suffix}.pdf"] = partial(figure.savefig, dpi=DPI, metadata={"CreationDate": None})
     for suffix, mesh in drawing.meshes.items():
         writers[f"{name}_{suffix}.stl"] = mesh.export
     writers[f"{name}.json"] = lambda draft: draft.write_text(text)

@@ -28,7 +28,7 @@ _BEYOND = 1.5  # size of the leaves of xi, relative to the patch and to the dist
 _AT = np.array([0.5, -0.1, 0.15])  # x [m] and xi, relative to the middle, where gradients are drawn
 _ARROW = 0.48  # length of the gradients in the picture [rad]
 _LIFT = 0.045  # height of the arrows above the leaf [rad]
-_SHEET = "#8ab6f2"
+_SHEET, _BASE = "#8ab6f2", "#0b2f6b"
 _GRADIENTS = {r"$\nabla x$": INK, r"$\nabla\xi_1$": FIRST, r"$\nabla\xi_2$": "#a87e00"}
 _LOW, _HIGH = np.array([1, -5, 3]) * np.pi / 8, np.array([6, 2, 8]) * np.pi / 8
 _VIEW = (20, 162)
@@ -49,6 +49,12 @@ class Grid:
         return np.concatenate([np.stack(f, axis=-1).reshape(-1, 3) for f in ((a, b, d), (a, d, c))])
 
     @property
+    def border(self) -> Array:
+        """The points around the surface, (4 N - 3, 3)."""
+        p = self.points
+        return np.concatenate([p[0, :-1], p[:-1, -1], p[-1, :0:-1], p[::-1, 0]])
+
+    @property
     def normals(self) -> Array:
         """Unit normals at inner points from central differences, (N - 2, N - 2, 3)."""
         along = self.points[2:, 1:-1] - self.points[:-2, 1:-1], self.points[1:-1, 2:] - self.points[1:-1, :-2]
@@ -65,14 +71,16 @@ def draw(quick: bool) -> Drawing:
     task_leaves = [grid(coordinates, np.array([x]), _REACH[0] * sheet, _REACH[1] * sheet) for x in _VALUES]
     heights, zero = wide * _VALUES[-1], np.zeros(1)
     walls = [grid(coordinates, heights, zero, _REACH[1] * wide), grid(coordinates, heights, _REACH[0] * wide, zero)]
-    figure = new_figure(4.4, 5.2, layout=None)
-    axes = add_3d(figure, 0.06, 0.1, 0.9, 0.88)
+    figure = new_figure(4.1, 5.2, layout=None)
+    axes = add_3d(figure, 0.04, 0.11, 0.92, 0.87)
     joint_cube(axes, _LOW, _HIGH, parts=1, margin=np.pi / 8)
     scene = _scene(task_leaves, walls)
+    base = grid(coordinates, np.zeros(1), _REACH[0] * sheet, _REACH[1] * sheet)
+    scene.add_tube(base.border, 0.022, _BASE)
     _add_gradients(axes, scene, coordinates)
-    scene.draw(axes, _VIEW, _LOW, _HIGH, 1.12)
+    scene.draw(axes, _VIEW, _LOW, _HIGH, 1.24)
     names = ("$x$ = const", r"$\xi_1$ = const", r"$\xi_2$ = const")
-    line_legend(figure, dict(zip(names, (_SHEET, FIRST, SECOND), strict=True)))
+    line_legend(figure, {"base leaf, $x = 0$": _BASE} | dict(zip(names, (_SHEET, FIRST, SECOND), strict=True)))
     return Drawing({"": figure}, _numbers(coordinates, task_leaves, walls))
 
 

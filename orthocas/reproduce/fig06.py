@@ -7,6 +7,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
+from matplotlib.patheffects import withStroke
 
 from orthocas import problems
 from orthocas.casadi_tools.batch import Batched, dense_function
@@ -22,6 +23,10 @@ _LABELLED = (1, 3, 5, 7)  # indices of the labelled levels, counted from either 
 _BIG, _SMALL = 2.0, 0.95  # radii of the torus in the picture
 _SHADES = mpl.colormaps["viridis"].resampled(256)
 _NORM = Normalize(-2.0, 2.0)
+_VIEW = (50, -14)
+_ANGLES_AT = np.array([-1.3, 0.15])  # where the arrows of both angles begin on the torus [rad]
+_ANGLES_END = _ANGLES_AT + np.array([[0.75, 0.0], [0.0, 1.1]])
+_NAME_AT = np.array([[0.22, 0.0], [0.0, 0.55]])  # of their names, from the ends of the arrows
 
 
 def draw(quick: bool) -> Drawing:
@@ -80,6 +85,13 @@ def embedded(q: Array) -> Array:
     return np.stack([radius * np.cos(q[:, 0]), radius * np.sin(q[:, 0]), _SMALL * np.sin(q[:, 1])], axis=1)
 
 
+def above(q: Array, height: float) -> Array:
+    """Points above the embedded torus, (N, 3), so that tubes around them do not sink into it."""
+    outwards = np.stack([np.cos(q[:, 0]) * np.cos(q[:, 1]), np.sin(q[:, 0]) * np.cos(q[:, 1]), np.sin(q[:, 1])], axis=1)
+    points: Array = embedded(q) + height * outwards
+    return points
+
+
 def _draw_plane(axes: Any, task: Task, singular: Array, cells: int) -> tuple[Array, Array]:
     """Draw level sets in the plane; return the points of the lines (N, 2) and their levels (N,)."""
     q = np.linspace(-np.pi, np.pi, cells + 1)
@@ -115,19 +127,44 @@ def _draw_torus(axes: Any, task: Task, singular: Array, cells: int) -> None:
     scene.add_surface(embedded(q), torus_faces(cells, cells // 2), "#e9edf2", lines=lines)
     for point in singular:
         scene.add_ball(point, 0.11, EXTRA)
+    for joint, end in enumerate(_ANGLES_END):
+        curve = above(np.linspace(_ANGLES_AT, end, 30), 0.06)
+        scene.add_tube(curve, 0.035, INK)
+        scene.add_arrow(curve[-1], 0.3 * _unit(curve[-1] - curve[-2]), 0.035, INK)
+        name = axes.text(
+            *above(np.array([end]) + _NAME_AT[joint], 0.1)[0], f"$q_{joint + 1}$", fontsize=LABEL, zorder=9
+        )
+        name.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
+    outwards = singular * np.sign(np.linalg.norm(singular, axis=1, keepdims=True) - _BIG)
+    hidden = singular[outwards @ _towards(_VIEW) < 0]
+    axes.plot(
+        *hidden.T, "o", markersize=7, markerfacecolor="none", markeredgecolor=EXTRA, markeredgewidth=1.2, zorder=9
+    )
     reach = _BIG + _SMALL
-    scene.draw(axes, (50, -14), (-reach, -reach, -_SMALL), (reach, reach, _SMALL), zoom=1.38)
+    scene.draw(axes, _VIEW, (-reach, -reach, -_SMALL), (reach, reach, _SMALL), zoom=1.38)
     axes.set_axis_off()
     axes.text2D(0.5, 0.955, "(b) on the 2-torus", fontsize=LABEL, ha="center", transform=axes.transAxes)
     axes.text2D(
         0.5,
         -0.06,
-        "singular: two visible, two hidden",
+        "singular points; rings: behind the torus",
         fontsize=TICK,
         color=EXTRA,
         ha="center",
         transform=axes.transAxes,
     )
+
+
+def _towards(view: tuple[float, float]) -> Array:
+    """The direction of the camera, (3,)."""
+    elevation, azimuth = np.radians(view)
+    level = np.cos(elevation)
+    return np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+
+
+def _unit(vector: Array) -> Array:
+    unit: Array = vector / np.linalg.norm(vector)
+    return unit
 
 
 def torus_faces(rows: int, columns: int) -> Array:

@@ -14,11 +14,12 @@ from orthocas.checks import Array
 from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.self_motion import pieces_in_cube, trace, wrapped
-from orthocas.reproduce.style import EXTRA, INK, LABEL, TASK, TURN, add_3d, joint_cube, line_legend, new_figure
+from orthocas.reproduce.style import EXTRA, GREY, INK, LABEL, TASK, TURN, add_3d, joint_cube, line_legend, new_figure
 from orthocas.tasks import Task
 
 Flags = NDArray[np.bool_]  #: one per curve
 _FAR, _NEAR = (1.25, 1.8, 2.4, 2.8), (0.4, 0.8)  # distances of the tip from the base [m]
+_AT_A_FACE = np.pi - 1e-6  # [rad]; a piece of a curve that ends there goes on at the opposite face
 _ANGLES = TURN * np.arange(3) / 3  # directions of the tip [rad]
 
 
@@ -35,7 +36,8 @@ def draw(quick: bool) -> Drawing:
         joint_cube(axes)
         scene.draw(axes, view, -np.pi, np.pi, zoom=0.98)
         axes.text2D(0.5, 0.99, name, fontsize=LABEL, ha="center", transform=axes.transAxes)
-    line_legend(figure, {"tip beyond 1 m": TASK, "tip within 1 m": EXTRA, "the line $q_2 = q_3 = 0$": INK})
+    names = {"tip beyond 1 m": TASK, "tip within 1 m": EXTRA, "the line $q_2 = q_3 = 0$": INK}
+    line_legend(figure, names | {"goes on at the opposite face": GREY})
     return Drawing({"": figure}, _numbers(task, curves, around))
 
 
@@ -62,6 +64,9 @@ def _scene(curves: list[Array], around: Flags) -> Scene:
     for curve, encircling in zip(curves, around, strict=True):
         for piece in pieces_in_cube(curve):
             scene.add_tube(piece, 0.05, TASK if encircling else EXTRA)
+            for end in piece[[0, -1]]:
+                if np.abs(end).max() > _AT_A_FACE:
+                    scene.add_ball(end, 0.11, GREY)
     return scene
 
 

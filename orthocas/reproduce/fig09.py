@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
@@ -28,6 +27,7 @@ _LOW, _HIGH = np.array([1, -1]) * np.pi / 12, np.array([6, 4]) * np.pi / 12  # c
 _LEVELS = {-0.2: "-3", 0.2: "-2", 0.6: "-1", LEVEL: "0", 1.4: "1"}  # task value [m] -> name of the leaf
 _VALUES = np.linspace(-1.2, 1.2, 19)  # xi on the leaves in the figure [rad]
 _CROSSINGS = ((1.0, -0.5), (1.0, 0.0), (0.6, 0.4), (0.2, 0.1))  # (x, xi) of the arrows
+_PAPER = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
 _LENGTH = 0.16  # length of arrows [rad]
 _ARROWS = {  # text -> colour, as in the paper
     r"$J_x$": "#0b2f6b",
@@ -40,8 +40,8 @@ _ARROWS = {  # text -> colour, as in the paper
 def draw(quick: bool) -> Drawing:
     """Draw leaves and arrows; the numbers show the accuracy of right angles, and that gradients are not parallel."""
     chart = grown_chart(planar_problem("inertia"))
-    figure = new_figure(3.9, layout=None)
-    axes = figure.add_axes((0.1, 0.12, 0.54, 0.86))
+    figure = new_figure(4.3, layout=None)
+    axes = figure.add_axes((0.1, 0.12, 0.54, 0.77))
     _draw_leaves(axes, chart, 20 if quick else 100)
     crossings = chart.inverse(_CROSSINGS, np.tile((_LOW + _HIGH) / 2, (len(_CROSSINGS), 1)))
     for vectors, colour in zip(_vectors(chart, crossings), _ARROWS.values(), strict=True):
@@ -62,14 +62,12 @@ def _draw_leaves(axes: Any, chart: Chart, steps: int) -> None:
     q = np.stack(np.meshgrid(*np.linspace(_LOW, _HIGH, 121).T), axis=-1)
     h = chart.task(q.reshape(-1, 2)).reshape(121, 121)
     widths = [2.4 if level == LEVEL else 1.4 for level in _LEVELS]
-    lines = axes.contour(q[..., 0], q[..., 1], h, levels=list(_LEVELS), colors=TASK, linewidths=widths, linestyles="-")
-    diagonal = np.linspace(_LOW, _HIGH, 200)
-    values = chart.task(diagonal)[:, 0]
-    places = [tuple(diagonal[np.argmin(np.abs(values - level))]) for level in _LEVELS]
-    names = {level: f"$S_{{{name}}}$: $x={level:g}$ m" for level, name in _LEVELS.items()}
-    texts = axes.clabel(lines, fmt=names, fontsize=TICK, inline_spacing=3, manual=places)
-    for text in texts:
-        text.set_path_effects([withStroke(linewidth=2, foreground="white")])
+    axes.contour(q[..., 0], q[..., 1], h, levels=list(_LEVELS), colors=TASK, linewidths=widths, linestyles="-")
+    for level, name in _LEVELS.items():
+        k = int(np.argmin(np.abs(h[-1] - level)))  # where the leaf leaves the patch at the top
+        text = f"$S_{{{name}}}$: {level:g} m"
+        axes.annotate(text, q[-1, k], (-3, 3), textcoords="offset points", fontsize=TICK, color=TASK, rotation=35)
+    axes.text(0.03, 0.03, "to the maximum of $x$,\nat $q = 0$", fontsize=TICK, transform=axes.transAxes, bbox=_PAPER)
     seeds = base_leaf(chart).points(_VALUES[:, None])
     for goal in (1.999, -1.5):
         for curve in flow_lines(chart.problem, seeds, np.full(len(seeds), goal), steps):
@@ -85,7 +83,7 @@ def _vectors(chart: Chart, points: Array) -> list[Array]:
 
 def _add_legend(figure: Any) -> None:
     arrows = [Line2D([], [], color=colour, linewidth=2.2, label=text) for text, colour in _ARROWS.items()]
-    task = Line2D([], [], color=TASK, linewidth=1.4, label="leaves $S_i$ of the task")
+    task = Line2D([], [], color=TASK, linewidth=1.4, label="leaves $S_i$ of the task, $x$")
     extra = Line2D([], [], color=INK, linewidth=1.0, label=r"leaves of $\xi$")
     figure.legend(
         handles=[task, extra, *arrows], loc="center left", bbox_to_anchor=(0.67, 0.5), fontsize=LABEL, frameon=False

@@ -10,6 +10,7 @@ squared area of the two gradients and X_1, X_2 are dual to them.
 
 import casadi as ca
 import numpy as np
+from matplotlib.patheffects import withStroke
 
 from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.chart import Chart
@@ -34,9 +35,9 @@ _LOW, _HIGH = np.array([-2, 3, 2]) * np.pi / 8, np.array([3, 7, 6]) * np.pi / 8
 _DEGREE = 4
 _LEAF = "#b4b8be"
 _LABELS = {
-    "$q_0$": (0.0, 0.1, 0.04),
-    "$q_a$": (0.0, 0.0, -0.12),
-    "$q_b$": (0.0, 0.1, -0.04),
+    "$q_0$": (0.0, 0.13, 0.08),
+    "$q_a$": (0.0, -0.04, -0.17),
+    "$q_b$": (0.0, 0.16, -0.08),
 }  # offsets of the labels [rad]
 _ARROW = 0.22  # length of unit gradients in the picture [rad]
 _VIEW = (20, 14)
@@ -55,7 +56,8 @@ def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     joint_cube(axes, _LOW, _HIGH, parts=1, margin=np.pi / 8)
     _scene(problem, chart, ways, 30 if quick else 90).draw(axes, _VIEW, _LOW, _HIGH, 1.08)
     for place, (text, offset) in zip((_START, *(path[-1] for path in ways)), _LABELS.items(), strict=True):
-        axes.text(*(place + offset), text, fontsize=LABEL, ha="center", va="center")
+        label = axes.text(*(place + offset), text, fontsize=LABEL + 2, ha="center", va="center", zorder=9)
+        label.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
     first, second = "$x$, then $y$", "$y$, then $x$"
     gradients = {r"$\nabla x$": RED, r"$\nabla y$": GREEN}
     line_legend(figure, {"self-motion curves": TASK, first: INK, second: EXTRA} | gradients | {r"$\xi$ = const": _LEAF})
@@ -85,8 +87,8 @@ def _scene(problem: Problem, chart: Chart, ways: list[Array], cells: int) -> Sce
         for q, units in zip(places, unit_gradients(problem, places), strict=True):
             for unit, paint in zip(units, (RED, GREEN), strict=True):
                 scene.add_arrow(q, _ARROW * unit, 0.011, paint)
-        scene.add_ball(path[-1], 0.035, colour)
-    scene.add_ball(_START, 0.035, TASK)
+        scene.add_ball(path[-1], 0.06, colour)
+    scene.add_ball(_START, 0.06, TASK)
     return scene
 
 

@@ -4,7 +4,8 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.colors import LightSource
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LightSource, Normalize
 from matplotlib.ticker import MaxNLocator
 
 from orthocas.checks import Array
@@ -24,8 +25,11 @@ def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     figure = new_figure(3.1, layout=None)
     panels = (("(a) task $h(q) = x$ [m]", h), (r"(b) fitted coordinate $\xi(q)$ [1]", xi))
     for k, (title, values) in enumerate(panels):
-        axes = add_3d(figure, 0.01 + 0.495 * k, 0.02, 0.48, 0.94)
+        axes = add_3d(figure, -0.01 + 0.495 * k, 0.02, 0.44, 0.94)
         _draw_surface(axes, q, values)
+        scale = ScalarMappable(Normalize(values.min(), values.max()), "viridis")
+        bar = figure.colorbar(scale, cax=figure.add_axes((0.44 + 0.495 * k, 0.28, 0.01, 0.5)))
+        bar.ax.tick_params(labelsize=TICK)
         axes.text2D(0.5, 0.97, title, fontsize=LABEL, ha="center", transform=axes.transAxes)
     centres = cell_centres(cells)
     angles = deviations(chart.problem, centres, chart.jacobian(centres)[:, 1])
@@ -44,9 +48,10 @@ def _draw_surface(axes: Any, q: Array, values: Array) -> None:
     """Draw a shaded surface with isolines below it."""
     low, high = values.min(), values.max()
     shades = LightSource(315, 50).shade(values, mpl.colormaps["viridis"], blend_mode="soft", vert_exag=0.4)
-    axes.plot_surface(
+    surface = axes.plot_surface(
         *np.meshgrid(q, q), values, facecolors=shades, rcount=len(q), ccount=len(q), linewidth=0, antialiased=False
     )
+    surface.set_rasterized(True)  # in vector graphics
     floor = low - 0.45 * (high - low)
     axes.contour(
         q,
@@ -66,4 +71,4 @@ def _draw_surface(axes: Any, q: Array, values: Array) -> None:
         joint_axis(axes, letter, joint)
     axes.tick_params(labelsize=TICK, pad=0)
     axes.view_init(32, -62)
-    axes.set_box_aspect((1, 1, 0.8), zoom=0.83)
+    axes.set_box_aspect((1, 1, 1), zoom=0.83)

@@ -4,7 +4,10 @@ Our coordinate is a polynomial, that of the paper a neural network. Rectangles m
 isosurfaces. They lie 0.03 rad above the surfaces, on the side of the viewer, so that their tilt is visible.
 """
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
@@ -18,7 +21,7 @@ from orthocas.reproduce.drawing import Drawing
 from orthocas.reproduce.fig10 import GREEN, RED
 from orthocas.reproduce.scene import Scene
 from orthocas.reproduce.section import curves_inside, isosurface, section, tilts, unit_gradients
-from orthocas.reproduce.style import TASK, add_3d, joint_cube, line_legend, new_figure
+from orthocas.reproduce.style import LABEL, TASK, TICK, add_3d, joint_cube, line_legend, new_figure
 
 _LOW, _HIGH = np.array([-2.0, 1, 1]) * np.pi / 8, np.array([2.0, 5, 5]) * np.pi / 8
 _DEGREE = 5
@@ -27,7 +30,9 @@ _SPREAD = 0.45  # distance of self-motion curves along the task gradients at the
 _HALF, _ARROW = 0.13, 0.2  # half an edge of the rectangles, length of the gradients [rad]
 _LIFT = 0.03  # height of the rectangles above isosurfaces [rad]
 _SAMPLES = 2000
-_LEAF, _PLANE = "#c9cdd3", "#e4572e"
+_LEAF = "#c9cdd3"
+_TILTS = Normalize(0, 15)  # [deg]
+_SHADES = mpl.colormaps["plasma_r"]
 _VIEW = (25, 244)
 
 
@@ -42,15 +47,19 @@ def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     curves = curves_inside(problem, _starts(problem), 0.02)
     places = np.concatenate([_crossings(chart, curve, levels) for curve in curves])
     figure = new_figure(4.6, layout=None)
-    axes = add_3d(figure, 0.1, 0.1, 0.8, 0.89)
+    axes = add_3d(figure, 0.04, 0.1, 0.8, 0.89)
     joint_cube(axes, _LOW, _HIGH, parts=1, margin=np.pi / 8)
-    scene = _scene(problem, curves, places)
+    scene = _scene(problem, curves, places, tilts(chart, places))
     for level in levels:
         leaf = isosurface(chart, float(level), 25 if quick else 80)
         scene.add_surface(leaf.vertices, leaf.faces, _LEAF, 0.6)
     scene.draw(axes, _VIEW, _LOW, _HIGH, 1.05)
-    names = {"self-motion curves": TASK, r"$\nabla h_1$": RED, r"$\nabla h_2$": GREEN, "their plane": _PLANE}
-    line_legend(figure, names | {r"$\xi$ = const": _LEAF})
+    line_legend(
+        figure, {"self-motion curves": TASK, r"$\nabla h_1$": RED, r"$\nabla h_2$": GREEN, r"$\xi$ = const": _LEAF}
+    )
+    bar = figure.colorbar(ScalarMappable(_TILTS, _SHADES), cax=figure.add_axes((0.9, 0.3, 0.014, 0.45)), extend="max")
+    bar.set_label("tilt of their plane against the leaf [deg]", fontsize=LABEL)
+    bar.ax.tick_params(labelsize=TICK)
     return Drawing({"": figure}, _numbers(problem, chart, places))
 
 
@@ -71,17 +80,17 @@ def _crossings(chart: Chart, curve: Array, levels: Array) -> Array:
     return np.stack([np.interp(inside, xi[order], curve[order, k]) for k in range(3)], axis=1)
 
 
-def _scene(problem: Problem, curves: list[Array], places: Array) -> Scene:
+def _scene(problem: Problem, curves: list[Array], places: Array, angles: Array) -> Scene:
     scene = Scene()
     scene.add_cube(_LOW, _HIGH, 0.01)
     elevation, azimuth = np.radians(_VIEW)
     towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     for curve in curves:
         scene.add_tube(curve, 0.012, TASK)
-    for q, units in zip(places, unit_gradients(problem, places), strict=True):
+    for q, units, angle in zip(places, unit_gradients(problem, places), angles, strict=True):
         normal = np.cross(*units)
         lifted = q + _LIFT * np.sign(normal @ towards) * normal / np.linalg.norm(normal)
-        scene.add_surface(*_rectangle(lifted, units), _PLANE)
+        scene.add_surface(*_rectangle(lifted, units), _SHADES(_TILTS(angle)))
         for unit, colour in zip(units, (RED, GREEN), strict=True):
             scene.add_arrow(lifted, _ARROW * unit, 0.011, colour)
     return scene

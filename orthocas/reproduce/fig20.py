@@ -21,9 +21,9 @@ _MEANING = r"$\angle(\mathrm{d}\xi_j,\,\nabla_M h_i)$"
 
 
 def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
-    """Draw both histograms with the same axes; the numbers are their means and standard deviations."""
+    """Draw both histograms, each with its own scale of shares; the numbers are their means and standard deviations."""
     figure = new_figure(2.9)
-    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    panels = figure.subplots(1, 2, sharex=True)
     numbers: dict[str, float] = {}
     for axes, (key, (name, title, colour)) in zip(panels, _PANELS.items(), strict=True):
         report = _judged(name, quick, chosen)

@@ -55,16 +55,16 @@ def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
         "strong_linear": arm.linear("x", STRONG),
         "strong_fitted": arm.fitted("x", STRONG, quick, chosen),
     }
-    figure = new_figure(9.1, layout=None)
+    figure = new_figure(10.0, layout=None)
     grid = figure.add_gridspec(
-        3, 3, left=_LEFT, right=_RIGHT, top=0.955, bottom=0.395, height_ratios=(1, 1.7, 0.9), hspace=0.42, wspace=0.42
+        3, 3, left=_LEFT, right=_RIGHT, top=0.96, bottom=0.46, height_ratios=(1, 1.7, 0.9), hspace=0.42, wspace=0.42
     )
     numbers: dict[str, float] = {}
     for column, (name, (title, place, view)) in enumerate(_COLUMNS.items()):
         run = follow(charts[name], arm.base(place), ALL_OF_X)
         _draw_column(figure, [grid[row, column] for row in range(3)], run, column, title)
-        axes = add_3d(figure, 0.01 + 0.33 * column, 0.088, 0.333, 0.255)
-        axes.text2D(0.1, 1.02, f"({'jkl'[column]}) joint space", fontsize=LABEL, transform=axes.transAxes)
+        axes = add_3d(figure, 0.005 + 0.33 * column, 0.085, 0.335, 0.3)
+        axes.text2D(0.1, 1.06, f"({'jkl'[column]}) joint space", fontsize=LABEL, transform=axes.transAxes)
         lines = _GRID if name == "strong_fitted" else None
         draw_path(axes, run, _TARGETS, view, 16 if quick else 40, lines)
         numbers |= run.numbers(f"{name}_")

@@ -55,7 +55,7 @@ def _picture(run: Run) -> Figure:
     figure = new_figure(4.9)
     grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1))
     coordinates, accelerations, joints = (figure.add_subplot(grid[row, 0]) for row in range(3))
-    plane = figure.add_subplot(grid[:2, 1])
+    plane = figure.add_subplot(grid[:, 1])
     draw_coordinates(coordinates, run)
     _draw_parts(accelerations, run)
     draw_plane(plane, run, "x", "xi1")
@@ -65,10 +65,7 @@ def _picture(run: Run) -> Figure:
     name_panel(plane, r"(c) plane of $x$ and $\xi_1$")
     name_panel(joints, "(d) joint motion [rad]")
     joints.set_xlabel("time [s]", fontsize=LABEL)
-    handles, names = accelerations.get_legend_handles_labels()
-    corner = figure.add_subplot(grid[2, 1])
-    corner.axis("off")
-    corner.legend(handles, names, loc="center left", fontsize=TICK, title="terms in (b)", title_fontsize=TICK)
+    accelerations.legend(fontsize=TICK - 1, loc="lower left", frameon=False, borderpad=0, labelspacing=0.2)
     curve_legend(figure, run)
     return figure
 

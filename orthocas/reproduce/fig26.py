@@ -51,7 +51,7 @@ def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
 
 def _picture(runs: dict[str, Run]) -> Figure:
     figure = new_figure(5.3)
-    rows: Any = figure.subplots(3, len(runs), height_ratios=(1, 1.15, 0.9))
+    rows: Any = figure.subplots(3, len(runs), height_ratios=(1, 1.15, 0.9), sharey="row")
     for column, (name, run) in enumerate(runs.items()):
         above, plane, below = rows[:, column]
         draw_coordinates(above, run)
@@ -61,6 +61,8 @@ def _picture(runs: dict[str, Run]) -> Figure:
         for axes, text, letters in zip((above, plane, below), texts, ("abcd", "efgh", "ijkl"), strict=True):
             name_panel(axes, f"({letters[column]}) {text}")
         below.set_xlabel("time [s]", fontsize=LABEL)
+        plane.sharex(rows[1, 0])
+        plane.autoscale()
         if column:
             plane.set_ylabel("")
     rows[0, 0].set_ylabel("motion in $x$, $y$ [m],\n$\\xi$ [1]", fontsize=LABEL)

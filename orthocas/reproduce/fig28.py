@@ -33,7 +33,9 @@ JOURNEY = (  # coordinate and target of each step, relative to the value at the 
 )
 _FIRST, _PAUSE, _REST = 1.0, 2.0, 6.0  # time of the first step, between steps, and after the last step [s]
 _TOLERANCE = 1e-10  # of CVODES; without feedback, its errors remain in the joints
-_COLOURS = ("#1f5fa8", "#d95f02", "#1b9e77", "#e7298a", "#7570b3", "#a6761d", "#222222")
+_OF_TASK = ("#08306b", "#2b7bba", "#8ab8dd", "#08519c", "#5ba3cf", "#b0cfe6")  # blue
+_OF_XI = ("#d94801", "#1b7837", "#c51b7d", "#c9a000")
+_OF_JOINTS = ("#000000", "#4d4d4d", "#999999", "#762a83", "#af8dc3", "#8c510a", "#d8b365")  # grey, violet, brown
 
 
 @lru_cache(maxsize=4)
@@ -106,19 +108,26 @@ def _picture(chart: Chart, times: Array, q: Array, actual: Array, desired: Array
     panes = figure.subplots(3, 1, sharex=True)
     m, units = chart.m, sorted(set(chart.problem.task.units))
     names = [*chart.problem.task.labels, *(rf"$\xi_{k + 1}$" for k in range(chart.r))]
-    for axes, which, title in (
-        (panes[0], slice(m), f"(a) task $x$ [{', '.join(units)}]; wide: desired, thin: actual"),
-        (panes[1], slice(m, None), r"(b) coordinates $\xi$ [1]"),
+    for axes, which, colours, title in (
+        (panes[0], slice(m), _OF_TASK, f"(a) task $x$ [{', '.join(units)}]; wide: desired, thin: actual"),
+        (panes[1], slice(m, None), _OF_XI, r"(b) coordinates $\xi$ [1]"),
     ):
-        _draw_values(axes, times, desired[:, which], actual[:, which], names[which], title)
+        _draw_values(
+            axes,
+            times,
+            desired[:, which],
+            actual[:, which],
+            dict(zip(names[which], cycle(colours), strict=False)),
+            title,
+        )
     _draw_joints(panes[2], times, q)
     panes[2].set_xlabel("time [s]", fontsize=LABEL)
     return figure
 
 
-def _draw_values(axes: Any, times: Array, desired: Array, actual: Array, names: list[str], title: str) -> None:
-    """Draw desired values wide and pale, and actual values thin and dark on top."""
-    for wanted, reached, name, colour in zip(desired.T, actual.T, names, cycle(_COLOURS), strict=False):
+def _draw_values(axes: Any, times: Array, desired: Array, actual: Array, colours: dict[str, str], title: str) -> None:
+    """Draw desired values wide and pale, and actual values thin and dark on top, in the colours of their names."""
+    for wanted, reached, (name, colour) in zip(desired.T, actual.T, colours.items(), strict=True):
         axes.plot(times, wanted, color=colour, linewidth=3.2, alpha=0.3)
         axes.plot(times, reached, color=colour, linewidth=0.9, label=name)
     _finish(axes, title)
@@ -126,7 +135,7 @@ def _draw_values(axes: Any, times: Array, desired: Array, actual: Array, names: 
 
 def _draw_joints(axes: Any, times: Array, joints: Array) -> None:
     """Draw joint positions, with dotted lines at their start values."""
-    for k, (q, colour) in enumerate(zip(joints.T, cycle(_COLOURS), strict=False), 1):
+    for k, (q, colour) in enumerate(zip(joints.T, cycle(_OF_JOINTS), strict=False), 1):
         axes.plot(times, q, color=colour, linewidth=0.9, label=f"$q_{{{k}}}$")
         axes.axhline(q[0], color=colour, linewidth=0.9, linestyle=":")
     _finish(axes, "(c) joints $q$ [rad]; dotted: start values")

@@ -1,5 +1,7 @@
 """[AS2023] Fig. 30: steps in x, y and xi with fitted coordinates for the task (x, y), with and without feed-forward."""
 
+from typing import Any
+
 from matplotlib.figure import Figure
 
 from orthocas.reproduce.chosen_fit import USUAL, ChosenFit
@@ -30,10 +32,15 @@ def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
 def _picture(runs: dict[str, Run]) -> Figure:
     figure = new_figure(6.4)
     grid = figure.add_gridspec(3, 2, height_ratios=(1, 1.9, 0.8))
+    first: dict[int, Any] = {}  # the axes of the first column
     for column, (name, run) in enumerate(runs.items()):
-        above, below = (figure.add_subplot(grid[row, column]) for row in (0, 2))
+        above, below = (figure.add_subplot(grid[row, column], sharey=first.get(row)) for row in (0, 2))
         draw_coordinates(above, run)
         planes = draw_planes(figure, grid[1, column], run)
+        planes[0].sharex(first.setdefault(3, planes[0]))
+        planes[0].sharey(first[3])
+        planes[0].autoscale()
+        first |= {0: above, 2: below}
         draw_joints(below, run)
         below.set_xlabel("time [s]", fontsize=LABEL)
         texts = f"{_TITLES[name]}: motion in $x$, $y$ [m], $\\xi$ [1]", "coordinate planes", "joint motion [rad]"

@@ -10,7 +10,7 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
 from orthocas.reproduce.drawing import Drawing
-from orthocas.reproduce.fig06 import embedded, torus_faces
+from orthocas.reproduce.fig06 import above, embedded, torus_faces
 from orthocas.reproduce.painting import Isolines
 from orthocas.reproduce.planar_flow import (
     EXTREME,
@@ -37,6 +37,7 @@ from orthocas.singularities import SingularPoint, singular_points
 _LEVELS = np.linspace(-1.8, 1.8, 10)  #: task values of the drawn leaves [m]
 _PULLED = np.array([[2.5, 0.6], [-1.2, -1.9], [-0.25, 0.45]])  #: start points of example pulls [rad]
 _PULL, _END = "#c8102e", "#7b2fbe"
+_EVERY = 3  # only one in so many curves is drawn; the numbers are of all
 _BIG = 2.95  # reach of the torus of `embedded`
 
 
@@ -55,11 +56,12 @@ def draw_flow(metric: str, quick: bool) -> Drawing:
     pulls = flow_lines(problem, _PULLED, np.full(len(_PULLED), LEVEL), steps)
     figure = new_figure(3.85, layout=None)
     left = figure.add_axes((0.105, 0.285, 0.4, 0.655))
-    _draw_plane(left, chart, up + down, starts, pulls)
+    shown = up[::_EVERY] + down[::_EVERY]
+    _draw_plane(left, chart, shown, starts[::_EVERY], pulls)
     mark_singular(left, singular)
     left.set_title(f"(a) in the plane, ${NAMES[metric]}$", fontsize=LABEL)
     right = add_3d(figure, 0.51, 0.22, 0.49, 0.76)
-    _draw_torus(right, chart, up + down, pulls, singular, 50 if quick else 160)
+    _draw_torus(right, chart, shown, pulls, singular, 50 if quick else 160)
     right.text2D(0.5, 0.93, "(b) on the 2-torus", fontsize=LABEL, ha="center", transform=right.transAxes)
     _add_legend(figure)
     numbers = _curve_numbers(up, down, singular) | _pull_numbers(chart, pulls, 1000 if quick else 50_000)
@@ -90,23 +92,16 @@ def _draw_torus(
     lines = Isolines(chart.task(q)[:, 0], _LEVELS, colours, 0.035)
     scene.add_surface(embedded(q), torus_faces(cells, cells // 2), "#eef1f4", lines=lines)
     for curve in curves:
-        scene.add_tube(_above(_thinned(curve), 0.016), 0.016, EXTRA)
-    scene.add_tube(_above(base_leaf(chart).curve[::10], 0.04), 0.05, INK)
+        scene.add_tube(above(_thinned(curve), 0.016), 0.016, EXTRA)
+    scene.add_tube(above(base_leaf(chart).curve[::10], 0.04), 0.05, INK)
     for pull in pulls:
-        scene.add_tube(_above(_thinned(pull), 0.04), 0.05, _PULL)
+        scene.add_tube(above(_thinned(pull), 0.04), 0.05, _PULL)
         scene.add_ball(embedded(pull[:1])[0], 0.1, INK)
         scene.add_ball(embedded(pull[-1:])[0], 0.1, _END)
     for point in embedded(np.array([s.point for s in singular])):
         scene.add_ball(point, 0.12, "white")
     scene.draw(axes, (48, -14), (-_BIG, -_BIG, -0.95), (_BIG, _BIG, 0.95), zoom=1.3)
     axes.set_axis_off()
-
-
-def _above(q: Array, height: float) -> Array:
-    """Points above the embedded torus, (N, 3), so that tubes around them do not sink into it."""
-    outwards = np.stack([np.cos(q[:, 0]) * np.cos(q[:, 1]), np.sin(q[:, 0]) * np.cos(q[:, 1]), np.sin(q[:, 1])], axis=1)
-    points: Array = embedded(q) + height * outwards
-    return points
 
 
 def _thinned(curve: Array, step: float = 0.02) -> Array:

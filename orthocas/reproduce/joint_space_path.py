@@ -17,7 +17,7 @@ from orthocas.reproduce.style import INK, TICK, joint_cube
 SHEETS = ("#5b97da", "#a9b8cc")  #: colours of self-motion manifolds, in the order of the targets
 _MARGIN = 0.12  # of the box around the curve [rad]
 _SLIMMEST = 0.5  # smallest edge of the box relative to its longest edge
-_ALPHA = 0.5
+_ALPHA = 0.3
 _EVERY = 3  # grid points from one coordinate line to the next
 
 
@@ -39,6 +39,7 @@ def draw_path(
     joint_cube(axes, low, high)
     for letter, least, most in zip("xyz", low, high, strict=True):
         _set_ticks(getattr(axes, f"{letter}axis"), least, most)
+        getattr(axes, f"{letter}axis").labelpad = 3
     size = float(np.max(high - low))
     scene = Scene()
     scene.add_cube(low, high, 0.004 * size)
@@ -54,9 +55,9 @@ def draw_path(
         scene.add_surface(mesh.vertices, mesh.faces, colour, _ALPHA)
         if grid is not None:
             add_coordinate_lines(scene, coordinate_grid(run.chart, q[0], float(target), grid), 0.004 * size)
-    scene.add_tube(_thinned(q, 0.004 * size), 0.009 * size, INK)
-    scene.add_ball(q[0], 0.025 * size, INK)
-    scene.draw(axes, view, low, high, 0.95)
+    scene.add_tube(_thinned(q, 0.004 * size), 0.013 * size, INK)
+    scene.add_ball(q[0], 0.035 * size, INK)
+    scene.draw(axes, view, low, high, 1.02)
 
 
 def coordinate_grid(chart: Chart, start: Array, target: float, grid: Array) -> Array:
@@ -99,8 +100,8 @@ def _thinned(curve: Array, step: float) -> Array:
 
 
 def _set_ticks(axis: Any, low: float, high: float) -> None:
-    """Set two or three round ticks away from the ends, where the labels of other axes are."""
-    ticks = np.asarray(MaxNLocator(3).tick_values(low, high))
+    """Set one to three round ticks away from the ends, where the labels of other axes are."""
+    ticks = np.asarray(MaxNLocator(2).tick_values(low, high))
     inside = ticks[np.abs(ticks - (low + high) / 2) < 0.42 * (high - low)]
     axis.set_ticks(inside, [f"{tick:g}" for tick in inside], fontsize=TICK)
 

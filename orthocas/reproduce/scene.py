@@ -99,6 +99,7 @@ class Scene:
         shaded = _lit(np.concatenate(self._normals), self.colours, view)
         edges = np.where(shaded[:, 3:] < 1, [0.0, 0.0, 0.0, 0.0], shaded)  # hides hairlines between opaque faces
         faces = Poly3DCollection(self.corners, facecolors=shaded, edgecolors=edges, linewidths=0.18, clip_on=False)
+        faces.set_rasterized(True)  # in vector graphics, whose text and lines stay lines
         axes.add_collection3d(faces)
         lower, upper = np.broadcast_to(low, 3), np.broadcast_to(high, 3)
         for letter, least, most in zip("xyz", lower, upper, strict=True):

@@ -133,6 +133,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},
         (*_LAW_OPTIONS, *_RUN_OPTIONS),
     ),
+    "charts": (("ur5-position", "ur5", "chart.orthocas", ""), {}, ("--out",)),
     "atlas info": (("arm.orthocas-atlas", *_FILES), {}, ("--seed",)),
     "atlas evaluate": (("arm.orthocas-atlas", *_FILES), {"--samples": "20"}, ("--seed",)),
     "export": (_FILES, {"--to": "numpy", "--out": "module.py"}, ()),

@@ -216,6 +216,8 @@ def _functions() -> dict[str, Call]:
         "jumps": (oc.jumps, {"chart": circle(), "radius": 0.02}),
         "lie_bracket": (oc.lie_bracket, {"f": symbol, "g": symbol**2, "q": symbol}),
         "load": (oc.load, {"path": "no.orthocas"}),
+        "charts.load": (oc.charts.load, {"name": "ur5-position"}),
+        "charts.card": (oc.charts.card, {"name": "ur5-position"}),
         "Chart.load": (oc.Chart.load, {"path": "no.orthocas"}),
         "loss": (oc.loss, {**box, "weights": (1, 1), "samples": 20, "seed": 0, "start": None}),
         "compare": (

@@ -1,0 +1,10 @@
+"""Ready charts of known arms, fitted and certified, each with a card of its quality (ours).
+
+`names` lists them, `load` gives a chart, and `card` tells how good it is, where it holds, and how it was made.
+`make charts` makes them again; docs/charts.md shows all.
+"""
+
+from orthocas.charts.card import Card, Model
+from orthocas.charts.catalogue import card, load, names
+
+__all__ = ["Card", "Model", "card", "load", "names"]

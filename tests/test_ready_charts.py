@@ -1,0 +1,103 @@
+"""Ready charts: the files belong to their cards, the proofs to the charts, and the figures can be measured again."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ready_charts
+from programs import Run
+
+import orthocas as oc
+from orthocas.domains import sample_uniform
+from orthocas.errors import UnknownNameError
+
+ROOT = Path(__file__).parent.parent
+NAMES = oc.charts.names()
+
+
+def test_there_are_charts_of_ten_arms() -> None:
+    assert len(NAMES) >= 15
+    assert len({oc.charts.card(name).model.robot for name in NAMES}) >= 10
+    assert set(NAMES) == set(ready_charts.RECIPES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_chart_has_a_proof_and_is_the_one_on_its_card(name: str) -> None:
+    """Loading refuses a proof of another chart, so a proof that is there is valid."""
+    chart, card = oc.charts.load(name), oc.charts.card(name)
+    assert chart.certificate is not None
+    assert chart.certificate.proved
+    assert chart.certificate.fingerprint == card.fingerprint
+    assert chart.certificate.regular.proved_count == card.proved_parts
+    assert chart.problem.robot.joint_names == card.joints
+    assert np.array_equal(chart.problem.domain.half_width, card.half_width)
+    assert card.quality["folded_samples"] == 0
+    assert card.model.robot.split()[0] in repr(card)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_recipes_are_those_on_the_cards_and_licences_travel(name: str) -> None:
+    assert ready_charts.up_to_date(name, ready_charts.DATA)
+    licence = oc.charts.card(name).licence_text
+    assert any(word in licence for word in ("Apache License", "Mozilla Public License", "Redistribution and use"))
+
+
+@pytest.mark.parametrize("name", ["panda-pose", "tiago-pro-left-position"])
+def test_figures_of_cards_are_found_at_other_samples(name: str) -> None:
+    """Root mean squares of 4,000 other points differ by some percent."""
+    report, quality = oc.evaluate(oc.charts.load(name), 4000, seed=7), oc.charts.card(name).quality
+    assert report.leak.rms == pytest.approx(quality["leak_deg"]["rms"], rel=0.1)
+    assert report.task_angle.std == pytest.approx(quality["task_angle_deg"]["std"], rel=0.1)
+    assert report.conditioning.mean == pytest.approx(quality["conditioning"]["mean"], rel=0.02)
+    assert report.conditioning.min >= 0.95 * quality["conditioning"]["min"]
+
+
+def test_a_cyclic_joint_may_be_anywhere() -> None:
+    """The Jacobian of a ready chart stays regular when the base joint turns over its whole range."""
+    chart = oc.charts.load("panda-position")
+    q = sample_uniform(chart.problem.domain, 500, 3)
+    signs = np.sign(np.linalg.det(chart.jacobian(q)))
+    assert np.ptp(q[:, 0]) > 5.5
+    assert np.all(signs == signs[0])
+
+
+@pytest.mark.slow
+def test_a_proof_holds_when_it_is_checked_again() -> None:
+    chart = oc.charts.load("xarm7-pose")
+    assert oc.check_certificate(chart, chart.certificate)
+
+
+def test_cards_keep_all_they_have_as_text() -> None:
+    card = oc.charts.card("panda-position")
+    assert oc.charts.Card.from_json(card.to_json()).as_dict() == card.as_dict()
+
+
+@pytest.mark.parametrize("call", [oc.charts.load, oc.charts.card])
+def test_unknown_names_are_told_the_known_ones(call: object) -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown ready chart 'panda'.*panda-position"):
+        call("panda")  # type: ignore[operator]
+
+
+def test_command_lists_charts_shows_cards_and_writes_files(run: Run) -> None:
+    code, listed, _ = run("charts")
+    assert code == 0
+    assert len(listed.splitlines()) == len(NAMES) + 1
+    code, shown, _ = run("charts", "panda-position", "--out", "panda.orthocas")
+    assert code == 0
+    assert "orthocas fit panda.urdf --tip panda_hand" in shown
+    assert oc.load("panda.orthocas").labels == ("x", "y", "z", "xi1", "xi2", "xi3", "xi4")
+    data = json.loads(run("charts", "--json")[1])
+    assert [card["name"] for card in data["charts"]] == list(NAMES)
+    code, _, complaint = run("charts", "--out", "all.orthocas")
+    assert (code, len(complaint.splitlines())) == (2, 1)
+
+
+def test_page_shows_the_figures_of_the_cards() -> None:
+    page = (ROOT / "docs" / "charts.md").read_text(encoding="utf-8")
+    for line in ready_charts.table():
+        assert line in page
+    pictures = re.findall(r"\]\((figures/charts/[^)]+)\)", page)
+    assert {Path(path).stem for path in pictures} == set(NAMES)
+    assert all((ROOT / "docs" / path).exists() for path in pictures)
