@@ -7,10 +7,13 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+from numpy.typing import ArrayLike
 from sphinx.application import Sphinx
 from sphinx.ext.napoleon import Config, GoogleDocstring
+from sphinx.util.typing import stringify_annotation
 
 import orthocas
+from orthocas.checks import Array
 
 NAMES = ["alpha", "beta", "delta", "epsilon", "theta", "lambda", "xi", "rho", "sigma", "tau", "phi", "psi", "pi"]
 GREEK = dict(zip(NAMES, "αβδεθλξρστφψπ", strict=True))
@@ -23,7 +26,8 @@ INDEX = re.compile(rf"(?<!\w)(d?(?:[A-Za-z]|{LETTER})|grad)_({LETTER}|[A-Za-z0-9
 WORD = re.compile(rf"(?<![\w`])(d?)({LETTER})(\d?)(?!\w|=|\.\w)")
 PAGE = re.compile(r"docs/(\w+)\.md(?:#[\w-]+)?")
 CITED = re.compile(r"\[([A-Z]{1,5}\d{4})\]")
-SECTIONS = Config(napoleon_use_rtype=False)
+TYPES = {stringify_annotation(kind, "smart"): name for kind, name in ((ArrayLike, "ArrayLike"), (Array, "Array"))}
+SECTIONS = Config(napoleon_use_rtype=False, napoleon_custom_sections=["Source"])
 ITEM = re.compile(r"(    \*{0,2}\w+(?:, \w+)*: )(.*)")  # a line `name: text` below Args keeps its name
 
 
@@ -70,11 +74,19 @@ def converted(lines: list[str]) -> Iterator[str]:
 
 def rewrite(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
     """Called by autodoc for each docstring."""
-    kind = "method" if what == "property" else what  # of properties, napoleon takes `q (n,): text` for a type
+    kind = "method" if what in {"property", "attribute"} else what  # there, napoleon takes `q (n,): text` for a type
     lines[:] = GoogleDocstring(list(converted(lines)), SECTIONS, app, kind, name, thing, options).lines()
+
+
+def shortened(app: Sphinx, what: str, name: str, thing: Any, options: Any, words: str, result: str) -> tuple[str, str]:
+    """Called by autodoc for each signature: NumPy's unions get back their names."""
+    for long, short in TYPES.items():
+        words, result = (part and part.replace(long, short) for part in (words, result))
+    return words, result
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register with autodoc."""
     app.connect("autodoc-process-docstring", rewrite)
+    app.connect("autodoc-process-signature", shortened)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
