@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
-.PHONY: demo test check fuzz lint types wheel-check bench charts clean
+.PHONY: demo test check docs fuzz lint types wheel-check bench charts clean
 
 demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and picture in out/
 	$(BIN)/python examples/iiwa_demo.py --out out
@@ -15,6 +15,10 @@ test: $(INSTALLED)  ## the whole test suite
 
 check: lint  ## while working: lint and the fast tests, with the slowest of them named
 	$(PYTEST) -m "not slow" --durations 5
+
+docs: $(INSTALLED)  ## the documentation site in build/docs, its pages run; a warning is an error
+	$(BIN)/python -m pip install --quiet -e '.[docs]'
+	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -q -W --keep-going -E -j 2 -b html docs build/docs
 
 COUNT ?= 1000
 fuzz: $(INSTALLED)  ## the campaign of faults; COUNT mutants of each kind, CAMPAIGN="charts ..." for some kinds

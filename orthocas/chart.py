@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 class Chart(InverseMethods, Shown):
     """A problem and its fitted or grown coordinates xi(q) ([AS2023] eq. (27)).
 
-    Methods take one joint position (n,), a column (n, 1), or a set (N, n), [rad] or [m]. The methods xi, task, phi and
-    jacobian also take a CasADi column (n, 1), SX or MX, and return an expression. Grown coordinates are NaN at points
-    from which the flow does not reach the charted part of the base leaf.
+    Methods take one joint position (n,), a column (n, 1), or a set (N, n), [rad] or [m]. The methods `xi`, `task`,
+    `phi` and `jacobian` also take a CasADi column (n, 1), SX or MX, and return an expression. Grown coordinates are NaN
+    at points from which the flow does not reach the charted part of the base leaf.
 
     Example:
         >>> import numpy as np

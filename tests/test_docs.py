@@ -33,23 +33,24 @@ def test_python_quickstart_runs(checkout: Path) -> None:
 
 
 @pytest.mark.slow
-def test_python_block_of_exact_coordinates_runs(checkout: Path) -> None:
-    code = blocks("python")[1]
-    verdict, numbers = python(code, checkout).splitlines()
-    assert "orthogonal" in verdict
-    exact, distilled = map(float, numbers.split())
-    assert exact < 1e-9 < distilled < 0.1
-
-
-@pytest.mark.slow
 @pytest.mark.usefixtures("checkout")
-def test_shell_quickstart_runs(run: Run) -> None:
-    commands = [shlex.split(line) for line in blocks("sh")[1].splitlines()]
-    assert len(commands) == 11
-    for words in commands:
-        assert words[0] == "orthocas"
-        code, _, err = run(*words[1:])
-        assert (code, err) == (0, "")
+def test_newcomers_path_from_a_urdf_to_c_runs(run: Run) -> None:
+    """Every command of the README after the first, which installs; ten are enough."""
+    install, find, *commands = blocks("sh")[1].splitlines()
+    assert install.startswith("pip install . ")
+    assert len(commands) <= 8
+    name, _, asked = find.partition("=")
+    here = Path(sys.executable).parent
+    found = output_of("bash", "-c", f'PATH="{here}:$PATH"; {find}; echo ${name}').strip()
+    assert asked.startswith("$(python ")
+    for line in commands:
+        program, *words = shlex.split(line.replace(f"${name}", found))
+        assert program == "orthocas"
+        code, printed, err = run(*words)
+        assert (code, err) == (0, ""), line
+        if words[0] == "certify":
+            assert "no fold everywhere on the domain" in printed
+    assert Path("c/panda.c").exists()
 
 
 @pytest.mark.slow

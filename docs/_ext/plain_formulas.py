@@ -1,0 +1,92 @@
+"""Docstrings as pages show them: formulas with Greek letters, indices and powers, and links to pages and names.
+
+The docstrings themselves are plain text, for `help` and editors: J_x A^-1 J_xi^T = 0, docs/angles.md, [AS2023].
+"""
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from numpy.typing import ArrayLike
+from sphinx.application import Sphinx
+from sphinx.ext.napoleon import Config, GoogleDocstring
+from sphinx.util.typing import stringify_annotation
+
+import orthocas
+from orthocas.checks import Array
+
+NAMES = ["alpha", "beta", "delta", "epsilon", "theta", "lambda", "xi", "rho", "sigma", "tau", "phi", "psi", "pi"]
+GREEK = dict(zip(NAMES, "αβδεθλξρστφψπ", strict=True))
+LETTER = "|".join(GREEK)
+
+CODE = re.compile(r"(`[^`]+`)")
+LINKED = re.compile(rf"`(?:orthocas\.|oc\.)?((?:{'|'.join(orthocas.__all__)})(?:\.\w+)*)(?:\(.*\))?`")
+POWER = re.compile(r"\^(-?\d+|-?T|#A?|\*|\{[^}\s]+\})")
+INDEX = re.compile(rf"(?<!\w)(d?(?:[A-Za-z]|{LETTER})|grad)_({LETTER}|[A-Za-z0-9]{{1,3}}|\{{[^}}\s]+\}})(?!\w)")
+WORD = re.compile(rf"(?<![\w`])(d?)({LETTER})(\d?)(?!\w|=|\.\w)")
+PAGE = re.compile(r"docs/(\w+)\.md(?:#[\w-]+)?")
+CITED = re.compile(r"\[([A-Z]{1,5}\d{4})\]")
+TYPES = {stringify_annotation(kind, "smart"): name for kind, name in ((ArrayLike, "ArrayLike"), (Array, "Array"))}
+SECTIONS = Config(napoleon_use_rtype=False, napoleon_custom_sections=["Source"])
+ITEM = re.compile(r"(    \*{0,2}\w+(?:, \w+)*: )(.*)")  # a line `name: text` below Args keeps its name
+
+
+def markup(text: str) -> str:
+    """A line of prose as reStructuredText; public names in backticks become links, other code stays code."""
+    return "".join(_code(part) if part.startswith("`") else _prose(part) for part in CODE.split(text))
+
+
+def _code(text: str) -> str:
+    name = LINKED.fullmatch(text)
+    return f":py:obj:`{text.strip('`')} <orthocas.{name[1]}>`" if name else f"`{text}`"
+
+
+def _prose(text: str) -> str:
+    text = re.sub(r"([\\*|])", r"\\\1", text)
+    text = POWER.sub(lambda found: rf"\ :sup:`{_plain(found[1])}`\ ", text.replace(r"^\*", "^*"))
+    text = INDEX.sub(lambda found: rf"{_plain(found[1])}\ :sub:`{_plain(found[2])}`\ ", text)
+    text = WORD.sub(lambda found: f"{found[1]}{GREEK[found[2]]}{found[3]}", text)
+    text = PAGE.sub(r":doc:`/\1`", text)
+    text = CITED.sub(r":doc:`[\1] </references>`", text)
+    return re.sub(r"(?<=\w)_(?!\w)", r"\\_", text)  # name_ would be a link
+
+
+def _plain(text: str) -> str:
+    """A symbol with Greek letters, without the braces around long indices."""
+    return re.sub(rf"(?<![A-Za-z])(d?)({LETTER})", lambda found: found[1] + GREEK[found[2]], text.strip("{}")).replace(
+        "grad", "∇"
+    )
+
+
+def converted(lines: list[str]) -> Iterator[str]:
+    """The lines of a docstring in Google's style; headings and examples are left alone."""
+    section = ""
+    for line in lines:
+        heading = re.fullmatch(r"[A-Z][a-z]+:", line)
+        if heading or (line and not line[0].isspace()):
+            section = line if heading else ""
+        item = ITEM.fullmatch(line) if section else None
+        if heading or section == "Example:":
+            yield line
+        else:
+            yield item[1] + markup(item[2]) if item else markup(line)
+
+
+def rewrite(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Called by autodoc for each docstring."""
+    kind = "method" if what in {"property", "attribute"} else what  # there, napoleon takes `q (n,): text` for a type
+    lines[:] = GoogleDocstring(list(converted(lines)), SECTIONS, app, kind, name, thing, options).lines()
+
+
+def shortened(app: Sphinx, what: str, name: str, thing: Any, options: Any, words: str, result: str) -> tuple[str, str]:
+    """Called by autodoc for each signature: NumPy's unions get back their names."""
+    for long, short in TYPES.items():
+        words, result = (part and part.replace(long, short) for part in (words, result))
+    return words, result
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register with autodoc."""
+    app.connect("autodoc-process-docstring", rewrite)
+    app.connect("autodoc-process-signature", shortened)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,25 @@
+"""What a release needs agrees: version, dependencies, and contents of the archives."""
+
+import pytest
+import release
+
+
+def test_recipe_has_the_dependencies_of_the_project(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert list(release.dependencies()) == []
+    monkeypatch.setitem(release.PROJECT, "dependencies", [*release.PROJECT["dependencies"], "other>=2"])
+    assert list(release.dependencies()) == ["tools/recipe.yaml lacks 'other >=2', unlike pyproject.toml"]
+
+
+def test_all_files_name_the_same_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [fault for fault in release.texts() if "has version" in fault] == []
+    monkeypatch.setattr(release, "VERSION", "9.9.9")
+    assert sum("has version 0.1.0, expected 9.9.9" in fault for fault in release.texts()) == 2
+
+
+def test_contents_of_archives_are_judged() -> None:
+    found = ["a/LICENSE", "tests/x.py"]
+    assert list(release.contents("w.whl", found, ("LICENSE",), ("docs/",))) == []
+    assert list(release.contents("w.whl", found, ("py.typed",), ("tests/",))) == [
+        "w.whl lacks py.typed",
+        "w.whl holds tests/",
+    ]

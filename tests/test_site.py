@@ -1,0 +1,55 @@
+"""The documentation site: every public name has a place in the reference, and every page a place in the contents."""
+
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import orthocas
+
+DOCS = Path(__file__).parent.parent / "docs"
+sys.path.insert(0, str(DOCS / "_ext"))
+DIRECTIVE = re.compile(r"^\.\. auto(?:class|function|module):: (orthocas(?:\.\w+)+)$", flags=re.MULTILINE)
+PAGES = {str(path.relative_to(DOCS).with_suffix("")): path.read_text() for path in DOCS.rglob("*.md")}
+
+
+def described() -> list[str]:
+    return [name for page in PAGES.values() for name in DIRECTIVE.findall(page)]
+
+
+def contents(page: str) -> set[str]:
+    """The pages that the tables of contents of a page name."""
+    folder = Path(page).parent
+    trees = re.findall(r"```\{toctree\}\n(.*?)```", PAGES[page], flags=re.DOTALL)
+    names = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
+    return {str(folder / name) for name in names}
+
+
+def test_every_public_name_is_in_the_reference_once() -> None:
+    found = described()
+    assert len(found) == len(set(found)) > 100
+    packages = (orthocas.control, orthocas.simulation, orthocas.obstacles, orthocas.following, orthocas.plotting)
+    wanted = {f"orthocas.{name}" for name in orthocas.__all__}
+    for package in packages:
+        own = {f"{package.__name__}.{name}" for name in package.__all__}
+        wanted |= {name for name in own if f"orthocas.{name.split('.')[-1]}" not in wanted}
+    assert wanted - set(found) == set()
+
+
+def test_every_page_is_reached_from_the_first_one() -> None:
+    reached, new = set[str](), {"index"}
+    while new:
+        reached |= new
+        new = {name for page in new for name in contents(page)} - reached
+    assert reached == set(PAGES)
+
+
+def test_formulas_of_docstrings_become_markup() -> None:
+    pytest.importorskip("sphinx")
+    markup = import_module("plain_formulas").markup
+    assert markup("J_x A^-1 J_xi^T = 0") == r"J\ :sub:`x`\  A\ :sup:`-1`\  J\ :sub:`ξ`\ \ :sup:`T`\  = 0"
+    assert markup("`xi_1` and lambda1 |dxi_j|, see [AS2023]") == (
+        r"``xi_1`` and λ1 \|dξ\ :sub:`j`\ \|, see :doc:`[AS2023] </references>`"
+    )
