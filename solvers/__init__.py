@@ -7,11 +7,13 @@ from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.gradient_flow import GradientFlow
 from orthocas.solvers.ipopt import Ipopt
 from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.quasi_newton import QuasiNewton
 
-__all__ = ["LBFGS", "SOLVERS", "Adam", "GaussNewton", "GradientFlow", "Ipopt", "get"]
+__all__ = ["LBFGS", "SOLVERS", "Adam", "GaussNewton", "GradientFlow", "Ipopt", "QuasiNewton", "get"]
 
 SOLVERS: dict[str, type[GaussNewton] | type[LBFGS] | type[Ipopt] | type[Adam] | type[GradientFlow]] = {
     "gauss_newton": GaussNewton,
+    "quasi_newton": QuasiNewton,
     "lbfgs": LBFGS,
     "ipopt": Ipopt,
     "adam": Adam,

@@ -44,11 +44,11 @@ class LBFGS:
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
         """Minimise from theta0."""
-        run = _Run(self, objective, theta0, watch)
+        run = LBFGSRun(self, objective, theta0, watch)
         return run.best.run(run.iterate)
 
 
-class _Run:
+class LBFGSRun:
     """State of one minimisation."""
 
     def __init__(self, settings: LBFGS, objective: Objective, theta0: Array, watch: Watch) -> None:
@@ -63,6 +63,7 @@ class _Run:
         self.pairs = deque(_restored_pairs(kept, self.theta.size), maxlen=settings.memory)
 
     def iterate(self) -> Status:
+        """Iterate to the end."""
         best, limit = self.best, self.settings.max_iterations
         if best.iterations == 0:
             self.value, self.gradient = best.value_and_gradient(self.theta)
@@ -74,12 +75,24 @@ class _Run:
             before = self.value
             if not self._step():
                 return Status.STALLED
-            least = self.settings.tolerance * max(abs(before), abs(self.value), 1.0)
-            self.converged = before - self.value <= least
-            best.next_iteration(limit, **self._state())
+            self.converged = before - self.value <= self.least_gain(before)
+            best.next_iteration(limit, **self.state())
         return Status.CONVERGED if self.converged else Status.ITERATION_LIMIT
 
-    def _state(self) -> dict[str, Array | float]:
+    def least_gain(self, before: float) -> float:
+        """The gain of a step from this value below which a run has converged."""
+        return self.settings.tolerance * max(abs(before), abs(self.value), 1.0)
+
+    def scaled(self, direction: Array) -> Array:
+        """A first approximation of the inverse Hessian times a vector: a multiple of it."""
+        step, change = self.pairs[-1]
+        return np.asarray(direction * (step @ change) / (change @ change))
+
+    def first_direction(self) -> Array:
+        """A direction of descent without a memory."""
+        return np.asarray(-self.gradient / np.linalg.norm(self.gradient))
+
+    def state(self) -> dict[str, Array | float]:
         """All that a run needs to go on, besides the best point."""
         pairs = {f"pair_{k}": pair for k, pair in enumerate(self.pairs)}
         numbers = {"value": self.value, "converged": self.converged}
@@ -90,7 +103,7 @@ class _Run:
         if self.pairs and self._search(self._direction()):
             return True
         self.pairs.clear()
-        return self._search(-self.gradient / np.linalg.norm(self.gradient))
+        return self._search(self.first_direction())
 
     def _search(self, direction: Array) -> bool:
         """Search along a direction; whether a step was found, which is then taken and its pair stored."""
@@ -119,8 +132,7 @@ class _Run:
         for (step, change), curvature in zip(reversed(self.pairs), reversed(curvatures), strict=True):
             factors.append((direction @ step) / curvature)
             direction = direction - factors[-1] * change
-        newest = self.pairs[-1][1]
-        direction *= curvatures[-1] / (newest @ newest)
+        direction = self.scaled(direction)
         for (step, change), curvature, factor in zip(self.pairs, curvatures, reversed(factors), strict=True):
             direction += (factor - (direction @ change) / curvature) * step
         return direction

@@ -45,6 +45,7 @@ RESUMED = [
     (oc.Polynomial(3), solvers.GradientFlow(max_iterations=9), "polynomial:3"),
     (oc.MLP((6, 5)), solvers.GradientFlow(max_iterations=9), "mlp:6x5"),
     (oc.Polynomial(3), solvers.LBFGS(max_iterations=40), "polynomial:3"),
+    (oc.Polynomial(3), solvers.QuasiNewton(tolerance=1e-9), "polynomial:3"),
     (oc.MLP((6, 5)), solvers.LBFGS(max_iterations=40), "mlp:6x5"),
 ]
 NAMES = [f"{solver.name} in {stage} of {parametrisation.label}" for parametrisation, solver, stage in RESUMED]

@@ -189,7 +189,7 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["fit", "iiwa", "--param", "spline"], "unknown parametrisation 'spline', known: linear, polynomial"),
         (["fit", "iiwa", "--param", "polynomial:0"], "degree is 0, expected a whole number >= 1"),
         (["fit", "iiwa", "--param", "polynomial:25"], "GiB"),
-        (["fit", "iiwa", "--solver", "sgd"], "unknown solver 'sgd', known: gauss_newton, lbfgs"),
+        (["fit", "iiwa", "--solver", "sgd"], "unknown solver 'sgd', known: gauss_newton, quasi_newton"),
         (["fit", "iiwa", "--param", "mlp:100000x100000"], "GiB"),
         (["fit", "iiwa", "--half-width", "1e300"], "half_width is 1e+300"),
         (["fit", "iiwa", "--metric", ""], "unknown metric ''"),

@@ -8,15 +8,26 @@ import pytest
 import scipy.optimize
 
 import orthocas as oc
-from orthocas import solvers
+from orthocas import problems, solvers
 from orthocas.errors import CheckpointError, InvalidValueError, SolveError, UnknownNameError
-from orthocas.minimising.objective import ConstrainedObjective, LeastSquaresObjective, Objective, SmoothObjective
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.spectral_start import spectral_start
+from orthocas.minimising.objective import (
+    ConstrainedObjective,
+    EstimatedObjective,
+    LeastSquaresObjective,
+    Objective,
+    SmoothObjective,
+)
 from orthocas.minimising.solver import Solver, SolveResult, Status
 from orthocas.minimising.watch import Progress, State, Watch
+from orthocas.parametrisations import JointSpace
+from orthocas.samples import sample_problem
 from orthocas.solvers.line_search import Trial, wolfe_step
 
 ALL = [
     solvers.GaussNewton(max_iterations=60, tolerance=1e-12),
+    solvers.QuasiNewton(tolerance=1e-12),
     solvers.LBFGS(tolerance=1e-15),
     solvers.Ipopt(tolerance=1e-10),
     solvers.Adam(learning_rate=0.05),
@@ -24,6 +35,7 @@ ALL = [
 ]
 SHORT = [
     solvers.GaussNewton(max_iterations=3, tolerance=0.0),
+    solvers.QuasiNewton(max_iterations=3, tolerance=0.0),
     solvers.LBFGS(max_iterations=3, tolerance=0.0),
     solvers.Ipopt(max_iterations=3),
     solvers.Adam(epochs=3, steps=10, learning_rate=0.05),
@@ -50,6 +62,10 @@ class Valley:
     def normal_equations(self, theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         rho, D = self.residuals(theta)
         return float(rho @ rho / 2), D.T @ rho, D.T @ D
+
+    def curvature_estimate(self, theta: np.ndarray) -> np.ndarray:
+        D = self.residuals(theta)[1]
+        return D.T @ D
 
 
 class SmoothValley(Valley):
@@ -194,6 +210,7 @@ class TestShortRuns:
 KILLED = [
     solvers.GaussNewton(tolerance=0.0),
     solvers.GaussNewton(),
+    solvers.QuasiNewton(),
     solvers.Adam(epochs=6, steps=10),
     solvers.GradientFlow(),
     solvers.GradientFlow(max_iterations=7),
@@ -204,7 +221,7 @@ KILLED = [
 
 @pytest.mark.parametrize(
     ("solver", "objective"),
-    [(solver, Valley()) for solver in KILLED] + [(solver, Plain(Valley())) for solver in KILLED[2:]],
+    [(solver, Valley()) for solver in KILLED] + [(solver, Plain(Valley())) for solver in KILLED[3:]],
     ids=lambda value: getattr(value, "name", type(value).__name__),
 )
 def test_killed_run_loses_nothing(solver: Solver, objective: Objective) -> None:
@@ -373,12 +390,13 @@ PAIRS = [
     for parametrisation in (oc.Polynomial(2), oc.Fourier(1), oc.MLP((6, 5)))
     for solver in (
         solvers.GaussNewton(),
+        solvers.QuasiNewton(),
         solvers.LBFGS(max_iterations=60),
         solvers.Ipopt(max_iterations=60, tolerance=1e-4),
         solvers.Adam(epochs=10, steps=100, batch=50, learning_rate=2e-2),
         solvers.GradientFlow(max_iterations=18),
     )
-    if not (isinstance(parametrisation, oc.MLP) and isinstance(solver, solvers.GaussNewton))
+    if not (isinstance(parametrisation, oc.MLP) and isinstance(solver, solvers.GaussNewton | solvers.QuasiNewton))
 ]
 
 
@@ -398,13 +416,34 @@ def test_every_pair_that_makes_sense_beats_linear_coordinates(
     assert np.isnan(report.mutual_angle.std)
 
 
-def test_gauss_newton_refuses_objectives_without_normal_equations(planar_xy: oc.Problem) -> None:
+@pytest.mark.parametrize("solver", [solvers.GaussNewton(), solvers.QuasiNewton()], ids=lambda s: s.name)
+def test_solvers_with_a_matrix_refuse_objectives_without_one(planar_xy: oc.Problem, solver: Solver) -> None:
     with pytest.raises(InvalidValueError, match="expected lbfgs or adam"):
-        oc.fit(planar_xy, oc.MLP((4,)), solvers.GaussNewton(), samples=50)
+        oc.fit(planar_xy, oc.MLP((4,)), solver, samples=50)
+
+
+def test_quasi_newton_meets_gauss_newton_with_few_matrices() -> None:
+    """The same minimum of a real fit, from one matrix for many steps."""
+    problem, counts = problems.get("iiwa"), []
+
+    class Counted(BasisObjective):
+        def curvature_estimate(self, theta: np.ndarray) -> np.ndarray:
+            counts.append(theta)
+            return super().curvature_estimate(theta)
+
+    family = oc.Polynomial(1).family(JointSpace.of(problem), problem.r)
+    samples = sample_problem(problem, 500, (3,))
+    start = spectral_start(family, samples)
+    objective = Counted(family, samples, oc.Weights(regularity=0, folds=0), start, lambda *_: samples)
+    quasi = solvers.QuasiNewton(tolerance=1e-12).minimise(objective, start)
+    gauss = solvers.GaussNewton(tolerance=1e-12).minimise(objective, start)
+    assert quasi.value == pytest.approx(gauss.value, rel=1e-9)
+    assert len(counts) < quasi.iterations / 2
 
 
 def test_protocols_are_recognised() -> None:
     assert isinstance(Valley(), LeastSquaresObjective)
+    assert isinstance(Valley(), EstimatedObjective)
     assert not isinstance(Valley(), SmoothObjective)
     assert isinstance(SmoothValley(), SmoothObjective)
     assert isinstance(Bowl(0.0), ConstrainedObjective)
@@ -424,9 +463,9 @@ def test_bad_settings_of_solvers_are_refused() -> None:
 
 
 def test_solvers_by_name() -> None:
-    for name in ("gauss_newton", "lbfgs", "ipopt", "adam", "gradient_flow"):
+    for name in ("gauss_newton", "quasi_newton", "lbfgs", "ipopt", "adam", "gradient_flow"):
         assert solvers.get(name).name == name
-    with pytest.raises(UnknownNameError, match="unknown solver 'sgd', known: gauss_newton, lbfgs, ipopt, adam"):
+    with pytest.raises(UnknownNameError, match="unknown solver 'sgd', known: gauss_newton, quasi_newton, lbfgs, ipopt"):
         solvers.get("sgd")
 
 

@@ -69,7 +69,8 @@ def fit(
         str | None,
         typer.Option(
             "--solver",
-            help="gauss_newton, lbfgs, ipopt, adam or gradient_flow; default: one that suits the parametrisation.",
+            help="gauss_newton, quasi_newton, lbfgs, ipopt, adam or gradient_flow; "
+            "default: one that suits the parametrisation.",
         ),
     ] = None,
     centre: CentreText = None,

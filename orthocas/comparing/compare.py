@@ -97,7 +97,7 @@ def compare(
         raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
     cells = [
         Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file, force)
-        for parametrisation, solver, seed, file in _fits(parametrisations, solvers, count, folder)
+        for parametrisation, solver, seed, file in _fits(problem, parametrisations, solvers, count, folder)
     ]
     for cell in cells:
         if cell.chart_file is not None:
@@ -106,6 +106,7 @@ def compare(
 
 
 def _fits(
+    problem: Problem,
     parametrisations: Sequence[Parametrisation],
     solvers: Sequence[Solver] | None,
     seeds: int,
@@ -114,7 +115,7 @@ def _fits(
     """Parametrisation, solver, seed and chart file of every fit of a grid."""
     for parametrisation in parametrisations:
         closed = parametrisation.closed_form is not None
-        fitting = [default_solver(parametrisation)] if closed or solvers is None else solvers
+        fitting = [default_solver(parametrisation, problem)] if closed or solvers is None else solvers
         for solver, seed in product(fitting, range(1 if closed else seeds)):
             name = re.sub(r"[^\w.-]", "-", f"{parametrisation.label}_{solver.name}_{seed}.orthocas")
             yield parametrisation, solver, seed, None if folder is None else folder / name

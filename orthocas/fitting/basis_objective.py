@@ -20,6 +20,8 @@ from orthocas.samples import Draw, Samples, even_parts
 _CHUNK = 512  # samples per product of the Hessian, so that the rows stay in the cache
 _BLOCKS = 8  # blocks of samples per thread: a fixed number, so that sums do not depend on the number of threads
 _STRIDE = 2  # every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
+_MOST_STRIDE = 16  # of rough estimates; a divisor of the samples in a block
+_ROUGH = 12  # residuals per coefficient in a rough estimate
 
 
 class BasisObjective:
@@ -110,12 +112,15 @@ class BasisObjective:
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """L(theta), its gradient, and the Gauss-Newton matrix, computed with products in single precision."""
         value, gradient = self.value_and_gradient(theta)
-        derivatives = residual_columns(self._loss)(self._jacobian_entries(theta), *self._data)
-        H = self._gauss_newton_matrix(derivatives[: self.r])
-        hinges = derivatives[self.r :]
-        for residual, derivative in zip(hinges[::2], hinges[1::2], strict=True):
-            H += self._hinge_matrix(residual, derivative)
-        return value, gradient, H
+        return value, gradient, self._matrix(theta, _STRIDE)
+
+    def curvature_estimate(self, theta: Array) -> Array:
+        """The Gauss-Newton matrix from as few samples as steer a quasi-Newton method."""
+        residuals = self.N * (self._loss.hinge_rows.start or 1)
+        stride = _STRIDE
+        while 2 * stride <= _MOST_STRIDE and residuals >= 2 * stride * _ROUGH * theta.size:
+            stride *= 2
+        return self._matrix(theta, stride)
 
     def hessian(self, theta: Array) -> Array:
         """d^2L/dtheta^2, exact, (size, size)."""
@@ -184,13 +189,12 @@ class BasisObjective:
             self._expanded["all"] = self._gradients.dense(self.G, self.N)
         return self._expanded["all"]
 
-    @property
-    def _halves(self) -> list[Array]:
-        """G of the coefficients of each coordinate at every second sample, (N / 2, n, K_j), in single precision."""
-        names = [row.tobytes().hex() for row in self.kept]
+    def _thinned(self, stride: int) -> list[Array]:
+        """G of the coefficients of each coordinate at some samples, (N / stride, n, K_j), in single precision."""
+        names = [f"{stride} {row.tobytes().hex()}" for row in self.kept]
         for name, row in zip(names, self.kept, strict=True):
             if name not in self._expanded:
-                self._expanded[name] = self._gradients.dense_part(self.G, self.N, row, _STRIDE, np.float32)
+                self._expanded[name] = self._gradients.dense_part(self.G, self.N, row, stride, np.float32)
         return [self._expanded[name] for name in names]
 
     def _by_joint(self, theta: Array) -> Array:
@@ -228,20 +232,29 @@ class BasisObjective:
         J = np.concatenate(in_threads(lambda part: C @ self.G[part], self._parts))
         return J.reshape(len(J), self.n * self.r, -1)
 
-    def _gauss_newton_matrix(self, derivatives: list[Array]) -> Array:
-        """Gauss-Newton matrix of the smooth residuals, by blocks of coordinate pairs, from every second sample."""
+    def _matrix(self, theta: Array, stride: int) -> Array:
+        """Gauss-Newton matrix; that of the smooth residuals from every `stride`-th sample."""
+        derivatives = residual_columns(self._loss)(self._jacobian_entries(theta), *self._data)
+        H = self._gauss_newton_matrix(derivatives[: self.r], stride)
+        hinges = derivatives[self.r :]
+        for residual, derivative in zip(hinges[::2], hinges[1::2], strict=True):
+            H += self._hinge_matrix(residual, derivative)
+        return H
+
+    def _gauss_newton_matrix(self, derivatives: list[Array], stride: int) -> Array:
+        """Gauss-Newton matrix of the smooth residuals, by blocks of coordinate pairs."""
         rows = self._loss.smooth_rows
         if not any(rows):
             return np.zeros((self.kept.sum(), self.kept.sum()))
         shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
-        gradients = self._halves
-        H = normal_matrix([self._rows(derivative) for derivative in derivatives], gradients, shared)
+        gradients = self._thinned(stride)
+        H = normal_matrix([self._rows(derivative, stride) for derivative in derivatives], gradients, shared)
         return H / len(gradients[0])
 
-    def _rows(self, derivative: Array) -> Array:
-        """Derivatives of residuals (B, n rows, c) at every second sample, (N / 2, rows, n), in single precision."""
+    def _rows(self, derivative: Array, stride: int) -> Array:
+        """Derivatives of residuals (B, n rows, c) at some samples, (N / stride, rows, n), in single precision."""
         blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
-        return by_sample(blocks, self.N, _STRIDE).astype(np.float32)
+        return by_sample(blocks, self.N, stride).astype(np.float32)
 
     def _hinge_matrix(self, residual: Array, derivative: Array) -> Array:
         """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""

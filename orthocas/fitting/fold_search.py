@@ -10,7 +10,13 @@ from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.checkpoint import Stage
 from orthocas.fitting.graph_objective import GraphObjective
 from orthocas.fitting.loss import FOLD_TERM, LEAST_CONDITIONING
-from orthocas.minimising.objective import LeastSquaresObjective, Objective, SampledObjective, SmoothObjective
+from orthocas.minimising.objective import (
+    EstimatedObjective,
+    LeastSquaresObjective,
+    Objective,
+    SampledObjective,
+    SmoothObjective,
+)
 from orthocas.minimising.watch import Monitor, Progress
 from orthocas.parametrisations import JointSpace, Parametrisation
 from orthocas.problem import Problem
@@ -97,6 +103,12 @@ class _LinearSum(_Sum):
         value, gradient, H = self._loss.normal_equations(theta)
         more, slope, curvature = self._penalty.normal_equations(theta)
         return value + more, gradient + slope, H + curvature
+
+    def curvature_estimate(self, theta: Array) -> Array:
+        """A rough Gauss-Newton matrix of loss and penalty."""
+        assert isinstance(self._loss, EstimatedObjective)
+        assert isinstance(self._penalty, EstimatedObjective)
+        return self._loss.curvature_estimate(theta) + self._penalty.curvature_estimate(theta)
 
     def hessian(self, theta: Array) -> Array:
         """Hessian of loss and penalty."""

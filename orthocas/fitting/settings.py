@@ -10,13 +10,14 @@ from orthocas.domains import Torus
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.loss import WeightNumbers, Weights
 from orthocas.minimising.solver import Solver
-from orthocas.parametrisations import Parametrisation, Polynomial
+from orthocas.parametrisations import GradedParametrisation, Parametrisation, Polynomial
 from orthocas.postures.clear_box import ClearBox
 from orthocas.postures.corridor import Corridor
 from orthocas.problem import Problem
 from orthocas.samples import sample_problem
-from orthocas.solvers import LBFGS, GaussNewton, Ipopt
+from orthocas.solvers import LBFGS, GaussNewton, Ipopt, QuasiNewton
 
+_MANY_TERMS = 1000  # where a Gauss-Newton matrix takes much longer than a gradient: degree 6 for seven joints
 _TELLTALE = (20, (0, 1000))  # number and seed of the samples that identify a problem
 _LEAST_BOUND = 1e-6  # deg; rounding hides smaller angles
 
@@ -56,7 +57,7 @@ class FitSettings:
         if max_mutual_deg is not None:
             _require_bound(bound, max_mutual_deg)
         if solver is None:
-            solver = default_solver(bound) if max_mutual_deg is None else Ipopt()
+            solver = default_solver(bound, problem) if max_mutual_deg is None else Ipopt()
         require_solver(solver)
         if max_mutual_deg is not None and not isinstance(solver, Ipopt):
             raise InvalidValueError("solver", solver.name, "ipopt, the only solver that supports max_mutual_deg")
@@ -94,9 +95,12 @@ def default_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
     return Polynomial(degree=4 if bounded or problem.n > 7 else 5)
 
 
-def default_solver(parametrisation: Parametrisation) -> Solver:
-    """Gauss-Newton for families linear in their parameters, L-BFGS for others."""
-    return GaussNewton() if parametrisation.linear else LBFGS()
+def default_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
+    """Gauss-Newton for families linear in their parameters, with fewer matrices if these are large; else L-BFGS."""
+    if not parametrisation.linear:
+        return LBFGS()
+    many = isinstance(parametrisation, GradedParametrisation) and parametrisation.term_count(problem.n) > _MANY_TERMS
+    return QuasiNewton() if many else GaussNewton()
 
 
 def require_parametrisation(value: object) -> None:

@@ -28,6 +28,15 @@ class LeastSquaresObjective(Objective, Protocol):
 
 
 @runtime_checkable
+class EstimatedObjective(Objective, Protocol):
+    """A mean of squared residuals with a rough Gauss-Newton matrix, which costs less than the one of all samples."""
+
+    def curvature_estimate(self, theta: Array) -> Array:
+        """An estimate of the Gauss-Newton matrix, (size, size)."""
+        ...
+
+
+@runtime_checkable
 class SmoothObjective(Objective, Protocol):
     """An objective with its exact Hessian."""
 

@@ -42,7 +42,13 @@ _WORDS = (
     "circle:circle:mlp:2x2",
     ":",
 )
-_SOLVERS = ("gauss_newton", "lbfgs", "ipopt", "newton")  # Adam takes the paper's 10,000 steps, 20 s, for any fit
+_SOLVERS = (
+    "gauss_newton",
+    "quasi_newton",
+    "lbfgs",
+    "ipopt",
+    "newton",
+)  # Adam takes the paper's 10,000 steps, 20 s, for any fit
 _LAWS = ("impedance", "pd_plus", "kinematic", "projector", "kinematic_projector", "none", "pid")
 _COUNTS = ("0", "1", "2", "-1", "20", "99999999999999999999", "1.5", "")
 _VALUES: dict[str, tuple[str, ...]] = {

@@ -152,7 +152,7 @@ def _makers() -> dict[str, Call]:
         ),
         **{
             f"{kind.__name__}": (kind, {"max_iterations": 5, "tolerance": 1e-3})
-            for kind in (solvers.GaussNewton, solvers.LBFGS, solvers.Ipopt, solvers.GradientFlow)
+            for kind in (solvers.GaussNewton, solvers.QuasiNewton, solvers.LBFGS, solvers.Ipopt, solvers.GradientFlow)
         },
         "Adam": (solvers.Adam, {"epochs": 2, "steps": 3, "batch": 20, "learning_rate": 1e-3}),
     }
