@@ -386,6 +386,9 @@ def test_command_line_builds_shows_and_evaluates(run: Run) -> None:
     code, out, _ = run("atlas", "info", "a.orthocas-atlas")
     assert code == 0
     assert "cyclic q1" in out
+    code, out, err = run("atlas", "evaluate", "a.orthocas-atlas", "--samples", "9" * 20)
+    assert (code, out) == (2, "")
+    assert "samples of an atlas" in err
 
 
 @pytest.mark.parametrize(
