@@ -50,7 +50,7 @@ def write_library(
     if controller is not None:
         require_controller(controller)
         controller = source.law(controller)
-        safety = _matching_safety(controller, safety)
+        safety = _matching_safety(source.safety(controller), safety)
     name = _name(source.chart, controller) if name is None else name
     _require_identifier(name)
     precision = SINGLE if single_precision else DOUBLE
@@ -89,13 +89,13 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
     if controller is not None:
         graph = source.graph(precision.graph(controller))
         inputs = graph.mx_in()
-        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller)]
+        clear = source.clear_box if controller.chart is not None else None
+        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, clear)]
     return found
 
 
-def _matching_safety(controller: Controller, safety: Safety | None) -> Safety:
-    """The settings, checked against the sizes of the law; default those of `Safety.of`."""
-    wanted = Safety.of(controller)
+def _matching_safety(wanted: Safety, safety: Safety | None) -> Safety:
+    """The settings, checked against the sizes of the default ones."""
     if safety is None:
         return wanted
     require_kind("safety", safety, Safety)
