@@ -78,7 +78,7 @@ def packages(dist: Path) -> Iterator[str]:
     with zipfile.ZipFile(wheel) as archive:
         yield from contents(wheel.name, archive.namelist(), IN_WHEEL, NOT_IN_WHEEL)
         metadata = archive.read(f"orthocas-{VERSION}.dist-info/METADATA").decode()
-    for line in (f"Version: {VERSION}", "License-Expression: MIT"):
+    for line in (f"Version: {VERSION}", f"License-Expression: {PROJECT['license']}"):
         if line not in metadata.splitlines():
             yield f"{wheel.name} lacks the line {line!r} in its metadata"
 

@@ -1,6 +1,7 @@
 """The directive `{command-line}`: all commands of `orthocas` with their arguments, from the program itself."""
 
 import inspect
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,6 +11,8 @@ from sphinx.util.docutils import SphinxDirective
 from typer.main import get_command
 
 from orthocas.cli.commands import COMMANDS, app_for
+
+OPTION = re.compile(r"(--[a-z][a-z-]*)")
 
 
 def leaves(command: Any, name: str) -> Iterator[tuple[str, Any]]:
@@ -37,7 +40,8 @@ def _row(parameter: Any) -> str:
         text += " Required."
     elif not flag and parameter.default not in (None, ()):
         text += f" Default: {parameter.default}."
-    return f"| `{_cell(words)}` | {_cell(text)} |"
+    meaning = OPTION.sub(r"`\1`", _cell(text))
+    return f"| `{_cell(words)}` | {meaning} |"
 
 
 def _cell(text: str) -> str:

@@ -3,21 +3,27 @@
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.application import Sphinx
+from sphinx.transforms import SphinxTransform
 
 
-def index_terms(app: Sphinx, doctree: nodes.document) -> None:
-    """Put a mark for the index before each term."""
-    if app.env.docname != "glossary":
-        return
-    for row in doctree.findall(nodes.row):
-        if isinstance(row.parent, nodes.tbody):
-            name, first = row[0].astext(), f"term-{app.env.new_serialno('term')}"
-            target = nodes.target("", "", ids=[first])
-            marks = addnodes.index(entries=[("single", term, first, "", None) for term in name.split(", ")])
-            row[0].insert(0, [marks, target])
+class TermsInIndex(SphinxTransform):
+    """Puts a mark for the index before each term."""
+
+    default_priority = 500  # before Sphinx collects the marks
+
+    def apply(self) -> None:
+        """Called by Sphinx for each page."""
+        if self.env.docname != "glossary":
+            return
+        for count, row in enumerate(self.document.findall(nodes.row)):
+            if isinstance(row.parent, nodes.tbody):
+                place = f"term-{count}"
+                terms = row[0].astext().split(", ")
+                mark = addnodes.index(entries=[("single", term, place, "", None) for term in terms])
+                row[0].insert(0, [mark, nodes.target("", "", ids=[place])])
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Connect to the reading of pages."""
-    app.connect("doctree-read", index_terms)
+    """Register the transform."""
+    app.add_transform(TermsInIndex)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
