@@ -6,6 +6,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_at_least, require_count, require_kind
@@ -50,7 +51,7 @@ def self_motion_figure(chart: Chart, postures: int = 9, reach: float | None = 0.
     require_count("postures", postures, most=_MOST_POSTURES)
     if reach is not None:
         require_at_least("reach", reach, 0)
-    figure = Picture(figsize=(3.0 * chart.r, 3.6), layout="constrained")
+    figure = Picture(figsize=(3.0 * chart.r, 3.5), layout=ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1))
     sweeps = [_sweep(chart, j, postures, reach) for j in range(chart.r)]
     everything = chart.problem.robot.joint_points(np.concatenate(sweeps)).reshape(-1, 3)
     colours = mpl.colormaps["viridis"](np.linspace(0.1, 0.9, postures))
