@@ -10,7 +10,7 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.errors import Interrupted, InvalidValueError, MemoryNeedError, ShapeError
+from orthocas.errors import Interrupted, InvalidValueError, MemoryNeedError, ShapeError, UnknownNameError
 from orthocas.fitting.fit import Fit
 from orthocas.minimising.objective import Objective
 from orthocas.minimising.solver import SolveResult, Status
@@ -223,6 +223,12 @@ def test_degree_too_large_for_memory_says_how_much_it_needs(iiwa: oc.Problem) ->
 
 
 def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
+    with pytest.raises(UnknownNameError, match="unknown precision 'half'"):
+        oc.fit(planar_x, precision="half")
+    with pytest.raises(InvalidValueError, match="precision is 'single' with max_mutual_deg"):
+        oc.fit(planar_x, max_mutual_deg=3.0, precision="single")
+    with pytest.raises(InvalidValueError, match="precision is 'single' with circle:mlp:3"):
+        oc.fit(planar_x, oc.parametrisations.Circle(oc.MLP((3,))), samples=50, precision="single")
     with pytest.raises(InvalidValueError, match="samples is 0"):
         oc.fit(planar_x, samples=0)
     with pytest.raises(InvalidValueError, match="parametrisation is 'polynomial:3'"):

@@ -9,6 +9,8 @@ import pytest
 import orthocas as oc
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import graph_objective
+from orthocas.fitting.array_objective import ArrayObjective
+from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.graph_objective import GraphObjective
 from orthocas.fitting.loss import REGULAR_VOLUME, Loss, Sizes, Weights, mutual_cosines, pairs, task_cosines
@@ -123,6 +125,43 @@ def test_graph_cut_into_blocks_gives_the_same_loss(planar_x: oc.Problem, monkeyp
     assert len(blocked._blocks) == 8
     np.testing.assert_allclose(blocked.value_and_gradient(family.initial(1))[0], value, rtol=1e-13)
     np.testing.assert_allclose(blocked.value_and_gradient(family.initial(1))[1], gradient, atol=1e-11)
+
+
+@pytest.mark.parametrize("network", [oc.MLP((7,)), oc.MLP((6, 5, 4)), oc.MLP((6, 5), raw=True)], ids=lambda p: p.label)
+def test_arrays_of_a_network_agree_with_its_graph(problem: oc.Problem, network: oc.MLP) -> None:
+    """Derivatives by hand against CasADi's, for 40 samples and for 260 in pieces of 130; single precision to 1e-5."""
+    family = network.family(JointSpace.of(problem), problem.r)
+    theta = family.initial(1)
+    for count in (40, 260):
+        settings = (family, sample_problem(problem, count, 2), EVEN, theta, draw_from(problem))
+        value, gradient = GraphObjective(*settings).value_and_gradient(theta)
+        for single, error in ((False, 1e-12), (True, 1e-5)):
+            ours = ArrayObjective(*settings, single)
+            found, slopes = ours.value_and_gradient(theta)
+            np.testing.assert_allclose([found, ours.value(theta)], value, rtol=error)
+            np.testing.assert_allclose(slopes, gradient, rtol=0, atol=error * np.abs(gradient).max())
+
+
+def test_arrays_of_prismatic_joints_agree_with_their_graph() -> None:
+    space = JointSpace(np.zeros(3), np.ones(3), (False, True, False), ("a", "b", "c"))
+    family = oc.MLP((5, 4)).family(space, 2)
+    theta, points = family.initial(0), np.random.default_rng(1).normal(size=(6, 3))
+    q = ca.MX.sym("q", 3, 6)
+    wanted = ca.Function("J", [q], family.jacobian(q, ca.DM(theta)))(points.T)
+    np.testing.assert_allclose(family.pullback(points, theta)[0].transpose(1, 2, 0), wanted, atol=1e-14)
+
+
+def test_single_precision_of_a_basis_changes_the_last_digits(problem: oc.Problem) -> None:
+    family = oc.Polynomial(3).family(JointSpace.of(problem), problem.r)
+    theta, gradients = family.initial(3), BasisGradients(family, problem.n, np.float32)
+    settings = (family, sample_problem(problem, 300, 9), EVEN, theta, draw_from(problem))
+    double, single = BasisObjective(*settings), BasisObjective(*settings, gradients=gradients)
+    assert 2 * single.G.nbytes == double.G.nbytes
+    value, gradient, H = double.normal_equations(theta)
+    found, slopes, matrix = single.normal_equations(theta)
+    assert 0 < abs(found / value - 1) < 1e-5
+    np.testing.assert_allclose(slopes, gradient, rtol=0, atol=1e-5 * np.abs(gradient).max())
+    np.testing.assert_allclose(matrix, H, rtol=0, atol=1e-4 * np.abs(H).max())
 
 
 @pytest.mark.parametrize("parametrisation", [oc.Polynomial(2), oc.Fourier(1), oc.MLP((6,))], ids=lambda p: p.label)

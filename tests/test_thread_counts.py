@@ -104,6 +104,17 @@ def test_threads_do_not_change_a_fit(planar_x: oc.Problem, solver: Solver) -> No
         np.testing.assert_array_equal(other, found[0])
 
 
+def test_threads_do_not_change_a_network(planar_x: oc.Problem) -> None:
+    """Pieces of samples in a fixed order, more than one, in both precisions."""
+    settings = {"samples": 1000, "weights": (1000, 30)}
+    for precision in ("double", "single"):
+        found = [
+            oc.fit(planar_x, oc.MLP((300, 4)), solvers.LBFGS(4), **settings, threads=count, precision=precision)
+            for count in (1, 3)
+        ]
+        np.testing.assert_array_equal(*(fit.chart.coordinates.theta for fit in found))
+
+
 def test_threads_do_not_change_a_bounded_fit(planar_x: oc.Problem) -> None:
     found = []
     for count in (1, 3):

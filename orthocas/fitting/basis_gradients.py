@@ -9,6 +9,8 @@ from orthocas.casadi_tools.columns import ColumnFunction, blocked
 from orthocas.checks import Array
 from orthocas.parametrisations import LinearFamily
 
+_PART = 16  # blocks
+
 
 class BasisGradients:
     """d psi / dq of a linear family.
@@ -19,10 +21,11 @@ class BasisGradients:
     Args:
         family: the basis, with K functions of n joints.
         n: number of joints.
+        dtype: type of the numbers that `at` returns; they are computed in double precision.
     """
 
-    def __init__(self, family: LinearFamily, n: int) -> None:
-        self._family, self._n = family, n
+    def __init__(self, family: LinearFamily, n: int, dtype: DTypeLike = np.float64) -> None:
+        self._family, self._n, self._type = family, n, np.dtype(dtype)
 
     @cached_property
     def terms_of_joints(self) -> NDArray[np.int_]:
@@ -40,7 +43,12 @@ class BasisGradients:
         Entry w of joint i belongs to function `terms_of_joints[i, w]`. `orthocas.casadi_tools.columns` describes the
         blocks.
         """
-        gradients = self._columns(blocked(points))[0]
+        blocks = blocked(points)
+        if self._type == np.float64:
+            gradients = self._columns(blocks)[0]
+        else:  # some blocks at a time, so that the memory never holds all of them in double precision
+            parts = (self._columns(blocks[k : k + _PART])[0] for k in range(0, len(blocks), _PART))
+            gradients = np.concatenate([part.astype(self._type) for part in parts])
         return gradients.reshape(len(gradients), self._n, -1, gradients.shape[2])
 
     def dense(self, gradients: Array, samples: int) -> Array:

@@ -43,7 +43,8 @@ class BasisObjective:
         kept: the coefficients (r, K) that may differ from zero; theta holds only these. Default: all.
         exchanged: pairs of components whose sum and difference are coordinates, see `orthocas.fitting.mirror`. Then
             C and J_xi are those of the components.
-        gradients: gradients of the basis, if they are known already. Default: those of the family.
+        gradients: gradients of the basis, if they are known already, or of another type than float64; products with
+            them are computed with numbers of that type. Default: those of the family.
     """
 
     def __init__(
@@ -200,7 +201,7 @@ class BasisObjective:
     def _by_joint(self, theta: Array) -> Array:
         """Coefficients of the terms that depend on each joint, (n, r, W)."""
         C = expanded(theta, self.kept).reshape(self.r, self.K)[:, self._gradients.terms_of_joints]
-        return np.ascontiguousarray(C.transpose(1, 0, 2))
+        return np.ascontiguousarray(C.transpose(1, 0, 2), dtype=self.G.dtype)
 
     def _collected(self, gradient: Array) -> Array:
         """Gradient with respect to theta, (size,), from the gradient with respect to `_by_joint`."""
@@ -217,19 +218,19 @@ class BasisObjective:
 
     def _sums(self, C: Array, run: Run, part: slice) -> tuple[float, Array]:
         """Share of some blocks in the loss, and in its slopes with respect to the coefficients of `_by_joint`."""
-        value, gradient = 0.0, np.zeros_like(C)
+        value, gradient = 0.0, np.zeros(C.shape)
         losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
         arrays = (self.G, self._share, *self._data)
         for G, share, *data in zip(*(array[part] for array in arrays), strict=True):  # G leaves memory only once
-            run([C @ G, *data], [losses, slopes])
+            run([_double(C @ G), *data], [losses, slopes])
             value += float(losses @ share)
-            gradient += (slopes * share).reshape(self.n, self.r, -1) @ G.transpose(0, 2, 1)
+            gradient += (slopes * share).astype(G.dtype, copy=False).reshape(self.n, self.r, -1) @ G.transpose(0, 2, 1)
         return value, gradient
 
     def _jacobian_entries(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
         C = self._by_joint(theta)
-        J = np.concatenate(in_threads(lambda part: C @ self.G[part], self._parts))
+        J = _double(np.concatenate(in_threads(lambda part: C @ self.G[part], self._parts)))
         return J.reshape(len(J), self.n * self.r, -1)
 
     def _matrix(self, theta: Array, stride: int) -> Array:
@@ -265,6 +266,11 @@ class BasisObjective:
         rows = (D @ G.astype(np.float32))[:, self.kept]
         product: Array = (rows.T @ rows).astype(float) / self.N
         return product
+
+
+def _double(products: Array) -> Array:
+    """Numbers of the type that CasADi's functions read."""
+    return products.astype(np.float64, copy=False)
 
 
 def expanded(theta: Array, kept: NDArray[np.bool_]) -> Array:

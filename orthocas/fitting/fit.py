@@ -20,7 +20,7 @@ from orthocas.fitting.fold_search import FoldSearch
 from orthocas.fitting.gauge import aligned, in_closed_form, in_gauge, normalised
 from orthocas.fitting.idle_joints import idle_joints
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers, Weights
-from orthocas.fitting.settings import FitSettings, default_parametrisation
+from orthocas.fitting.settings import PRECISIONS, FitSettings, default_parametrisation
 from orthocas.fitting.stages import StageRunner
 from orthocas.minimising.solver import Solver, Status
 from orthocas.minimising.watch import Monitor, silent
@@ -101,6 +101,7 @@ def fit(
     align_to: Chart | None = None,
     threads: int | None = None,
     split_idle: bool = True,
+    precision: str = PRECISIONS[0],
 ) -> Fit:
     """Find coordinates xi(q) that are as orthogonal as possible to the task.
 
@@ -132,6 +133,9 @@ def fit(
             Default: OMP_NUM_THREADS, or the number of cores.
         split_idle: whether joints that do not affect the task become coordinates themselves. The paper's network learns
             them; False is for comparisons with it.
+        precision: 'double', or 'single' for the large products of loss and gradient: those of a network, and those with
+            the gradients of a basis, which then take half of the memory. Losses and angles change by less than 1e-5 of
+            their size at the same parameters. Parameters and charts are double.
 
     Returns:
         The chart, the result of each stage, and the seconds.
@@ -158,7 +162,9 @@ def fit(
     wanted = (
         default_parametrisation(problem, max_mutual_deg is not None) if parametrisation is None else parametrisation
     )
-    settings = FitSettings.checked(problem, wanted, solver, weights, samples, seed, max_mutual_deg, split_idle)
+    settings = FitSettings.checked(
+        problem, wanted, solver, weights, samples, seed, max_mutual_deg, split_idle, precision
+    )
     warn_unless_savable(settings.parametrisation)
     if isinstance(settings.parametrisation, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))

@@ -6,6 +6,7 @@ import numpy as np
 
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
+from orthocas.fitting.array_objective import ArrayObjective
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.checkpoint import Stage
 from orthocas.fitting.graph_objective import GraphObjective
@@ -62,7 +63,7 @@ class FoldSearch:
         self.found = worst_points(problem, coordinates, seed)
         self._points = np.concatenate([self._points, self.found.below(_COLLECTED)])
 
-    def added_to(self, objective: BasisObjective | GraphObjective) -> Objective:
+    def added_to(self, objective: BasisObjective | ArrayObjective | GraphObjective) -> Objective:
         """The objective plus the fold term at all points collected."""
         if not len(self._points):
             return objective

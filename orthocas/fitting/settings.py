@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocas.checks import as_number, require_count, require_kind
+from orthocas.checks import as_number, require_count, require_kind, require_known
 from orthocas.domains import Torus
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.loss import WeightNumbers, Weights
@@ -17,6 +17,7 @@ from orthocas.problem import Problem
 from orthocas.samples import sample_problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt, QuasiNewton
 
+PRECISIONS = ("double", "single")  #: of the large products of a fit
 _MANY_TERMS = 1000  # where a Gauss-Newton matrix takes much longer than a gradient: degree 6 for seven joints
 _TELLTALE = (20, (0, 1000))  # number and seed of the samples that identify a problem
 _LEAST_BOUND = 1e-6  # deg; rounding hides smaller angles
@@ -33,6 +34,7 @@ class FitSettings:
     seed: int
     max_mutual_deg: float | None
     split_idle: bool = True
+    precision: str = PRECISIONS[0]
 
     @classmethod
     def checked(
@@ -45,6 +47,7 @@ class FitSettings:
         seed: int,
         max_mutual_deg: float | None,
         split_idle: bool = True,
+        precision: str = PRECISIONS[0],
     ) -> "FitSettings":
         """Check the settings, and fill in the default solver and the default angles.
 
@@ -64,7 +67,16 @@ class FitSettings:
         count = None if samples is None else require_count("samples", samples, least=2)
         loss = Weights.of(weights).for_metric(problem.metric)
         require_kind("split_idle", split_idle, bool)
-        return cls(bound, solver, loss, count, require_count("seed", seed, least=0), max_mutual_deg, split_idle)
+        require_known("precision", precision, PRECISIONS)
+        if precision == "single" and max_mutual_deg is not None:
+            raise InvalidValueError("precision", "'single' with max_mutual_deg", "double: Ipopt needs its digits")
+        tag = require_count("seed", seed, least=0)
+        return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision)
+
+    @property
+    def single(self) -> bool:
+        """Whether large products are computed in single precision."""
+        return self.precision == "single"
 
     @property
     def max_mutual(self) -> float | None:
@@ -87,6 +99,7 @@ class FitSettings:
             "seed": repr(self.seed),
             "max_mutual_deg": repr(self.max_mutual_deg),
             **({} if self.split_idle else {"split_idle": "False"}),
+            **({"precision": self.precision} if self.single else {}),
         }
 
 

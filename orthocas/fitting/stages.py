@@ -13,6 +13,8 @@ from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.checks import Array, require_memory
 from orthocas.domains import sample_evenly
 from orthocas.errors import CheckpointError, InfeasibleError, InvalidValueError, SolveError
+from orthocas.fitting.array_objective import ArrayObjective
+from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.basis_objective import BasisObjective, expanded
 from orthocas.fitting.bounded_mutual import BoundedMutual
 from orthocas.fitting.checkpoint import Checkpoint, Stage
@@ -25,7 +27,7 @@ from orthocas.fitting.spectral_start import spectral_start
 from orthocas.minimising.objective import Objective
 from orthocas.minimising.solver import Solver, SolveResult, Status
 from orthocas.minimising.watch import Monitor, Progress, Watch
-from orthocas.parametrisations import Family, GradedParametrisation, JointSpace, LinearFamily
+from orthocas.parametrisations import ArrayFamily, Family, GradedParametrisation, JointSpace, LinearFamily
 from orthocas.problem import Problem
 from orthocas.samples import Samples, sample_problem, samples_at
 from orthocas.solvers import GaussNewton
@@ -89,8 +91,8 @@ class StageRunner:
         done = self.checkpoint.finished(plan.label)
         if done is not None:
             return done
-        # networks are few large products: they need the threads of BLAS more than the last digits
-        with one_blas_thread() if isinstance(family, LinearFamily) else nullcontext():
+        # other networks are few large products: they need the threads of BLAS more than the last digits
+        with one_blas_thread() if isinstance(family, LinearFamily | ArrayFamily) else nullcontext():
             stage = self._minimised(plan, kept)
         self.checkpoint.add(stage)
         return stage
@@ -121,7 +123,7 @@ class StageRunner:
 
     def _objective(self, plan: Plan, samples: Samples, kept: NDArray[np.bool_] | None) -> tuple[Objective, Array]:
         """The loss of a family on samples, and the start in the parameters that it leaves free."""
-        family, theta, weights = plan.family, plan.start, self.settings.weights
+        family, theta = plan.family, plan.start
         if not isinstance(family, LinearFamily):
             if self.settings.max_mutual is not None:
                 raise InvalidValueError(
@@ -131,11 +133,21 @@ class StageRunner:
                 )
             self._require_graph_memory(plan.label, family, len(samples))
             theta = family.initial(self.settings.seed) if theta is None else theta
-            return self.folds.added_to(GraphObjective(family, samples, weights, theta, self._draw)), theta
+            return self.folds.added_to(self._network_objective(family, samples, theta)), theta
         objective, start = self._linear_objective(family, samples, theta, None if kept is None else self.mirror)
         if self.settings.max_mutual is None:
             return self.folds.added_to(objective), start
         return self._bounded(objective, start, fresh=theta is None)
+
+    def _network_objective(self, family: Family, samples: Samples, theta: Array) -> ArrayObjective | GraphObjective:
+        """The loss of a family that is not linear in its parameters."""
+        weights, single = self.settings.weights, self.settings.single
+        if isinstance(family, ArrayFamily):
+            return ArrayObjective(family, samples, weights, theta, self._draw, single)
+        if single:
+            label = self.settings.parametrisation.label
+            raise InvalidValueError("precision", f"'single' with {label}", "double, or a basis or a network (mlp)")
+        return GraphObjective(family, samples, weights, theta, self._draw)
 
     def _linear_objective(
         self, family: LinearFamily, samples: Samples, theta: Array | None, mirror: Mirror | None
@@ -148,7 +160,11 @@ class StageRunner:
             theta = mirror.components(theta)
         theta = theta if kept is None else theta.reshape(kept.shape)[kept]
         exchanged = () if mirror is None else mirror.exchanged
-        return BasisObjective(family, samples, self.settings.weights, theta, self._draw, kept, exchanged), theta
+        gradients = BasisGradients(family, self.space.n, np.float32 if self.settings.single else np.float64)
+        objective = BasisObjective(
+            family, samples, self.settings.weights, theta, self._draw, kept, exchanged, gradients
+        )
+        return objective, theta
 
     def _trial(self, family: LinearFamily, mirror: Mirror) -> float:
         """The loss that a family reaches with these symmetric coordinates."""

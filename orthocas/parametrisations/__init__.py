@@ -4,6 +4,7 @@ from orthocas.parametrisations.basis import BasisFamily
 from orthocas.parametrisations.circle import Circle
 from orthocas.parametrisations.cyclic_joints import cyclic_joints
 from orthocas.parametrisations.family import (
+    ArrayFamily,
     ClosedForm,
     CombinableFamily,
     CyclicParametrisation,
@@ -37,6 +38,7 @@ from orthocas.parametrisations.sew import SEW
 __all__ = [
     "MLP",
     "SEW",
+    "ArrayFamily",
     "BasisFamily",
     "Circle",
     "ClosedForm",

@@ -81,6 +81,23 @@ class Family(Protocol):
 
 
 @runtime_checkable
+class ArrayFamily(Family, Protocol):
+    """A family whose coordinate gradients NumPy computes, with their derivative, in any precision."""
+
+    def pullback(self, points: Array, theta: Array) -> tuple[Array, Callable[[Array], Array]]:
+        """J_xi at points, and the derivative of any function L of it.
+
+        Args:
+            points: joint positions, (N, n).
+            theta: parameters, (size,). Products are computed with numbers of its type.
+
+        Returns:
+            J_xi, (N, r, n), and the map from dL/dJ_xi (N, r, n) to dL/dtheta (size,).
+        """
+        ...
+
+
+@runtime_checkable
 class ReorderableFamily(Family, Protocol):
     """A family whose components can be reordered."""
 
