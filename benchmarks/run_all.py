@@ -30,6 +30,7 @@ SCRIPTS = (
     "compiled_loss",
     "ipopt_front",
     "starts",
+    "gradient_flow",
     "mesh_chart",
     "growing_queries",
     "lengths",

@@ -373,6 +373,33 @@ def test_gradient_flow_follows_the_closed_form() -> None:
     np.testing.assert_allclose(path[:, 1], 2 * path[:, 0] ** 3, atol=1e-6)
 
 
+def test_gradient_flow_takes_the_hessian_where_there_is_one_and_keeps_it_for_some_steps() -> None:
+    asked: list[np.ndarray] = []
+
+    class Bowls(SmoothValley):
+        def hessian(self, theta: np.ndarray) -> np.ndarray:
+            asked.append(theta)
+            return super().hessian(theta)
+
+        def normal_equations(self, theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+            raise AssertionError("the Gauss-Newton matrix is not needed")
+
+    flow = solvers.GradientFlow(tolerance=1e-9)
+    result = flow.minimise(Bowls(), START)
+    np.testing.assert_allclose(result.theta, 1.0, atol=1e-5)
+    assert result.iterations < len(asked) < result.evaluations / 4
+
+
+def test_flow_of_a_basis_costs_a_few_times_what_lbfgs_does(planar_xy: oc.Problem) -> None:
+    """In evaluations, of which the flow's come with few Hessians; processor times: benchmarks/gradient_flow.py."""
+    ours, theirs = (
+        oc.fit(planar_xy, oc.Polynomial(3), solver).stages for solver in (solvers.GradientFlow(), solvers.LBFGS())
+    )
+    assert ours[-1].result.status is Status.CONVERGED
+    assert ours[-1].result.value < 1.003 * theirs[-1].result.value
+    assert sum(s.result.evaluations for s in ours) < 5 * sum(s.result.evaluations for s in theirs)
+
+
 def test_adam_takes_fresh_samples_and_judges_on_fixed_ones() -> None:
     asked: list[tuple[int, int, tuple[int, ...]]] = []
 
