@@ -1,6 +1,7 @@
 """Numbers as C literals."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.checks import Array
 
@@ -11,6 +12,6 @@ def numbers(values: Array) -> str:
     return ", ".join(words.get(float(value), repr(float(value))) for value in values)
 
 
-def flags(values: Array) -> str:
+def flags(values: NDArray[np.bool_]) -> str:
     """Truth values as C has them."""
     return ", ".join(str(int(value)) for value in values)
