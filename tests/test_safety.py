@@ -1,13 +1,18 @@
 """Strong pushes on the 7-DoF arm in MuJoCo, against the compiled supervised law."""
 
+import numpy as np
 import pytest
 from charts import with_metric
 from programs import needs_c
 
 import orthocas as oc
+from orthocas.codegen import Supervisor
+from orthocas.control import PDPlus, Safety
+from orthocas.simulation import MuJoCoPlant
 
 pytest.importorskip("mujoco", reason="the extra sim is not installed")
 
+import default_gains
 import safety
 
 pytestmark = [needs_c, pytest.mark.slow]
@@ -22,3 +27,15 @@ def test_pushed_arms_slow_down_come_to_rest_and_come_back(iiwa: oc.Problem) -> N
         assert push.rest_after <= 2.0
         assert push.change <= 1.0 + 1e-9  # N m in a millisecond
         assert push.back_after < 60.0
+
+
+def test_a_start_with_a_wrong_mass_is_not_caught_and_integral_action_takes_the_sag_away() -> None:
+    """With A = M the light wrist makes up for the sag of the tip: a law that faded in over 0.2 s made it too fast."""
+    chart = default_gains.chart_of("iiwa", "position", "inertia")
+    law, plant = PDPlus.on_chart(chart), MuJoCoPlant(chart.problem.robot.with_scaled_masses(1.2))
+    worst = default_gains.starts_of(chart.problem, 3)[2]
+    with default_gains.compiled(law) as library:
+        default = Supervisor(library, law, Safety.of(law, integral_rate=3.0))
+        slow = Supervisor(library, law, Safety.of(law, integral_rate=3.0, fade_in=0.2))
+        assert default_gains.held(law, default, plant, worst) < 1e-3  # [m] after 2 s
+        assert np.isinf(default_gains.held(law, slow, plant, worst))  # caught
