@@ -1,4 +1,7 @@
-"""Atlases of arms: boxes, time, bytes and coverage against half-width and degree, from a random share of the tiles."""
+"""Atlases of arms: boxes, time, bytes and coverage against half-width and degree, from a random share of the tiles.
+
+Also corridors: leak against the radius, and what loops of the tool leave behind.
+"""
 
 import argparse
 import time
@@ -11,10 +14,12 @@ import numpy as np
 import orthocas as oc
 from orthocas import problems
 from orthocas.atlases.atlas_file import ATLAS, add_results, header_of, plan_terms
+from orthocas.atlases.box_fit import BoxFitter
 from orthocas.atlases.cells import Cell
 from orthocas.atlases.outcomes import Outcome, Result
 from orthocas.atlases.plan import make_plan
 from orthocas.atlases.regions import joint_range_of
+from orthocas.checks import Array
 from orthocas.files.blocks import create
 
 ROBOTS = {  # of the package example-robot-data: file and tip
@@ -93,6 +98,60 @@ def large(count: int) -> str:
     )
 
 
+def widths(name: str, task: str, boxes: int) -> str:
+    """Leak and conditioning of boxes around random clear positions against their size, which an atlas halves to."""
+    plan = make_plan(problem_of(name, task), oc.AtlasSettings(), 5.0)
+    fitter, joints, domain = BoxFitter(plan), list(plan.joints), plan.problem.domain
+    q = domain.centre + domain.half_width * np.random.default_rng(0).uniform(-1, 1, (50 * boxes, plan.problem.n))
+    q = q[plan.singular_values(q) > plan.settings.least_singular_value][:boxes, joints]
+    lines = [f"{name}, {task}: boxes divide {len(joints)} joints", "half-width: leak (median), conditioning (median)"]
+    for half_width in (0.4, 0.2, 0.1, 0.05):
+        found = [fitter.fit(plan.box_around(row - half_width, row + half_width))[0] for row in q]
+        known = np.array([(chart.leak_deg, chart.conditioning) for chart in found if chart is not None])
+        lines.append("{:g} rad: {:.1f} deg, {:.2f}".format(half_width, *np.median(known, axis=0)))
+    return "\n".join(lines)
+
+
+def pseudo_inverse(problem: oc.Problem, q: Array, x: Array) -> Array:
+    """Postures along task values, by steps of least norm."""
+    postures = []
+    for wanted in x:
+        for _ in range(4):
+            J = problem.task.batched_jacobian(q[None])[0].reshape(problem.m, problem.n)
+            q = q + np.linalg.pinv(J) @ (wanted - problem.task.batched(q[None])[0][0])
+        postures.append(q)
+    return np.array(postures)
+
+
+def corridor(quick: bool) -> str:
+    """Charts along a straight tool path of 0.98 m, and circles of the tool."""
+    problem = problems.get("iiwa")
+    ends = np.array([[0.25, -0.45, 0.55], [0.6, 0.4, 0.2]])
+    start = np.array([-1.0, 0.5, 0.0, -1.4, 0.0, 0.9, 0.0])
+    here = problem.task.batched(start[None])[0][0]
+    start = pseudo_inverse(problem, start, np.linspace(here, ends[0], 50))[-1]
+    postures = pseudo_inverse(problem, start, np.linspace(ends[0], ends[1], 200))
+    lines = ["corridor of 0.98 m: radius, seconds of the fit, leak rms without idle joints, least conditioning"]
+    for radius in (0.2,) if quick else (0.1, 0.2, 0.35, 0.5):
+        begin = time.perf_counter()
+        chart = oc.fit(oc.corridor_problem(problem, postures, radius), oc.Polynomial(3, "auto")).chart
+        seconds, found = time.perf_counter() - begin, oc.evaluate(chart)
+        leak = (found.without_idle or found).leak.rms
+        lines.append(f"{radius:g} rad: {seconds:.1f} s, {leak:.2f} deg, {found.conditioning.min:.2f}")
+    lines.append("circles of the tool: radius, left over by the pseudo-inverse, by a chart of a corridor")
+    turn, home = np.linspace(0, 2 * np.pi, 160)[:, None], problem.domain.centre
+    for size in (0.1,) if quick else (0.05, 0.1, 0.2):
+        x = problem.task.batched(home[None])[0][0] + size * np.hstack([np.cos(turn) - 1, np.sin(turn), 0 * turn])
+        postures = pseudo_inverse(problem, home, x)
+        chart = oc.fit(oc.corridor_problem(problem, postures), oc.Polynomial(3, "auto"), samples=1500).chart
+        q, xi = home, chart.xi(home)
+        for wanted in x:
+            q = chart.inverse(np.concatenate([wanted, xi]), q_start=q)
+        left = [np.abs(last - home).max() for last in (postures[-1], q)]
+        lines.append("{:g} m: {:.2g} rad, {:.1g} rad".format(size, *left))
+    return "\n".join(lines)
+
+
 def _memory() -> float:
     """Resident memory of this process [MiB]."""
     text = Path("/proc/self/status").read_text()
@@ -101,6 +160,8 @@ def _memory() -> float:
 
 def main(quick: bool, jobs: int | None) -> None:
     """Print the tables."""
+    print(corridor(quick))
+    print(widths("panda", "pose", 4 if quick else 12))
     print(large(2000 if quick else 100_000))
     print(HEADER)
     share = 0.02 if quick else 0.05

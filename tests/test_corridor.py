@@ -9,6 +9,8 @@ import pytest
 
 import orthocas as oc
 from orthocas import codegen, problems
+from orthocas.certifying.chart_rows import chart_rows
+from orthocas.certifying.outside import judge_of
 from orthocas.checks import Array
 from orthocas.control import ControlStatus
 from orthocas.domains import sample_heavily, sample_uniform
@@ -99,6 +101,22 @@ def test_loop_closes_where_the_pseudo_inverse_drifts(loop: tuple[oc.Problem, Arr
     assert drift > 0.01
     assert np.abs(q - postures[0]).max() < 1e-6 * drift
     assert oc.evaluate(chart, 1000).conditioning.min > 0.5
+
+
+def test_certificate_covers_the_corridor_and_leaves_out_nothing_of_it(chart: oc.Chart) -> None:
+    domain = chart.problem.domain
+    certificate = oc.certify(chart)
+    assert certificate.proved
+    assert oc.check_certificate(chart, certificate)
+    judge = judge_of(chart, chart_rows(chart), 0.0)
+    rng = np.random.default_rng(7)
+    middle = rng.uniform(-1, 1, (200, 3))
+    corners = [domain.centre + domain.half_width * (middle + side) for side in (-0.1, 0.1)]
+    verdicts = judge(*corners)
+    outside = verdicts.sign == 0
+    assert 5 < outside.sum() < 195
+    for low, high in zip(corners[0][outside], corners[1][outside], strict=True):
+        assert not domain.contains(rng.uniform(low, high, (200, 3))).any()
 
 
 def test_laws_and_generated_c_fall_back_outside(

@@ -15,7 +15,7 @@ from orthocas.certifying.outside import judge_of
 from orthocas.certifying.search import Limits, Look, Search, distances, largest_first, nearest_first
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_number, require_at_least, require_executor, require_kind
-from orthocas.domains import Box, Domain, contains, reach
+from orthocas.domains import Box, Domain, SelfDrawing, contains, reach, sample_heavily
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.files.chart_file import fingerprint
 from orthocas.minimising.watch import Monitor, Progress, silent
@@ -45,7 +45,8 @@ def certify(
     sufficient condition: the symmetric part of J(centre)^-1 J(q) is positive definite.
 
     In a `ClearBox`, parts need no proof that are proved, by the same arithmetic, to lie outside: the relative singular
-    value of the task is at most the bound there. They count as proved in the share of the box.
+    value of the task is at most the bound there. They count as proved in the share of the box. So do parts of the box
+    of a `Corridor` that are farther from its path than the radius.
 
     Args:
         chart: a fitted chart.
@@ -213,6 +214,8 @@ def _suspects(chart: Chart) -> Array:
     powers = rng.choice([1.0, 0.5, 0.25], (_SAMPLES, 1))
     points = np.vstack([domain.centre, domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers])
     points = points[contains(domain, points)]
+    if isinstance(domain, SelfDrawing):
+        points = sample_heavily(domain, _SAMPLES, 0)
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
     worst = int(np.argmin(volumes * np.sign(volumes[0])))

@@ -1,4 +1,4 @@
-"""Boxes that need no proof, because they are proved to lie outside a ClearBox (ours)."""
+"""Boxes that need no proof, because they are proved to lie outside a ClearBox or a Corridor (ours)."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,9 @@ from orthocas.certifying.task_rows import task_rows
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.postures.clear_box import ClearBox
+from orthocas.postures.corridor import Corridor
 
+_ROUNDING = 1e-6  # of distances, far above that of floating-point numbers
 _LENGTH = 1e-9  # of singular vectors: their deviation from 1 is far smaller
 _GUARDS = 1e-12  # of |J_x|^2: elimination in floating-point numbers is exact to less, so guards agree
 
@@ -66,9 +68,40 @@ class OutsideJudge:
         return outside, np.array(across.variables)[np.argmax(np.nan_to_num(influences), axis=0)]
 
 
+@dataclass(frozen=True, eq=False)
+class CorridorJudge:
+    """Counts boxes as proved, without a sign, that are farther from the path than the radius.
+
+    A box is, if the distance of its middle is larger than the radius by more than half of its diagonal.
+
+    Another judge judges the other boxes, and their det J must have the sign of the first posture of the path.
+    """
+
+    inside: RegularityJudge
+    domain: Corridor
+    sign: float
+
+    def __call__(self, low: Array, high: Array) -> Verdicts:
+        """Judge boxes between corners (boxes, n)."""
+        middle, half = (low + high) / 2, (high - low) / 2
+        distance = np.sqrt(self.domain.squared_distance(middle))
+        outside = distance > 1 + _ROUNDING + self.domain.lengths(half)
+        found = self.inside(low, high)
+        return Verdicts(
+            proved=(found.proved & (found.sign == self.sign)) | outside,
+            regular=found.regular & (distance <= 1),  # only these signs tell about the corridor
+            sign=np.where(outside, 0, found.sign),
+            conditioning=np.where(outside, np.inf, found.conditioning),
+            widest=found.widest,
+        )
+
+
 def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
-    """The judge of a chart: of its whole box or, in a ClearBox, of what is not proved to lie outside."""
+    """The judge of a chart: of its whole box or, of a part of it, of what is not proved to lie outside."""
     judge, domain = RegularityJudge(rows, bound), chart.problem.domain
+    if isinstance(domain, Corridor):
+        start = domain.postures[domain.contains(domain.postures)][:1]
+        return CorridorJudge(judge, domain, float(judge(start, start).sign[0]))
     if not isinstance(domain, ClearBox):
         return judge
     q = ca.SX.sym("q", chart.n)

@@ -85,7 +85,7 @@ class Corridor(Box):
         """Whether points (n,) or (N, n) lie in the corridor: a bool, or (N,)."""
         points, single = as_point_set("q", q, len(self.centre))
         inside = np.array(super().contains(points))
-        inside[inside] = self._near(points[inside]).any(axis=1)
+        inside[inside] = self.squared_distance(points[inside]) <= 1
         return inside[0] if single else inside
 
     @cached_property
@@ -127,11 +127,15 @@ class Corridor(Box):
         along = rng.uniform(-1.0, length[k] + 1)[:, None]
         return np.asarray(starts[k] + along * axes[k] + distance * direction)
 
-    def _near(self, points: Array) -> Any:
-        """Which lines have each point (N, n) within the radius, (N, lines)."""
+    def squared_distance(self, points: Array) -> Array:
+        """Squared distance of points (N, n) from the path in radii, (N,)."""
         along, across = self._parts(points)
         beyond = along - np.clip(along, 0.0, 1.0)
-        return across + beyond**2 * self._lines[2] <= 1.0
+        return np.asarray((across + beyond**2 * self._lines[2]).min(axis=1))
+
+    def lengths(self, steps: Array) -> Array:
+        """Lengths of steps (N, n) in radii, (N,)."""
+        return np.asarray(np.linalg.norm(steps / self.radius, axis=1))
 
     def _parts(self, points: Array) -> tuple[Array, Array]:
         """Place of points (N, n) along every line, from 0 to 1 on it, and squared distance from it, (N, lines) each."""
