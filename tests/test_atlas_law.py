@@ -1,5 +1,6 @@
 """A law across the charts of an atlas in C: that of each chart, and hand-overs that ask for the same posture."""
 
+import re
 import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,11 +10,12 @@ from typing import Any
 import atlas_corridor
 import numpy as np
 import pytest
-from programs import built, needs_c
+from programs import built, needs_c, output_of
 
 import orthocas as oc
 from orthocas.checks import Array
 from orthocas.codegen import ChartReference, CompiledLibrary, GeneratedC, Supervisor, compile_shared, gain_numbers
+from orthocas.codegen.library import STRICT, compilers
 from orthocas.control import Controller, ControlStatus, Kinematic, PDPlus, Projector
 from orthocas.errors import InvalidValueError
 
@@ -187,3 +189,12 @@ def test_laws_without_a_chart_are_refused(way_atlas: oc.Atlas, planar_fit: Any, 
     for law in (Projector(way_atlas.problem, 80.0, 10.0), PDPlus(planar_fit.chart, 50.0)):
         with pytest.raises(InvalidValueError, match="expected a law on a chart of the atlas"):
             oc.generate_c(way_atlas, tmp_path, law)
+
+
+def test_program_of_the_page_on_atlases_in_c_compiles(generated: GeneratedC, tmp_path: Path) -> None:
+    """With C99 and every warning an error."""
+    page = (Path(__file__).parent.parent / "docs" / "atlas_in_c.md").read_text()
+    (code,) = re.findall(r"```c\n(.*?)```", page, flags=re.DOTALL)
+    declared = code[code.index("arm_status tick(") : code.index(") {") + 1] + ";\n"
+    (tmp_path / "page.c").write_text(code.replace("/* One tick", f"{declared}\n/* One tick", 1))
+    output_of(compilers()[0], *STRICT, "-fsyntax-only", f"-I{generated.folder}", tmp_path / "page.c")
