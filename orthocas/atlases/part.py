@@ -110,6 +110,11 @@ class AtlasPart(Shown):
         """The numbers of the atlas."""
         return self.atlas._evaluation
 
+    def certified(self, fitted: Indices) -> int:
+        """How many of some fitted charts are proved not to fold."""
+        stock = self.atlas._stock
+        return int((stock.records["certified"][stock.charts[fitted]] > 0).sum())
+
     def clear_shares(self, fitted: Indices) -> Any:
         """Shares of the samples of fitted charts that are clear of singular positions, (fitted,)."""
         stock = self.atlas._stock

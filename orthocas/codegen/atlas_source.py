@@ -125,6 +125,7 @@ class AtlasSource:
             "which": "int chart, ",
             "that": "chart, ",
             "check_that": "0, ",
+            "of_chart": " for chart 0",
             "require_chart": "  if (!known(chart)) return {NAME}_OUTSIDE_DOMAIN;\n".format(**known),
             "dynamics_status": "{NAME}_OK".format(**known),
             "basis": self._basis.code,

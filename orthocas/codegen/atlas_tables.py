@@ -4,6 +4,7 @@ Numbers of fitted charts are stored once. Charts that are images of them are tol
 its map, and by order, signs and constants of their coordinates.
 """
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import ceil, log2
@@ -33,7 +34,9 @@ class AtlasTables:
 
     def values(self) -> dict[str, str]:
         """Values of the placeholders of templates/tables.c.in, without sizes of work arrays."""
-        return {**self._joints(), **self._tiles(), **self._charts(), **self._sizes()}
+        tables = {**self._joints(), **self._tiles(), **self._charts()}
+        digest = hashlib.sha256("\n".join(tables.values()).encode()).hexdigest()
+        return {**tables, **self._sizes(), "fingerprint": digest}
 
     @cached_property
     def depth(self) -> int:
@@ -90,6 +93,7 @@ class AtlasTables:
             "cell_count": len(self._cells[0]),
             "table_bytes": self.bytes,
             "depth": self.depth,
+            "certified": self.part.certified(self.fits),
             "tile_steps": ceil(log2(len(self.tiles))) if len(self.tiles) > 1 else 0,
             "cells_searched": 1 + 2 * len(plan.joints),
         }

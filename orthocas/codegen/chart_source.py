@@ -91,7 +91,9 @@ class ChartSource:
             "is_clear": "1" if self.condition is None else "is_clear(q)",
             "mem": "0",
             "dynamics_status": "inside(q) ? {NAME}_OK : {NAME}_OUTSIDE_DOMAIN".format(**known),
-            **dict.fromkeys(("which", "that", "check_that", "require_chart", "tables_c", "atlas_functions_h"), ""),
+            **dict.fromkeys(
+                ("which", "that", "check_that", "require_chart", "tables_c", "atlas_functions_h", "of_chart"), ""
+            ),
         }
         everything = {**known, **values}
         values["clear_c"] = "" if self.condition is None else condition_code(self.condition, everything)
@@ -113,6 +115,7 @@ def position_within(domain: Domain) -> Array:
     return np.round(domain.centre + (shares[0] if shares else 0.0) * domain.half_width, 3)
 
 
+_NUMBERS_OF_CHARTS = ("which", "that", "check_that", "require_chart", "of_chart", "tables_c", "atlas_functions_h")
 _OF_CHARTS = (
     *("beyond", "reference_chart", "no_chart_yet", "state_chart", "state_carry", "hand_over_h", "home", "first_chart"),
     *("choose_chart", "carry", "fade_carry", "reference_of_chart", "same_chart", "other_chart", "changed"),

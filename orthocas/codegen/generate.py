@@ -12,6 +12,7 @@ from orthocas.codegen.generated import GeneratedC
 from orthocas.codegen.library_files import write_library
 from orthocas.codegen.source import Source
 from orthocas.control import Controller, Safety
+from orthocas.errors import InvalidValueError
 
 
 def generate_c(
@@ -42,7 +43,7 @@ def generate_c(
         single_precision: whether numbers are `float` instead of `double`, for processors that compute in single
             precision only.
         rows: also write NAME_rows.c and NAME_rows.h with NAME_phi_rows, phi of many joint positions, for vector
-            instructions. Not for large networks.
+            instructions. Not for large networks, and not for atlases.
 
     Raises:
         NoExpressionError: if the chart is grown; `orthocas.distil` turns it into a chart with a closed expression.
@@ -61,7 +62,10 @@ def generate_c(
         ...     sorted(path.name for path in generated.folder.iterdir())
         ['CMakeLists.txt', 'README.md', 'arm.c', 'arm.h', 'arm.pc.in']
     """
-    return write_library(_source(chart), out, controller, name, force, safety, single_precision, rows)
+    source = _source(chart)
+    if rows and isinstance(source, AtlasSource):
+        raise InvalidValueError("rows", rows, "False for an atlas, whose charts are evaluated one position at a time")
+    return write_library(source, out, controller, name, force, safety, single_precision, rows)
 
 
 def _source(chart: Chart | Atlas | AtlasPart) -> Source:
