@@ -7,6 +7,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import signal
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
 
@@ -107,6 +108,17 @@ def arm_chart() -> oc.Chart:
     problem = oc.problems.get("iiwa")
     inertial = with_metric(problem, "inertia")
     return oc.fit(inertial, oc.Polynomial(2)).chart
+
+
+@pytest.fixture(scope="session")
+def way_atlas(planar_x: oc.Problem, tmp_path_factory: pytest.TempPathFactory) -> oc.Atlas:
+    """Charts of the planar arm, A = M, around a way that leads through several of them."""
+    path = tmp_path_factory.mktemp("atlas") / "arm.orthocas-atlas"
+    asked = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.6, splits=4)
+    way = np.linspace([0.6, 2.6, 0.9], [0.6, 3.6, -0.9], 40)
+    with ThreadPoolExecutor(1) as executor:
+        problem = with_metric(planar_x, "inertia")
+        return oc.build_atlas(problem, path, asked, region=way, radius=0.5, executor=executor)
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,7 @@ from orthocas.atlases.plan import make_plan
 from orthocas.atlases.processes import Processes
 from orthocas.atlases.regions import joint_range_of, read_postures
 from orthocas.checks import Array
-from orthocas.errors import AtlasFileError, InvalidValueError, PathFileError
+from orthocas.errors import AtlasFileError, InvalidValueError, PathFileError, ShapeError
 from orthocas.files.blocks import create, owned
 
 ASKED = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.8, splits=5)
@@ -121,6 +121,19 @@ def test_jacobian_is_the_derivative_of_xi_in_the_same_chart(atlas: oc.Atlas, poi
     numbers, h = atlas.chart_at(points), 1e-6
     steps = [(atlas.xi(points + h * e, numbers) - atlas.xi(points - h * e, numbers)) / (2 * h) for e in np.eye(3)]
     assert np.abs(np.stack(steps, axis=-1) - atlas.jacobian(points, numbers)).max() < 1e-8
+
+
+def test_inverse_in_charts_finds_what_phi_came_from(atlas: oc.Atlas, points: Array) -> None:
+    numbers = atlas.chart_at(points)
+    x, xi = atlas.problem.task.batched(points)[0], atlas.xi(points)
+    starts = points + np.random.default_rng(8).uniform(-0.02, 0.02, points.shape)
+    found = atlas.inverse(x, xi, numbers, starts)
+    assert np.isfinite(found).all(axis=1).mean() > 0.95  # the others leave the box of their chart on the way
+    assert np.nanmax(np.abs(found - points)) < 1e-8
+    assert np.isnan(atlas.inverse(x[0] + 9.0, xi[0], numbers[0], points[0])).all()
+    assert np.isnan(atlas.inverse(x[0], xi[0], -1, points[0])).all()
+    with pytest.raises(ShapeError, match="xi has shape"):
+        atlas.inverse(x[0], xi[:2], numbers[0], points[0])
 
 
 def test_charts_are_as_good_as_asked_for(atlas: oc.Atlas) -> None:
@@ -386,6 +399,9 @@ def test_command_line_builds_shows_and_evaluates(run: Run) -> None:
     code, out, _ = run("atlas", "info", "a.orthocas-atlas")
     assert code == 0
     assert "cyclic q1" in out
+    code, out, err = run("atlas", "evaluate", "a.orthocas-atlas", "--samples", "9" * 20)
+    assert (code, out) == (2, "")
+    assert "samples of an atlas" in err
 
 
 @pytest.mark.parametrize(

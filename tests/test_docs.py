@@ -72,10 +72,11 @@ def test_python_blocks_of_the_page_on_domains_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_python_block_of_the_page_on_atlases_runs(tmp_path: Path) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "atlas.md").read_text(), flags=re.DOTALL)
+def test_python_blocks_of_the_page_on_atlases_run(tmp_path: Path) -> None:
+    code, corridor = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "atlas.md").read_text(), flags=re.DOTALL)
     (tmp_path / "program.py").write_text(code)  # processes start by importing it
     assert output_of(sys.executable, "program.py", folder=tmp_path).splitlines() == ["('x', 'y', 'xi1') (1,)", "1.0"]
+    assert python(corridor, tmp_path) == "True True\n"
 
 
 @pytest.mark.slow

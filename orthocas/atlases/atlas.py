@@ -1,18 +1,19 @@
 """Atlases: many charts that cover the joint range of a robot, in one file (ours)."""
 
 from collections import OrderedDict
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.atlases.atlas_facts import data_of, facts_of
 from orthocas.atlases.atlas_file import Stock, read_stock, require_whole
 from orthocas.atlases.chart_of_box import chart_of, clipped, moved
 from orthocas.atlases.evaluation import Evaluation
 from orthocas.atlases.index import Index
-from orthocas.atlases.outcomes import Outcome
+from orthocas.atlases.inverse import inverse_in_charts
 from orthocas.atlases.plan import AtlasSettings, Plan
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
@@ -24,11 +25,12 @@ from orthocas.checks import (
     as_point,
     as_point_set,
     require_count,
+    require_shape,
 )
 from orthocas.domains import Box
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.problem import Problem
-from orthocas.showing import Shown, listed, number_list
+from orthocas.showing import Shown
 
 Turns = tuple[int, ...]  #: full turns of each joint that boxes divide
 _KEPT = 32  # charts that stay built, the last ones
@@ -118,44 +120,11 @@ class Atlas(Shown):
 
     def facts(self) -> dict[str, str]:
         """Charts, joints and what was asked of them."""
-        plan, names = self._stock.plan, self.problem.robot.joint_names
-        counts = " x ".join(str(count) for count in plan.lattice.counts.tolist())
-        asked = plan.settings
-        return {
-            "atlas": f"{len(self)} charts of {self.problem.heading}",
-            "fitted": f"{self.fitted} charts; {len(plan.maps)} symmetries, the identity included",
-            "task": self.problem.task.heading,
-            "metric": self.problem.metric.name,
-            "boxes": f"divide {listed(names[i] for i in plan.joints)}; {counts} tiles",
-            "half-widths": f"of tiles {number_list(plan.lattice.width / 2)}, halved at most {asked.splits} times",
-            "left out": f"cyclic {listed(names[i] for i in plan.cyclic) or 'none'}, "
-            f"idle {listed(names[i] for i in plan.idle) or 'none'}",
-            "asked": f"leak {asked.leak_deg:g} deg, conditioning {asked.conditioning:g}, "
-            f"relative singular value above {asked.least_singular_value:g}",
-            "file": f"{self._stock.contents.size / 2**20:.3g} MiB",
-        }
+        return facts_of(self.stock, len(self))
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        plan, names = self._stock.plan, self.problem.robot.joint_names
-        outcomes = np.bincount(self._stock.records["outcome"], minlength=len(Outcome))
-        return {
-            "charts": len(self),
-            "fitted": self.fitted,
-            "bytes": self._stock.contents.size,
-            "task": self.problem.task.name,
-            "metric": self.problem.metric.name,
-            "joints": [names[i] for i in plan.joints],
-            "cyclic_joints": [names[i] for i in plan.cyclic],
-            "idle_joints": [names[i] for i in plan.idle],
-            "symmetries": len(plan.maps),
-            "tiles": plan.lattice.counts.tolist(),
-            "tile_half_widths": (plan.lattice.width / 2).tolist(),
-            "settings": asdict(plan.settings),
-            "boxes": {outcome.name.lower(): int(outcomes[outcome]) for outcome in Outcome},
-            "certified": int((self._stock.records["certified"][self._stock.charts] > 0).sum()),
-            "fit_seconds": float(self._stock.records["seconds"].sum()),
-        }
+        return data_of(self.stock, len(self))
 
     def chart_at(self, q: ArrayLike, current: ArrayLike | None = None) -> Any:
         """The number of the chart for joint positions (n,) or (N, n): an int, or (N,); -1 where there is none.
@@ -205,6 +174,29 @@ class Atlas(Shown):
         known = numbers >= 0
         found[known] = self._evaluation.jacobian(points[known], numbers[known])
         return found[0] if single else found
+
+    def inverse(self, x: ArrayLike, xi: ArrayLike, charts: ArrayLike, q_start: ArrayLike) -> Array:
+        """Joint positions with task values x and coordinates xi, (n,) or (N, n); NaN where none is found.
+
+        Newton's method from q_start, in the chart of each row. Solutions lie in the box of that chart.
+
+        Args:
+            x: task values, (m,) or (N, m).
+            xi: coordinates in the charts, (r,) or (N, r).
+            charts: numbers of the charts, one or (N,); -1 for none.
+            q_start: where to begin, (n,) or (N, n) [rad] or [m].
+
+        Raises:
+            ShapeError, InvalidValueError: for arguments of the wrong shape, or a number that is no chart.
+        """
+        starts, single = as_point_set("q_start", q_start, self.problem.n)
+        sizes = {"x": self.problem.m, "xi": self.problem.r}
+        parts = [as_float_array(name, value) for name, value in (("x", x), ("xi", xi))]
+        for part, (name, size) in zip(parts, sizes.items(), strict=True):
+            require_shape(name, part.shape, (size,) if single else (len(starts), size))
+        phi = np.hstack([np.atleast_2d(part) for part in parts])
+        found = inverse_in_charts(self._evaluation, phi, self._numbers("charts", charts, len(starts)), starts)
+        return np.asarray(found[0] if single else found)
 
     def chart(self, number: int, near: ArrayLike | None = None) -> Chart:
         """A chart as all of orthocas takes it: its domain is the box, less what lies beyond the joint limits.

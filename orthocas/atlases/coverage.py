@@ -7,12 +7,13 @@ import numpy as np
 
 from orthocas.atlases.atlas import Atlas
 from orthocas.atlases.outcomes import Outcome
-from orthocas.checks import Array, Indices, require_count, require_kind
+from orthocas.checks import Array, Indices, require_count, require_kind, require_memory
 from orthocas.judging.gradients import in_the_metric
 from orthocas.samples import samples_at
 from orthocas.showing import Shown
 
 _PIECE = 20_000  # joint positions at once
+_NUMBERS = 8  # for each sample, beside joint positions
 _BINS = 24  # of the coverage by joint
 REASONS = {
     Outcome.SINGULAR: "most of the box is too near to singular positions",
@@ -117,6 +118,7 @@ def evaluate_atlas(atlas: Atlas, samples: int = 100_000, seed: int = 1) -> Cover
     require_kind("atlas", atlas, Atlas)
     count, seed = require_count("samples", samples), require_count("seed", seed, least=0)
     plan, domain = atlas.plan, atlas.problem.domain
+    require_memory(f"{count} samples of an atlas", 8.0 * count * (3 * plan.problem.n + _NUMBERS))
     joints = list(plan.joints)
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
     drawn = np.random.default_rng((seed, 1)).uniform(low, high, (count, plan.problem.n))

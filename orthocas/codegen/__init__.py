@@ -1,5 +1,7 @@
 """Charts and controllers as small C libraries."""
 
+from orthocas.codegen.atlas_proof import check_c_of_atlas
+from orthocas.codegen.chart_reference import ChartReference
 from orthocas.codegen.compiled_inverse import CompiledInverse, compile_inverse
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.generated import GeneratedC
@@ -9,6 +11,7 @@ from orthocas.codegen.supervisor import Supervisor
 from orthocas.codegen.ticks import Ticks, control_tick, time_ticks
 
 __all__ = [
+    "ChartReference",
     "CompiledInverse",
     "CompiledLibrary",
     "GeneratedC",
@@ -16,6 +19,7 @@ __all__ = [
     "Supervisor",
     "Ticks",
     "check_c",
+    "check_c_of_atlas",
     "compile_inverse",
     "compile_shared",
     "control_tick",

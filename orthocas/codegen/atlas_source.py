@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from string import Template
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -18,7 +19,7 @@ from orthocas.codegen.filling import filled
 from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.codegen.precision import Precision
 from orthocas.codegen.table_coordinates import TABLE_CODE, TableCoordinates
-from orthocas.control import Controller
+from orthocas.control import Controller, Safety
 from orthocas.control.controller import without_border
 from orthocas.domains import Box
 from orthocas.errors import InvalidValueError
@@ -70,10 +71,36 @@ class AtlasSource:
         """The law with the same settings for whichever chart is the present one."""
         law: Any = controller
         own, problem = self.part.plan.problem, controller.problem
-        if law.chart is None or (own.robot, own.task, own.metric) != (problem.robot, problem.task, problem.metric):
+        same = (own.robot, own.task, own.metric) == (problem.robot, problem.task, problem.metric)
+        if law.chart is None or law.labels != self.chart.labels or not same:
             raise InvalidValueError("controller", f"a {law.name} of something else", "a law on a chart of the atlas")
         found: Controller = replace(law, chart=self.chart)
         return found
+
+    def safety(self, controller: Controller) -> Safety:
+        """The default settings, with margins within the overlap of boxes: where charts meet, there is no border."""
+        room = self._overlap
+        return Safety.of(
+            controller,
+            near_margin=min(0.06, 0.6 * room),
+            catch_margin=min(0.01, 0.1 * room),
+            return_margin=min(0.1, 0.8 * room),
+        )
+
+    def law_values(self, controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
+        """The border of what charts cover, and the hand-over from chart to chart."""
+        values = {place: Template(text).substitute(known) for place, text in _LAW.items()}
+        values["enough"] = repr(round(0.99 * self._overlap, 6))
+        everything = {**known, **values}
+        for place, template in _LAW_PARTS.items():
+            values[place] = filled(template, everything)
+        return values
+
+    @property
+    def _overlap(self) -> float:
+        """How far cells are inside their boxes, in half-widths of the boxes."""
+        overlap = self.part.plan.settings.overlap
+        return overlap / (1 + overlap)
 
     def graph(self, graph: ca.Function) -> ca.Function:
         """The graph without the border of the first chart: C code knows which box counts."""
@@ -125,6 +152,34 @@ class AtlasSource:
         return generate_kernels([scalar_code(function) for function in functions], _PREFIX)
 
 
+_LAW = {  # lines of templates that are empty for a single chart
+    "posture_evaluations": "12",  # a few steps of Newton's method from the arm, which is near
+    "law_mem": "known(chart) ? chart : 0",
+    "law_now": "(state->law[i] + state->carry[i])",
+    "middle": "middle",
+    "const_reference": "",
+    "home": "state->chart, ",
+    "no_chart_yet": ", 0",
+    "changed": ", changed",
+    "other_chart": " ||\n      reference->chart != state->chart",
+    "reference_chart": "  int chart; /* whose xi these are; ${name}_step changes all with the chart */\n",
+    "state_chart": "  int chart;                 /* in use; NO_CHART until there was one */\n"
+    "  int hand_overs;            /* from one chart to another */\n",
+    "state_carry": "  double carry[$n];          /* what the law of the last chart commanded more; fades */\n",
+    "first_chart": "  state->chart = state->reference.chart = ${name}_chart_at(state->q, NO_CHART);\n",
+    "choose_chart": "  changed = choose_chart(state, reference, here);\n",
+    "carry": "      if (changed && state->mode == ${NAME}_LAW)\n"
+    "        state->carry[i] += state->law[i] - (law[i] - fallback[i]);\n",
+    "fade_carry": "  for (i = 0; i < N; ++i) state->carry[i] *= LEFT_BEHIND / (LEFT_BEHIND + period);\n",
+    "reference_of_chart": "  reference->chart = chart;\n",
+    "same_chart": "  reference->chart = from->chart;\n",
+}
+_LAW_PARTS = {
+    "beyond": "beyond.c",
+    "border_tables": "border_tables_of_atlas.c",
+    "border_c": "border_of_atlas.c",
+    "hand_over_h": "hand_over.h",
+}
 _PARTS = {
     "about_chart": "about_atlas.h",
     "about_md": "about_atlas.md",

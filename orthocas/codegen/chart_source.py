@@ -12,11 +12,11 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.description import chart_values
 from orthocas.codegen.filling import filled
-from orthocas.codegen.numbers import numbers
+from orthocas.codegen.numbers import flags, numbers
 from orthocas.codegen.precision import Precision, bounds_inside
 from orthocas.codegen.words import words
-from orthocas.control import Controller
-from orthocas.domains import Conditioned, Domain, contains, reach
+from orthocas.control import Controller, Safety
+from orthocas.domains import Conditioned, Domain, borders, contains, reach
 from orthocas.errors import InvalidValueError
 
 
@@ -44,6 +44,31 @@ class ChartSource:
         if (controller.chart or self.chart) is not self.chart or controller.problem is not self.chart.problem:
             raise InvalidValueError("controller", f"a {controller.name} of another chart", "a controller of this chart")
         return controller
+
+    def safety(self, controller: Controller) -> Safety:
+        """The default settings of the supervised law."""
+        return Safety.of(controller)
+
+    def law_values(self, controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
+        """The border of the box, which is none for laws without a chart, and nothing about charts."""
+        domain = controller.problem.domain
+        lower, upper = borders(domain)
+        bordered = np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None)
+        values = {
+            "domain_half_width": numbers(domain.half_width),
+            "bordered": flags(bordered),
+            "law_mem": "0",
+            "law_now": "state->law[i]",
+            "middle": "centre",
+            "const_reference": "const ",
+            **dict.fromkeys(_OF_CHARTS, ""),
+        }
+        everything = {**known, **values}
+        return {
+            **values,
+            "border_tables": filled("border_tables.c", everything),
+            "border_c": filled("border_of_box.c", everything),
+        }
 
     def graph(self, graph: ca.Function) -> ca.Function:
         """The graph as it is."""
@@ -88,6 +113,10 @@ def position_within(domain: Domain) -> Array:
     return np.round(domain.centre + (shares[0] if shares else 0.0) * domain.half_width, 3)
 
 
+_OF_CHARTS = (
+    *("beyond", "reference_chart", "no_chart_yet", "state_chart", "state_carry", "hand_over_h", "home", "first_chart"),
+    *("choose_chart", "carry", "fade_carry", "reference_of_chart", "same_chart", "other_chart", "changed"),
+)
 _PARTS = {
     "about_chart": "about_box.h",
     "about_md": "about_box.md",

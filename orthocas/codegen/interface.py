@@ -11,7 +11,7 @@ from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.numbers import numbers
 from orthocas.codegen.precision import Precision
 from orthocas.codegen.source import Source
-from orthocas.codegen.supervision import supervision_values
+from orthocas.codegen.supervision import clear_border, supervision_values
 from orthocas.codegen.words import words
 from orthocas.control import Controller, Safety
 from orthocas.version import VERSION
@@ -52,8 +52,10 @@ def template_values(
     }
     values |= source.values(values, precision)
     if controller is not None and safety is not None:
-        values |= control_values(controller) | supervision_values(controller, safety)
-        values["clearance_c"] = filled("clearance.c", values) if "clear_span" in values else ""
+        clear = clear_border(source, controller)
+        values |= control_values(controller) | supervision_values(controller, safety, clear)
+        values["clearance_c"] = "" if clear is None else filled("clearance.c", values)
+        values |= source.law_values(controller, values)
         values["compose"] = filled(f"compose_{controller.command}.c", values)
     for template in ("control.h", "control.c", "check_control.c", "control.md", "supervisor.h", "supervisor.c"):
         values[template.replace(".", "_")] = "" if controller is None else filled(template, values)

@@ -64,6 +64,11 @@ class CompiledLibrary:
     r: int = 0  #: number of extra coordinates, for the functions that only libraries of an atlas have
 
     @property
+    def of_atlas(self) -> bool:
+        """Whether its functions take the number of a chart."""
+        return hasattr(self._c, f"{self.name}_chart_at")
+
+    @property
     def precision(self) -> Precision:
         """The number type of the library."""
         return SINGLE if self.single_precision else DOUBLE

@@ -18,7 +18,7 @@ from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
 from orthocas.codegen.rows import names_of_files, rows_files
 from orthocas.codegen.source import Source
-from orthocas.codegen.supervision import supervision_kernels
+from orthocas.codegen.supervision import clear_border, supervision_kernels
 from orthocas.control import Controller, Safety
 from orthocas.control.controller import require_controller
 from orthocas.coordinates.turns import require_no_turns
@@ -50,7 +50,7 @@ def write_library(
     if controller is not None:
         require_controller(controller)
         controller = source.law(controller)
-        safety = _matching_safety(controller, safety)
+        safety = _matching_safety(source.safety(controller), safety)
     name = _name(source.chart, controller) if name is None else name
     _require_identifier(name)
     precision = SINGLE if single_precision else DOUBLE
@@ -89,13 +89,13 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
     if controller is not None:
         graph = source.graph(precision.graph(controller))
         inputs = graph.mx_in()
-        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller)]
+        clear = clear_border(source, controller)
+        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, clear)]
     return found
 
 
-def _matching_safety(controller: Controller, safety: Safety | None) -> Safety:
-    """The settings, checked against the sizes of the law; default those of `Safety.of`."""
-    wanted = Safety.of(controller)
+def _matching_safety(wanted: Safety, safety: Safety | None) -> Safety:
+    """The settings, checked against the sizes of the default ones."""
     if safety is None:
         return wanted
     require_kind("safety", safety, Safety)

@@ -8,7 +8,7 @@ import casadi as ca
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.codegen.precision import Precision
-from orthocas.control import Controller
+from orthocas.control import Controller, Safety
 from orthocas.domains import Conditioned
 
 
@@ -42,6 +42,14 @@ class Source(Protocol):
 
     def law(self, controller: Controller) -> Controller:
         """The law on `chart`, for one of the charts; raises InvalidValueError for a law of another chart."""
+        ...
+
+    def safety(self, controller: Controller) -> Safety:
+        """The default settings of the supervised law."""
+        ...
+
+    def law_values(self, controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
+        """Values of the placeholders in the templates of laws that depend on the border or on the chart."""
         ...
 
     def graph(self, graph: ca.Function) -> ca.Function:

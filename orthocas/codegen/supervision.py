@@ -4,15 +4,21 @@ import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.scalar_code import scalar_code
-from orthocas.codegen.numbers import numbers
+from orthocas.codegen.numbers import flags, numbers
+from orthocas.codegen.source import Source
 from orthocas.control import Controller
 from orthocas.control.safety import Safety
 from orthocas.control.turns import without_turns
-from orthocas.domains import borders
 from orthocas.postures.clear_box import ClearBox
 
 
-def supervision_kernels(controller: Controller) -> list[ca.Function]:
+def clear_border(source: Source, controller: Controller) -> ClearBox | None:
+    """The domain of the law, if its border depends on the singular values of the task."""
+    condition = source.condition
+    return condition if controller.chart is not None and isinstance(condition, ClearBox) else None
+
+
+def supervision_kernels(controller: Controller, clear: ClearBox | None) -> list[ca.Function]:
     """Fallback(q, gains) -> command, and deviation(q, reference) -> quantities, reference - quantities."""
     n, k = controller.problem.n, len(controller.labels)
     fallback, q, reference = controller.fallback, ca.MX.sym("q", n), ca.MX.sym("reference", k)
@@ -25,39 +31,32 @@ def supervision_kernels(controller: Controller) -> list[ca.Function]:
         ca.Function("fallback", inputs, fallback.call(inputs)),
         ca.Function("deviation", [q, reference], [ca.densify(measured), ca.densify(error)]),
     ]
-    clear = _clear_box(controller)
     return found if clear is None else [*found, scalar_code(ca.Function("gram", [q], [clear.gram(q)]))]
 
 
-def _clear_box(controller: Controller) -> ClearBox | None:
-    """The domain of the law, if its border depends on the singular values of the task."""
-    domain = controller.problem.domain
-    return domain if controller.chart is not None and isinstance(domain, ClearBox) else None
+def supervision_values(controller: Controller, safety: Safety, clear: ClearBox | None) -> dict[str, str]:
+    """Values of the placeholders in the templates of the supervised law.
 
-
-def supervision_values(controller: Controller, safety: Safety) -> dict[str, str]:
-    """Values of the placeholders in the templates of the supervised law."""
-    problem = controller.problem
-    robot, domain = problem.robot, problem.domain
-    lower, upper = borders(domain)
-    bordered = np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None)
+    Args:
+        controller: the law.
+        safety: its settings.
+        clear: the domain of the law, if its border depends on the singular values of the task.
+    """
+    robot = controller.problem.robot
     endless = np.isinf(robot.lower) & np.isinf(robot.upper) & ~np.array(robot.tree.prismatic)
     torque, settings = controller.command == "torque", safety.in_c(controller.command)
     return {
         "catcher": _TORQUE if torque else _VELOCITY,
-        "domain_half_width": numbers(domain.half_width),
-        "bordered": _flags(bordered),
-        "turning": _flags(endless),
+        "turning": flags(endless),
         "safety_fields": "\n".join(_field(name, value) for name, value in settings.items()),
         "safety_values": ",\n".join(f"  {_literal(value)}" for value in settings.values()),
-        **_clearance_values(controller),
+        **_clearance_values(clear),
         "fallback_arguments": "\n".join(f"  arg[{1 + i}] = gains->{gain};" for i, gain in enumerate(controller.gains)),
     }
 
 
-def _clearance_values(controller: Controller) -> dict[str, str]:
+def _clearance_values(clear: ClearBox | None) -> dict[str, str]:
     """The bound on the singular value of the task as a part of the border."""
-    clear = _clear_box(controller)
     if clear is None:
         return {"nearest": "1.0", "clearance_too": " in half-widths", "clear_border": ""}
     return {
@@ -86,7 +85,3 @@ def _literal(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"{{{numbers(value)}}}"
     return str(value) if isinstance(value, int) else repr(float(value))  # type: ignore[arg-type]
-
-
-def _flags(values: np.ndarray) -> str:
-    return ", ".join(str(int(value)) for value in values)

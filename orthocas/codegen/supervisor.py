@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
+from orthocas.codegen.chart_reference import ChartReference
 from orthocas.codegen.library import CompiledLibrary, gain_numbers
 from orthocas.codegen.precision import Precision
 from orthocas.control import Controller, ControlStatus, Safety
@@ -35,7 +36,7 @@ class Supervisor:
         else:
             require_kind("safety", safety, Safety)
             self._safety = _packed(safety.in_c(controller.command), library.precision)
-        self._state = _state_type(self._n, self._k, library.precision)()
+        self._state = _state_type(self._n, self._k, library.precision, library.of_atlas)()
         self._command = library.numbers(np.zeros(self._n))
         self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
 
@@ -53,14 +54,29 @@ class Supervisor:
         """Ask for the law again."""
         self._functions["resume"](self._here)
 
-    def step(self, q: Array, dq: Array, reference: Array, period: float = 1e-3) -> tuple[Array, ControlStatus]:
-        """Command (n,) and status of one control period. The reference is [value, velocity, acceleration], (3 k,)."""
-        given = {"q": (q, self._n), "dq": (dq, self._n), "reference": (reference, 3 * self._k)}
-        inputs = [self._numbers(name, *value) for name, value in given.items()]
-        inputs.append(self._library.numbers(self.gains))
-        time = as_number("period", period)
+    def step(
+        self, q: Array, dq: Array, reference: Array | ChartReference, period: float = 1e-3
+    ) -> tuple[Array, ControlStatus]:
+        """Command (n,) and status of one control period.
+
+        Args:
+            q: joint positions (n,).
+            dq: joint velocities (n,).
+            reference: [value, velocity, acceleration], (3 k,); of an atlas a `ChartReference`, which goes over to
+                another chart with the arm.
+            period: time since the last call [s].
+        """
+        inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("dq", dq))]
+        gains, time = self._library.numbers(self.gains), as_number("period", period)
+        if self._library.of_atlas:
+            require_kind("reference", reference, ChartReference)
+        if isinstance(reference, ChartReference):
+            asked = reference.address
+        else:
+            inputs.append(self._numbers("reference", reference, 3 * self._k))
+            asked = _pointer(inputs[2])
         status = self._functions["step"](
-            self._here, self._safety, *map(_pointer, inputs), time, _pointer(self._command)
+            self._here, self._safety, *map(_pointer, inputs[:2]), asked, _pointer(gains), time, _pointer(self._command)
         )
         return self._command.copy(), ControlStatus(status)
 
@@ -85,14 +101,18 @@ class Supervisor:
         return ctypes.byref(self._state)
 
 
-def _state_type(n: int, k: int, precision: Precision) -> type[ctypes.Structure]:
+def _state_type(n: int, k: int, precision: Precision, of_atlas: bool) -> type[ctypes.Structure]:
     joints, quantities = precision.c_type * n, precision.c_type * k
     names = ("q", "dq", "command", "law", "anchor", "safe")
     layout = [
         *((name, ctypes.c_int) for name in ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks")),
+        *((name, ctypes.c_int) for name in ("chart", "hand_overs") if of_atlas),
         *((name, precision.c_type) for name in ("weight", "brake")),
         *((name, joints) for name in names),
-        *((name, quantities) for name in ("offset", "integral", "value", "velocity", "acceleration")),
+        *((name, quantities) for name in ("offset", "integral")),
+        *((name, joints) for name in ("carry",) if of_atlas),
+        *((name, quantities) for name in ("value", "velocity", "acceleration")),
+        *((name, ctypes.c_int) for name in ("reference_chart",) if of_atlas),
     ]
     return type("State", (ctypes.Structure,), {"_fields_": layout})
 

@@ -17,6 +17,15 @@
 #define NUMBER double
 #endif
 
+#ifdef ARM_CHARTS /* an atlas: -DMIDDLE= is a position to wander around, and the reference stays in the chart it began in */
+static const double middle[N] = {MIDDLE};
+#define REFERENCE_AT(q, reference) arm_reference_at(state.chart, q, reference)
+#define MIDDLE_OF(i) middle[i]
+#else
+#define REFERENCE_AT(q, reference) arm_reference_at(q, reference)
+#define MIDDLE_OF(i) (0.5 * (arm_domain_lower[i] + arm_domain_upper[i]))
+#endif
+
 static uint64_t seed = 88172645463325252ULL;
 
 static double uniform(void) { /* -1 to 1 */
@@ -40,6 +49,11 @@ static int state_makes_sense(const arm_state *state) {
     if (!isfinite(state->q[i]) || !isfinite(state->anchor[i]) || !isfinite(state->law[i])) return 0;
   for (i = 0; i < K; ++i)
     if (!isfinite(state->offset[i]) || !isfinite(state->integral[i]) || !isfinite(state->reference.value[i])) return 0;
+#ifdef ARM_CHARTS
+  if (state->chart < ARM_NO_CHART || state->chart >= ARM_CHARTS || state->hand_overs < 0) return 0;
+  for (i = 0; i < N; ++i)
+    if (!isfinite(state->carry[i])) return 0;
+#endif
   return 1;
 }
 
@@ -58,7 +72,7 @@ int main(void) {
   arm_state state;
   arm_reference reference;
   int i;
-  for (i = 0; i < N; ++i) q[i] = 0.5 * (arm_domain_lower[i] + arm_domain_upper[i]);
+  for (i = 0; i < N; ++i) q[i] = (NUMBER)MIDDLE_OF(i);
   memset(dq, 0, sizeof dq);
   arm_start(&state, q, 0);
   memcpy(before, state.command, sizeof before);
@@ -67,13 +81,12 @@ int main(void) {
     double period = uniform() > 0.98 ? 0.05 * (1.0 + uniform()) : 1e-3;
     int status, measured, referred;
     for (i = 0; i < N; ++i) {
-      const double middle = 0.5 * (arm_domain_lower[i] + arm_domain_upper[i]);
       if (k % 4000 < 1200) dq[i] += 0.2 * uniform() - 0.02 * dq[i]; /* wanders */
-      else dq[i] += 1e-4 * uniform() - 0.02 * dq[i] - 0.001 * (q[i] - middle); /* comes back */
+      else dq[i] += 1e-4 * uniform() - 0.02 * dq[i] - 0.001 * (q[i] - MIDDLE_OF(i)); /* comes back */
       measured_q[i] = q[i] += 1e-3 * dq[i];
       measured_dq[i] = dq[i];
     }
-    if (k % 1000 == 0) arm_reference_at(q, &reference);
+    if (k % 1000 == 0) REFERENCE_AT(q, &reference);
     for (i = 0; i < K; ++i) reference.velocity[i] = k % 7000 < 100 ? 0.1 : 0.0; /* stands still and claims to move */
     if (k % 1500 == 0) arm_resume(&state);
     if (k % 50000 == 49999) arm_take_over(&state, q, before);
@@ -98,6 +111,9 @@ int main(void) {
     memcpy(before, command, sizeof before);
   }
   for (i = 0; i < 11; ++i) printf("%ld ", counts[i]);
+#ifdef ARM_CHARTS
+  printf("%d", state.hand_overs);
+#endif
   printf("\n");
   return 0;
 }

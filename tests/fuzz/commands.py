@@ -157,9 +157,9 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         ("--chart", "--path", "--robot", "--cycles", "--host", "--port", *_PROBLEM_OPTIONS),
     ),
     "codegen": (
-        _FILES,
+        ("arm.orthocas-atlas", *_FILES),
         {"--controller": "pd_plus", "--out": "out"},
-        (*_LAW_OPTIONS, "--name", "--model", "--gravity", "--inputs"),
+        (*_LAW_OPTIONS, "--name", "--model", "--gravity", "--inputs", "--along", "--radius"),
     ),
 }
 

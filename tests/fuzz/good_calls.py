@@ -43,6 +43,8 @@ def _physics() -> dict[str, Call]:
     options = {"stops": True, "effort_limits": True, "payload": payload, "wall": wall, "timestep": 1e-3}
     return {
         "AtlasSettings": (oc.AtlasSettings, {"degree": 3, "leak_deg": 5.0, "half_width": 0.5, "splits": 4}),
+        "AtlasPart": (oc.AtlasPart, {"atlas": atlas(), "charts": [0, 1]}),
+        "AtlasPart.along": (oc.AtlasPart.along, {"atlas": atlas(), "q": [[0.0, 0.9, 0.9]], "radius": 0.1}),
         "atlas.chart_at": (atlas().chart_at, {"q": q, "current": 0}),
         "atlas.xi": (atlas().xi, {"q": q, "charts": 0}),
         "atlas.chart": (atlas().chart, {"number": 0, "near": q}),

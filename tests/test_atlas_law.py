@@ -1,0 +1,203 @@
+"""A law across the charts of an atlas in C: that of each chart, and hand-overs that ask for the same posture."""
+
+import subprocess
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from programs import built, needs_c
+
+import orthocas as oc
+from orthocas.checks import Array
+from orthocas.codegen import ChartReference, CompiledLibrary, GeneratedC, Supervisor, compile_shared, gain_numbers
+from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus, Projector
+from orthocas.errors import InvalidValueError
+
+pytestmark = needs_c
+
+TICK = 1e-3
+START, END = np.array([0.6, 2.7, 0.8]), np.array([0.6, 3.11, 0.1])
+
+
+@pytest.fixture(scope="module")
+def law(way_atlas: oc.Atlas) -> Controller:
+    return PDPlus.on_chart(way_atlas.chart(0), limit=150.0)
+
+
+@pytest.fixture(scope="module")
+def generated(way_atlas: oc.Atlas, law: Controller, tmp_path_factory: pytest.TempPathFactory) -> GeneratedC:
+    return oc.generate_c(way_atlas, tmp_path_factory.mktemp("law"), law, "arm")
+
+
+@pytest.fixture(scope="module")
+def library(generated: GeneratedC) -> CompiledLibrary:
+    return CompiledLibrary(compile_shared(generated, generated.folder), "arm", 3, r=2)
+
+
+def places(atlas: oc.Atlas, count: int) -> Iterator[tuple[Array, int]]:
+    """Positions around the way and their charts."""
+    rng = np.random.default_rng(3)
+    for share in rng.uniform(size=count):
+        q = START + share * (END - START) + rng.uniform(-0.15, 0.15, 3)
+        yield q, atlas.chart_at(q)
+
+
+@pytest.mark.parametrize("make", [PDPlus, pytest.param(Impedance, marks=pytest.mark.slow), Kinematic])
+def test_law_of_each_chart_is_that_of_python(way_atlas: oc.Atlas, tmp_path: Path, make: Any) -> None:
+    """Also its status beyond the box of the chart, where the fallback comes, and for bad numbers."""
+    given: Any = make.on_chart(way_atlas.chart(3), limit=60.0)
+    generated = oc.generate_c(way_atlas, tmp_path, given, "arm")
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3, r=2)
+    assert library.check() < 1e-10
+    rng, seen = np.random.default_rng(4), set()
+    for q, number in places(way_atlas, 8):
+        chart = way_atlas.chart(number, near=q)
+        law, gains = replace(given, chart=chart), gain_numbers(given)
+        dq, reference = rng.normal(size=3), np.concatenate([chart.phi(q) + 0.02, rng.normal(size=6)])
+        outside = chart.problem.domain.centre + 1.1 * chart.problem.domain.half_width
+        for position, asked in ((q, reference), (outside, reference), (q, reference * [np.nan, *np.ones(8)])):
+            wanted, status = law.function(position, dq, *np.split(asked, 3), *law.gains.values())
+            found, got = library.control(position, dq, asked, gains, number)
+            assert got == float(status)
+            assert np.abs(found - wanted.full()[:, 0]).max() <= 1e-10 * max(1.0, np.abs(wanted.full()).max())
+            seen.add(ControlStatus(got))
+    assert seen >= {ControlStatus.OUTSIDE_DOMAIN, ControlStatus.NOT_FINITE}
+    assert seen & {ControlStatus.OK, ControlStatus.SATURATED}
+
+
+def test_hand_over_asks_for_the_same_posture_velocity_and_acceleration(
+    way_atlas: oc.Atlas, library: CompiledLibrary
+) -> None:
+    """Against `Atlas.handed_over`, with the arm somewhere near the posture asked for."""
+    rng, pairs = np.random.default_rng(6), set()
+    for q, number in places(way_atlas, 200):
+        dq, ddq = rng.normal(size=(2, 3))
+        others = [k for k in range(len(way_atlas)) if k != number and way_atlas.box(k, near=q).contains(q)]
+        for other in others[:1]:
+            asked = np.concatenate(way_atlas.handed_over(q, dq, ddq, number))
+            reference = ChartReference(library, asked, number)
+            assert reference.hand_over(other, q + 0.01 * rng.normal(size=3)) == ControlStatus.OK
+            assert reference.chart == other
+            assert np.abs(reference.values - np.concatenate(way_atlas.handed_over(q, dq, ddq, other))).max() < 1e-8
+            assert (reference.values[[0, 3, 6]] == asked[[0, 3, 6]]).all()  # those of the task
+            pairs.add((number, other))
+    assert len(pairs) > 4
+
+
+def test_hand_over_of_bad_numbers_changes_nothing(library: CompiledLibrary) -> None:
+    for values, chart, status in (
+        (np.full(9, np.nan), 1, ControlStatus.NOT_FINITE),
+        (np.zeros(9), -1, ControlStatus.OUTSIDE_DOMAIN),
+        (np.zeros(9), 10_000, ControlStatus.OUTSIDE_DOMAIN),
+    ):
+        reference = ChartReference(library, values, 0)
+        assert reference.hand_over(chart, START) == status
+        assert reference.chart == 0
+        np.testing.assert_array_equal(reference.values, values)
+
+
+class Arm:
+    """The rigid body dynamics, integrated in small steps."""
+
+    def __init__(self, robot: oc.Robot, q: Array) -> None:
+        self.robot, self.q, self.dq = robot, q.copy(), np.zeros(robot.n)
+
+    def move(self, torque: Array) -> None:
+        for _ in range(2):
+            ddq = self.robot.forward_dynamics(self.q + TICK / 4 * self.dq, self.dq, torque)
+            self.dq = self.dq + TICK / 2 * ddq
+            self.q = self.q + TICK / 2 * self.dq
+
+
+def led(atlas: oc.Atlas, supervisor: Supervisor, library: CompiledLibrary, arm: Arm, seconds: float) -> Iterator[Any]:
+    """Lead the arm along a way of joint positions; what happens in each tick."""
+    reference = ChartReference.at(library, arm.q, supervisor.chart)
+    ticks, last, start, rate = round(seconds / TICK), None, arm.q.copy(), 1.2 / seconds
+    for k in range(ticks):
+        s = min(1.0, 1.2 * k / ticks)
+        q = start + (END - start) * s**3 * (10 - 15 * s + 6 * s * s)
+        dq = (END - start) * 30 * (s * (1 - s)) ** 2 * rate
+        ddq = (END - start) * 60 * s * (1 - s) * (1 - 2 * s) * rate**2
+        reference.values[:] = np.concatenate(atlas.handed_over(q, dq, ddq, reference.chart))
+        before = reference.chart
+        command, status = supervisor.step(arm.q, arm.dq, reference, TICK)
+        yield status, command - (command if last is None else last), before != reference.chart, reference, q
+        last = command
+        arm.move(command)
+
+
+def test_arm_goes_through_several_charts_without_a_step_in_posture_or_torque(
+    way_atlas: oc.Atlas, law: Controller, library: CompiledLibrary
+) -> None:
+    supervisor, arm = Supervisor(library, law), Arm(way_atlas.problem.robot, START)
+    supervisor.start(START)
+    assert supervisor.chart == way_atlas.chart_at(START)
+    jumps, statuses = [], []
+    for status, change, handed, reference, q in led(way_atlas, supervisor, library, arm, 2.0):
+        statuses.append(status)
+        if handed:
+            chart = way_atlas.chart(reference.chart, near=q)
+            assert np.abs(chart.phi(q) - reference.values[:3]).max() < 1e-9  # the posture asked for
+            jumps.append(np.abs(change).max())
+    assert supervisor.hand_overs == len(jumps) >= 2
+    assert max(jumps) < 0.1
+    assert set(statuses[300:]) <= {ControlStatus.OK, ControlStatus.NEAR_BORDER}
+    assert np.abs(arm.q - END).max() < 0.01
+
+
+def test_beyond_all_charts_the_arm_is_caught_and_returns_when_asked(
+    way_atlas: oc.Atlas, law: Controller, library: CompiledLibrary
+) -> None:
+    supervisor, arm = Supervisor(library, law), Arm(way_atlas.problem.robot, START)
+    supervisor.start(START)
+    statuses = [row[0] for row in led(way_atlas, supervisor, library, arm, 0.3)]
+    push = np.array([0.0, -80.0, 0.0])
+    reference = ChartReference.at(library, arm.q, supervisor.chart)
+    for k in range(3000):
+        command, status = supervisor.step(arm.q, arm.dq, reference, TICK)
+        arm.move(command + push * (k < 400))
+        statuses.append(status)
+        if k == 2000:
+            assert way_atlas.chart_at(arm.q) == -1 or status == ControlStatus.OK
+            supervisor.resume()
+    assert ControlStatus.CAUGHT in statuses
+    assert ControlStatus.RETURNING in statuses
+    assert supervisor.cause in (ControlStatus.OUTSIDE_DOMAIN, ControlStatus.TOO_FAST)
+
+
+def test_away_from_all_charts_the_catcher_holds_the_arm(
+    way_atlas: oc.Atlas, law: Controller, library: CompiledLibrary
+) -> None:
+    supervisor, q = Supervisor(library, law), np.array([0.6, -1.0, 1.5])
+    assert way_atlas.chart_at(q) == -1
+    supervisor.start(q)
+    assert supervisor.chart == -1
+    reference = ChartReference(library, np.zeros(9), 0)
+    command, status = supervisor.step(q, np.zeros(3), reference, TICK)
+    assert status == ControlStatus.CAUGHT
+    np.testing.assert_allclose(command, way_atlas.problem.robot.gravity(q), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_hostile_ticks_give_statuses_under_sanitizers(generated: GeneratedC, tmp_path: Path) -> None:
+    flags = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    middle = ",".join(str(x) for x in (START + END) / 2)
+    program = built(
+        generated, "supervised_ticks.c", tmp_path, "-DTICKS=140000L", "-DLIMIT=150.0", f"-DMIDDLE={middle}", *flags
+    )
+    done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{done.returncode}: {done.stderr}"
+    *counts, hand_overs = map(int, done.stdout.split())
+    assert sum(counts) == 140_000
+    assert counts[ControlStatus.CAUGHT] > 1000
+    assert counts[ControlStatus.OK] > 1000
+    assert hand_overs > 10
+
+
+def test_laws_without_a_chart_are_refused(way_atlas: oc.Atlas, planar_fit: Any, tmp_path: Path) -> None:
+    for law in (Projector(way_atlas.problem, 80.0, 10.0), PDPlus(planar_fit.chart, 50.0)):
+        with pytest.raises(InvalidValueError, match="expected a law on a chart of the atlas"):
+            oc.generate_c(way_atlas, tmp_path, law)
