@@ -46,6 +46,20 @@ def test_every_page_is_reached_from_the_first_one() -> None:
     assert reached == set(PAGES)
 
 
+def test_names_on_the_pages_exist() -> None:
+    """Whatever a page calls `oc.name` or `oc.module.name`."""
+    used = {name for page in PAGES.values() for name in re.findall(r"\boc\.(\w+(?:\.\w+)?)", page)}
+    assert len(used) > 40
+    assert [name for name in sorted(used) if not exists(name)] == []
+
+
+def exists(name: str) -> bool:
+    part: object = orthocas
+    for word in name.split("."):
+        part = getattr(part, word, None)
+    return part is not None
+
+
 def test_formulas_of_docstrings_become_markup() -> None:
     pytest.importorskip("sphinx")
     markup = import_module("plain_formulas").markup
