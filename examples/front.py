@@ -86,10 +86,10 @@ def _draw_regularity(upper: Axes, lower: Axes, degree: int, lambda3: tuple[float
     """The conditioning above, and the task angle that it costs below."""
     places = np.arange(len(lambda3))
     upper.plot(places, [r.conditioning.p01 for r in reports], "o-", color="#1f5fa8", label="1 % quantile")
-    upper.plot(places, [r.conditioning.min for r in reports], "s-", color="#7570b3", label="minimum")
+    upper.plot(places, [r.conditioning.min for r in reports], "s-", color="#7570b3", label="minimum, searched")
     upper.set(ylabel="conditioning", ylim=(0, 1))
     upper.set_title(rf"price of a chart without folds, degree {degree}, $\lambda_2 = 30$", fontsize=10)
-    upper.legend(fontsize=8, loc="center left")
+    upper.legend(fontsize=8, loc="center right")
     upper.tick_params(labelbottom=False)
     lower.plot(places, [r.task_angle.std for r in reports], "^-", color="#d95f02")
     lower.set_xticks(places, [f"{v:g}\n{r.folded_samples}" for v, r in zip(lambda3, reports, strict=True)])

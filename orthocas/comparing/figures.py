@@ -17,7 +17,8 @@ from orthocas.showing.picture import Picture
 Colour = tuple[float, float, float, float]
 _HUES = {"linear": "Greys", "polynomial": "Blues", "fourier": "Greens", "mlp": "Oranges", "sew": "Purples"}
 _MARKERS = "osD^vPX*"
-_ASIDE, _WIDE, _HIGH = 16.0, 110.0, 13.0  # of labels: distance from the point, and room [pt]
+_ASIDE, _LETTER, _HIGH = 16.0, 5.4, 13.0  # of labels: distance from the point, room for a letter, and height [pt]
+_ROOM = 2.0  # the largest loss in the picture, over the largest final one
 _STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)))
 
 
@@ -71,6 +72,8 @@ def convergence_figure(comparison: Comparison) -> Figure:
         axes.plot(seconds[-1], loss[-1], ".", color=colour)
     axes.set_xscale("log")
     axes.set_yscale("log")
+    if drawn:  # how networks fall from their random starts is of no interest
+        axes.set_ylim(top=_ROOM * max(result.history[-1][1] for result in drawn))
     axes.set_xlabel("time [s]")
     axes.set_ylabel("training loss")
     axes.set_title(f"{_problem(comparison)}: training loss over time", fontsize=10)
@@ -108,6 +111,10 @@ def _place(summary: Summary, single: bool) -> tuple[float, float]:
     return summary.task_std_deg, summary.conditioning_p01 if single else summary.mutual_std_deg
 
 
+def _key(summary: Summary) -> tuple[str, str]:
+    return summary.parametrisation, summary.solver
+
+
 def _draw_front(axes: Axes, summaries: Sequence[Summary], single: bool) -> None:
     """Connect the points that no other one beats in both directions; summaries have the least task angle first."""
     front: list[tuple[float, float]] = []
@@ -126,16 +133,17 @@ def _label(axes: Axes, summaries: Sequence[Summary], single: bool, colours: Mapp
     axes.margins(x=0.12)
     axes.figure.draw_without_rendering()  # type: ignore[union-attr]  # so that places in points are known
     scale = 72 / axes.figure.dpi
-    places = {name: scale * axes.transData.transform(_place(summary, single)) for name, summary in best.items()}
-    used: list[tuple[float, float]] = []
-    for name, (x, y) in sorted(places.items(), key=lambda entry: entry[1][1]):
-        height = y
-        while any(abs(x - other) < _WIDE and abs(height - taken) < _HIGH for other, taken in used):
+    points = {(s.parametrisation, s.solver): scale * axes.transData.transform(_place(s, single)) for s in summaries}
+    boxes = [(x - _HIGH / 2, x + _HIGH / 2, y) for x, y in points.values()]  # left, right and height of what is there
+    for name, summary in sorted(best.items(), key=lambda entry: points[_key(entry[1])][1]):
+        x, y = points[_key(summary)]
+        left, right, height = x + _ASIDE, x + _ASIDE + _LETTER * len(name), y
+        while any(left < other[1] and other[0] < right and abs(height - other[2]) < _HIGH for other in boxes):
             height += 1.0
-        used.append((x, height))
+        boxes.append((left, right, height))
         axes.annotate(
             name,
-            _place(best[name], single),
+            _place(summary, single),
             xytext=(_ASIDE, height - y),
             textcoords="offset points",
             fontsize=9,
