@@ -35,7 +35,8 @@ def our_seconds(seed: int) -> float:
     """Time of our fit; infinite if it does not reach the quality."""
     problem = problems.get("iiwa")
     oc.fit(problem, oc.Polynomial(1))  # first calls load libraries
-    fit = oc.fit(problem, oc.Polynomial(4), GaussNewton(tolerance=1e-2), WEIGHTS, SAMPLES, seed)
+    solver = GaussNewton(tolerance=1e-2)
+    fit = oc.fit(problem, oc.Polynomial(4), solver, weights=WEIGHTS, samples=SAMPLES, seed=seed)
     report = oc.evaluate(fit.chart, 50_000)
     there = report.task_angle.std <= TASK and report.mutual_angle.std <= MUTUAL
     return fit.seconds if there else float("inf")

@@ -13,6 +13,7 @@ from orthocas.minimising.solver import SolveResult, Status
 from orthocas.minimising.watch import UNWATCHED, Watch
 
 _MOMENT, _SQUARE, _SMALL = 0.9, 0.999, 1e-8  # the usual constants of [KB2015]
+_PART = 2**14  # parameters at a time, which stay in the cache
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,8 @@ class _Run:
         self.best = BestPoint(objective, theta0, watch)
         kept = self.best.restored or {}
         self.theta = np.array(kept.get("theta", theta0), dtype=float)
-        self.mean = np.array(kept.get("mean", np.zeros_like(theta0)))
-        self.square = np.array(kept.get("square", np.zeros_like(theta0)))
+        self.mean = np.array(kept.get("mean", np.zeros_like(self.theta)))
+        self.square = np.array(kept.get("square", np.zeros_like(self.theta)))
 
     def iterate(self) -> Status:
         best, epochs = self.best, self.settings.epochs
@@ -74,7 +75,8 @@ class _Run:
                     return Status.STALLED
                 self._step(gradient, best.iterations * self.settings.steps + k)
             self._judge()
-            best.next_iteration(epochs, theta=self.theta, mean=self.mean, square=self.square)
+            state = {"theta": self.theta, "mean": self.mean, "square": self.square}
+            best.next_iteration(epochs, **{name: array.copy() for name, array in state.items()})
         return Status.ITERATION_LIMIT
 
     def _parts(self, epoch: int) -> Iterable[Objective]:
@@ -87,10 +89,14 @@ class _Run:
         """Take step k = 0, 1, ..., counted over all epochs."""
         total = self.settings.epochs * self.settings.steps
         rate = self.settings.learning_rate * 0.5 * (1 + np.cos(np.pi * k / total))
-        self.mean = self.mean + (1 - _MOMENT) * (gradient - self.mean)
-        self.square = self.square + (1 - _SQUARE) * (gradient**2 - self.square)
-        unbiased = np.sqrt(self.square / (1 - _SQUARE ** (k + 1))) + _SMALL
-        self.theta = self.theta - rate / (1 - _MOMENT ** (k + 1)) * self.mean / unbiased
+        for start in range(0, len(gradient), _PART):
+            theta, mean, square, slope = (
+                array[start : start + _PART] for array in (self.theta, self.mean, self.square, gradient)
+            )
+            mean += (1 - _MOMENT) * (slope - mean)
+            square += (1 - _SQUARE) * (slope**2 - square)
+            unbiased = np.sqrt(square / (1 - _SQUARE ** (k + 1))) + _SMALL
+            theta -= rate / (1 - _MOMENT ** (k + 1)) * mean / unbiased
 
     def _judge(self) -> bool:
         """Evaluate the loss on the fixed samples, and return whether it is finite."""

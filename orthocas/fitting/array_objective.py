@@ -87,7 +87,9 @@ class ArrayObjective:
 
         with columns.borrowed(min(thread_count(), len(self._pieces))) as runs:
             parts = in_threads_with(runs, part, self._pieces)
-        gradient: Array = np.sum([slope for _, slope in parts], axis=0, dtype=float)
+        gradient = parts[0][1].astype(np.float64)
+        for _, slope in parts[1:]:
+            gradient += slope
         return sum(value for value, _ in parts), gradient
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:

@@ -219,10 +219,13 @@ class StageRunner:
 
     def require_memory(self, target: GradedParametrisation, r: int) -> None:
         """Refuse a degree that exceeds the memory, before building anything."""
-        K = target.term_count(self.space.n)
-        N = self._linear_sample_count(K, r)
-        curvature = (self.space.n * r) ** 2 if self.settings.max_mutual is not None else 0
-        needed = 8 * (N * (2 * self.space.n * K + 2 * curvature) + 4 * (r * K) ** 2)
+        n, half = self.space.n, 1 if self.mirror is None else 2
+        K = target.term_count(n)
+        N = self._linear_sample_count(K, r) / half
+        of_a_joint = K - target.term_count(n - 1) if n > 1 else K
+        gradients = n * (2 * (4 if self.settings.single else 8) * of_a_joint + 4 * K)  # twice while they are built
+        curvature = 16 * (n * r) ** 2 if self.settings.max_mutual is not None else 0
+        needed = N * (gradients + curvature) + 32 * (r * K / half) ** 2
         require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)
 
 
