@@ -1,6 +1,7 @@
 """Boxes that need no proof, because they are proved to lie outside a ClearBox or a Corridor (ours)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -84,7 +85,7 @@ class CorridorJudge:
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
         middle, half = (low + high) / 2, (high - low) / 2
-        distance = np.sqrt(self.domain.squared_distance(middle))
+        distance: Any = np.sqrt(self.domain.squared_distance(middle))
         outside = distance > 1 + _ROUNDING + self.domain.lengths(half)
         found = self.inside(low, high)
         return Verdicts(
