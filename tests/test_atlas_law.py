@@ -170,6 +170,14 @@ def test_arm_follows_a_corridor_in_mujoco_without_a_step_in_posture_or_torque() 
 
 
 @pytest.mark.slow
+def test_hand_over_keeps_to_the_stack_that_the_header_states(generated: GeneratedC, tmp_path: Path) -> None:
+    program = built(generated, "stack_use.c", tmp_path, "-O0", f"-DPOSITION={','.join(map(str, START))}")
+    used = [int(word) for word in output_of(program).split()]
+    assert len(used) == 5  # one more number if the chart did not change
+    assert 1000 < max(used) <= generated.stack_bytes
+
+
+@pytest.mark.slow
 def test_hostile_ticks_give_statuses_under_sanitizers(generated: GeneratedC, tmp_path: Path) -> None:
     flags = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     middle = ",".join(str(x) for x in (START + END) / 2)
