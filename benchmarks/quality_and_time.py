@@ -20,6 +20,8 @@ from matplotlib.figure import Figure
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.minimising.solver import Solver
+from orthocas.solvers import QuasiNewton
 
 
 class Point(NamedTuple):
@@ -40,17 +42,24 @@ class Case(NamedTuple):
     label: str
     weights: oc.Weights
     precision: str = "double"
+    solver: Solver | None = None  #: the default one
 
 
 FREE, SAFE = oc.Weights(folds=0), oc.Weights()
 WITHOUT_TERMS = oc.Weights(regularity=0, folds=0)
 SINGLE = "single precision, lambda2 = 36 to 38, without regularity"
+EARLY = "the same with a tolerance of 1e-3, lambda2 = 42 and 39"
+LOOSE = QuasiNewton(tolerance=1e-3)
 CASES = (
     *(Case("polynomials, folds allowed", f"polynomial:{degree}", FREE) for degree in (2, 3, 4, 5, 6)),
     *(Case("polynomials, without regularity", f"polynomial:{degree}", WITHOUT_TERMS) for degree in (4, 5, 6, 7)),
     *(
         Case(SINGLE, f"polynomial:{degree}", oc.Weights(mutual=mutual, regularity=0, folds=0), "single")
         for degree, mutual in ((6, 38), (7, 38), (8, 36))
+    ),
+    *(
+        Case(EARLY, f"polynomial:{degree}", oc.Weights(mutual=mutual, regularity=0, folds=0), "single", LOOSE)
+        for degree, mutual in ((7, 42), (8, 39))
     ),
     *(Case("polynomials without folds", f"polynomial:{degree}", SAFE) for degree in (4, 5, 6)),
     *(Case("valid for all A1, without folds", f"polynomial:{degree}:cyclic", SAFE) for degree in (4, 5)),
@@ -71,7 +80,7 @@ def measured(case: Case, samples: int, wall: bool) -> Point:
     oc.fit(problem, oc.Polynomial(1))  # the first call loads libraries
     chosen = oc.parametrisations.parse_parametrisation(case.label)
     start = clock()
-    fit = oc.fit(problem, chosen, weights=case.weights, precision=case.precision)
+    fit = oc.fit(problem, chosen, case.solver, weights=case.weights, precision=case.precision)
     seconds = clock() - start
     report = oc.evaluate(fit.chart, samples)
     angles = report.task_angle.std, report.mutual_angle.std
@@ -106,7 +115,7 @@ def draw(points: list[Point], file: Path) -> None:
     for point in points:
         by_family.setdefault(point.family, []).append(point)
     for axes, name, paper in zip(panels, ("task", "mutual"), PAPER, strict=True):
-        for (family, own), marker, height in zip(by_family.items(), "osD^vPX*", (4, -11) * 4, strict=False):
+        for (family, own), marker, height in zip(by_family.items(), "osD^vPX*<>", (4, -11) * 5, strict=False):
             seconds, values = [p.seconds for p in own], [getattr(p, name) for p in own]
             axes.plot(seconds, values, marker=marker, label=family, markersize=11 if family == PEER else 5)
             for point, value in zip(own, values, strict=True):

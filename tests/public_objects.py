@@ -253,6 +253,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "SEW": oc.SEW,
     "given coordinates": lambda: given().coordinates.parametrisation,  # type: ignore[attr-defined]
     "solver": solvers.GaussNewton,
+    "quasi-Newton solver": solvers.QuasiNewton,
     "samples": lambda: sample_problem(planar(), 20, 0),
     "report": lambda: oc.evaluate(fitted().chart, 500),
     "quality of a point": lambda: fitted().chart.quality(planar().domain.centre),

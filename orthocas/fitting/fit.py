@@ -129,8 +129,8 @@ def fit(
         checkpoint: a file that keeps the state of a long fit. If it exists, the fit resumes from it.
         align_to: a chart of the same robot that defines order and signs of the coordinates, for a refit. By default,
             coordinates that move the first joints come first, and each moves its main joint in the positive direction.
-        threads: threads that share the work; coordinates linear in their parameters do not depend on their number.
-            Default: OMP_NUM_THREADS, or the number of cores.
+        threads: threads that share the work; bases and networks (`MLP`) do not depend on their number. Default:
+            OMP_NUM_THREADS, or the number of cores.
         split_idle: whether joints that do not affect the task become coordinates themselves. The paper's network learns
             them; False is for comparisons with it.
         precision: 'double', or 'single' for the large products of loss and gradient: those of a network, and those with

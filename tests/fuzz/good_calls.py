@@ -180,6 +180,7 @@ def _functions() -> dict[str, Call]:
                 "samples": 50,
                 "seed": 0,
                 "checkpoint": None,
+                "precision": "single",
             },
         ),
         "bounded fit": (oc.fit, {**box, "solver": None, "samples": 50, "max_mutual_deg": None}),
