@@ -1,9 +1,9 @@
-"""How far fits are from the best possible orthogonality: a spline solution of the variational problem (4 min).
+"""How far fits are from the best possible orthogonality: a spline solution of the variational problem (10 min).
 
-Cubic splines on a grid of the box, solved by Gauss-Newton from two starts, are refined until the loss no longer
-changes. That is the infimum of the loss over all smooth coordinates near the start, with an error bar from the last
-refinements. Six families are judged by the same loss with the same quadrature. For the arm with seven joints no grid
-is fine enough; there the loss is extrapolated over the degree of polynomials.
+Cubic splines on grids of the box, solved by Gauss-Newton from two starts, bound the infimum of the loss over all smooth
+coordinates from above; where refinement changes the loss geometrically, its limit is the infimum near the start. Six
+families are judged by the same loss with the same quadrature. For the arm with seven joints no grid is fine enough;
+there the loss is extrapolated over the degree of polynomials.
 """
 
 import argparse

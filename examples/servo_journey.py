@@ -1,0 +1,98 @@
+"""Fig. 28 with servos in MuJoCo: the journey of the 7-DoF arm, with joints that give way and rub (2 min).
+
+The law of Sec. 9 of [AS2023] gives joint velocities, and their integral is what the servos are asked for. Each servo is
+a spring and a damper between the wanted and the actual joint, plus the gravity torque at the wanted posture. The spring
+stands for the position controller and the elasticity of the gear in series, which act alike below its resonance. The
+motion is logged as a lab would log it, and drawn from the log.
+"""
+
+import argparse
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.control import Kinematic
+from orthocas.reproduce.chosen_fit import USUAL
+from orthocas.reproduce.fig28 import arm_chart, draw_log, journey
+from orthocas.simulation import Friction, MuJoCoPlant, simulate
+
+TICK, LOGGED = 1e-3, 10  # period of the servos [s], and ticks between rows of the log
+BANDWIDTH = 2 * np.pi * 10  # of the servos [rad/s]
+LEAST = 200.0  # stiffness [N m/rad]
+RATIO = 0.7  # of damping
+COULOMB = (1.0, 1.0, 0.6, 0.6, 0.3, 0.1, 0.1)  # friction of the joints [N m]
+VISCOUS = (2.0, 2.0, 1.0, 1.0, 0.5, 0.2, 0.2)  # [N m s/rad]
+SECONDS = 5.0  # of the quick run
+
+
+def servo_run(chart: Chart, times: Array, wanted: Array, rates: Array, friction: Friction | None) -> Array:
+    """Joint positions (N, n) of servos that are asked for positions (N, n) and rates (N, n), at the rows of the log."""
+    robot = chart.problem.robot
+    plant = MuJoCoPlant(robot, friction=friction, timestep=TICK)
+    plant.reset(wanted[0])
+    inertia = np.diagonal(np.array(robot.function("mass_matrix")(wanted[0])))
+    stiffness = np.maximum(BANDWIDTH**2 * inertia, LEAST)
+    damping = 2 * RATIO * np.sqrt(stiffness * inertia)
+    rows = []
+    for k in range(len(times)):
+        if k % LOGGED == 0:
+            rows.append(plant.q)
+        gravity = np.asarray(robot.gravity(wanted[k]), dtype=float).ravel()
+        plant.step(stiffness * (wanted[k] - plant.q) + damping * (rates[k] - plant.dq) + gravity, TICK)
+    return np.array(rows)
+
+
+def write_log(path: Path, chart: Chart, times: Array, q: Array, desired: Array) -> None:
+    """A CSV file that `orthocas reproduce fig28 --log` draws."""
+    names = chart.problem.robot.joint_names
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time_s", *names, *(f"desired_{label}" for label in chart.labels)])
+        writer.writerows(np.column_stack([times, q, desired]).round(9).tolist())
+
+
+def main(out: Path, quick: bool = False) -> dict[str, dict[str, float]]:
+    """Largest errors of task and coordinates, for ideal joints, stiff ones, and stiff ones with friction.
+
+    Args:
+        out: folder for logs and pictures.
+        quick: the first seconds only.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    chart = arm_chart(quick, USUAL)
+    reference = journey(chart)
+    run = simulate(Kinematic(chart, limit=np.inf), reference, chart.problem.domain.centre)
+    times = np.arange(0.0, SECONDS if quick else reference.duration, TICK)
+    wanted, rates, desired = (
+        np.column_stack([np.interp(times, run.times, column) for column in rows.T])
+        for rows in (run.q, run.dq, run.reference)
+    )
+    logged = slice(None, None, LOGGED)
+    friction = Friction(VISCOUS, COULOMB)
+    rows = {
+        "ideal": wanted[logged],
+        "servos": servo_run(chart, times, wanted, rates, None),
+        "servos with friction": servo_run(chart, times, wanted, rates, friction),
+    }
+    found = {}
+    for name, q in rows.items():
+        path = out / f"fig28_{name.replace(' ', '_')}.csv"
+        write_log(path, chart, times[logged], q, desired[logged])
+        drawing = draw_log(path, chart)
+        drawing.figures[""].savefig(path.with_suffix(".png"), dpi=110)
+        found[name] = dict(drawing.numbers)
+    return found
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out"))
+    parser.add_argument("--quick", action="store_true")
+    arguments = parser.parse_args()
+    for name, numbers in main(arguments.out, arguments.quick).items():
+        print(name)
+        for key, value in numbers.items():
+            print(f"  {key:42} {value:.4g}")
