@@ -33,7 +33,7 @@ def servo_run(chart: Chart, times: Array, wanted: Array, rates: Array, friction:
     robot = chart.problem.robot
     plant = MuJoCoPlant(robot, friction=friction, timestep=TICK)
     plant.reset(wanted[0])
-    # what a joint feels while the others are free; A1 and A3 are nearly parallel, so the diagonal of M would be too much
+    # what a joint feels while the others are free: the diagonal of M is too much, as A1 and A3 are nearly parallel
     inertia = 1 / np.diagonal(np.linalg.inv(np.array(robot.function("mass_matrix")(wanted[0]))))
     stiffness = np.maximum(BANDWIDTH**2 * inertia, LEAST)
     damping = 2 * RATIO * np.sqrt(stiffness * inertia)
