@@ -20,7 +20,7 @@ from orthocas.reproduce.fig28 import arm_chart, draw_log, journey
 from orthocas.simulation import Friction, MuJoCoPlant, simulate
 
 TICK, LOGGED = 1e-3, 10  # period of the servos [s], and ticks between rows of the log
-BANDWIDTH = 2 * np.pi * 10  # of the servos [rad/s]
+BANDWIDTH = 2 * np.pi * 30  # of the servos [rad/s]
 LEAST = 200.0  # stiffness [N m/rad]
 RATIO = 0.7  # of damping
 COULOMB = (1.0, 1.0, 0.6, 0.6, 0.3, 0.1, 0.1)  # friction of the joints [N m]
@@ -33,7 +33,8 @@ def servo_run(chart: Chart, times: Array, wanted: Array, rates: Array, friction:
     robot = chart.problem.robot
     plant = MuJoCoPlant(robot, friction=friction, timestep=TICK)
     plant.reset(wanted[0])
-    inertia = np.diagonal(np.array(robot.function("mass_matrix")(wanted[0])))
+    # what a joint feels while the others are free: the diagonal of M is too much, as A1 and A3 are nearly parallel
+    inertia = 1 / np.diagonal(np.linalg.inv(np.array(robot.function("mass_matrix")(wanted[0]))))
     stiffness = np.maximum(BANDWIDTH**2 * inertia, LEAST)
     damping = 2 * RATIO * np.sqrt(stiffness * inertia)
     rows = []
