@@ -15,6 +15,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.sparse.linalg import spsolve
@@ -223,14 +224,21 @@ def limit_over_degree(degrees: Array, losses: Array) -> tuple[float, float]:
 
 def draw(rows: dict[str, dict[str, float]]) -> Figure:
     """The families beside the infimum, as angles."""
-    figure = Figure(figsize=(8.4, 3.4), layout="constrained")
-    panels = figure.subplots(1, len(rows))
+    figure = Figure(figsize=(10.5, 3.6), layout="constrained")
+    panels = figure.subplots(1, len(rows), sharey=True, squeeze=False)[0]
     for axes, (name, numbers) in zip(panels, rows.items(), strict=True):
         labels = [label for label in numbers if ":" in label or label == "linear"]
-        axes.barh(labels[::-1], [as_angle(numbers[label]) for label in labels[::-1]], color="C0")
-        axes.axvline(as_angle(max(numbers["infimum"], 0.0)), color="C3", label="infimum")
-        axes.set(title=name, xlabel="root mean square angle [deg]")
-        axes.legend(fontsize=8)
+        axes.plot([as_angle(numbers[label]) for label in labels], labels, "o", color="C0", label="fitted")
+        if numbers["infimum"] > 0:
+            axes.axvline(as_angle(numbers["infimum"]), color="C3", label="best found by splines")
+        axes.set(title=name, xlabel="angle, root mean square [deg]", xscale="log")
+        axes.xaxis.set(
+            major_locator=LogLocator(subs=(1, 2, 3, 5)), major_formatter="{x:g}", minor_formatter=NullFormatter()
+        )
+        axes.grid(alpha=0.3)
+    panels[0].invert_yaxis()
+    handles, words = panels[-1].get_legend_handles_labels()
+    figure.legend(handles, words, loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 
