@@ -50,25 +50,25 @@ def random_ticks(case: Generated, ticks: int, out: Path, *flags: str) -> Path:
     return built(generated, "random_ticks.c", out, f"-DTICKS={ticks}L", f"-DLIMIT={limit}", "-DSINGULAR=0,0,0", *flags)
 
 
-@pytest.mark.parametrize("case", ["pd_plus", "on_the_torus"])
-def test_a_million_random_ticks_under_sanitizers_never_trap(
-    case: str, request: pytest.FixtureRequest, tmp_path: Path
+@pytest.mark.parametrize(("case", "ticks"), [("pd_plus", 1_000_000), ("on_the_torus", 200_000)])
+def test_random_ticks_under_sanitizers_never_trap(
+    case: str, ticks: int, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     """Address and undefined-behaviour sanitizers; the program itself checks statuses, finiteness and the limit."""
     flags = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    program = random_ticks(request.getfixturevalue(case), 1_000_000, tmp_path, *flags)
+    program = random_ticks(request.getfixturevalue(case), ticks, tmp_path, *flags)
     done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{done.returncode}: {done.stderr}"
     well, outside, singular, not_finite, cut = (int(word) for word in done.stdout.split())
-    assert well + outside + singular + not_finite + cut == 1_000_000
-    assert cut > 10_000
-    assert not_finite > 50_000
-    assert well + cut > 100_000
+    assert well + outside + singular + not_finite + cut == ticks
+    assert cut > 0.01 * ticks
+    assert not_finite > 0.05 * ticks
+    assert well + cut > 0.1 * ticks
     if case == "pd_plus":
-        assert outside > 100_000
+        assert outside > 0.1 * ticks
     else:
         assert outside == 0
-        assert singular > 50_000
+        assert singular > 0.05 * ticks
 
 
 def test_inverse_may_write_on_its_inputs(pd_plus: Generated, tmp_path: Path) -> None:
@@ -116,9 +116,10 @@ def test_calls_take_no_more_stack_than_the_header_says(iiwa: oc.Problem, clang: 
     problem = with_metric(iiwa, "inertia")
     polynomial = oc.fit(problem, oc.Polynomial(2)).chart
     network = oc.fit(problem, oc.MLP((40, 30)), samples=300, solver=oc.solvers.LBFGS(max_iterations=3)).chart
-    for law in (PDPlus(polynomial, 50.0), PDPlus(network, 50.0)):
+    gcc, clang_2 = (compilers()[0], "-O0"), (clang, "-O2")
+    for law, ways in ((PDPlus(polynomial, 50.0), (gcc, clang_2)), (PDPlus(network, 50.0), (gcc,))):
         generated = oc.generate_c(law.chart, tmp_path, law, "arm")
-        for compiler, flag in ((compilers()[0], "-O0"), (clang, "-O2")):
+        for compiler, flag in ways:
             program = built(generated, "stack_use.c", tmp_path, flag, compiler=compiler)
             printed = subprocess.run([str(program)], capture_output=True, text=True, check=True).stdout
             used = [int(word) for word in printed.split()]
