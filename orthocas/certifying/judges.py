@@ -50,8 +50,8 @@ class RegularityJudge:
             return _joined([self._few(part) for part in _parts(J)], J.variables)
 
     def _few(self, J: TaylorModel) -> tuple[Array, ...]:
-        turned, signs = in_singular_basis(J)
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):  # boxes where bounds are infinite
+            turned, signs = in_singular_basis(J)
             regular = _all_positive(pivots(turned)) & (signs != 0)
         conditioning = np.zeros(len(signs))
         if self.bound > 0 and regular.any():
