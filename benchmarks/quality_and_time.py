@@ -109,7 +109,7 @@ def row(point: Point) -> str:
 
 def draw(points: list[Point], file: Path) -> None:
     """Task and mutual angles against seconds, a line for each family."""
-    figure = Figure(figsize=(10.5, 4.6), layout="constrained")
+    figure = Figure(figsize=(10.5, 5.4), layout="constrained")
     panels = figure.subplots(1, 2)
     by_family: dict[str, list[Point]] = {}
     for point in points:
@@ -117,14 +117,17 @@ def draw(points: list[Point], file: Path) -> None:
     for axes, name, paper in zip(panels, ("task", "mutual"), PAPER, strict=True):
         for (family, own), marker, height in zip(by_family.items(), "osD^vPX*<>", (4, -11) * 5, strict=False):
             seconds, values = [p.seconds for p in own], [getattr(p, name) for p in own]
-            axes.plot(seconds, values, marker=marker, label=family, markersize=11 if family == PEER else 5)
+            axes.plot(seconds, values, marker=marker, label=family, markersize=8 if family == PEER else 5)
             for point, value in zip(own, values, strict=True):
                 short = point.label.split(":", 1)[-1].removesuffix(":cyclic")
                 axes.annotate(short, (point.seconds, value), xytext=(4, height), textcoords="offset points", fontsize=7)
         axes.axhline(paper, color="0.7", linestyle="--", zorder=0)
-        axes.set(xscale="log", xlabel="seconds", title=f"{name} angle, std [deg]")
+        axes.set(xscale="log", xlabel="seconds of one thread", title=f"{name} angle, std [deg]")
+        axes.margins(x=0.15)
         axes.grid(alpha=0.3, which="both")
-    panels[0].legend(fontsize=7.5, loc="upper right")
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8, frameon=False
+    )
     panels[1].annotate("the paper's network", (0.72, PAPER[1] + 0.02), xycoords=("axes fraction", "data"), fontsize=7)
     figure.savefig(file, dpi=130)
 
