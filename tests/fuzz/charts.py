@@ -37,6 +37,12 @@ def _iiwa() -> oc.Chart:
     return oc.fit(oc.Problem(arm.robot, task, domain=arm.domain), oc.Polynomial(1), samples=100).chart
 
 
+def _corridor() -> oc.Chart:
+    path = np.linspace([0.0, 0.6, 0.8], [0.8, 1.4, 0.8], 9)
+    problem = oc.corridor_problem(oc.problems.get("planar_3r_xy"), path)
+    return oc.fit(problem, oc.Polynomial(2), samples=100).chart
+
+
 CHARTS: dict[str, Callable[[], oc.Chart]] = {
     **public_objects.CHARTS,
     "torus": _torus,
@@ -49,6 +55,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
         ),
     ),
     "real robot": _iiwa,
+    "corridor": _corridor,
     "certified": lambda: replace(public_objects.fitted().chart, certificate=public_objects.certificate()),
 }
 
