@@ -7,6 +7,7 @@ import csv
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -128,7 +129,8 @@ def _stopped(folder: Path, name: str, number: int, moment: float, alone: bool, w
 
 def _complaint(code: int, number: int, late: float, err: str) -> str | None:
     """What is wrong with exit code or words; before and after our handlers the signal, or Python, ends the process."""
-    if err.startswith(_PYTHON_BEGINS):
+    frames = re.findall(r'^  File "(.*?)"', err, flags=re.MULTILINE)
+    if err.startswith(_PYTHON_BEGINS) or (frames and all(frame.startswith("<frozen ") for frame in frames)):
         return None
     codes = {0, -number, 128 + number}
     if code not in codes:
