@@ -11,7 +11,12 @@ from typing import Any, Generic, Self, TypeVar, overload
 T = TypeVar("T")
 
 _PLACE = "_built"
-_building = RLock()  # one lock for all: values are built from other cached values, in any order
+building = RLock()
+"""Held while CasADi functions are built: CVODES integrators crash if another thread builds at the same time.
+
+One lock for all, because values are built from other cached values, in any order. Nothing may be evaluated in threads
+under it.
+"""
 
 
 class _Store(dict[str, Any]):
@@ -45,7 +50,7 @@ class cached_property(Generic[T]):  # noqa: N801  (takes the place of the one in
 
     def _once(self, instance: object) -> T:
         """The value. The first thread builds it while the others wait."""
-        with _building:
+        with building:
             store = instance.__dict__.setdefault(_PLACE, _Store())
             if self._name not in store:
                 store[self._name] = self._build(instance)
@@ -62,7 +67,7 @@ class BuiltOnUse(Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         if name not in self._values:
-            with _building:
+            with building:
                 if name not in self._values:
                     self._values[name] = self._build(name)
         return self._values[name]

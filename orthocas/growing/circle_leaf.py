@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from orthocas.casadi_tools.cached import cached_property
+from orthocas.casadi_tools.cached import building, cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array, frozen_array
 from orthocas.errors import GrowError, InvalidValueError
@@ -162,7 +162,10 @@ def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, floa
     rate = length * (across / ca.norm_2(across) - home)
     grid = np.linspace(0.0, 1.0, steps + 1)
     options = {"abstol": 1e-12, "reltol": 1e-12, "max_num_steps": 100_000, "disable_internal_warnings": True}
-    integrator = ca.integrator("trace", "cvodes", {"x": q, "p": length, "ode": rate}, 0.0, grid[1:].tolist(), options)
+    with building:
+        integrator = ca.integrator(
+            "trace", "cvodes", {"x": q, "p": length, "ode": rate}, 0.0, grid[1:].tolist(), options
+        )
 
     def trace(start: Array, span: float) -> Array:
         try:

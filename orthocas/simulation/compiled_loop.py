@@ -12,6 +12,7 @@ from typing import Any
 
 import casadi as ca
 
+from orthocas.casadi_tools.cached import building
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.checks import Array
@@ -34,7 +35,7 @@ class CompiledLoop:
     """
 
     def __init__(self, loop: ClosedLoop, reference: Reference) -> None:
-        with deferred():  # CasADi may lose Ctrl-C while it builds functions
+        with deferred(), building:  # CasADi may lose Ctrl-C while it builds functions
             self._law = _law(loop.controller)
             self._plant = _plant(_Keyed(loop.plant_key, loop))
             self._profile = _profile(reference.profile)

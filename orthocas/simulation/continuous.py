@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.cached import building
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
@@ -52,7 +53,7 @@ def integrate(
 
 
 def _by_cvodes(loop: ClosedLoop, reference: Reference, tolerance: float) -> Integrator:
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+    with deferred(), building:  # CasADi may lose Ctrl-C while it builds functions
         integrator = _integrator(loop, reference, tolerance)
 
     def run(span: tuple[float, float], since: float, parameters: Array, load: Array, state: Array) -> Array:

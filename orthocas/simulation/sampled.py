@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.cached import building
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.control.reference import Reference
@@ -73,7 +74,7 @@ def held_plant(loop: ClosedLoop, length: float, tolerance: float) -> ca.Function
 
 
 def _by_cvodes(loop: ClosedLoop, period: float, k: int, tolerance: float) -> Ticks:
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+    with deferred(), building:  # CasADi may lose Ctrl-C while it builds functions
         ticks = _tick(loop, period, k, tolerance).mapaccum(_TICKS)
 
     def run(state: Array, *columns: Array) -> tuple[Array, Array, Array]:

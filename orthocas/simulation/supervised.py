@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.cached import building
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array, as_number, require_kind
 from orthocas.control import Controller, Reference, Safety
@@ -92,7 +93,7 @@ def run_supervised(
     ticks = int(np.floor(reference.duration * rate + 1e-9))
     times = np.arange(ticks) / rate
     wanted, errors, loads = np.hstack(reference.sample(times)), noise.sample(ticks, n), loop.loads.mean(times, 1 / rate)
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+    with deferred(), building:  # CasADi may lose Ctrl-C while it builds functions
         plant = held_plant(loop, 1 / rate, tolerance)
     law.start(start[:n] + errors[0, :n])
     state, sent = start, np.zeros(n + 2)
