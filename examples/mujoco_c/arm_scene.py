@@ -49,7 +49,7 @@ def write_scene(tree: KinematicTree, path: Path, wall_x: float, wall_z: float) -
 
 def _add_body(carrier: Element, tree: KinematicTree, i: int) -> Element:
     """Body i with its joint, its inertia, and what is seen of it: the joint's axis and a link to each child."""
-    turn = Rotation.from_matrix(tree.rotations[i]).as_quat(scalar_first=True)
+    turn = Rotation.from_matrix(np.array(tree.rotations[i])).as_quat(scalar_first=True)
     body = _add(carrier, "body", name=f"body{i}", pos=tree.translations[i], quat=turn)
     ends = (tree.lower[i], tree.upper[i])
     _add(body, "joint", name=f"joint{i}", axis=(0, 0, 1), limited="true", range=ends, armature=tree.armatures[i])

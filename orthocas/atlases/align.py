@@ -111,7 +111,7 @@ def _tree(count: int, first: Indices, second: Indices, match: Array) -> list[tup
     best: dict[tuple[int, int], int] = {}
     for k in np.argsort(weights)[::-1].tolist():
         best[min(first[k], second[k]), max(first[k], second[k])] = k
-    pairs = np.array(list(best))
+    pairs = np.array(list(best), dtype=np.int32)  # older versions of SciPy walk through no others
     graph = scipy.sparse.coo_array((weights[list(best.values())], pairs.T), shape=(count, count))
     tree = scipy.sparse.csgraph.minimum_spanning_tree(graph.tocsr())
     tree = (tree + tree.T).tocsr()
