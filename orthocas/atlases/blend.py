@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from orthocas.atlases.index import Index
-from orthocas.casadi_tools.cached import cached_property
+from orthocas.casadi_tools.cached import building, cached_property
 from orthocas.checks import Array, Indices
 
 _KEPT = 64  # lists of neighbours
@@ -63,9 +63,10 @@ class Blend:
             apart = self._centres - self._centres[near]
             apart -= np.where(lattice.endless, 2 * np.pi * np.round(apart / (2 * np.pi)), 0.0)
             known = np.flatnonzero((np.abs(apart) <= self._half_widths + self._half_widths[near]).all(axis=1))
-            while len(self._neighbours) >= _KEPT:
-                self._neighbours.pop(next(iter(self._neighbours)), None)
-            self._neighbours[near] = known
+            with building:  # threads may share the blend
+                while len(self._neighbours) >= _KEPT:
+                    self._neighbours.pop(next(iter(self._neighbours)))
+                self._neighbours[near] = known
         return known
 
     @cached_property

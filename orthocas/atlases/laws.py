@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from orthocas.atlases.asked_posture import AskedPosture
 from orthocas.atlases.atlas import Atlas
 from orthocas.atlases.blend import Blend
-from orthocas.casadi_tools.cached import cached_property
+from orthocas.casadi_tools.cached import building, cached_property
 from orthocas.chart import Chart
 from orthocas.checks import Array, require_kind
 from orthocas.control.controller import Controller
@@ -79,14 +79,16 @@ class HandedOver:
         return Command(np.array(torque).ravel(), int(status), storage, power)
 
     def _of(self, asked: AskedPosture) -> Controller:
-        if asked.number not in self._built:
-            law = self.law(asked.chart)
-            if law.command != "torque":
-                raise InvalidValueError("law", f"one that commands {law.command}", "a torque law")
-            while len(self._built) >= _LAWS:
-                self._built.pop(next(iter(self._built)))
-            self._built[asked.number] = law
-        return self._built[asked.number]
+        with building:  # threads may share the law
+            law = self._built.get(asked.number)
+            if law is None:
+                law = self.law(asked.chart)
+                if law.command != "torque":
+                    raise InvalidValueError("law", f"one that commands {law.command}", "a torque law")
+                while len(self._built) >= _LAWS:
+                    self._built.pop(next(iter(self._built)))
+                self._built[asked.number] = law
+            return law
 
 
 @dataclass(frozen=True, eq=False)
