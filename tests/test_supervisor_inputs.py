@@ -11,7 +11,7 @@ from supervised import TICK, Arm, at_rest, run
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor
 from orthocas.codegen.generated import GeneratedC
-from orthocas.control import ControlStatus
+from orthocas.control import Controller, ControlStatus
 
 pytestmark = needs_c
 
@@ -116,3 +116,19 @@ def test_a_million_hostile_ticks_stay_bounded_with_the_right_status(supervised_c
     assert sum(counts) == 1_000_000
     for status in ("OK", "SATURATED", "NEAR_BORDER", "CAUGHT", "RETURNING", "BAD_INPUT"):
         assert counts[ControlStatus[status]] > 50, (status, counts)  # each is met
+
+
+def test_joints_that_turn_without_end_may_report_any_number_of_whole_turns(
+    supervised_library: CompiledLibrary, supervised_law: Controller
+) -> None:
+    """The joints of the planar arm have no limits; a sensor that starts at another turn changes nothing."""
+    domain, commands = supervised_law.problem.domain, []
+    q, wanted = domain.centre + 0.5 * domain.half_width, at_rest(supervised_law.chart, domain.centre)
+    for turns in (np.zeros(3), 2 * np.pi * np.array([1.0, -3.0, 2.0])):
+        supervisor = Supervisor(supervised_library, supervised_law)
+        supervisor.start(q + turns)
+        ticks = [supervisor.step(q + turns, np.zeros(3), wanted, TICK) for _ in range(100)]
+        assert {status for _, status in ticks} <= {ControlStatus.OK, ControlStatus.SATURATED}
+        commands.append(np.array([command for command, _ in ticks]))
+    np.testing.assert_allclose(commands[1], commands[0], atol=1e-9)
+    assert np.abs(commands[0] - supervised_law.problem.robot.gravity(q)).max() > 1.0
