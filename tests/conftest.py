@@ -20,7 +20,7 @@ from programs import Run
 import orthocas as oc
 from orthocas import problems
 from orthocas.cli import main
-from orthocas.codegen import GeneratedC
+from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
 from orthocas.control import PDPlus
 from orthocas.fitting.fit import Fit
 from orthocas.reproduce import FIGURES, Drawing
@@ -126,6 +126,30 @@ def pd_plus(planar_fit: Fit, tmp_path_factory: pytest.TempPathFactory) -> tuple[
     """A law on a box of the planar arm, and its C."""
     law = PDPlus(planar_fit.chart, np.linspace(20, 80, 3), 0.6, "decoupled", limit=90.0)
     return oc.generate_c(law.chart, tmp_path_factory.mktemp("pd_plus"), law, "arm"), law
+
+
+@pytest.fixture(scope="session")
+def supervised_law(planar_for_control: oc.Chart) -> PDPlus:
+    """A law on a box of the planar arm, to be supervised."""
+    return PDPlus.on_chart(planar_for_control, limit=120.0)
+
+
+@pytest.fixture(scope="session")
+def supervised_c(supervised_law: PDPlus, tmp_path_factory: pytest.TempPathFactory) -> GeneratedC:
+    """Its C."""
+    return oc.generate_c(supervised_law.chart, tmp_path_factory.mktemp("supervised"), supervised_law, "arm")
+
+
+@pytest.fixture(scope="session")
+def supervised_library(supervised_c: GeneratedC) -> CompiledLibrary:
+    """Its C, compiled."""
+    return CompiledLibrary(compile_shared(supervised_c, supervised_c.folder), "arm", 3)
+
+
+@pytest.fixture
+def supervisor(supervised_library: CompiledLibrary, supervised_law: PDPlus) -> Supervisor:
+    """Its state in C."""
+    return Supervisor(supervised_library, supervised_law)
 
 
 @pytest.fixture(scope="module")
