@@ -78,8 +78,8 @@ class InverseMethods(PhiFunctions):
             q_start: initial guess (n,), or (N, n) with one guess per row of phi.
             tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
             inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
-                other starts, get the q inside with the same x and the nearest xi that Ipopt finds (10 ms a row),
-                status NEAREST, or OUT_OF_REACH if none has that x. Not for grown coordinates.
+                other starts, get the q inside with the same x and the nearest xi that is found, a local minimum, with
+                the status NEAREST, or OUT_OF_REACH if none has that x. Not for grown coordinates.
             local: another solver of phi(q) = phi near given starts; `orthocas.compile_inverse` has one.
 
         Returns:

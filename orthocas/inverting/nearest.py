@@ -1,11 +1,10 @@
-"""The nearest coordinates inside the domain at given task values (ours).
+"""The nearest coordinates inside the domain at given task values, by Ipopt, one row at a time (ours).
 
 Where no q inside the domain has phi(q) = (x, xi), the nearest one that keeps the task solves
 
     minimise |xi(q) - xi|^2 / 2   subject to   h(q) = x,  q in the domain.
 
-Ipopt finds a local minimum, from the point of the domain nearest to the best q so far, and where that fails, from
-points of a table whose task values are near.
+Ipopt finds a local minimum in 10 to 50 ms; `nearest_xi` treats all rows at once, and leaves few to Ipopt.
 """
 
 from dataclasses import dataclass
