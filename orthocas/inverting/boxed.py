@@ -6,9 +6,9 @@ import numpy as np
 
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
-from orthocas.domains import borders
-from orthocas.inverting.newton import ROUNDING, PhiMap
-from orthocas.problem import Problem
+from orthocas.domains import Domain, borders
+from orthocas.inverting.phi_map import ROUNDING, PhiMap
+from orthocas.tasks import Task
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,43 +18,44 @@ class BoxedPhi:
     Values need not be finite: errors are infinite there, and derivatives 0 or NaN.
     """
 
-    problem: Problem
+    task: Task
+    domain: Domain
     phi_map: PhiMap
 
     @property
     def m(self) -> int:
         """Number of task components."""
-        return self.problem.m
+        return self.task.m
 
     @cached_property
     def low(self) -> Array:
         """Lowest u, (n,): -1, or -inf for joints without borders."""
-        return (borders(self.problem.domain)[0] - self.problem.domain.centre) / self.problem.domain.half_width
+        return (borders(self.domain)[0] - self.domain.centre) / self.domain.half_width
 
     @cached_property
     def high(self) -> Array:
         """Highest u, (n,)."""
-        return (borders(self.problem.domain)[1] - self.problem.domain.centre) / self.problem.domain.half_width
+        return (borders(self.domain)[1] - self.domain.centre) / self.domain.half_width
 
     def points(self, u: Array) -> Array:
         """q at u (N, n), within the borders, (N, n)."""
-        domain = self.problem.domain
+        domain = self.domain
         return np.clip(domain.centre + domain.half_width * u, *borders(domain))
 
     def of_points(self, q: Array) -> Array:
         """u of the points of the box nearest to q (N, n), (N, n)."""
-        u = (q - self.problem.domain.centre) / self.problem.domain.half_width
+        u = (q - self.domain.centre) / self.domain.half_width
         return np.clip(u, self.low, self.high)
 
     def task_errors(self, x: Array, u: Array) -> Array:
         """(x - h(q)) / scale, (N, m), for task values x (N, m); scale as in `PhiMap`."""
-        errors = (x - self.problem.task.batched(self.points(u))[0]) / self._scale(x)
+        errors = (x - self.task.batched(self.points(u))[0]) / self._scale(x)
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def task_jacobians(self, x: Array, u: Array) -> Array:
         """d(h / scale)/du, (N, m, n); 0 where it is not finite."""
-        J = self.problem.task.batched_jacobian(self.points(u))[0].reshape(len(u), self.m, -1)
-        J = J * self.problem.domain.half_width / self._scale(x)[:, :, None]
+        J = self.task.batched_jacobian(self.points(u))[0].reshape(len(u), self.m, -1)
+        J = J * self.domain.half_width / self._scale(x)[:, :, None]
         return np.where(np.isfinite(J), J, 0.0)
 
     def xi_errors(self, targets: Array, u: Array) -> Array:
@@ -63,7 +64,7 @@ class BoxedPhi:
 
     def jacobians(self, targets: Array, u: Array) -> tuple[Array, Array]:
         """d(h / scale)/du (N, m, n) and dxi/du (N, r, n)."""
-        J = self.phi_map.jacobian(self.points(u)) * self.problem.domain.half_width
+        J = self.phi_map.jacobian(self.points(u)) * self.domain.half_width
         return J[:, : self.m] / self._scale(targets[:, : self.m])[:, :, None], J[:, self.m :]
 
     def _scale(self, x: Array) -> Array:

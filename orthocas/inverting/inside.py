@@ -49,7 +49,7 @@ class Inside:
         """Points of the domain with task values as in targets (N, n), as q (N, n), and the nearest xi, (N, n)."""
         u, minimal = nearest_xi(self.boxed, targets, self.boxed.of_points(q))
         found = self.boxed.points(u)
-        allowed = self.boxed.problem.domain.contains(found)
+        allowed = self.boxed.domain.contains(found)
         undecided = np.flatnonzero(~(minimal & allowed))
         if undecided.size:
             found[undecided] = self._searched_by_ipopt(targets[undecided], found[undecided], allowed[undecided])

@@ -11,7 +11,8 @@ from orthocas.domains import borders
 from orthocas.inverting.boxed import BoxedPhi
 from orthocas.inverting.inside import Inside
 from orthocas.inverting.nearest import Nearest
-from orthocas.inverting.newton import Attempt, LocalSolver, PhiMap, largest
+from orthocas.inverting.newton import Attempt, LocalSolver
+from orthocas.inverting.phi_map import PhiMap, largest
 from orthocas.inverting.solutions import InverseStatus, Solutions
 from orthocas.inverting.starts import Starts
 from orthocas.problem import Problem
@@ -179,7 +180,7 @@ class Inverse:
         """Searches inside the domain, for fitted coordinates."""
         if self.nearest is None:
             return None
-        return Inside(BoxedPhi(self.problem, self.phi_map), self.starts, self.nearest)
+        return Inside(BoxedPhi(self.problem.task, self.problem.domain, self.phi_map), self.starts, self.nearest)
 
     @cached_property
     def starts(self) -> Starts:

@@ -23,8 +23,9 @@ from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError, Si
 from orthocas.inverting.implicit import inverse_function
 from orthocas.inverting.inverse import Inverse
 from orthocas.inverting.nearest import Nearest
-from orthocas.inverting.newton import LocalSolver, Newton, PhiMap
+from orthocas.inverting.newton import LocalSolver, Newton
 from orthocas.inverting.own_inverse import OwnInverse
+from orthocas.inverting.phi_map import PhiMap
 from orthocas.inverting.point import FewRows, PointFunctions
 from orthocas.inverting.solutions import Solutions
 from orthocas.inverting.tracker import Tracker
@@ -190,7 +191,9 @@ class InverseMethods(PhiFunctions):
         if isinstance(self.coordinates, InvertibleMap):
             return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map))
         local = FewRows(phi_map, self._point_functions, Newton(phi_map))
-        return Inverse(self.problem, phi_map, local, Nearest(self.problem, self.function("phi"), phi_map))
+        return Inverse(
+            self.problem, phi_map, local, Nearest(self.problem.domain, self.m, self.function("phi"), phi_map)
+        )
 
     @cached_property
     def _inverse_function(self) -> ca.Function:

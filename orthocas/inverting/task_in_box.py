@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthocas.checks import Array, Indices
 from orthocas.inverting.boxed import BoxedPhi
-from orthocas.inverting.newton import largest
+from orthocas.inverting.phi_map import largest
 
 KEPT = 1e-11  #: task error, relative to the sizes of the components, at which x counts as reached
 _GOAL = 1e-13  # task error at which the search stops
