@@ -103,6 +103,12 @@ def planar_for_control(planar_x: oc.Problem) -> oc.Chart:
 
 
 @pytest.fixture(scope="session")
+def planar_arm() -> oc.Chart:
+    """A planar arm with one coordinate, quickly fitted: for the inverse map."""
+    return oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(3), samples=300).chart
+
+
+@pytest.fixture(scope="session")
 def arm_chart() -> oc.Chart:
     """The 7-DoF arm with A = M, roughly fitted: laws have to be right for any regular chart."""
     problem = oc.problems.get("iiwa")
