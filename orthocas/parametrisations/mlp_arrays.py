@@ -37,8 +37,7 @@ class NetworkArrays:
         self._a = [array[-1] for array in self._up]
         self._a[0][...] = inputs
         for V, b, before, a, s in zip(self._V, self._b, self._a, self._a[1:], self._s[1:], strict=False):
-            np.matmul(before, V, out=a)
-            a += b
+            np.add(np.matmul(before, V, out=a), b, out=a)
             np.tanh(a, out=a)
             np.multiply(a, a, out=s)
             np.subtract(1, s, out=s)
