@@ -1,10 +1,12 @@
 """From numbers in an atlas to boxes and charts as the rest of orthocas knows them (ours)."""
 
+from collections.abc import Sequence
 from functools import reduce
 
 import numpy as np
 
 from orthocas.atlases.cells import Cell
+from orthocas.atlases.local_task import is_turning
 from orthocas.atlases.plan import Plan
 from orthocas.chart import Chart
 from orthocas.checks import Array
@@ -15,6 +17,8 @@ from orthocas.files.problem_parts import problem_from_data, problem_to_data
 from orthocas.parametrisations import JointSpace, Polynomial
 from orthocas.postures.clear_box import ClearBox
 from orthocas.problem import Problem
+
+STEP = 0.6  # [rad]
 
 
 def box_of(plan: Plan, cell: Cell) -> Box:
@@ -39,6 +43,26 @@ def clipped(plan: Plan, low: Array, high: Array) -> Box:
     return plan.box_around(np.maximum(low, robot.lower[joints]), np.minimum(high, robot.upper[joints]))
 
 
+def part_near(plan: Plan, box: Box, steps: Sequence[int]) -> Box:
+    """The part of a box where cyclic joints lie within 1.2 rad of so many steps of 0.6 rad from its middle.
+
+    There, a reference orientation in the middle is less than half a turn away.
+    """
+    cyclic = list(plan.cyclic)
+    middle = box.centre[cyclic] + STEP * np.array(steps)
+    low = np.maximum(middle - 2 * STEP, (box.centre - box.half_width)[cyclic])
+    high = np.minimum(middle + 2 * STEP, (box.centre + box.half_width)[cyclic])
+    centre, half_width = box.centre.copy(), box.half_width.copy()
+    centre[cyclic], half_width[cyclic] = (low + high) / 2, (high - low) / 2
+    return Box(centre, half_width, [i for i in box.unbounded if i not in cyclic])
+
+
+def steps_to(plan: Plan, q: Array) -> tuple[int, ...]:
+    """Steps of 0.6 rad from the middle of cyclic joints that come nearest to a position (n,)."""
+    cyclic = list(plan.cyclic)
+    return tuple(np.round((q - plan.problem.domain.centre)[cyclic] / STEP).astype(int).tolist())
+
+
 def chart_of(plan: Plan, box: Box, numbers: Array, clear: float, problem: Problem) -> Chart:
     """The chart of a box from its numbers on the cube (fitted, 1 + K).
 
@@ -46,11 +70,13 @@ def chart_of(plan: Plan, box: Box, numbers: Array, clear: float, problem: Proble
         plan: plan of the atlas.
         box: the box.
         numbers: constants and coefficients.
-        clear: share of its samples that are clear of singular positions. If it is not 1, the domain is a ClearBox.
+        clear: share of its samples that are clear of singular positions. If it is not 1, or the task compares
+            orientations, the domain is a ClearBox.
         problem: that of the plan, or `without_limits` of it for a box beyond them.
     """
     base = problem
-    domain = ClearBox(box, base.task, plan.settings.least_singular_value, plan.scale) if clear < 1 else box
+    bound = plan.settings.least_singular_value
+    domain = ClearBox(box, base.task, bound, plan.scale) if clear < 1 or is_turning(base.task) else box
     problem = Problem(base.robot, base.task, base.metric, domain, base.name)
     parametrisation = Polynomial(plan.settings.degree, plan.cyclic_names)
     r = plan.fitted
