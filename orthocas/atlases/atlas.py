@@ -212,7 +212,8 @@ class Atlas(Shown):
 
         Raises:
             InvalidValueError: if there is no such chart.
-            DomainError: if the box lies about half a turn from the reference orientation; see `with_reference`.
+            DomainError: if the box lies beyond joint limits, as images of others may, or about half a turn from the
+                reference orientation; see `with_reference`.
         """
         which = self._numbered(number, near)
         chart = self._kept.get(which)
@@ -285,7 +286,9 @@ class Atlas(Shown):
     def _borders(self, number: int, turns: Turns) -> tuple[Array, Array]:
         """Borders of the box of a chart in the joints that boxes divide, also beyond the limits."""
         numbers = np.array([number])
-        centre = self._index.image_centres(numbers)[0][0] + 2 * np.pi * np.array(turns[: self._index.plan.lattice.low.size])
+        centre = self._index.image_centres(numbers)[0][0] + 2 * np.pi * np.array(
+            turns[: self._index.plan.lattice.low.size]
+        )
         half = self._index.box_half_widths[self._index.rows(numbers)[1]][0]
         return centre - half, centre + half
 

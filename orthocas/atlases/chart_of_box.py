@@ -12,6 +12,7 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import Box
+from orthocas.errors import DomainError
 from orthocas.files.json import plain
 from orthocas.files.problem_parts import problem_from_data, problem_to_data
 from orthocas.parametrisations import JointSpace, Polynomial
@@ -37,10 +38,21 @@ def widened(plan: Plan, low: Array, high: Array) -> tuple[Array, Array]:
 
 
 def clipped(plan: Plan, low: Array, high: Array) -> Box:
-    """The part of a box within the joint limits."""
+    """The part of a box within the joint limits.
+
+    Raises:
+        DomainError: if there is none, as for images of boxes near limits that the symmetry does not keep.
+    """
     joints = list(plan.joints)
     robot = plan.problem.robot
-    return plan.box_around(np.maximum(low, robot.lower[joints]), np.minimum(high, robot.upper[joints]))
+    low, high = np.maximum(low, robot.lower[joints]), np.minimum(high, robot.upper[joints])
+    beyond = np.flatnonzero(low >= high)
+    if beyond.size:
+        name = robot.joint_names[joints[int(beyond[0])]]
+        raise DomainError(
+            f"the box of the chart lies beyond the limits of joint '{name}', expected one that chart_at finds"
+        )
+    return plan.box_around(low, high)
 
 
 def part_near(plan: Plan, box: Box, steps: Sequence[int]) -> Box:
