@@ -25,6 +25,8 @@ class AtlasSession(Session):
         InvalidValueError: if the atlas has no chart at q, or none at all.
     """
 
+    beyond = 0.1
+
     def __init__(self, atlas: Atlas, q: Array | None = None) -> None:
         require_kind("atlas", atlas, Atlas)
         home = _middle(atlas) if q is None else as_point("q", q, atlas.problem.n)

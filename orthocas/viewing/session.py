@@ -34,6 +34,7 @@ class Session:
         InvalidValueError: if q lies outside the domain, or J is singular there.
     """
 
+    beyond = 0.0  #: how far a wish for a coordinate may lie beyond its ends in the chart, as a share of their distance
     _wished: Array  #: phi, (n,)
 
     def __init__(self, chart: Chart, q: Array | None = None) -> None:
