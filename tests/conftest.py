@@ -15,10 +15,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from charts import with_metric
+from planar_atlas import built
 from programs import Run
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.checks import Array
 from orthocas.cli import main
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
 from orthocas.control import PDPlus
@@ -125,6 +127,19 @@ def way_atlas(planar_x: oc.Problem, tmp_path_factory: pytest.TempPathFactory) ->
     with ThreadPoolExecutor(1) as executor:
         problem = with_metric(planar_x, "inertia")
         return oc.build_atlas(problem, path, asked, region=way, radius=0.5, executor=executor)
+
+
+@pytest.fixture(scope="session")
+def planar_atlas(tmp_path_factory: pytest.TempPathFactory) -> oc.Atlas:
+    """The whole joint range of the planar arm, A = I."""
+    return built(tmp_path_factory.mktemp("atlas") / "arm.orthocas-atlas")
+
+
+@pytest.fixture(scope="session")
+def covered(planar_atlas: oc.Atlas) -> Array:
+    """Positions that have a chart of it."""
+    q = np.random.default_rng(7).uniform(-np.pi, np.pi, (500, 3))
+    return np.asarray(q[planar_atlas.chart_at(q) >= 0])
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from orthocas.cli.corridor_argument import CorridorPath, CorridorRadius, corridor_or_box
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, report_rows, whole_number
 from orthocas.cli.problem_argument import (
     CentreText,
@@ -19,7 +20,6 @@ from orthocas.cli.problem_argument import (
     TaskName,
     TipName,
     ToolText,
-    build_problem,
     parse_numbers,
 )
 from orthocas.cli.progress import terminal_monitor
@@ -46,6 +46,7 @@ AnglesName = Annotated[
         help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia.",
     ),
 ]
+_IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 _NUMBERS = ("task", "mutual", "regularity", "length", "folds")
 WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _NUMBERS)
 
@@ -62,7 +63,7 @@ def fit(
         typer.Option(
             "--param",
             help="Parametrisation: polynomial:5, polynomial:5:cyclic, fourier:2, mlp:64x64, linear or sew; "
-            "default: polynomial:5, or polynomial:4 for more than seven joints.",
+            "default: polynomial:5, or polynomial:4 for more than seven joints; polynomial:3:cyclic with --corridor.",
         ),
     ] = None,
     solver: Annotated[
@@ -85,6 +86,8 @@ def fit(
         ),
     ] = None,
     domain: DomainText = None,
+    corridor: CorridorPath = None,
+    radius: CorridorRadius = None,
     leak_deg: Annotated[
         float | None, typer.Option("--leak-deg", parser=number, help="Largest leak for --domain auto [deg]; default 8.")
     ] = None,
@@ -127,10 +130,11 @@ def fit(
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
     words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width, least_singular_value)
-    bounds = _bounds(domain, leak_deg, conditioning)
-    built = build_problem(problem, words) if bounds is None else None
+    bounds = _bounds(domain, leak_deg, conditioning, corridor)
+    built = corridor_or_box(problem, words, corridor, radius) if bounds is None else None
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
     require_free(target, CHART, force)
+    param = _IN_CORRIDOR if param is None and corridor is not None else param
     parametrisation = None if param is None else parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
     loss = parse_weights(weights, angles)
@@ -164,8 +168,12 @@ def fit(
         raise typer.Exit(130)
 
 
-def _bounds(domain: str | None, leak_deg: float | None, conditioning: float | None) -> Bounds | None:
+def _bounds(
+    domain: str | None, leak_deg: float | None, conditioning: float | None, corridor: Path | None
+) -> Bounds | None:
     """What --domain auto asks for; None without it."""
+    if domain is not None and corridor is not None:
+        raise InvalidValueError("--domain", repr(domain), "none with --corridor, which is the domain")
     given = {"--leak-deg": leak_deg, "--conditioning": conditioning}
     if domain is None:
         for option, value in given.items():
