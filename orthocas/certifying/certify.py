@@ -10,7 +10,7 @@ import numpy as np
 from orthocas.certificates.certificate import METHOD, Certificate
 from orthocas.certificates.subdivision import OPEN, Subdivision
 from orthocas.certifying.chart_rows import ChartRows, chart_rows
-from orthocas.certifying.judges import InjectivityJudge, RegularityJudge, injectivity_judge
+from orthocas.certifying.judges import RegularityJudge, injectivity_judge
 from orthocas.certifying.outside import judge_of
 from orthocas.certifying.search import Limits, Look, Search, distances, largest_first, nearest_first
 from orthocas.chart import Chart
@@ -89,8 +89,7 @@ def certify(
         search.run(_shown(monitor, "regular"))
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
-            judge_too = injectivity_judge(rows, chart.problem.domain.centre)
-            injective = _one_to_one(judge_too, base, left, executor, monitor)
+            injective = _one_to_one(chart, rows, base, left, executor, monitor)
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
     return so_far()
@@ -238,9 +237,9 @@ def _suspects(chart: Chart) -> Array:
 
 
 def _one_to_one(
-    judge: InjectivityJudge, base: Subdivision, seconds: float, executor: Executor | None, monitor: Monitor
+    chart: Chart, rows: ChartRows, base: Subdivision, seconds: float, executor: Executor | None, monitor: Monitor
 ) -> Subdivision | None:
-    """The largest of some boxes around the centre that the judge accepts, with its parts; None if it accepts none."""
+    """The largest of some boxes around the centre with a proof, and its parts; None if there is no proof for any."""
     end = time.monotonic() + seconds
     best = None
     low, high = 0, len(_SCALES)  # the scales before `low` are proved, those from `high` on are not
@@ -248,6 +247,7 @@ def _one_to_one(
         middle = (low + high) // 2
         part = _scaled(base, _SCALES[middle])
         limits = Limits(max(end - time.monotonic(), 0.0), boxes=_INJECTIVE_BOXES)
+        judge = injectivity_judge(rows, chart.problem.domain.centre, part)
         search = Search(judge, part, limits, largest_first(part), executor)
         search.run(_shown(monitor, "one-to-one"))
         if search.finished:
