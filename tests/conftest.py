@@ -5,6 +5,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: threads of BLAS that spin take other processes' cores
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import json
 import signal
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -15,15 +16,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from charts import with_metric
+from matplotlib.figure import Figure
 from planar_atlas import built
 from programs import Run
+from simulate_command import SHORT
 
 import orthocas as oc
 from orthocas import problems
 from orthocas.checks import Array
-from orthocas.cli import main
+from orthocas.cli import main, simulate
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
-from orthocas.control import PDPlus
+from orthocas.control import PDPlus, Reference
 from orthocas.fitting.fit import Fit
 from orthocas.reproduce import FIGURES, Drawing
 from orthocas.robots import files
@@ -150,6 +153,20 @@ def pd_plus(planar_fit: Fit, tmp_path_factory: pytest.TempPathFactory) -> tuple[
 
 
 @pytest.fixture(scope="session")
+def planar_q0(planar_x: oc.Problem) -> Array:
+    """The middle of the domain of the planar arm."""
+    return planar_x.domain.centre
+
+
+@pytest.fixture(scope="session")
+def planar_steps(planar_chart: oc.Chart, planar_q0: Array) -> Reference:
+    """Interleaved steps in x and xi1, as in Sec. 8.1."""
+    phi = planar_chart.phi(planar_q0)
+    changes = [(0.3, {"x": phi[0] + 0.1}), (2.0, {"xi1": 0.05}), (4.0, {"x": phi[0]}), (6.0, {"xi1": 0.0})]
+    return Reference.steps(planar_chart.labels, phi, changes, 8.0)
+
+
+@pytest.fixture(scope="session")
 def supervised_law(planar_for_control: oc.Chart) -> PDPlus:
     """A law on a box of the planar arm, to be supervised."""
     return PDPlus.on_chart(planar_for_control, limit=120.0)
@@ -192,6 +209,26 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureF
         return int(stop.value.code or 0), out, err
 
     return call
+
+
+@pytest.fixture
+def run_simulate(run: Run, planar_fit: Fit) -> Run:
+    """Run `orthocas simulate` in a folder with a.orthocas and short.json."""
+    planar_fit.chart.save("a.orthocas")
+    Path("short.json").write_text(json.dumps(SHORT))
+
+    def call(
+        controller: str, *words: str, steps: str = "short.json", chart: str = "a.orthocas"
+    ) -> tuple[int, str, str]:
+        return run("simulate", chart, "--controller", controller, "--steps", steps, "--out", "out", *words)
+
+    return call
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No curves in pictures of `orthocas simulate`, for tests of numbers: drawing takes longer than the runs."""
+    monkeypatch.setattr(simulate, "trajectory_figure", lambda run, units: Figure())
 
 
 _ONE_JOINT = """<robot name="r"><link name="base"/>

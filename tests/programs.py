@@ -49,7 +49,7 @@ def built(generated: GeneratedC, program: str, out: Path, *flags: str, compiler:
         compiler or compilers()[0],
         "-std=c99",
         "-O1",
-        "-g",
+        "-g1",
         *flags,
         f"-I{generated.folder}",
         *sources,

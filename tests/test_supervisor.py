@@ -82,14 +82,14 @@ def test_the_catcher_takes_energy_and_never_adds_any(supervisor: Supervisor, pla
     supervisor.take_over(q, robot.gravity(q))
     arm, reference = Arm(robot, q, np.full(3, 1.2)), at_rest(planar_for_control, q)
     stiffness, law = Safety.of(PDPlus.on_chart(planar_for_control)).brake_stiffness.reshape(3, 3), []
-    for _ in range(3000):
+    for _ in range(1600):
         command, _ = supervisor.step(arm.q, arm.dq, reference, TICK)
         if supervisor.mode == 1 and supervisor.weight == 0.0:
             e = arm.q - supervisor.anchor
             law.append(0.5 * arm.dq @ robot.mass_matrix(arm.q) @ arm.dq + 0.5 * e @ stiffness @ e)
         arm.move(command, steps=20)
     energy = np.array(law)
-    assert len(energy) > 2000
+    assert len(energy) > 1000
     assert energy[0] > 0.05
     assert (energy - np.minimum.accumulate(energy)).max() < 0.02 * energy[0]
     assert energy[-1] < 1e-6

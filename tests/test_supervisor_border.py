@@ -28,13 +28,14 @@ def test_the_bound_on_singular_values_is_a_border_with_a_zone_before_it(tmp_path
     generated = oc.generate_c(chart, tmp_path, law, "arm")
     library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3)
     supervisor = Supervisor(library, law, Safety.of(law, command_rate=np.inf))
-    arm, straight = Arm(robot, box.centre), np.array([0.6, 0.0, 0.1])
-    supervisor.start(box.centre)
-    run(supervisor, arm, at_rest(chart, box.centre), 0.5)
+    straight, speed = np.array([0.6, 0.0, 0.1]), np.array([0.0, -0.2, -0.175])
+    start = straight - 2 * speed
+    arm = Arm(robot, start)
+    supervisor.start(start)
+    run(supervisor, arm, at_rest(chart, start), 0.2)
     statuses, commands, sizes = [], [], []
-    for k in range(4000):
-        wanted = box.centre + k / 4000 * (straight - box.centre)
-        command, status = supervisor.step(arm.q, arm.dq, moving(chart, wanted, (straight - box.centre) / 4.0), TICK)
+    for k in range(2000):
+        command, status = supervisor.step(arm.q, arm.dq, moving(chart, start + k * TICK * speed, speed), TICK)
         arm.move(command)
         statuses.append(status)
         commands.append(command)
@@ -54,7 +55,7 @@ def test_the_bound_on_singular_values_is_a_border_with_a_zone_before_it(tmp_path
     assert changes[first[0] - 100 :].max() < 2.0  # the law hands over in the 30 ticks of fade_out
     assert np.abs(arm.dq).max() < 1e-3
     supervisor.resume()
-    statuses, _, _ = run(supervisor, arm, at_rest(chart, box.centre), 4.0)
+    statuses, _, _ = run(supervisor, arm, at_rest(chart, box.centre), 2.5)
     assert statuses[0] is ControlStatus.RETURNING
     assert statuses[-1] is ControlStatus.OK
 
