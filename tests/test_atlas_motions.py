@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
+import atlas_loops
 import numpy as np
 import pytest
 from conftest import robot_data
@@ -137,3 +138,10 @@ def test_sessions_begin_in_the_middle_of_the_joint_range(planar_atlas: oc.Atlas)
     assert session.number == planar_atlas.chart_at(session.q)
     with pytest.raises(InvalidValueError, match="`view` shows atlases"):
         export_page(planar_atlas, planar_atlas.path.with_name("page.html"))
+
+
+def test_one_chart_along_a_motion_closes_loops_that_cross_charts() -> None:
+    found = atlas_loops.main(quick=True)
+    assert found["hand_overs"] >= 2
+    assert found["pseudo_inverse_rad"] > 1e-3
+    assert found["worst_ratio"] < 1e-6  # 1/100 is asked for
