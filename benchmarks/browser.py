@@ -24,7 +24,8 @@ _OPTIONS = (
 class Page:
     """One tab."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, process: int) -> None:
+        self.process = process  #: number of the browser's process
         self._socket = import_module("websockets.sync.client").connect(address, max_size=None)
         self._numbers = itertools.count(1)
         self.call("Page.enable")
@@ -89,7 +90,7 @@ def browser(folder: Path, size: tuple[int, int] = (1000, 640)) -> Iterator[Page]
         port = _port(folder / "DevToolsActivePort", process)
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
             tabs = [tab for tab in json.load(answer) if tab["type"] == "page"]
-        yield Page(tabs[0]["webSocketDebuggerUrl"])
+        yield Page(tabs[0]["webSocketDebuggerUrl"], process.pid)
     finally:
         process.terminate()
         process.wait(10)
