@@ -1,8 +1,8 @@
 """The page of a chart in chromium: time to the first picture, updates and pictures a second, and a screenshot.
 
-The browser renders without a graphics card. What it draws is measured in three sizes of the picture: the whole window,
-a window of 1000 x 640, and the latter with a coarse picture (`?fixedDpr=0.3`), which shows what is left when drawing
-takes little. Times of the processor count all processes of the browser, so they tell more than rates on a busy machine.
+The browser renders without a graphics card. What it draws is measured in a large window, in one of 1000 x 640, in that
+without antialiasing, and in that with a coarse picture (`?fixedDpr=0.3`), which shows what is left when drawing takes
+little. Times of the processor count all processes of the browser, so they tell more than rates on a busy machine.
 `--robot` takes a URDF file with meshes.
 """
 
@@ -19,7 +19,12 @@ from orthocas.chart import Chart
 from orthocas.viewing import View
 
 SECONDS = 4.0  # of a sweep
-SIZES = (("1500 x 900", (1500, 900), 1.0), ("1000 x 640", (1000, 640), 1.0), ("1000 x 640, coarse", (1000, 640), 0.3))
+SIZES = (
+    ("1500 x 900", (1500, 900), 1.0, True),
+    ("1000 x 640", (1000, 640), 1.0, True),
+    ("1000 x 640, no antialiasing", (1000, 640), 1.0, False),
+    ("1000 x 640, coarse", (1000, 640), 0.3, True),
+)
 _COUNTERS = """
 window.drawn = 0;
 const clear = WebGL2RenderingContext.prototype.clear;
@@ -46,8 +51,8 @@ def main(out: Path, chart: Chart, robot: Path | None = None, patience: float = 2
     begin = time.perf_counter()
     with oc.view(chart, robot_file=robot, port=0) as view:
         found = {"page served after [s]": time.perf_counter() - begin, "solved, written and sent a second": _sent(view)}
-        for name, size, detail in SIZES:
-            with TemporaryDirectory() as folder, browser(Path(folder) / "profile", size) as page:
+        for name, size, detail, smooth in SIZES:
+            with TemporaryDirectory() as folder, browser(Path(folder) / "profile", size, smooth) as page:
                 page.call("Page.addScriptToEvaluateOnNewDocument", source=_COUNTERS)
                 page.open(f"{view.url}/?fixedDpr={detail}")
                 first = page.wait("!!document.querySelector('[data-oc]') && !!document.querySelector('canvas')")
