@@ -243,3 +243,10 @@ def one_joint(folder: Path, mass: str = "1", joint: str = "j", kind: str = "revo
     path = folder / "arm.urdf"
     path.write_text(_ONE_JOINT.format(mass=mass, joint=joint, kind=kind, lower=lower))
     return path
+
+
+@pytest.fixture
+def saved(planar_fit: Fit, tmp_path: Path) -> Path:
+    path = tmp_path / "chart.orthocas"
+    planar_fit.chart.save(path)
+    return path
