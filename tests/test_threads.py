@@ -31,6 +31,7 @@ from public_objects import (
 )
 
 import orthocas as oc
+from orthocas import solvers
 from orthocas.atlases import atlas as atlas_module
 from orthocas.atlases.asked_posture import AskedPosture
 from orthocas.atlases.laws import AtlasLaw
@@ -223,10 +224,16 @@ def test_a_value_is_built_once() -> None:
 
 @pytest.mark.slow
 def test_fits_in_threads_are_those_of_one_thread() -> None:
+    """Also by solvers that build integrators and programs of CasADi, while simulations build theirs."""
+    families = [oc.Polynomial(2), oc.MLP((4,)), oc.Polynomial(1), oc.Polynomial(1)]
+    minimisers = [None, None, solvers.GradientFlow(max_iterations=3), solvers.Ipopt(max_iterations=5)]
+
     def theta(k: int) -> Array:
-        chart = oc.fit(planar(), [oc.Polynomial(2), oc.MLP((4,))][k % 2], samples=100).chart
+        if k % 5 == 4:
+            return numbers(simulate(impedance(), steps(), planar().domain.centre, control_rate=50.0))[0]
+        chart = oc.fit(planar(), families[k % 5], minimisers[k % 5], samples=100).chart
         return np.asarray(chart.coordinates.theta)  # type: ignore[attr-defined]
 
-    expected = [theta(0), theta(1)]
-    for k, found in enumerate(in_threads(theta, 4)):
-        np.testing.assert_array_equal(found, expected[k % 2])
+    expected = [theta(k) for k in range(5)]
+    for k, found in enumerate(in_threads(theta, 10)):
+        np.testing.assert_array_equal(found, expected[k % 5])
