@@ -15,12 +15,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from charts import with_metric
+from planar_atlas import built
 from programs import Run
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.checks import Array
 from orthocas.cli import main
-from orthocas.codegen import GeneratedC
+from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
 from orthocas.control import PDPlus
 from orthocas.fitting.fit import Fit
 from orthocas.reproduce import FIGURES, Drawing
@@ -103,6 +105,12 @@ def planar_for_control(planar_x: oc.Problem) -> oc.Chart:
 
 
 @pytest.fixture(scope="session")
+def planar_arm() -> oc.Chart:
+    """A planar arm with one coordinate, quickly fitted: for the inverse map."""
+    return oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(3), samples=300).chart
+
+
+@pytest.fixture(scope="session")
 def arm_chart() -> oc.Chart:
     """The 7-DoF arm with A = M, roughly fitted: laws have to be right for any regular chart."""
     problem = oc.problems.get("iiwa")
@@ -122,10 +130,47 @@ def way_atlas(planar_x: oc.Problem, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture(scope="session")
+def planar_atlas(tmp_path_factory: pytest.TempPathFactory) -> oc.Atlas:
+    """The whole joint range of the planar arm, A = I."""
+    return built(tmp_path_factory.mktemp("atlas") / "arm.orthocas-atlas")
+
+
+@pytest.fixture(scope="session")
+def covered(planar_atlas: oc.Atlas) -> Array:
+    """Positions that have a chart of it."""
+    q = np.random.default_rng(7).uniform(-np.pi, np.pi, (500, 3))
+    return np.asarray(q[planar_atlas.chart_at(q) >= 0])
+
+
+@pytest.fixture(scope="session")
 def pd_plus(planar_fit: Fit, tmp_path_factory: pytest.TempPathFactory) -> tuple[GeneratedC, PDPlus]:
     """A law on a box of the planar arm, and its C."""
     law = PDPlus(planar_fit.chart, np.linspace(20, 80, 3), 0.6, "decoupled", limit=90.0)
     return oc.generate_c(law.chart, tmp_path_factory.mktemp("pd_plus"), law, "arm"), law
+
+
+@pytest.fixture(scope="session")
+def supervised_law(planar_for_control: oc.Chart) -> PDPlus:
+    """A law on a box of the planar arm, to be supervised."""
+    return PDPlus.on_chart(planar_for_control, limit=120.0)
+
+
+@pytest.fixture(scope="session")
+def supervised_c(supervised_law: PDPlus, tmp_path_factory: pytest.TempPathFactory) -> GeneratedC:
+    """Its C."""
+    return oc.generate_c(supervised_law.chart, tmp_path_factory.mktemp("supervised"), supervised_law, "arm")
+
+
+@pytest.fixture(scope="session")
+def supervised_library(supervised_c: GeneratedC) -> CompiledLibrary:
+    """Its C, compiled."""
+    return CompiledLibrary(compile_shared(supervised_c, supervised_c.folder), "arm", 3)
+
+
+@pytest.fixture
+def supervisor(supervised_library: CompiledLibrary, supervised_law: PDPlus) -> Supervisor:
+    """Its state in C."""
+    return Supervisor(supervised_library, supervised_law)
 
 
 @pytest.fixture(scope="module")

@@ -70,7 +70,9 @@ def build(
     ] = _ASKED.splits,
     certify: Annotated[
         float,
-        typer.Option("--certify", metavar="SECONDS", parser=number, help="Time limit of each proof; 0 for no proofs."),
+        typer.Option(
+            "--certify", metavar="SECONDS", parser=number, help="Processor time for each proof; 0 for no proofs."
+        ),
     ] = _ASKED.certify_seconds,
     share: Annotated[float, typer.Option("--share", parser=number, help="Build this share of the tiles only.")] = 1.0,
     seconds: Annotated[

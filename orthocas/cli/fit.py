@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from orthocas.cli.corridor_argument import CorridorPath, CorridorRadius, corridor_or_box
 from orthocas.cli.fit_argument import (
     WEIGHTS_TEXT,
     AnglesName,
@@ -21,7 +22,6 @@ from orthocas.cli.problem_argument import (
     DomainText,
     ProblemName,
     ProblemOptions,
-    build_problem,
     with_options,
 )
 from orthocas.cli.progress import terminal_monitor
@@ -41,6 +41,8 @@ from orthocas.quality import Report, evaluate
 from orthocas.showing import number_list
 from orthocas.solvers import get as get_solver
 
+_IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
+
 
 @with_options(*CHAIN, *DOMAIN, "least_singular_value")
 def fit(
@@ -51,7 +53,7 @@ def fit(
         typer.Option(
             "--param",
             help="Parametrisation: polynomial:5, polynomial:5:cyclic, fourier:2, mlp:64x64, linear or sew; "
-            "default: polynomial:5, or polynomial:4 for more than seven joints.",
+            "default: polynomial:5, or polynomial:4 for more than seven joints; polynomial:3:cyclic with --corridor.",
         ),
     ] = None,
     solver: Annotated[
@@ -63,6 +65,8 @@ def fit(
         ),
     ] = None,
     domain: DomainText = None,
+    corridor: CorridorPath = None,
+    radius: CorridorRadius = None,
     leak_deg: Annotated[
         float | None, typer.Option("--leak-deg", parser=number, help="Largest leak for --domain auto [deg]; default 8.")
     ] = None,
@@ -98,10 +102,11 @@ def fit(
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
-    bounds = _bounds(domain, leak_deg, conditioning)
-    built = build_problem(problem, words) if bounds is None else None
+    bounds = _bounds(domain, leak_deg, conditioning, corridor)
+    built = corridor_or_box(problem, words, corridor, radius) if bounds is None else None
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
     require_free(target, CHART, force)
+    param = _IN_CORRIDOR if param is None and corridor is not None else param
     parametrisation = None if param is None else parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
     loss = parse_weights(weights, angles)
@@ -136,8 +141,12 @@ def fit(
         raise typer.Exit(130)
 
 
-def _bounds(domain: str | None, leak_deg: float | None, conditioning: float | None) -> Bounds | None:
+def _bounds(
+    domain: str | None, leak_deg: float | None, conditioning: float | None, corridor: Path | None
+) -> Bounds | None:
     """What --domain auto asks for; None without it."""
+    if domain is not None and corridor is not None:
+        raise InvalidValueError("--domain", repr(domain), "none with --corridor, which is the domain")
     given = {"--leak-deg": leak_deg, "--conditioning": conditioning}
     if domain is None:
         for option, value in given.items():

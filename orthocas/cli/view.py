@@ -8,6 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from orthocas import problems
+from orthocas.atlases.atlas import Atlas
+from orthocas.atlases.atlas_file import ATLAS
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.chart import Chart
 from orthocas.cli.output import AsJson, Force, note, print_json, print_rows, whole_number
@@ -20,6 +22,7 @@ from orthocas.cli.problem_argument import (
     with_options,
 )
 from orthocas.errors import InvalidValueError
+from orthocas.files.blocks import begins
 from orthocas.following.path_file import read_path
 from orthocas.robots import Robot
 from orthocas.viewing import View, cyclic_motions, export_page
@@ -46,8 +49,8 @@ def view(
     target: Annotated[
         str,
         typer.Argument(
-            metavar="CHART|RUN|FILE.urdf",
-            help="A chart file; trajectory.npz or a folder of simulate; a CSV file of follow; a robot file or problem.",
+            metavar="CHART|ATLAS|RUN|FILE.urdf",
+            help="A chart or atlas file; trajectory.npz or folder of simulate; CSV file of follow; robot or problem.",
         ),
     ],
     words: ProblemOptions,
@@ -73,7 +76,7 @@ def view(
     force: Force = False,
     json: AsJson = False,
 ) -> None:
-    """Show a chart, a robot or a motion in the browser, until Ctrl-C."""
+    """Show a chart, an atlas, a robot or a motion in the browser, until Ctrl-C."""
     if export is None:
         require_free(host, port)
     else:
@@ -108,7 +111,7 @@ def _asked(target: str, chart: Path | None, meshes: Path | None, words: ProblemO
         return _Asked(motion, owner, meshes, locked)
     if chart is not None:
         raise InvalidValueError("--chart", chart, f"no chart beside the chart {target}")
-    return _Asked(Chart.load(place), None, meshes, locked)
+    return _Asked(Atlas.load(place) if begins(place, ATLAS) else Chart.load(place), None, meshes, locked)
 
 
 def _owner(chart: Path | None, meshes: Path | None, words: ProblemOptions) -> Robot | Chart:
