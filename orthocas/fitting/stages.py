@@ -84,6 +84,7 @@ class StageRunner:
         if found is None or not isinstance(target, GradedParametrisation):
             return found
         family = self.family(target.of_degree(min(target.degree, _TRIAL_DEGREE)), len(found.parities))
+        assert isinstance(family, LinearFamily)
         return min(found.choices(), key=lambda mirror: self._trial(family, mirror))
 
     def family(self, parametrisation: Parametrisation, r: int) -> Family:
