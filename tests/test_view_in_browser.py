@@ -24,6 +24,7 @@ pytestmark = [
     pytest.mark.slow,
 ]
 NUMBERS = "Object.fromEntries([...document.querySelectorAll('[data-oc]')].map(b => [b.dataset.oc, +b.dataset.value]))"
+COARSE = "/?fixedDpr=0.15"  # a coarse picture takes seconds less without a graphics card
 SLIDERS = "document.querySelectorAll('.mantine-Slider-root')"
 
 
@@ -32,13 +33,13 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """The tab of a browser, which all tests of this file share."""
     if PROGRAM is None:
         pytest.skip("no chromium: apt-get install chromium")
-    with browser(tmp_path_factory.mktemp("profile")) as tab:
+    with browser(tmp_path_factory.mktemp("profile"), (800, 560), smooth=False) as tab:
         yield tab
 
 
 def opened(page: Page, url: str) -> None:
-    """Open a page with a coarse picture, which takes seconds less without a graphics card."""
-    page.open(f"{url}/?fixedDpr=0.3")
+    """Open the page of a server."""
+    page.open(f"{url}{COARSE}")
     page.wait("!!document.querySelector('[data-oc]') && !!document.querySelector('canvas')")
 
 
@@ -119,7 +120,7 @@ def test_a_written_page_needs_no_server_and_no_network(page: Page, tmp_path: Pat
     ).chart
     export_page(chart, tmp_path / "page.html")
     page.asked.clear()
-    page.open((tmp_path / "page.html").as_uri())
+    page.open((tmp_path / "page.html").as_uri() + COARSE.removeprefix("/"))
     page.wait("!!document.querySelector('canvas') && !!document.querySelector('.mantine-Slider-root')")  # of the player
     page.wait("+document.querySelector('input').value > 0.5")  # it plays
     page.picture(tmp_path / "page.png")
@@ -145,7 +146,7 @@ def test_the_command_line_serves_until_ctrl_c(page: Page, tmp_path: Path) -> Non
 def test_blocks_of_the_page_on_views_run(run: Run, tmp_path: Path) -> None:
     text = (Path(__file__).parent.parent / "docs" / "view.md").read_text()
     code = "\n".join(re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL))
-    printed = python(f"{code}\nchart.save('arm.orthocas')", tmp_path).splitlines()
+    printed = python(f"{code}\nfit.chart.save('arm.orthocas')", tmp_path).splitlines()
     assert printed == ["True"]
     assert (tmp_path / "motion.png").exists()
     lines = "\n".join(re.findall(r"```sh\n(.*?)```", text, flags=re.DOTALL)).splitlines()

@@ -39,8 +39,8 @@ class AtlasSettings:
         overlap: how far a box reaches into its neighbours, as a share of its half-widths.
         splits: how often a tile may be halved.
         symmetric: fit one of several boxes that are images of each other.
-        certify_seconds: time limit for the proof that a chart does not fold; 0 for no proofs. A box without a proof is
-            halved while splits are left.
+        certify_seconds: processor time for the proof that a chart does not fold; 0 for no proofs. A box without a
+            proof is halved while splits are left.
     """
 
     degree: int = 3

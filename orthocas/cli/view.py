@@ -14,13 +14,12 @@ from orthocas.casadi_tools.interrupts import deferred
 from orthocas.chart import Chart
 from orthocas.cli.output import AsJson, Force, note, print_json, print_rows, whole_number
 from orthocas.cli.problem_argument import (
-    Locks,
+    ROBOT,
     ProblemOptions,
-    TipName,
-    ToolText,
     build_robot,
     is_robot_file,
     locked_joints,
+    with_options,
 )
 from orthocas.errors import InvalidValueError
 from orthocas.files.blocks import begins
@@ -45,6 +44,7 @@ class _Asked:
     locked: dict[str, float]
 
 
+@with_options(*ROBOT)
 def view(
     target: Annotated[
         str,
@@ -53,13 +53,11 @@ def view(
             help="A chart or atlas file; trajectory.npz or folder of simulate; CSV file of follow; robot or problem.",
         ),
     ],
+    words: ProblemOptions,
     chart: Annotated[Path | None, typer.Option("--chart", help="For runs: a chart of the robot that moved.")] = None,
     robot: Annotated[
         Path | None, typer.Option("--robot", metavar="FILE.urdf", help="Robot file with the meshes of the links.")
     ] = None,
-    tip: TipName = None,
-    lock: Locks = None,
-    tool: ToolText = None,
     compare: Annotated[
         bool,
         typer.Option("--compare", help="Play a closed path with constant xi beside the pseudo-inverse, which drifts."),
@@ -86,7 +84,7 @@ def view(
     if not compare and path is not None:
         raise InvalidValueError("--path", path, "--compare as well, which follows the path")
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
-        asked = _asked(target, chart, robot, ProblemOptions(tip, tuple(lock or ()), tool))
+        asked = _asked(target, chart, robot, words)
     if compare:
         asked = _compared(asked, path, cycles)
     if export is not None:

@@ -13,7 +13,7 @@ from orthocas.viewing.loop import Loop
 from orthocas.viewing.panel import ChartPanel
 from orthocas.viewing.session import Session
 from orthocas.viewing.stick_arm import Look, chain_length
-from orthocas.viewing.window import place_camera, place_floor
+from orthocas.viewing.window import place_camera, place_floor, place_lights
 
 _STEP = 1e-3  # of the sliders
 _SWEEP = 6.0  # [s] there and back
@@ -35,6 +35,7 @@ class ChartPage:
         robot = session.chart.problem.robot
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
         place_floor(server, robot)
+        place_lights(server, robot)
         place_camera(server, robot, self.session.home[None])
         self._handle = self._add_handle()
         self._readings = self._add_readings()
