@@ -1,6 +1,7 @@
 """Atlases on the way: inverse, hand-overs, and orientation tasks."""
 
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import atlas_loops
 import numpy as np
@@ -99,6 +100,11 @@ def test_orientation_is_held_from_chart_to_chart(wrist: oc.Atlas) -> None:
     assert motion.hand_overs >= 2
     found = wrist.with_reference(start).problem.task.batched(motion.q)[0]
     assert np.abs(found - turned).max() < 1e-9
+
+
+def test_proofs_are_refused_for_orientation_tasks(wrist: oc.Atlas, tmp_path: Path) -> None:
+    with pytest.raises(InvalidValueError, match="certify_seconds is 5"):
+        oc.build_atlas(wrist.problem, tmp_path / "a", oc.AtlasSettings(certify_seconds=5.0))
 
 
 def test_charts_beyond_the_limits_are_named(wrist: oc.Atlas) -> None:

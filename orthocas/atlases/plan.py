@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocas.atlases.lattice import Lattice, make_lattice
-from orthocas.atlases.local_task import local_problem
+from orthocas.atlases.local_task import is_turning, local_problem
 from orthocas.atlases.symmetry import Symmetries, find_symmetries, identity_only
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_number, require_at_least, require_count, require_kind
@@ -135,9 +135,12 @@ def make_plan(problem: Problem, settings: AtlasSettings, margin_deg: float) -> P
 
     Raises:
         DomainError: if a joint has no range left.
-        InvalidValueError: if boxes would divide no joint, or too many tiles would be needed.
+        InvalidValueError: if boxes would divide no joint, too many tiles would be needed, or a proof is asked for
+            charts of an orientation task.
     """
     require_kind("problem", problem, Problem)
+    if settings.certify_seconds and is_turning(problem.task):
+        raise InvalidValueError("certify_seconds", settings.certify_seconds, "0 for a task that compares orientations")
     region = joint_range(problem.robot, margin_deg)
     problem = Problem(problem.robot, problem.task, problem.metric, region, problem.name)
     names = problem.robot.joint_names
