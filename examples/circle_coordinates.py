@@ -39,7 +39,7 @@ from orthocas.samples import samples_at
 from orthocas.singularities import singular_points
 from orthocas.solvers import GaussNewton
 
-DEGREES = (8, 16, 24)  # total degree in both angles
+DEGREES = (8, 16, 24, 32)  # total degree in both angles
 LEVELS = {"euclidean": 1.0, "inertia": 0.05}  # of the leaves whose arc length labels flow lines at the start [m]
 NEAR = 0.2  # from a singular point: samples that are left out [rad]
 DISTANCES = (0.5, 0.7, 1.0)  # from singular points, beyond which angles are judged [rad]
