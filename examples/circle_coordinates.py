@@ -3,7 +3,7 @@
 The leaves of x are circles around its maximum and its minimum. Real-valued coordinates fold on each of them (Fig. 17
 of [AS2023]). Angles need not, but two saddles at one level reorder the leaves: an angle that winds once around the
 maximum jumps by pi there. One that winds twice has no jump. The pairs of Fourier terms start at twice the angle that is
-grown from a leaf next to the saddles, have the symmetries of the arm, and are fitted by Gauss-Newton, degree after
+grown from a leaf, have the symmetries of the arm, and are fitted by Gauss-Newton, degree after
 degree. They are compared with the networks of Fig. 17.
 """
 
@@ -40,7 +40,7 @@ from orthocas.singularities import singular_points
 from orthocas.solvers import GaussNewton
 
 DEGREES = (8, 16, 24, 32)  # total degree in both angles
-LEVEL = 0.05  # of the leaf whose arc length labels the flow lines at the start [m]; the saddles are at 0
+LEVELS = {"euclidean": 1.0, "inertia": 0.05}  # of the leaves whose arc length labels flow lines at the start [m]
 NEAR = 0.2  # from a singular point: samples that are left out [rad]
 DISTANCES = (0.5, 0.7, 1.0)  # from singular points, beyond which angles are judged [rad]
 STARTS = 3  # of real-valued networks
@@ -79,9 +79,9 @@ class SymmetricPairs:
         table = np.array(found)
         return table[:, :, self.of_u], table[:, :, self.of_v]
 
-    def started(self, points: Array) -> Array:
-        """Coefficients of the pairs nearest to those of twice the grown angle, which vanish at the extrema."""
-        chart = oc.grow(self.problem, LEVEL)
+    def started(self, points: Array, level: float) -> Array:
+        """Coefficients of the pairs nearest to those of twice the angle grown from a leaf; they vanish at extrema."""
+        chart = oc.grow(self.problem, level)
         angle, mirrored = (2 * chart.xi(points + shift)[:, 0] for shift in ([0.0, 0.0], [np.pi, 0.0]))
         known = np.isfinite(angle) & np.isfinite(mirrored)
         middle = np.angle(np.exp(1j * (angle + mirrored))[known].mean()) / 2  # xi(q1 + pi) = -xi is then nearly true
@@ -167,17 +167,17 @@ def fitted(metric: str, degrees: tuple[int, ...], iterations: int) -> list[oc.Ch
     """Circle-valued charts of all degrees; each starts from the one before."""
     problem = planar_problem(metric)
     stages = [SymmetricPairs(problem, degree) for degree in degrees]
-    theta = stages[0].started(_half_of_torus(problem, 60, 0.0))
+    theta = stages[0].started(half_of_torus(problem, 60, 0.0), LEVELS[metric])
     charts = []
     for before, pairs in pairwise([stages[0], *stages]):
         theta = pairs.embedded(theta, before)
-        points = _half_of_torus(problem, 4 * pairs.degree + 30, NEAR)
-        theta = GaussNewton(iterations, 2e-3).minimise(Leak(pairs, points), theta).theta
+        points = half_of_torus(problem, 4 * pairs.degree + 30, NEAR)
+        theta = GaussNewton(iterations, 5e-4).minimise(Leak(pairs, points), theta).theta
         charts.append(pairs.chart(theta))
     return charts
 
 
-def _half_of_torus(problem: oc.Problem, cells: int, away: float) -> Array:
+def half_of_torus(problem: oc.Problem, cells: int, away: float) -> Array:
     """Centres of the cells of a grid with q2 > 0, farther than so much from singular points."""
     points = cell_centres(cells)
     return points[(points[:, 1] > 0) & (distance_to(points, singular_points(problem)) > away)]
@@ -222,7 +222,8 @@ def draw(charts: dict[str, oc.Chart]) -> Figure:
     panels = figure.subplots(2, 2)
     for column, (metric, chart) in zip(panels.T, charts.items(), strict=True):
         q, points = corners(240)
-        angles = deviations(chart.problem, points, chart.jacobian(points)[:, 1]).reshape(241, 241)
+        cells = cell_centres(240)
+        angles = deviations(chart.problem, cells, chart.jacobian(cells)[:, 1]).reshape(240, 240)
         xi, h = (values.reshape(241, 241) for values in (chart.xi(points)[:, 0], chart.task(points)[:, 0]))
         frame = {"extent": 2 * (-np.pi, np.pi), "origin": "lower"}
         angle = column[0].imshow(xi, cmap="twilight", vmin=-np.pi, vmax=np.pi, **frame)

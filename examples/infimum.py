@@ -35,7 +35,7 @@ GRIDS = (2, 4, 8)  # cells along each axis; halves, so that the last three losse
 POINTS = 24  # of the quadrature along each axis, at least
 DEGREES = (2, 3, 4, 5, 6)  # of the arm with seven joints
 STEPS = (2, 4, 8)  # of staircases along each axis
-WIDTH = 1e-5  # of the layers between them, in steps
+WIDTH = 1e-7  # of the layers between them, in steps
 
 
 def cases() -> dict[str, oc.Problem]:
@@ -291,8 +291,11 @@ def main(out: Path, quick: bool = False) -> dict[str, dict[str, float]]:
         quick: coarse grids, two families, small fits.
     """
     out.mkdir(parents=True, exist_ok=True)
-    rows = {name: row(problem, quick) for name, problem in list(cases().items())[1 if quick else 0 :]}
-    draw(rows).savefig(out / "infimum.png", dpi=150)
+    rows: dict[str, dict[str, float]] = {}
+    for name, problem in list(cases().items())[1 if quick else 0 :]:
+        rows[name] = row(problem, quick)
+        draw(rows).savefig(out / "infimum.png", dpi=150)
+        (out / "infimum.json").write_text(json.dumps(rows, indent=1))
     rows["iiwa"] = seven_joints(quick)
     (out / "infimum.json").write_text(json.dumps(rows, indent=1))
     return rows
