@@ -68,8 +68,8 @@ class OutsideJudge:
             squared = (sizes**2).sum(axis=0) * UP
             squared += _GUARDS * (J.magnitude() ** 2).sum(axis=(0, 1))
             influences = np.nan_to_num((least.gains() * sizes).sum(axis=1))
-        outside: Array = squared <= self.domain.least_singular_value**2 * (1 - _LENGTHS)
-        outside &= is_orthogonal(left) & is_orthogonal(right)
+        small = squared <= self.domain.least_singular_value**2 * (1 - _LENGTHS)
+        outside: Array = small & is_orthogonal(left) & is_orthogonal(right)
         return outside, np.array(least.variables)[np.argmax(influences, axis=0)]
 
 
