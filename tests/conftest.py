@@ -17,6 +17,7 @@ import pinocchio as pin
 import pytest
 from charts import with_metric
 from matplotlib.figure import Figure
+from planar_atlas import built
 from programs import Run
 from simulate_command import SHORT
 
@@ -107,6 +108,12 @@ def planar_for_control(planar_x: oc.Problem) -> oc.Chart:
 
 
 @pytest.fixture(scope="session")
+def planar_arm() -> oc.Chart:
+    """A planar arm with one coordinate, quickly fitted: for the inverse map."""
+    return oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(3), samples=300).chart
+
+
+@pytest.fixture(scope="session")
 def arm_chart() -> oc.Chart:
     """The 7-DoF arm with A = M, roughly fitted: laws have to be right for any regular chart."""
     problem = oc.problems.get("iiwa")
@@ -123,6 +130,19 @@ def way_atlas(planar_x: oc.Problem, tmp_path_factory: pytest.TempPathFactory) ->
     with ThreadPoolExecutor(1) as executor:
         problem = with_metric(planar_x, "inertia")
         return oc.build_atlas(problem, path, asked, region=way, radius=0.5, executor=executor)
+
+
+@pytest.fixture(scope="session")
+def planar_atlas(tmp_path_factory: pytest.TempPathFactory) -> oc.Atlas:
+    """The whole joint range of the planar arm, A = I."""
+    return built(tmp_path_factory.mktemp("atlas") / "arm.orthocas-atlas")
+
+
+@pytest.fixture(scope="session")
+def covered(planar_atlas: oc.Atlas) -> Array:
+    """Positions that have a chart of it."""
+    q = np.random.default_rng(7).uniform(-np.pi, np.pi, (500, 3))
+    return np.asarray(q[planar_atlas.chart_at(q) >= 0])
 
 
 @pytest.fixture(scope="session")
@@ -222,4 +242,11 @@ def one_joint(folder: Path, mass: str = "1", joint: str = "j", kind: str = "revo
     """The URDF of an arm of one joint."""
     path = folder / "arm.urdf"
     path.write_text(_ONE_JOINT.format(mass=mass, joint=joint, kind=kind, lower=lower))
+    return path
+
+
+@pytest.fixture
+def saved(planar_fit: Fit, tmp_path: Path) -> Path:
+    path = tmp_path / "chart.orthocas"
+    planar_fit.chart.save(path)
     return path

@@ -1,9 +1,11 @@
 """Programs that tests start, and which of them a machine has."""
 
+import io
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import chdir, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,14 @@ def output_of(*words: str | Path, folder: Path | None = None) -> str:
 def python(code: str, folder: Path | None = None, *options: str) -> str:
     """What a new Python prints for some code."""
     return output_of(sys.executable, *options, "-c", code, folder=folder)
+
+
+def printed_here(code: str, folder: Path) -> str:
+    """What some code prints in this process, which knows the package already; not for code that registers things."""
+    out = io.StringIO()
+    with chdir(folder), redirect_stdout(out):
+        exec(compile(code, "page", "exec"), {"__name__": "page"})
+    return out.getvalue()
 
 
 def built(generated: GeneratedC, program: str, out: Path, *flags: str, compiler: str | None = None) -> Path:

@@ -28,6 +28,7 @@ from orthocas.fitting.fit import Fit
 from orthocas.metrics import Metric, metric_matrices
 from orthocas.samples import sample_problem
 from orthocas.simulation import (
+    Elasticity,
     Friction,
     MuJoCo,
     Noise,
@@ -313,6 +314,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "push at a link": lambda: Push(0.5, 1.0, [1.0, 0.0, 0.0], link="q2", point=[0.5, 0.0, 0.0]),
     "friction": lambda: Friction([1.0, 2.0, 3.0]),
     "stops": lambda: Stops([1e4, 2e4, 3e4]),
+    "elasticity": lambda: Elasticity([8000.0, 5000.0], [0.4, 0.2], 5.0),
     "payload": lambda: Payload(1.0, [0.0, 0.0, 0.1], np.diag([0.1, 0.2, 0.25])),
     "wall": lambda: Wall([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]),
     "MuJoCo": lambda: MuJoCo(planar().robot, payload=Payload(1.0), wall=Wall([1.0, 0.0, 0.0], [-1.0, 0.0, 0.0])),

@@ -1,6 +1,7 @@
 """The contents of the generated files: names, sizes, tables and comments."""
 
 import casadi as ca
+import numpy as np
 
 from orthocas.chart import Chart
 from orthocas.codegen.border_condition import BorderCondition, border_condition
@@ -44,6 +45,7 @@ def template_values(
         "joint_list": ", ".join(joints),
         **description_values(chart),
         "phi_sizes": numbers(chart.phi_sizes),
+        **_shortest_way(chart),
         "max_evaluations": str(_MAX_EVALUATIONS),
         "stack_bytes": str(stack_bytes),
         "check_q": numbers(somewhere),
@@ -71,6 +73,16 @@ def _clearance(condition: BorderCondition, values: dict[str, str]) -> str:
 def _sizes(chart: Chart) -> dict[str, str]:
     sizes = {"n": chart.n, "m": chart.m, "r": chart.r, "nn": chart.n**2}
     return {name: str(size) for name, size in sizes.items()}
+
+
+def _shortest_way(chart: Chart) -> dict[str, str]:
+    """The difference of two phi in C; angles of circle-valued coordinates take the shorter way around."""
+    if not chart.turns.any():
+        return {"turn_table": "", "shortest": "(wanted[i] - phi[i])"}
+    rounds = np.where(chart.turns > 0, 1 / np.where(chart.turns > 0, chart.turns, 1.0), 0.0)
+    table = f"\n  static const double turn[N] = {{{numbers(chart.turns)}}}, rounds[N] = {{{numbers(rounds)}}};"
+    whole = "turn[i] * floor((wanted[i] - phi[i]) * rounds[i] + 0.5)"
+    return {"turn_table": table, "shortest": f"(wanted[i] - phi[i] - {whole})"}
 
 
 def _title(source: Source, controller: Controller | None) -> str:

@@ -22,7 +22,6 @@ from orthocas.codegen.source import Source
 from orthocas.codegen.supervision import supervision_kernels
 from orthocas.control import Controller, Safety
 from orthocas.control.controller import require_controller
-from orthocas.coordinates.turns import require_no_turns
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.files.atomic import output_folder, published, require_writable
 
@@ -84,7 +83,6 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
         ca.Function("curvature", [q, dq, v], [chart.function("second_derivative")(q, dq, v)]),
         fast_form(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)]), n),
     ]
-    require_no_turns(chart.labels, chart.turns, "generated C")
     if source.condition is not None:
         found.append(scalar_code(ca.Function("pivots", [q], [source.condition.pivots(q)])))
     if controller is not None:

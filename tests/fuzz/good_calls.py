@@ -73,6 +73,7 @@ def _physics() -> dict[str, Call]:
         "atlas.inverse": (atlas().inverse, {"x": q[:2], "xi": q[2:], "charts": 0, "q_start": q}),
         "atlas.handed_over": (atlas().handed_over, {"q": q, "dq": q, "ddq": q, "number": 0}),
         "evaluate_atlas": (oc.evaluate_atlas, {"atlas": atlas(), "samples": 20, "seed": 0}),
+        "chart_along": (oc.chart_along, {"atlas": atlas(), "x": [[1.0, 1.0]], "q_start": q, "radius": 0.2}),
         "Stops": (lambda **given: _stopped(robot, simulation.Stops(**given)), {"stiffness": 1e4, "damping": [1.0] * 3}),
         "Payload": (simulation.Payload, {"mass": 1.0, "centre": q, "inertia": np.eye(3)}),
         "Wall": (simulation.Wall, {"point": q, "normal": q, "tip_radius": 0.1, "size": 1.0, "time_constant": 0.01}),
