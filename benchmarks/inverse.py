@@ -37,6 +37,7 @@ def main(quick: bool = False) -> dict[str, float]:
             for near in (0.01, 0.05, 0.1, None):
                 found |= batch(chart, solve, q, name, near)
         found |= stream(chart, compiled, 500 if quick else 5_000)
+    found |= inside(chart, rows // 10)
     print("\n| one call | us |\n| --- | --- |")
     for title in [title for title in found if title.endswith(" us")]:
         print(f"| {title.removesuffix(' us')} | {found[title]:.1f} |")
@@ -91,6 +92,17 @@ def stream(chart: oc.Chart, compiled: CompiledInverse, ticks: int) -> dict[str, 
         "chart.inverse, median us": 1e6 * float(np.median(single)),
         "NAME_inverse in C, from the last tick us": 1e6 * in_c(compiled, path, np.array(q)),
     }
+
+
+def inside(chart: oc.Chart, rows: int) -> dict[str, float]:
+    """Times of a row that has to stay inside, for targets of a box half as wide again; most lie outside."""
+    domain = chart.problem.domain
+    phi = chart.phi(domain.centre + 1.5 * (sample_uniform(domain, rows, 3) - domain.centre))
+    begin = time.perf_counter()
+    solutions = chart.solve(phi, inside=True)
+    seconds = (time.perf_counter() - begin) / rows
+    print(f"\n{solutions}")
+    return {f"a row of {rows} with inside=True us": 1e6 * seconds}
 
 
 def in_c(compiled: CompiledInverse, path: Any, q: Any) -> float:

@@ -22,7 +22,7 @@ from orthocas.control.matched_stiffness import SPRING_FREQUENCY
 from orthocas.errors import RobotError, SimulationError
 from orthocas.simulation import MuJoCoPlant
 
-KNOWN, TRIED = 20_000, 10  # joint positions of an atlas, and how many of them are tried
+KNOWN, TRIED = 20_000, 40  # joint positions of an atlas, and how many of them are tried
 
 
 class Method(Protocol):

@@ -60,9 +60,11 @@ class Limits:
             return PathError(f"the path cannot be followed {where}: {reason}{self._reach(q[last])}")
         distance = self.distances(q[k])
         pair = self.distances.pairs[int(np.argmin(distance))]
+        least = float(distance.min())
+        gap = f"are {least:.3g} m apart" if least >= 0 else f"overlap by {-least:.3g} m"
         return PathError(
-            f"the path cannot be followed {where}: {pair} are {distance.min():.3g} m apart, "
-            f"expected at least clearance = {self.clearance:g} m"
+            f"the path cannot be followed {where}: {pair} {gap}, "
+            f"expected a distance of at least clearance = {self.clearance:g} m"
         )
 
     def lost(self, plan: Plan, end: Lost) -> PathError:

@@ -9,7 +9,6 @@ So the problem has no constraints, and the Levenberg-Marquardt method solves it.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -19,9 +18,6 @@ from orthocas.coordinates.turns import counted_on
 from orthocas.following.costs import Costs
 from orthocas.following.plan import Plan
 from orthocas.following.solver import Solver
-
-if TYPE_CHECKING:
-    pass
 
 _LEAST, _MOST = 20, 60  # pieces of the spline
 _DENSITY = 10  # pieces on a path as long as x moves over the domain

@@ -37,7 +37,7 @@ class LinkDistances:
         >>> ball = oc.obstacles.Sphere([0.5, 1.0, 0.0], 0.2)
         >>> distances = oc.obstacles.LinkDistances(robot, [ball], 0.1)
         >>> distances.pairs
-        ("link of joint 'q1', obstacle 0", "link of joint 'q2', obstacle 0")
+        ("link of joint 'q1' and obstacle 0", "link of joint 'q2' and obstacle 0")
         >>> distances([0.0, 0.0]).round(3).tolist()  # the arm is stretched along x
         [0.7, 0.818]
     """
@@ -77,7 +77,7 @@ class LinkDistances:
     def pairs(self) -> tuple[str, ...]:
         """Which link and obstacle each distance belongs to, (K,)."""
         return tuple(
-            f"link of joint '{self.robot.joint_names[joint]}', obstacle {k}"
+            f"link of joint '{self.robot.joint_names[joint]}' and obstacle {k}"
             for joint, _, _ in self._links
             for k in range(len(self.obstacles))
         )
