@@ -11,6 +11,7 @@ NUMBERS: dict[str, tuple[str, ...]] = {  # of each figure
     "fig19": ("mean_tilt_in_section_deg", "task_angle_std_deg"),
     "fig20": ("involutive_std_deg", "non_involutive_std_deg"),
     "fig23": ("coupling_x_from_xi1", "coupling_xi1_from_x", "task_angle_std_deg"),
+    "fig24": ("strong_fitted_coupling_x_from_xi1", "strong_fitted_missed_x", "strong_fitted_task_angle_std_deg"),
     "fig25": ("largest_error", "largest_curvature", "largest_coriolis"),
     "fig26": ("fitted_large_tracking_error_x", "fitted_large_missed_x", "fitted_feedback_coupling_y_from_x"),
     "fig27": ("task_std_deg", "mutual_std_deg"),

@@ -1,25 +1,27 @@
-"""Circle-valued coordinates of the planar arm with two joints, on its whole torus, for A = I and A = M (3 min).
+"""Circle-valued coordinates of the planar arm with two joints, on its whole torus, for A = I and A = M (5 min).
 
 The leaves of x are circles around its maximum and its minimum. Real-valued coordinates fold on each of them (Fig. 17
-of [AS2023]). Angles need not, but two saddles at one level reorder the leaves: the grown coordinate jumps by pi there.
-Twice that angle has no jump at all: it is continuous but at the four singular points, and exact. The pairs of a network
-are fitted to its cosine and sine, then to the loss. Both parts are compared with the networks of Fig. 17.
+of [AS2023]). Angles need not, but two saddles at one level reorder the leaves: an angle that winds once around the
+maximum jumps by pi there. One that winds twice has no jump. The pairs of Fourier terms start at twice the angle that is
+grown from a leaf, have the symmetries of the arm, and are fitted by Gauss-Newton, degree after
+degree. They are compared with the networks of Fig. 17.
 """
 
 import argparse
-from functools import partial
+import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 import orthocas as oc
+from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.turns import shortest
-from orthocas.distil import _Distance, _Targets
-from orthocas.domains import sample_evenly
-from orthocas.fitting.graph_objective import GraphObjective
 from orthocas.parametrisations import JointSpace
+from orthocas.parametrisations.circle import CircleFamily
+from orthocas.parametrisations.product_basis import ProductFamily
 from orthocas.reproduce.chosen_fit import USUAL
 from orthocas.reproduce.planar_fit import freely_fitted, with_other_seed
 from orthocas.reproduce.planar_flow import (
@@ -33,56 +35,181 @@ from orthocas.reproduce.planar_flow import (
     planar_problem,
 )
 from orthocas.reproduce.style import joint_plane
-from orthocas.samples import sample_problem, samples_at
+from orthocas.samples import samples_at
 from orthocas.singularities import singular_points
-from orthocas.solvers import LBFGS
+from orthocas.solvers import GaussNewton
 
-WEIGHTS = oc.Weights(1000.0, 0.0, 150.0, folds=0.0, angles="paper")  # the third forbids folds
-NEAR, FAR = 0.7, 1.0  # from a singular point: samples that are left out, and beyond what angles are judged [rad]
+DEGREES = (8, 16, 24, 32)  # total degree in both angles
+LEVELS = {"euclidean": 1.0, "inertia": 0.05}  # of the leaves whose arc length labels flow lines at the start [m]
+NEAR = 0.2  # from a singular point: samples that are left out [rad]
+DISTANCES = (0.5, 0.7, 1.0)  # from singular points, beyond which angles are judged [rad]
 STARTS = 3  # of real-valued networks
 
 
-def fitted(metric: str, quick: bool) -> oc.Chart:
-    """The circle-valued chart, from twice the grown angle."""
+class SymmetricPairs:
+    """Pairs (u, v) of Fourier terms with u(-q) = u(q), v(-q) = v(q), u(q1 + pi) = u(q), v(q1 + pi) = -v(q).
+
+    Both maps take flow lines of x to flow lines. The first takes opposite lines at the maximum to each other, on which
+    an angle with two windings is equal; the second exchanges maximum and minimum, and takes xi to -xi.
+    """
+
+    def __init__(self, problem: oc.Problem, degree: int) -> None:
+        self.problem, self.degree = problem, degree
+        self.parametrisation = oc.Circle(oc.Fourier(degree))
+        family = self.parametrisation.family(JointSpace.of(problem), 1)
+        assert isinstance(family, CircleFamily)
+        assert isinstance(family.pairs, ProductFamily)
+        self.size = family.size
+        self.terms = np.array([(0, 0), *family.pairs.terms])  # 0: constant; 2 k - 1: cos k q; 2 k: sin k q
+        sines = ((self.terms > 0) & (self.terms % 2 == 0)).sum(axis=1)
+        harmonic = (self.terms[:, 0] + 1) // 2
+        self.of_u, self.of_v = (np.flatnonzero((sines % 2 == 0) & (harmonic % 2 == part)) for part in (0, 1))
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients that the symmetries leave."""
+        return len(self.of_u) + len(self.of_v)
+
+    def columns(self, points: Array) -> tuple[Array, Array]:
+        """Terms of u and of v at points (N, 2), with their derivatives, (3, N, terms) each."""
+        waves, slopes = _waves(points, self.degree)
+        first, second = self.terms.T
+        found = [waves[0][:, first] * waves[1][:, second]]
+        found += [slopes[0][:, first] * waves[1][:, second], waves[0][:, first] * slopes[1][:, second]]
+        table = np.array(found)
+        return table[:, :, self.of_u], table[:, :, self.of_v]
+
+    def started(self, points: Array, level: float) -> Array:
+        """Coefficients of the pairs nearest to those of twice the angle grown from a leaf; they vanish at extrema."""
+        chart = oc.grow(self.problem, level)
+        angle, mirrored = (2 * chart.xi(points + shift)[:, 0] for shift in ([0.0, 0.0], [np.pi, 0.0]))
+        known = np.isfinite(angle) & np.isfinite(mirrored)
+        middle = np.angle(np.exp(1j * (angle + mirrored))[known].mean()) / 2  # xi(q1 + pi) = -xi is then nearly true
+        x = self.problem.task.batched(points)[0][known, 0]
+        parts = (np.cos, np.sin)
+        wanted = [(1 - x**2 / 4) * part(angle[known] - middle) for part in parts]
+        found = [
+            np.linalg.lstsq(C[0, known], w, rcond=1e-8)[0] for C, w in zip(self.columns(points), wanted, strict=True)
+        ]
+        return np.concatenate(found)
+
+    def embedded(self, coefficients: Array, coarser: "SymmetricPairs") -> Array:
+        """Coefficients of a lower degree as those of this one."""
+        place = {tuple(term): k for k, term in enumerate(self.terms.tolist())}
+        here = np.zeros((2, len(self.terms)))
+        for row, part, values in zip(here, (coarser.of_u, coarser.of_v), coarser.split(coefficients), strict=True):
+            row[[place[tuple(term)] for term in coarser.terms[part].tolist()]] = values
+        return np.concatenate([here[0, self.of_u], here[1, self.of_v]])
+
+    def split(self, coefficients: Array) -> tuple[Array, Array]:
+        """Those of u and those of v."""
+        return coefficients[: len(self.of_u)], coefficients[len(self.of_u) :]
+
+    def chart(self, coefficients: Array) -> oc.Chart:
+        """The chart with these pairs."""
+        table = np.zeros((2, len(self.terms)))
+        table[0, self.of_u], table[1, self.of_v] = self.split(coefficients)
+        theta = np.concatenate([table[:, 1:].ravel(), table[:, 0]])
+        space = JointSpace.of(self.problem)
+        return oc.Chart(self.problem, Coordinates(self.parametrisation, space, (), theta, np.zeros(1), np.ones(1)))
+
+
+def _waves(points: Array, degree: int) -> tuple[list[Array], list[Array]]:
+    """1, sqrt(2) cos q, sqrt(2) sin q, ... of both angles, (N, 1 + 2 degree) each, and their derivatives."""
+    k, root = np.arange(1, degree + 1), np.sqrt(2)
+    values, slopes = [], []
+    for q in points.T:
+        c, s = root * np.cos(np.outer(q, k)), root * np.sin(np.outer(q, k))
+        values.append(np.column_stack([np.ones(len(q)), np.stack([c, s], axis=2).reshape(len(q), -1)]))
+        slopes.append(np.column_stack([np.zeros(len(q)), np.stack([-k * s, k * c], axis=2).reshape(len(q), -1)]))
+    return values, slopes
+
+
+class Leak:
+    """Half of the mean squared sine of the angle between dxi and the leaves of an exact coordinate, at points."""
+
+    def __init__(self, pairs: SymmetricPairs, points: Array) -> None:
+        self.pairs, self.u, self.v = pairs, *pairs.columns(points)
+        self.along = samples_at(pairs.problem, points).unit_task_gradients[:, 0].T  # (2, N), unit
+
+    def value(self, theta: Array) -> float:
+        """The loss."""
+        return float((self._sines(theta)[0] ** 2).mean()) / 2
+
+    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
+        """The loss and its gradient."""
+        value, gradient, _ = self.normal_equations(theta)
+        return value, gradient
+
+    def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
+        """The loss, its gradient and the Gauss-Newton matrix."""
+        r, D, (u, v), W = self._sines(theta)
+        w = (self.along - r * W / D) / D  # dr / dW, with W = u dv - v du
+        by_u = (w * v[1:]).sum(axis=0)[:, None] * self.u[0] - _weighted(w * v[0], self.u[1:])
+        by_v = _weighted(w * u[0], self.v[1:]) - (w * u[1:]).sum(axis=0)[:, None] * self.v[0]
+        J = np.hstack([by_u, by_v])
+        return float((r**2).mean()) / 2, J.T @ r / len(r), J.T @ J / len(r)
+
+    def _sines(self, theta: Array) -> tuple[Array, Array, tuple[Array, Array], Array]:
+        a, b = self.pairs.split(theta)
+        u, v = self.u @ a, self.v @ b
+        W = u[0] * v[1:] - v[0] * u[1:]
+        D = np.sqrt((W**2).sum(axis=0)) + 1e-300
+        return (self.along * W).sum(axis=0) / D, D, (u, v), W
+
+
+def _weighted(w: Array, columns: Array) -> Array:
+    """Sum over both angles of weights (2, N) times columns (2, N, terms)."""
+    return np.asarray(w[0][:, None] * columns[0] + w[1][:, None] * columns[1])
+
+
+def fitted(metric: str, degrees: tuple[int, ...], iterations: int) -> list[oc.Chart]:
+    """Circle-valued charts of all degrees; each starts from the one before."""
     problem = planar_problem(metric)
-    parametrisation = oc.Circle(oc.MLP((8, 8) if quick else (40, 40)))
-    family = parametrisation.family(JointSpace.of(problem), 1)
-    points = sample_evenly(problem.domain, 800 if quick else 6000, 0)
-    points = points[distance_to(points, singular_points(problem)) > NEAR]
-    xi, x = grown_chart(problem).xi(points)[:, 0], problem.task.batched(points)[0][:, 0]
-    known = np.isfinite(xi)
-    size = 1 - x[known] ** 2 / 4  # pairs vanish at the maximum and the minimum, around which the angle turns
-    pairs = size[:, None] * np.column_stack([np.cos(2 * xi[known]), np.sin(2 * xi[known])])
-    targets = _Targets(points[known], pairs, np.zeros((int(known.sum()), 2, 2)), 0.0)
-    steps = 40 if quick else 400
-    start = LBFGS(steps, 1e-9).minimise(_Distance(family.pairs, targets), family.initial(0)).theta
-    objective = GraphObjective(family, samples_at(problem, points), WEIGHTS, start, partial(sample_problem, problem))
-    theta = LBFGS(steps if quick else 1500, 1e-8).minimise(objective, start).theta
-    return oc.Chart(problem, Coordinates(parametrisation, JointSpace.of(problem), (), theta, np.zeros(1), np.ones(1)))
+    stages = [SymmetricPairs(problem, degree) for degree in degrees]
+    theta = stages[0].started(half_of_torus(problem, 60, 0.0), LEVELS[metric])
+    charts = []
+    for before, pairs in pairwise([stages[0], *stages]):
+        theta = pairs.embedded(theta, before)
+        points = half_of_torus(problem, 4 * pairs.degree + 30, NEAR)
+        theta = GaussNewton(iterations, 5e-4).minimise(Leak(pairs, points), theta).theta
+        charts.append(pairs.chart(theta))
+    return charts
+
+
+def half_of_torus(problem: oc.Problem, cells: int, away: float) -> Array:
+    """Centres of the cells of a grid with q2 > 0, farther than so much from singular points."""
+    points = cell_centres(cells)
+    return points[(points[:, 1] > 0) & (distance_to(points, singular_points(problem)) > away)]
 
 
 def real_valued(metric: str, quick: bool) -> oc.Chart:
     """The network of Fig. 17 with the least median deviation away from singular points."""
     charts = [freely_fitted(metric, quick, with_other_seed(USUAL, k)) for k in range(1 if quick else STARTS)]
-    return min(charts, key=lambda chart: judged(chart)["median_deg"])
+    return min(charts, key=lambda chart: judged(chart)["median_deg_beyond_1"])
 
 
-def judged(chart: oc.Chart, cells: int = 120) -> dict[str, float]:
-    """Deviations from right angles more than 1 rad from singular points, and the share of them that is folded."""
+def judged(chart: oc.Chart, cells: int = 140) -> dict[str, float]:
+    """Deviations from right angles beyond some distances from singular points, and the share that is folded."""
     points = cell_centres(cells)
-    points = points[distance_to(points, singular_points(chart.problem)) > FAR]
+    distance = distance_to(points, singular_points(chart.problem))
     J = chart.jacobian(points)
     angles, sides = deviations(chart.problem, points, J[:, 1]), np.sign(np.linalg.det(J))
-    return {
-        "median_deg": float(np.median(angles)),
-        "rms_deg": float(np.sqrt((angles**2).mean())),
-        "share_above_10_deg": float((angles > 10).mean()),
-        "folded": float(min((sides > 0).mean(), (sides < 0).mean())),
-    }
+    numbers = {}
+    for away in DISTANCES:
+        part = angles[distance > away]
+        numbers |= {
+            f"median_deg_beyond_{away:g}": float(np.median(part)),
+            f"rms_deg_beyond_{away:g}": float(np.sqrt((part**2).mean())),
+            f"deviation_99_percent_deg_beyond_{away:g}": float(np.quantile(part, 0.99)),
+            f"share_above_10_deg_beyond_{away:g}": float((part > 10).mean()),
+            f"folded_beyond_{away:g}": float(min((sides[distance > away] == side).mean() for side in (-1, 1))),
+        }
+    return numbers
 
 
 def jump_across_the_cut(chart: oc.Chart) -> float:
-    """Largest change of xi over 0.01 rad across the cut of the grown chart, along its base leaf [rad]."""
+    """Largest change of xi over 0.01 rad across the cut of the grown chart of Fig. 13, along its base leaf [rad]."""
     leaf = grown_chart(chart.problem).coordinates.leaf
     tangent = leaf.values(leaf.cut[None]).gradients[0, 0]
     near = leaf.cut + 0.005 * np.array([[-1.0], [1.0]]) * tangent / np.linalg.norm(tangent)
@@ -90,42 +217,52 @@ def jump_across_the_cut(chart: oc.Chart) -> float:
 
 
 def draw(charts: dict[str, oc.Chart]) -> Figure:
-    """The angle by colour, with leaves of the task."""
-    figure = Figure(figsize=(8, 4.2), layout="constrained")
-    panels = figure.subplots(1, 2)
-    for axes, (metric, chart) in zip(panels, charts.items(), strict=True):
+    """The angle by colour with leaves of the task, and its deviation from a right angle."""
+    figure = Figure(figsize=(8, 7.4), layout="constrained")
+    panels = figure.subplots(2, 2)
+    for column, (metric, chart) in zip(panels.T, charts.items(), strict=True):
         q, points = corners(240)
+        cells = cell_centres(240)
+        angles = deviations(chart.problem, cells, chart.jacobian(cells)[:, 1]).reshape(240, 240)
         xi, h = (values.reshape(241, 241) for values in (chart.xi(points)[:, 0], chart.task(points)[:, 0]))
-        shown = axes.imshow(xi, extent=2 * (-np.pi, np.pi), origin="lower", cmap="twilight", vmin=-np.pi, vmax=np.pi)
-        axes.contour(q, q, h, levels=np.linspace(-1.75, 1.75, 8), colors="white", linewidths=0.8, linestyles="-")
-        mark_singular(axes, singular_points(chart.problem))
-        joint_plane(axes, parts=2)
-        axes.set_title(f"${NAMES[metric]}$")
-    figure.colorbar(shown, ax=panels, label=r"$\xi$ [rad]", shrink=0.8)
+        frame = {"extent": 2 * (-np.pi, np.pi), "origin": "lower"}
+        angle = column[0].imshow(xi, cmap="twilight", vmin=-np.pi, vmax=np.pi, **frame)
+        column[0].contour(q, q, h, levels=np.linspace(-1.75, 1.75, 8), colors="white", linewidths=0.8, linestyles="-")
+        off = column[1].imshow(angles, cmap="Greys", vmin=0, vmax=10, **frame)
+        for axes in column:
+            mark_singular(axes, singular_points(chart.problem))
+            joint_plane(axes, parts=2)
+        column[0].set_title(f"${NAMES[metric]}$")
+    figure.colorbar(angle, ax=panels[0], label=r"$\xi$ [rad]")
+    figure.colorbar(off, ax=panels[1], label=r"$|\angle(\mathrm{d}\xi, \nabla_A h) - 90°|$ [deg]", extend="max")
     return figure
 
 
 def main(out: Path, quick: bool = False) -> dict[str, dict[str, float]]:
-    """Fit and judge both kinds for both metrics, and draw the angles.
+    """Fit and judge both kinds for both metrics, draw the angles, and write `circle_coordinates.json`.
 
     Args:
-        out: folder for the picture.
-        quick: small networks, few samples.
+        out: folder for the files.
+        quick: low degrees, small networks.
     """
     out.mkdir(parents=True, exist_ok=True)
-    charts = {metric: fitted(metric, quick) for metric in NAMES}
-    rows = {}
-    for metric, chart in charts.items():
-        rows[f"{metric}, circle"] = judged(chart) | {"jump_across_the_old_cut_rad": jump_across_the_cut(chart)}
+    degrees, best, rows = (DEGREES[:1] if quick else DEGREES), {}, {}
+    for metric in NAMES:
+        charts = fitted(metric, degrees, 10 if quick else 60)
+        for degree, chart in zip(degrees, charts, strict=True):
+            rows[f"{metric}, degree {degree}"] = judged(chart)
+        best[metric] = charts[-1]
+        rows[f"{metric}, degree {degrees[-1]}"]["jump_across_the_old_cut_rad"] = jump_across_the_cut(charts[-1])
         rows[f"{metric}, real"] = judged(real_valued(metric, quick))
-    draw(charts).savefig(out / "circle_coordinates.png", dpi=110)
+    draw(best).savefig(out / "circle_coordinates.png", dpi=110)
+    (out / "circle_coordinates.json").write_text(json.dumps(rows, indent=1))
     return rows
 
 
 def _table(rows: dict[str, dict[str, float]]) -> list[str]:
     lines = []
     for name, row in rows.items():
-        lines.append(f"{name:<20} " + "  ".join(f"{key} {value:.3g}" for key, value in row.items()))
+        lines.append(f"{name:<22} " + "  ".join(f"{key} {value:.3g}" for key, value in row.items()))
     return lines
 
 

@@ -9,8 +9,10 @@ import pytest
 
 import orthocas as oc
 from orthocas import solvers
+from orthocas.codegen import check_c
 from orthocas.control import Kinematic, Reference
 from orthocas.control.turns import without_turns
+from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.turns import shortest
 from orthocas.errors import InvalidValueError
 from orthocas.parametrisations import JointSpace
@@ -139,18 +141,58 @@ def test_chart_file_keeps_the_circle(around: oc.Chart, tmp_path: Path) -> None:
     assert again.turns.tolist() == around.turns.tolist()
 
 
-def test_consumers_without_circles_refuse_in_one_line(around: oc.Chart, tmp_path: Path) -> None:
-    whole = around.problem
-    bounded = oc.Problem(whole.robot, whole.task, whole.metric, oc.Box([0.0, 1.2], [1.0, 0.4]))
-    calls = (
-        lambda: oc.generate_c(around, tmp_path),
-        lambda: oc.compile_inverse(around, tmp_path),
-        lambda: oc.follow(around, [[1.5], [1.6]], velocity_limits=1),
-        lambda: oc.certify(replace(around, problem=bounded)),
+def test_c_equals_python_and_its_inverse_crosses_the_cut(around: oc.Chart, tmp_path: Path) -> None:
+    law = Kinematic(around, 5.0)
+    generated = oc.generate_c(around, tmp_path / "c", law, name="ring")
+    assert max(check_c(generated, around, law, states=100).differences.values()) < 1e-10
+    assert "xi1 is an angle [rad]" in (tmp_path / "c" / "ring.h").read_text()
+    q = around.inverse([around.task([0.0, 1.3])[0], np.pi - 0.01], [0.5, 1.3])
+    beyond = around.phi(q) + np.array([[0.0, 0.03], [0.0, 0.03 - 6 * np.pi]])  # the same point of the circle
+    found = oc.compile_inverse(around, tmp_path).solve(beyond, np.tile(q, (2, 1))).require().q
+    assert np.abs(found - q).max() < 0.1
+    assert found[0] == pytest.approx(found[1], abs=1e-9)
+    assert shortest(around.phi(found) - beyond, around.turns) == pytest.approx(np.zeros((2, 2)), abs=1e-8)
+
+
+def bounded(chart: oc.Chart, half_width: float) -> oc.Chart:
+    whole, box = chart.problem, oc.Box([0.0, 1.2], [half_width, 0.4])
+    return replace(chart, problem=oc.Problem(whole.robot, whole.task, whole.metric, box))
+
+
+def test_certificate_of_a_ring_ends_one_to_one_before_a_whole_turn(around: oc.Chart) -> None:
+    """The whole ring has no fold; but its ends share phi, so it is one-to-one on less than a turn only."""
+    whole = bounded(around, np.pi)
+    certificate = oc.certify(whole)
+    assert certificate.proved
+    assert certificate.injective is not None
+    low, high = certificate.injective.low[0], certificate.injective.high[0]
+    change = np.ptp(np.unwrap(around.xi(np.column_stack([np.linspace(low, high, 100), np.full(100, 1.2)]))[:, 0]))
+    assert 2 < change < 2 * np.pi
+    assert oc.check_certificate(whole, certificate)
+
+
+def test_path_goes_round_by_the_shorter_ways_of_its_schedule(around: oc.Chart) -> None:
+    """Angles from -pi to pi at the waypoints mean the same as angles that count on."""
+    bend = 0.05 * np.sin(np.linspace(0, np.pi, 9))
+    path, xi = around.task([0.0, 1.2]) + bend[:, None], np.linspace(0, 10, 9)[:, None]
+    motions = [
+        oc.follow(around, path, schedule, q_start=[0.0, 1.2], velocity_limits=1.0, period=0.1)
+        for schedule in (xi, shortest(xi, np.array([2 * np.pi])))
+    ]
+    assert np.abs(motions[1].q - motions[0].q).max() < 1e-9
+    assert np.ptp(motions[1].q[:, 0]) > 2 * np.pi
+    assert motions[1].xi[-1, 0] == pytest.approx(10.0)
+    chosen = oc.follow(around, path, "objective", q_start=[3.1, 1.2], velocity_limits=1.0, period=0.1)
+    assert np.abs(np.diff(chosen.xi[:, 0])).max() < 0.5
+
+
+def test_sets_of_self_motions_refuse_circles_in_one_line() -> None:
+    problem = oc.problems.get("planar_3r_x")
+    own = Coordinates(
+        oc.Circle(oc.Fourier(1)), JointSpace.of(problem), (), np.linspace(0.1, 1, 28), np.zeros(2), np.ones(2)
     )
-    for call in calls:
-        with pytest.raises(InvalidValueError, match=r"chart is one with circle-valued coordinates \(xi1\)"):
-            call()
+    with pytest.raises(InvalidValueError, match=r"chart is one with circle-valued coordinates \(xi1, xi2\)"):
+        oc.Chart(problem, own).self_motion(problem.domain.centre)
 
 
 @pytest.mark.parametrize("pairs", [oc.Linear(), oc.Circle(oc.Fourier(1)), "fourier:2", oc.Fourier(2, cyclic=("q1",))])

@@ -13,7 +13,7 @@ import orthocas as oc
 from orthocas import checks
 from orthocas.checks import Array
 from orthocas.errors import InvalidValueError, MissingExtraError, ShapeError, SimulationError
-from orthocas.simulation import Friction, MuJoCoPlant, Payload, Wall
+from orthocas.simulation import Elasticity, Friction, MuJoCoPlant, Payload, Wall
 
 pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[sim] is not installed")
 
@@ -103,6 +103,44 @@ def test_light_joints_hardly_creep_below_their_coulomb_friction() -> None:
 
 
 @pytest.mark.slow
+def test_elastic_gears_swing_as_the_equations_of_motion_say() -> None:
+    """M ddq + C dq + g = k (theta - q) + d (dtheta - dq), B ddtheta = u - k (theta - q) - d (dtheta - dq)."""
+    robot = oc.Robot.planar(lengths=[0.6, 0.4], masses=[3.0, 2.0])
+    k, B, d = np.array([900.0, 400.0]), np.array([0.3, 0.1]), np.array([2.0, 0.5])
+    plant = MuJoCoPlant(robot, elasticity=Elasticity(k, B, d), timestep=5e-4)
+    q0, u = np.array([0.3, 0.7]), np.array([8.0, -3.0])
+    plant.reset(q0)
+    sag = np.asarray(robot.gravity(q0)) / k
+    assert plant.motor_q == pytest.approx(q0 + sag)
+    for _ in range(100):
+        plant.step(u, 1e-3)
+
+    def rates(_: float, state: np.ndarray) -> np.ndarray:
+        q, theta, dq, dtheta = state.reshape(4, 2)
+        gear = k * (theta - q) + d * (dtheta - dq)
+        ddq = np.linalg.solve(np.asarray(robot.mass_matrix(q)), gear - np.asarray(robot.bias(q, dq)))
+        return np.concatenate([dq, dtheta, ddq, (u - gear) / B])
+
+    start = np.concatenate([q0, q0 + sag, np.zeros(4)])
+    end = solve_ivp(rates, (0.0, 0.1), start, rtol=1e-9, atol=1e-11).y[:, -1].reshape(4, 2)
+    found = np.array([plant.q, plant.motor_q, plant.dq, plant.motor_dq])
+    assert np.abs(found - end).max() < 1e-5
+    assert np.abs(end[1] - end[0]).max() > 5e-3
+    assert np.array_equal(plant.torque, u)
+
+
+def test_stiff_gears_are_rigid_ones_with_the_armature_of_the_rotors() -> None:
+    robot = oc.Robot.planar(lengths=[0.6, 0.4], masses=[3.0, 2.0])
+    tree = replace(robot.tree, armatures=np.array([0.3, 0.1]))
+    stiff = MuJoCoPlant(robot, elasticity=Elasticity(1e5, tree.armatures, 100.0))
+    rigid = MuJoCoPlant(oc.Robot(tree))
+    for plant in (stiff, rigid):
+        plant.reset([0.3, 0.7])
+        for _ in range(100):
+            plant.step(np.array([8.0, -3.0]), 1e-3)
+    assert stiff.q == pytest.approx(rigid.q, abs=2e-4)
+
+
 def test_stops_hold(panda: tuple[pin.Model, oc.Robot], plant: MuJoCoPlant) -> None:
     robot = panda[1]
     for sign in (-1, 1):

@@ -9,8 +9,8 @@ import numpy as np
 
 from orthocas.certificates.certificate import METHOD, Certificate
 from orthocas.certificates.subdivision import OPEN, Subdivision
-from orthocas.certifying.chart_rows import chart_rows
-from orthocas.certifying.judges import InjectivityJudge, RegularityJudge, injectivity_judge
+from orthocas.certifying.chart_rows import ChartRows, chart_rows
+from orthocas.certifying.judges import RegularityJudge, injectivity_judge
 from orthocas.certifying.outside import judge_of
 from orthocas.certifying.search import Limits, Look, Search, distances, largest_first, nearest_first
 from orthocas.chart import Chart
@@ -77,10 +77,8 @@ def certify(
     limits = Limits(seconds=checked_options(chart, time_limit, executor))
     bound = checked_bound(chart, bound)
     rows = chart_rows(chart)
-    _require_independent(chart, rows.variables)
-    judge = judge_of(chart, rows, bound)
     base = whole_domain(chart.problem.domain) if resume is None else _resumed(chart, bound, resume)
-    search = Search(judge, base, limits, largest_first(base), executor)
+    search = _regularity_search(chart, rows, bound, base, limits, executor)
     injective: Subdivision | None = None
 
     def so_far() -> Certificate:
@@ -91,11 +89,26 @@ def certify(
         search.run(_shown(monitor, "regular"))
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
-            judge_too = injectivity_judge(rows, chart.problem.domain.centre)
-            injective = _one_to_one(judge_too, base, left, executor, monitor)
+            injective = _one_to_one(chart, rows, base, left, executor, monitor)
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
     return so_far()
+
+
+def folds_nowhere(chart: Chart, time_limit: float) -> bool:
+    """Whether a processor time [s] is enough to prove that a chart does not fold. No one-to-one box is looked for."""
+    base, limits = whole_domain(chart.problem.domain), Limits(time_limit, time.thread_time)
+    search = _regularity_search(chart, chart_rows(chart), 0.0, base, limits, None)
+    search.visit(_suspects(chart))
+    search.run(lambda _: None)
+    return search.finished
+
+
+def _regularity_search(
+    chart: Chart, rows: ChartRows, bound: float, base: Subdivision, limits: Limits, executor: Executor | None
+) -> Search:
+    _require_independent(chart, rows.variables)
+    return Search(judge_of(chart, rows, bound), base, limits, largest_first(base), executor)
 
 
 def certified_box(
@@ -224,16 +237,17 @@ def _suspects(chart: Chart) -> Array:
 
 
 def _one_to_one(
-    judge: InjectivityJudge, base: Subdivision, seconds: float, executor: Executor | None, monitor: Monitor
+    chart: Chart, rows: ChartRows, base: Subdivision, seconds: float, executor: Executor | None, monitor: Monitor
 ) -> Subdivision | None:
-    """The largest of some boxes around the centre that the judge accepts, with its parts; None if it accepts none."""
+    """The largest of some boxes around the centre with a proof, and its parts; None if there is no proof for any."""
     end = time.monotonic() + seconds
     best = None
     low, high = 0, len(_SCALES)  # the scales before `low` are proved, those from `high` on are not
     while low < high:
         middle = (low + high) // 2
         part = _scaled(base, _SCALES[middle])
-        limits = Limits(max(end - time.monotonic(), 0.0), _INJECTIVE_BOXES)
+        limits = Limits(max(end - time.monotonic(), 0.0), boxes=_INJECTIVE_BOXES)
+        judge = injectivity_judge(rows, chart.problem.domain.centre, part)
         search = Search(judge, part, limits, largest_first(part), executor)
         search.run(_shown(monitor, "one-to-one"))
         if search.finished:

@@ -17,7 +17,6 @@ from orthocas.certifying.taylor import TaylorModel, stacked
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
-from orthocas.coordinates.turns import require_no_turns
 from orthocas.errors import CertifyError
 from orthocas.parametrisations.mlp import MLPFamily
 from orthocas.parametrisations.product_basis import ProductFamily
@@ -40,6 +39,7 @@ class ChartRows:
     variables: Variables  #: joints that J depends on
     task: "GraphRows"  #: of the active joints
     coordinates: CoordinateRows | None
+    turns: Array  #: periods of the rows; 0 for those that have none
 
     def __call__(self, low: Array, high: Array) -> TaylorModel:
         """Models (active, active, boxes) for the boxes between corners (boxes, n)."""
@@ -82,12 +82,10 @@ def chart_rows(chart: Chart) -> ChartRows:
 
     Raises:
         CertifyError: if the chart is grown, or uses operations without proven bounds.
-        InvalidValueError: if it is circle-valued.
     """
     coordinates = chart.coordinates
     if not isinstance(coordinates, Coordinates):
         raise CertifyError(f"a chart with {coordinates.label} coordinates has no expression, expected a fitted chart")
-    require_no_turns(chart.labels, chart.turns, "a proof")  # being one-to-one up to whole turns is another question
     if not np.all(coordinates.scale != 0):
         raise CertifyError("a coordinate is scaled by 0, so it is constant, expected coordinates that vary")
     active = tuple(coordinates.active)
@@ -99,7 +97,9 @@ def chart_rows(chart: Chart) -> ChartRows:
     if len(variables) > MOST_VARIABLES:
         raise CertifyError(f"the chart depends on {len(variables)} joints, expected at most {MOST_VARIABLES}")
     graph = TaylorGraph.of(dense_function("task_rows", [q], [J_x]), "the task")
-    return ChartRows(chart.n, chart.m, active, variables, GraphRows(graph, chart.m, allowance), own)
+    periods = coordinates.turns[: len(coordinates.offset)] / np.abs(coordinates.scale)
+    turns = np.concatenate([np.zeros(chart.m), periods])
+    return ChartRows(chart.n, chart.m, active, variables, GraphRows(graph, chart.m, allowance), own, turns)
 
 
 def joint_models(low: Array, high: Array, variables: Variables) -> tuple[list[TaylorModel], Array]:

@@ -58,7 +58,7 @@ def check_certificate(
     holds = all(verdicts.proved.all() for verdicts in regular) and len(signs) < 2 and least >= certificate.conditioning
     if certificate.injective is None or not holds:
         return holds
-    judge = injectivity_judge(rows, chart.problem.domain.centre)
+    judge = injectivity_judge(rows, chart.problem.domain.centre, certificate.injective)
     found = _judged(judge, certificate.injective, mapped, monitor)
     return certificate.injective.complete and all(verdicts.proved.all() for verdicts in found)
 

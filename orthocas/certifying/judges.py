@@ -7,9 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.casadi_tools.threads import one_blas_thread
+from orthocas.certificates.subdivision import Subdivision
 from orthocas.certifying.chart_rows import ChartRows
 from orthocas.certifying.elimination import between, in_singular_basis, lower_bound, pivots
 from orthocas.certifying.monomials import Variables
+from orthocas.certifying.rounding import UP
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.certifying.volume import conditioning_bound
 from orthocas.checks import Array
@@ -65,15 +67,17 @@ class InjectivityJudge:
     """Proves that the symmetric part of P J is positive definite, for one P on all boxes.
 
     On a convex set this makes phi one-to-one: (q - p)^T P (phi(q) - phi(p)) is the integral of (q - p)^T P J (q - p)
-    over the segment, which is positive.
+    over the segment, which is positive. For circle-valued coordinates that holds for angles that count on, so they must
+    also change by less than a turn on the segment.
     """
 
     rows: ChartRows
     inverse: Array  #: P, (active, active)
+    widths: Array  #: of the convex set, (active,)
 
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
-        with one_blas_thread():  # small products, and the same rounding everywhere
+        with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             J = self.rows(low, high)
             return _joined([self._few(part) for part in _parts(J)], J.variables)
 
@@ -87,28 +91,32 @@ class InjectivityJudge:
         symmetric = product + transposed
         vectors = np.linalg.eigh(np.nan_to_num(np.moveaxis(symmetric.centre, -1, 0)))[1][:, :, ::-1]
         turned = between(vectors.transpose(0, 2, 1), symmetric, vectors)
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            proved = _all_positive(pivots(turned))
+        proved: Array = np.asarray(_all_positive(pivots(turned)) & self._within_a_turn(J), dtype=np.bool_)
         return proved, proved, np.zeros(boxes), np.zeros(boxes), _influences(turned)
 
+    def _within_a_turn(self, J: TaylorModel) -> NDArray[np.bool_]:
+        """Whether rows with a period change by less than it, over the widths at their largest slopes, (boxes,)."""
+        circles = np.flatnonzero(self.rows.turns)
+        change = (J.magnitude()[circles] * self.widths[:, None]).sum(axis=1)
+        return np.asarray((change * UP < self.rows.turns[circles, None]).all(axis=0))
 
-def injectivity_judge(rows: ChartRows, centre: Array) -> InjectivityJudge:
-    """The judge with the inverse of J at a point as its P."""
+
+def injectivity_judge(rows: ChartRows, centre: Array, base: Subdivision) -> InjectivityJudge:
+    """The judge for a box, with the inverse of J at a point as its P."""
     J = rows(centre[None], centre[None]).centre[:, :, 0]
-    return InjectivityJudge(rows, np.asarray(np.linalg.pinv(J), dtype=float))
+    widths = (base.high - base.low)[list(rows.active)] * UP
+    return InjectivityJudge(rows, np.asarray(np.linalg.pinv(J), dtype=float), widths)
 
 
-def _all_positive(found: list[TaylorModel]) -> Array:
+def _all_positive(found: list[TaylorModel]) -> NDArray[np.bool_]:
     """Whether all pivots have one sign on the box and the pivots of the middle are positive."""
-    positive: Array = np.all([lower_bound(pivot) > 0 for pivot in found], axis=0)
-    return positive
+    return np.asarray(np.all([lower_bound(pivot) > 0 for pivot in found], axis=0))
 
 
 def _influences(turned: TaylorModel) -> Array:
-    """How much each variable changes the matrix, relative to its singular values, (boxes, variables)."""
+    """How much halving each variable narrows the matrix, relative to its singular values, (boxes, variables)."""
     middle = np.sqrt(np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))])) + 1e-300)
-    linear = np.abs(turned.coefficients[1 : 1 + len(turned.variables)])
-    influences: Array = (linear / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T
+    influences: Array = (turned.gains() / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T
     return np.nan_to_num(influences)
 
 

@@ -56,7 +56,7 @@ class CompiledInverse(Shown):
 
         in_threads(solve_piece, range(0, len(targets), _PIECE))
         phi_map = self.chart.phi_map
-        attempt.residual[:] = (targets - attempt.residual) / phi_map.scale(targets)
+        attempt.residual[:] = phi_map.difference(targets, attempt.residual) / phi_map.scale(targets)
         attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < SUSPICIOUS)
         failed = np.flatnonzero(condition < 0)
         if failed.size:

@@ -22,6 +22,10 @@ _TURN = (
     "tilt of the tip's {axis} axis from that of the reference, near it in [rad], and turn about it [rad].\n"
     " *   The reference, row by row: "
 )
+_ANGLE = (
+    "\n *   {label} is an angle [rad] from -pi to pi. The inverse map and the laws take the shorter way around, so"
+    "\n *   targets and references may have whole turns more or less."
+)
 
 
 def description_values(chart: Chart) -> dict[str, str]:
@@ -39,6 +43,7 @@ def description_values(chart: Chart) -> dict[str, str]:
         "task_labels": ", ".join(_with_units(chart.problem.task)),
         "orientation": _orientation(chart.problem.task),
         "extra_labels": ", ".join(words(chart.labels[chart.m :])),
+        "angles": _angles(chart),
         "tip": words([tree.tip_name])[0],
         "gravity": _row(tree.gravity),
     }
@@ -56,6 +61,12 @@ def chart_values(chart: Chart) -> dict[str, str]:
 def domain_lines(domain: Domain, names: list[str]) -> str:
     """The borders of a domain, joint by joint, and its condition on singular values."""
     return _border_lines(names, *borders(domain)) + clear_line(domain)
+
+
+def _angles(chart: Chart) -> str:
+    """Which extra coordinates are circle-valued."""
+    found = [label for label, turn in zip(words(chart.labels), chart.turns, strict=True) if turn]
+    return "".join(_ANGLE.format(label=label) for label in found)
 
 
 def _with_units(task: Task) -> list[str]:

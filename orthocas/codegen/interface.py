@@ -1,8 +1,10 @@
 """The contents of the generated files: names, sizes, tables and comments."""
 
 import casadi as ca
+import numpy as np
 
 from orthocas.chart import Chart
+from orthocas.codegen.border_condition import BorderCondition, border_condition
 from orthocas.codegen.check import check_values
 from orthocas.codegen.control_values import control_values
 from orthocas.codegen.description import description_values
@@ -11,7 +13,7 @@ from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.numbers import numbers
 from orthocas.codegen.precision import Precision
 from orthocas.codegen.source import Source
-from orthocas.codegen.supervision import clear_border, supervision_values
+from orthocas.codegen.supervision import supervision_values
 from orthocas.codegen.words import words
 from orthocas.control import Controller, Safety
 from orthocas.version import VERSION
@@ -43,6 +45,7 @@ def template_values(
         "joint_list": ", ".join(joints),
         **description_values(chart),
         "phi_sizes": numbers(chart.phi_sizes),
+        **_shortest_way(chart),
         "max_evaluations": str(_MAX_EVALUATIONS),
         "stack_bytes": str(stack_bytes),
         "check_q": numbers(somewhere),
@@ -52,9 +55,9 @@ def template_values(
     }
     values |= source.values(values, precision)
     if controller is not None and safety is not None:
-        clear = clear_border(source, controller)
-        values |= control_values(controller) | supervision_values(controller, safety, clear)
-        values["clearance_c"] = "" if clear is None else filled("clearance.c", values)
+        condition = border_condition(source, controller)
+        values |= control_values(controller) | supervision_values(controller, safety, condition)
+        values["clearance_c"] = "" if condition is None else _clearance(condition, values)
         values |= source.law_values(controller, values)
         values["compose"] = filled(f"compose_{controller.command}.c", values)
     for template in ("control.h", "control.c", "check_control.c", "control.md", "supervisor.h", "supervisor.c"):
@@ -62,9 +65,24 @@ def template_values(
     return values
 
 
+def _clearance(condition: BorderCondition, values: dict[str, str]) -> str:
+    """Code that tells how far a position is inside the condition of the domain, here and after a time."""
+    return filled("clearance.c", {**values, "condition_border": filled(condition.template, values)})
+
+
 def _sizes(chart: Chart) -> dict[str, str]:
     sizes = {"n": chart.n, "m": chart.m, "r": chart.r, "nn": chart.n**2}
     return {name: str(size) for name, size in sizes.items()}
+
+
+def _shortest_way(chart: Chart) -> dict[str, str]:
+    """The difference of two phi in C; angles of circle-valued coordinates take the shorter way around."""
+    if not chart.turns.any():
+        return {"turn_table": "", "shortest": "(wanted[i] - phi[i])"}
+    rounds = np.where(chart.turns > 0, 1 / np.where(chart.turns > 0, chart.turns, 1.0), 0.0)
+    table = f"\n  static const double turn[N] = {{{numbers(chart.turns)}}}, rounds[N] = {{{numbers(rounds)}}};"
+    whole = "turn[i] * floor((wanted[i] - phi[i]) * rounds[i] + 0.5)"
+    return {"turn_table": table, "shortest": f"(wanted[i] - phi[i] - {whole})"}
 
 
 def _title(source: Source, controller: Controller | None) -> str:

@@ -17,6 +17,7 @@ from orthocas.codegen.random_inputs import corner_cases, random_gains, spoiled
 from orthocas.control import Controller, ControlStatus
 from orthocas.control.controller import squared_volume
 from orthocas.control.status import FROM_THE_LAW
+from orthocas.coordinates.turns import shortest
 from orthocas.domains import Domain, contains
 from orthocas.errors import ProofError
 from orthocas.files.drafts import draft_folder
@@ -106,10 +107,10 @@ def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Ar
     status = np.select([~known, ~has_value], [ControlStatus.NOT_FINITE, ControlStatus.SINGULAR], inside)
     found = [library.chart(row) for row in q]
     _require_status("chart", [row[-1] for row in found], status, q)
-    differences = {
-        name: _difference(np.array([row[k] for row in found]), _zero_unless(has_value, value))
-        for k, (name, value) in enumerate(wanted.items())
-    }
+    phi, J = (np.array([row[k] for row in found]) for k in range(2))
+    wanted = {name: _zero_unless(has_value, value) for name, value in wanted.items()}
+    phi = wanted["phi"] + shortest(phi - wanted["phi"], chart.turns)  # pi and -pi are one angle
+    differences = {"phi": _difference(phi, wanted["phi"]), "jacobian": _difference(J, wanted["jacobian"])}
     wanted = {
         "mass_matrix": robot.mass_matrix(somewhere),
         "bias": robot.bias(somewhere, speed),
@@ -161,7 +162,7 @@ def _inverse_error(library: CompiledLibrary, chart: Chart, target: Array, start:
     if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
         if (status == ControlStatus.OK) != contains(chart.problem.domain, solution.astype(float)):
             raise ProofError(f"the status of inverse is {status} at q = {solution.tolist()}")
-        return float(np.abs(chart.phi(solution.astype(float)) - target).max())
+        return float(np.abs(shortest(chart.phi(solution.astype(float)) - target, chart.turns)).max())
     if status != ControlStatus.SINGULAR or not np.array_equal(solution, start):
         raise ProofError(f"inverse returns {solution.tolist()} and status {status}, expected its start")
     return np.inf

@@ -25,6 +25,14 @@ def shortest(difference: Any, turns: Array) -> Any:
     return difference - turns * np.round(difference / periods)
 
 
+def counted_on(rows: Array, turns: Array) -> Array:
+    """Rows (N, k) of values along a curve; periodic ones go on by the shorter way from row to row."""
+    if not turns.any():
+        return rows
+    steps = shortest(np.diff(rows, axis=0), turns)
+    return np.asarray(rows[0] + np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(steps, axis=0)]))
+
+
 def require_no_turns(labels: tuple[str, ...], turns: Array, purpose: str) -> None:
     """Raise InvalidValueError if a component of phi is periodic, for what cannot deal with that yet."""
     circles = [label for label, turn in zip(labels, turns, strict=True) if turn > 0]

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from orthocas.checks import Array
+from orthocas.coordinates.turns import counted_on
 from orthocas.following.costs import Costs
 from orthocas.following.plan import Plan
 from orthocas.following.solver import Solver
@@ -87,7 +88,7 @@ class XiChoice:
 
     def _first(self, q: Array) -> _State | None:
         """The spline through the coordinates of joint positions, or through their mean where that has no solution."""
-        xi = self.chart.xi(q)
+        xi = counted_on(self.chart.xi(q), self.chart.turns[self.chart.m :])
         values = np.linalg.lstsq(self._basis, xi, rcond=None)[0]
         return self._state(values, q) or self._state(np.tile(xi.mean(axis=0), (len(values), 1)), q)
 

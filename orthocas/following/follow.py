@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_float_array, as_number, as_point, require_kind
-from orthocas.coordinates.turns import require_no_turns
 from orthocas.errors import InvalidValueError, SolveError
 from orthocas.following.checks import Limits
 from orthocas.following.choose_xi import XiChoice
@@ -55,7 +54,8 @@ def follow(
         tool_path: task values of waypoints (N, m), or a function of s in [0, 1] that returns task values (m,).
         xi: "hold" keeps the coordinates of `q_start`. An array (N, r) gives them at the waypoints, a function of s in
             [0, 1] along the path. "objective" chooses them: away from the border of the domain, from positions where
-            the task is near-singular, and from obstacles, and with little motion.
+            the task is near-singular, and from obstacles, and with little motion. Circle-valued coordinates go from
+            each waypoint to the next by the shorter way, and count on beyond pi.
         q_start: a joint position (n,) near the start of the path. Default: the centre of the domain.
         period: distance of the time stamps [s].
         velocity_limits: (n,) or one number [rad/s] or [m/s]. Default: those of the robot's file.
@@ -87,7 +87,6 @@ def follow(
     """
     require_kind("chart", chart, Chart)
     chart.function("second_derivative")  # raises for grown charts
-    require_no_turns(chart.labels, chart.turns, "paths")
     start = chart.problem.domain.centre if q_start is None else as_point("q_start", q_start, chart.n)
     distances = LinkDistances(chart.problem.robot, obstacles, link_radius)
     limits = _limits(chart, velocity_limits, acceleration_limits, distances, clearance)

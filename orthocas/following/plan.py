@@ -7,6 +7,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from orthocas.checks import Array
+from orthocas.coordinates.turns import counted_on
 from orthocas.errors import InvalidValueError
 from orthocas.following.splines import places, same_ends, sampled, spline
 
@@ -33,7 +34,7 @@ class Plan:
     @classmethod
     def scheduled(cls, chart: "Chart", tool_path: Any, xi: Any) -> "Plan":
         """A tool path with a schedule: coordinates at the waypoints (N, r), or a function of s."""
-        values = sampled("xi", xi, chart.r, chart.labels[chart.m :])
+        values = counted_on(sampled("xi", xi, chart.r, chart.labels[chart.m :]), chart.turns[chart.m :])
         if callable(xi) or callable(tool_path):
             return cls._through(chart, tool_path, values, np.linspace(0.0, 1.0, len(values)))
         return cls._through(chart, tool_path, values, None)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.checks import Array, as_point
+from orthocas.coordinates.turns import counted_on
 from orthocas.domains import contains
 from orthocas.errors import InvalidValueError
 from orthocas.reaching.curves import Branch, LevelCurve
@@ -139,10 +140,7 @@ def branch_along(chart: "Chart", q: Array, k: int, sign: float) -> Branch:
 
 def xi_along(chart: "Chart", points: Array) -> Array:
     """Coordinates (N, r) along a curve from its first point on, without the jumps of circle-valued ones."""
-    xi, turns = chart.xi(points), chart.turns[chart.m :]
-    for k in np.flatnonzero(turns):
-        xi[:, k] = np.unwrap(xi[:, k], period=turns[k])
-    return xi
+    return counted_on(chart.xi(points), chart.turns[chart.m :])
 
 
 def _interval(chart: "Chart", q: Array, k: int) -> Interval:

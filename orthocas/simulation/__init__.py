@@ -5,13 +5,14 @@ from orthocas.simulation.coupling import Coupling, coupling_index
 from orthocas.simulation.disturbances import Friction, Noise, Push, Stops
 from orthocas.simulation.many import simulate_many
 from orthocas.simulation.mujoco_plant import MuJoCoPlant
-from orthocas.simulation.mujoco_scene import MuJoCo, Payload, Wall
+from orthocas.simulation.mujoco_scene import Elasticity, MuJoCo, Payload, Wall
 from orthocas.simulation.run import simulate
 from orthocas.simulation.trajectory import Outcome, Trajectory
 
 __all__ = [
     "Breakdown",
     "Coupling",
+    "Elasticity",
     "Friction",
     "MuJoCo",
     "MuJoCoPlant",

@@ -33,6 +33,11 @@ def body_name(i: int) -> str:
     return f"body{i}"
 
 
+def rotor_name(i: int) -> str:
+    """Name of the joint of rotor i, with elasticity."""
+    return f"rotor{i}"
+
+
 def handle_name(i: int) -> str:
     """Name of the massless body where pushes at body i act."""
     return f"handle{i}"
@@ -42,7 +47,8 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
     """An `mjModel` with the dynamics of a tree: M ddq + C dq + g = u - friction + loads.
 
     Joint i is "joint<i>", moved by the motor "motor<i>" (gear 1), and carries "body<i>" and the massless "handle<i>",
-    where pushes act. The tip frame is the body "tip".
+    where pushes act. The tip frame is the body "tip". With elasticity, the motor turns "rotor<i>", which the spring
+    "gear<i>" couples to the joint; friction then acts at the rotor.
 
     Args:
         tree: the robot.
@@ -64,8 +70,10 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
         carrier = bodies[parent] if parent >= 0 else spec.worldbody
         bodies.append(_add_body(mj, carrier, body_name(i), tree.translations[i], tree.rotations[i]))
         _place_inertia(bodies[i].add_body(name=handle_name(i)), 0.0)
-        _add_joint(mj, bodies[i], tree, i, scene.stops, viscous[i], coulomb[i])
-        _add_motor(mj, spec, i, tree.effort_limits[i] if scene.effort_limits else np.inf)
+        joint = _add_joint(mj, bodies[i], tree, i, scene.stops)
+        moved = joint if scene.elasticity is None else _add_rotor(mj, spec, joint, i, scene.elasticity.numbers(tree.n))
+        _add_friction(moved, viscous[i], coulomb[i])
+        _add_motor(mj, spec, moved.name, i, tree.effort_limits[i] if scene.effort_limits else np.inf)
     carrier = bodies[tree.tip_parent] if tree.tip_parent >= 0 else spec.worldbody
     tip = _add_body(mj, carrier, TIP, tree.tip_translation, tree.tip_rotation)
     if scene.wall is not None:
@@ -92,23 +100,41 @@ def _place_inertia(body: Any, scale: float) -> None:
     body.ipos, body.iquat = (0.1, 0.2, 0.3), (0.5, 0.5, -0.5, 0.5)
 
 
-def _add_joint(
-    mj: ModuleType, body: Any, tree: KinematicTree, i: int, stops: bool, viscous: float, coulomb: float
-) -> None:
+def _add_joint(mj: ModuleType, body: Any, tree: KinematicTree, i: int, stops: bool) -> Any:
     kind = mj.mjtJoint.mjJNT_SLIDE if tree.joint_kinds[i] == "prismatic" else mj.mjtJoint.mjJNT_HINGE
     joint = body.add_joint(name=f"joint{i}", type=kind, axis=(0, 0, 1), armature=tree.armatures[i])
-    joint.damping[0], joint.frictionloss = viscous, coulomb
-    joint.solimp_friction[:2] = _FRICTION_IMPEDANCE
     ends = np.array([tree.lower[i], tree.upper[i]])
     limited = stops and bool(np.isfinite(ends).any())
     joint.limited = mj.mjtLimited.mjLIMITED_TRUE if limited else mj.mjtLimited.mjLIMITED_FALSE
     if limited:
         joint.range, joint.solref_limit = np.clip(ends, -_FAR, _FAR), (_STOP_TIME, 1.0)
         joint.solimp_limit[:2] = _STOP_IMPEDANCE
+    return joint
 
 
-def _add_motor(mj: ModuleType, spec: Any, i: int, limit: float) -> None:
-    motor = spec.add_actuator(name=f"motor{i}", target=f"joint{i}", trntype=mj.mjtTrn.mjTRN_JOINT)
+def _add_rotor(mj: ModuleType, spec: Any, joint: Any, i: int, numbers: tuple[Array, Array, Array]) -> Any:
+    """A joint of its own in the world, with the inertia of a rotor, and a spring between it and the robot's joint."""
+    stiffness, inertia, damping = (float(part[i]) for part in numbers)
+    body = spec.worldbody.add_body(name=f"rotor_body{i}", gravcomp=1.0)
+    body.explicitinertial = True
+    body.mass, body.inertia = inertia, (inertia, inertia, inertia)
+    rotor = body.add_joint(name=rotor_name(i), type=joint.type, axis=(0, 0, 1))
+    rotor.limited = mj.mjtLimited.mjLIMITED_FALSE
+    joint.armature = 0.0
+    gear = spec.add_tendon(name=f"gear{i}", springlength=(0.0, 0.0))
+    gear.stiffness[0], gear.damping[0] = stiffness, damping
+    gear.wrap_joint(rotor.name, 1.0)
+    gear.wrap_joint(joint.name, -1.0)
+    return rotor
+
+
+def _add_friction(joint: Any, viscous: float, coulomb: float) -> None:
+    joint.damping[0], joint.frictionloss = viscous, coulomb
+    joint.solimp_friction[:2] = _FRICTION_IMPEDANCE
+
+
+def _add_motor(mj: ModuleType, spec: Any, target: str, i: int, limit: float) -> None:
+    motor = spec.add_actuator(name=f"motor{i}", target=target, trntype=mj.mjtTrn.mjTRN_JOINT)
     motor.set_to_motor()
     if np.isfinite(limit):
         motor.forcelimited, motor.forcerange = mj.mjtLimited.mjLIMITED_TRUE, (-limit, limit)

@@ -1,10 +1,10 @@
 """A robot in MuJoCo, driven tick by tick."""
 
-from math import ceil
+from math import ceil, sqrt
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.checks import Array, as_number, as_point, frozen_array, require_kind
 from orthocas.control.gains import non_negative_gains
@@ -12,8 +12,8 @@ from orthocas.errors import InvalidValueError, SimulationError
 from orthocas.robots import Robot
 from orthocas.showing import Shown
 from orthocas.simulation.disturbances import Friction
-from orthocas.simulation.mujoco_model import HAND, handle_name, mujoco, mujoco_model
-from orthocas.simulation.mujoco_scene import TIMESTEP, MuJoCo, Payload, Wall
+from orthocas.simulation.mujoco_model import HAND, handle_name, mujoco, mujoco_model, rotor_name
+from orthocas.simulation.mujoco_scene import TIMESTEP, Elasticity, MuJoCo, Payload, Wall
 from orthocas.simulation.places import Link, place_of
 
 _MOST_PARTS = 8  # of the longest step, for RK4
@@ -37,6 +37,8 @@ class MuJoCoPlant(Shown):
         payload: a body fixed at the tip.
         wall: a wall in the tip's way.
         timestep: longest step of the physics [s], from 1e-6 to 0.01.
+        elasticity: of the gears; default rigid ones. Motors and friction then act on rotors, which springs couple to
+            the joints.
 
     Raises:
         ShapeError, InvalidValueError: for arguments of the wrong shape, value or type.
@@ -66,22 +68,24 @@ class MuJoCoPlant(Shown):
         payload: Payload | None = None,
         wall: Wall | None = None,
         timestep: float = TIMESTEP,
+        elasticity: Elasticity | None = None,
     ) -> None:
         require_kind("robot", robot, Robot)
-        scene = MuJoCo(robot, stops, effort_limits, payload, wall, timestep)
+        scene = MuJoCo(robot, stops, effort_limits, payload, wall, timestep, elasticity)
         friction = Friction() if friction is None else friction
         require_kind("friction", friction, Friction)
         viscous, coulomb = (
             non_negative_gains(name, getattr(friction, name), robot.n) for name in ("viscous", "coulomb")
         )
-        self.robot = robot
+        self.robot, self.elasticity = robot, elasticity
         #: MuJoCo's model and data, for renderers and for looking; `step` owns them.
         self.model: Any = mujoco_model(robot.tree, scene, viscous, coulomb)
         self.data: Any = mujoco().MjData(self.model)
         self._step = mujoco().mj_step
         self._timestep = float(timestep)
-        names = [f"joint{i}" for i in range(robot.n)]
-        self._dofs = np.array([self.model.joint(name).dofadr[0] for name in names])
+        self._dofs = self._numbers([f"joint{i}" for i in range(robot.n)])
+        #: joints that the motors move: those of the robot, or their rotors
+        self._motors = self._dofs if elasticity is None else self._numbers([rotor_name(i) for i in range(robot.n)])
         self._handles = [int(self.model.body(handle_name(i)).id) for i in range(robot.n)]
         self.reset(np.zeros(robot.n))
 
@@ -101,6 +105,16 @@ class MuJoCoPlant(Shown):
         return np.asarray(self.data.qvel[self._dofs])
 
     @property
+    def motor_q(self) -> Array:
+        """Positions of the rotors, as encoders of motors measure them, (n,); with rigid gears those of the joints."""
+        return np.asarray(self.data.qpos[self._motors])
+
+    @property
+    def motor_dq(self) -> Array:
+        """Velocities of the rotors, (n,)."""
+        return np.asarray(self.data.qvel[self._motors])
+
+    @property
     def time(self) -> float:
         """Time since `reset` [s]."""
         return float(self.data.time)
@@ -108,7 +122,7 @@ class MuJoCoPlant(Shown):
     @property
     def torque(self) -> Array:
         """The torque of the motors in the last step, after saturation (n,) [N m] or [N]."""
-        return np.asarray(self.data.qfrc_actuator[self._dofs])
+        return np.asarray(self.data.qfrc_actuator[self._motors])
 
     @property
     def acceleration(self) -> Array:
@@ -130,6 +144,8 @@ class MuJoCoPlant(Shown):
     def reset(self, q: ArrayLike, dq: ArrayLike | None = None) -> None:
         """Begin anew at joint positions (n,) and velocities (n,), default at rest, at time 0 and without pushes.
 
+        Rotors of elastic gears start where their springs carry the robot's own weight.
+
         Raises:
             ShapeError, InvalidValueError: for other states.
         """
@@ -138,6 +154,9 @@ class MuJoCoPlant(Shown):
         mujoco().mj_resetData(self.model, self.data)
         for warning in self.data.warning:
             warning.number = 1  # MuJoCo prints and logs the first one: `step` raises an error instead
+        if self.elasticity is not None:
+            sag = np.asarray(self.robot.gravity(q), dtype=float) / self.elasticity.numbers(self.robot.n)[0]
+            self.data.qpos[self._motors], self.data.qvel[self._motors] = q + sag, dq
         self.data.qpos[self._dofs], self.data.qvel[self._dofs] = q, dq
         mujoco().mj_forward(self.model, self.data)
         self._choose_integrator()
@@ -146,16 +165,32 @@ class MuJoCoPlant(Shown):
         """Choose steps of at most 1 / rate, where rate is the largest eigenvalue of M^-1 D at the start.
 
         RK4 is stable up to 2.8 / rate. If 1 / rate is less than an eighth of the longest step, an implicit method of
-        first order takes eighths.
+        first order takes eighths. Springs K need steps of at most 1 / frequency with both, the root of the largest
+        eigenvalue of M^-1 K.
         """
-        M, damping = np.zeros((self.robot.n,) * 2), self.model.dof_damping
+        M = np.zeros((self.model.nv,) * 2)
         mujoco().mj_fullM(self.model, self.data, M)
-        rate = np.linalg.eigvals(np.linalg.solve(M, np.diag(damping))).real.max() if damping.any() else 0.0
-        parts = min(max(1.0, ceil(min(self._timestep * rate, _MOST_PARTS + 1))), _MOST_PARTS)
-        explicit = self._timestep * rate <= _MOST_PARTS
+        damped, squared = (self._timestep * _largest_eigenvalue(M, part) for part in self._dampers_and_springs())
+        parts = max(min(ceil(min(damped, _MOST_PARTS + 1)), _MOST_PARTS), ceil(sqrt(self._timestep * squared)), 1)
         kinds = mujoco().mjtIntegrator
-        self.model.opt.integrator = kinds.mjINT_RK4 if explicit else kinds.mjINT_IMPLICITFAST
+        self.model.opt.integrator = kinds.mjINT_RK4 if damped <= _MOST_PARTS else kinds.mjINT_IMPLICITFAST
         self._longest = self._timestep / parts
+
+    def _numbers(self, names: list[str]) -> NDArray[np.intp]:
+        """Where joints stand among all."""
+        return np.array([self.model.joint(name).dofadr[0] for name in names])
+
+    def _dampers_and_springs(self) -> tuple[Array, Array]:
+        """D and K of all joints and rotors."""
+        D = np.diag(self.model.dof_damping)
+        K = np.zeros_like(D)
+        if self.elasticity is not None:
+            stiffness, _, damping = self.elasticity.numbers(self.robot.n)
+            across = np.zeros((self.robot.n, self.model.nv))
+            rows = np.arange(self.robot.n)
+            across[rows, self._motors], across[rows, self._dofs] = 1.0, -1.0
+            D, K = D + across.T * damping @ across, across.T * stiffness @ across
+        return D, K
 
     def push(self, force: ArrayLike, link: Link = None, point: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """Push from now on, in addition to other pushes, until `release`.
@@ -222,3 +257,8 @@ class MuJoCoPlant(Shown):
         steps = max(1, ceil(count))
         self.model.opt.timestep = seconds / steps
         return steps
+
+
+def _largest_eigenvalue(M: Array, K: Array) -> float:
+    """Of M^-1 K, for symmetric M > 0 and K >= 0."""
+    return float(np.linalg.eigvals(np.linalg.solve(M, K)).real.max()) if K.any() else 0.0

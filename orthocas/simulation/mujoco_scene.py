@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.checks import Array, as_number, frozen_array, require_at_least, require_kind
+from orthocas.control.gains import non_negative_gains, positive_gains
 from orthocas.errors import InvalidValueError
 from orthocas.robots import Robot
 from orthocas.robots.tree_checks import require_body
@@ -75,6 +76,34 @@ class Wall:
 
 
 @dataclass(frozen=True, eq=False)
+class Elasticity:
+    """Springs and dampers between the rotors of the motors and the joints, as of gears that give way.
+
+    With rotors at theta, M ddq + C dq + g = k (theta - q) + d (dtheta - dq) + loads and
+    B ddtheta = u - friction - k (theta - q) - d (dtheta - dq). Rotors turn about their own axes only [S1987].
+
+    Args:
+        stiffness: k > 0, (n,) or one number [N m/rad].
+        inertia: B > 0 of the rotors, seen at the joints, which takes the place of the robot's armatures, (n,) or one
+            number [kg m^2].
+        damping: d >= 0, (n,) or one number [N m s/rad].
+    """
+
+    stiffness: ArrayLike
+    inertia: ArrayLike
+    damping: ArrayLike = 0.0
+
+    def numbers(self, n: int) -> tuple[Array, Array, Array]:
+        """Stiffness, inertia and damping of n joints, (n,) each.
+
+        Raises:
+            ShapeError, InvalidValueError: for other shapes and values.
+        """
+        found = [positive_gains(f"{name} of elasticity", getattr(self, name), n) for name in ("stiffness", "inertia")]
+        return found[0], found[1], non_negative_gains("damping of elasticity", self.damping, n)
+
+
+@dataclass(frozen=True, eq=False)
 class MuJoCo:
     """MuJoCo as plant of `simulate`: `simulate(..., plant=MuJoCo(...), control_rate=1000)`.
 
@@ -88,6 +117,7 @@ class MuJoCo:
         payload: a body fixed at the tip, which the controller does not know.
         wall: a wall in the tip's way.
         timestep: longest step of the physics [s], from 1e-6 to 0.01.
+        elasticity: of the gears; default rigid ones. Sensors then measure joints, not rotors.
     """
 
     robot: Robot | None = None
@@ -96,9 +126,10 @@ class MuJoCo:
     payload: Payload | None = None
     wall: Wall | None = None
     timestep: float = TIMESTEP
+    elasticity: Elasticity | None = None
 
     def __post_init__(self) -> None:
-        for name, kind in (("robot", Robot), ("payload", Payload), ("wall", Wall)):
+        for name, kind in (("robot", Robot), ("payload", Payload), ("wall", Wall), ("elasticity", Elasticity)):
             if getattr(self, name) is not None:
                 require_kind(name, getattr(self, name), kind)
         require_kind("stops", self.stops, bool)

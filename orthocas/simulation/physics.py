@@ -38,6 +38,7 @@ def run_physics(
         payload=scene.payload,
         wall=scene.wall,
         timestep=scene.timestep,
+        elasticity=scene.elasticity,
     )
     plant.reset(start[: loop.n], start[loop.n :])
     ticks = int(np.floor(reference.duration * rate + 1e-9))
