@@ -2,8 +2,8 @@
 
 The law of Sec. 9 of [AS2023] gives joint velocities, and their integral is what the servos are asked for. Each servo is
 a spring and a damper between the wanted and the actual motor, plus the gravity torque at the wanted posture. Gears are
-rigid, or give way: then the servos hold the rotors where the joints should be, as a robot does that measures its motors
-only, and the joints hang and swing on springs. The motion is logged as a lab would log it, and drawn from the log.
+rigid, or give way: then the servos measure the rotors only, hold them where the springs carry the weight of the wanted
+posture, and the joints swing on their springs. The motion is logged as a lab would log it, and drawn from the log.
 """
 
 import argparse
@@ -44,6 +44,7 @@ def servo_run(
     plant = MuJoCoPlant(robot, friction=friction, timestep=TICK, elasticity=gears)
     plant.reset(wanted[0])
     # what a joint feels while the others are free: the diagonal of M is too much, as A1 and A3 are nearly parallel
+    sag = np.zeros(robot.n)
     inertia = 1 / np.diagonal(np.linalg.inv(np.array(robot.function("mass_matrix")(wanted[0]))))
     if gears is not None:
         inertia = gears.numbers(robot.n)[1]  # a servo feels its rotor first
@@ -54,7 +55,9 @@ def servo_run(
         if k % LOGGED == 0:
             rows.append(plant.q)
         gravity = np.asarray(robot.gravity(wanted[k]), dtype=float).ravel()
-        error, rate = wanted[k] - plant.motor_q, rates[k] - plant.motor_dq
+        if gears is not None:
+            sag = gravity / gears.numbers(robot.n)[0]
+        error, rate = wanted[k] + sag - plant.motor_q, rates[k] - plant.motor_dq
         plant.step(stiffness * error + damping * rate + gravity, TICK)
     return np.array(rows)
 
