@@ -28,6 +28,7 @@ VISCOUS = (2.0, 2.0, 1.0, 1.0, 0.5, 0.2, 0.2)  # [N m s/rad]
 GEARS = Elasticity(  # of the order of light arms with strain wave gears; those of the paper's arm are not published
     stiffness=(10e3, 10e3, 8e3, 8e3, 6e3, 4e3, 4e3), inertia=(3.0, 3.0, 2.0, 2.0, 1.0, 0.5, 0.5), damping=10.0
 )
+RESTING = 150  # rows of the log
 SECONDS = 5.0  # of the quick run
 
 
@@ -60,6 +61,16 @@ def servo_run(
         error, rate = wanted[k] + sag - plant.motor_q, rates[k] - plant.motor_dq
         plant.step(stiffness * error + damping * rate + gravity, TICK)
     return np.array(rows)
+
+
+def coupling(chart: Chart, q: Array, desired: Array) -> dict[str, float]:
+    """Largest error of each component of phi while its reference has not moved for 1.5 s, at rows of the log."""
+    phi, found = chart.phi(q), {}
+    for k, label in enumerate(chart.labels):
+        still = 1e-5 * max(1.0, float(np.ptp(desired[:, k])))
+        rests = [np.ptp(desired[max(0, i - RESTING) : i + 1, k]) < still for i in range(len(q))]
+        found[f"coupling_{label}"] = float(np.abs(phi[rests, k] - desired[rests, k]).max(initial=0.0))
+    return found
 
 
 def write_log(path: Path, chart: Chart, times: Array, q: Array, desired: Array) -> None:
@@ -102,7 +113,7 @@ def main(out: Path, quick: bool = False) -> dict[str, dict[str, float]]:
         write_log(path, chart, times[logged], q, desired[logged])
         drawing = draw_log(path, chart)
         drawing.figures[""].savefig(path.with_suffix(".png"), dpi=110)
-        found[name] = dict(drawing.numbers)
+        found[name] = dict(drawing.numbers) | coupling(chart, q, desired[logged])
     return found
 
 

@@ -91,7 +91,7 @@ class InjectivityJudge:
         symmetric = product + transposed
         vectors = np.linalg.eigh(np.nan_to_num(np.moveaxis(symmetric.centre, -1, 0)))[1][:, :, ::-1]
         turned = between(vectors.transpose(0, 2, 1), symmetric, vectors)
-        proved = _all_positive(pivots(turned)) & self._within_a_turn(J)
+        proved: Array = np.asarray(_all_positive(pivots(turned)) & self._within_a_turn(J))
         return proved, proved, np.zeros(boxes), np.zeros(boxes), _influences(turned)
 
     def _within_a_turn(self, J: TaylorModel) -> NDArray[np.bool_]:
