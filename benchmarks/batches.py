@@ -2,15 +2,13 @@
 
 The C is that of `generate_c(..., rows=True)`, compiled for this processor.
 
-Rows of PyTorch and JAX appear where they are installed. Every figure is the best of three runs.
-
-    python benchmarks/batches.py [ROWS]
+Rows of PyTorch and JAX appear where they are installed. Every figure is the best of three runs. `--quick` takes 1,000
+rows.
 """
 
 import ctypes
 import importlib.util
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +17,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
+from benchmark import run, table
 
 import orthocas as oc
 from orthocas import problems
@@ -100,19 +99,20 @@ def of_jax(arm: ModuleType, points: Array) -> dict[str, Callable[[], Any]]:
     return {name: lambda name=name: compiled[name](q).block_until_ready() for name in NAMES}
 
 
-def main(rows: int = 1_000_000) -> list[str]:
-    """Rows of a table."""
+def main(quick: bool = False) -> list[str]:
+    """Print a table row by row."""
+    rows = 1_000 if quick else 1_000_000
     chart = oc.fit(problems.get("iiwa"), oc.Polynomial(4)).chart
     points = sample_uniform(chart.problem.domain, rows, 3)
-    table = [f"| {rows} rows, degree 4, [us a row] | xi | phi | Jacobian |", "| --- | --- | --- | --- |"]
+
+    def row(name: str, calls: dict[str, Callable[[], Any]]) -> str:
+        figures = (f"{best(calls[one]) / rows * 1e6:.2f}" if one in calls else "-" for one in NAMES)
+        return f"| {name} | {' | '.join(figures)} |"
+
     with TemporaryDirectory() as folder:
-        for name, calls in functions(chart, points, Path(folder)).items():
-            figures = " | ".join(
-                f"{best(calls[function]) / rows * 1e6:.2f}" if function in calls else "-" for function in NAMES
-            )
-            table.append(f"| {name} | {figures} |")
-    return table
+        header = f"| {rows} rows, degree 4, [us a row] | xi | phi | Jacobian |\n| --- | --- | --- | --- |"
+        return table(header, (row(*one) for one in functions(chart, points, Path(folder)).items()))
 
 
 if __name__ == "__main__":
-    print("\n".join(main(*map(int, sys.argv[1:]))))
+    run(main, __doc__)

@@ -19,12 +19,14 @@ _OPTIONS = (
     *("--enable-unsafe-swiftshader", "--remote-debugging-port=0", "--no-first-run", "--hide-scrollbars"),
     *("--disable-extensions", "--disable-background-networking", "--disable-component-update"),
 )
+_PLAIN = ("--webgl-antialias-mode=none", "--webgl-msaa-sample-count=0")
 
 
 class Page:
     """One tab."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, process: int) -> None:
+        self.process = process  #: number of the browser's process
         self._socket = import_module("websockets.sync.client").connect(address, max_size=None)
         self._numbers = itertools.count(1)
         self.call("Page.enable")
@@ -80,16 +82,20 @@ class Page:
 
 
 @contextmanager
-def browser(folder: Path, size: tuple[int, int] = (1000, 640)) -> Iterator[Page]:
-    """A browser with an empty profile in a folder, and its tab; small, because it renders without a graphics card."""
+def browser(folder: Path, size: tuple[int, int] = (1000, 640), smooth: bool = True) -> Iterator[Page]:
+    """A browser with an empty profile in a folder, and its tab.
+
+    It renders without a graphics card, so small windows are faster, and pictures without antialiasing (`smooth`).
+    """
     assert PROGRAM is not None
-    words = [PROGRAM, *_OPTIONS, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={folder}", "about:blank"]
+    options = (*_OPTIONS, *(() if smooth else _PLAIN), f"--window-size={size[0]},{size[1]}")
+    words = [PROGRAM, *options, f"--user-data-dir={folder}", "about:blank"]
     process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         port = _port(folder / "DevToolsActivePort", process)
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
             tabs = [tab for tab in json.load(answer) if tab["type"] == "page"]
-        yield Page(tabs[0]["webSocketDebuggerUrl"])
+        yield Page(tabs[0]["webSocketDebuggerUrl"], process.pid)
     finally:
         process.terminate()
         process.wait(10)

@@ -7,6 +7,8 @@ import tempfile
 import time
 from statistics import median
 
+from benchmark import run, table
+
 COMMANDS = (
     ["fit", "iiwa", "--out", "a.orthocas"],
     ["fit", "iiwa", "--param", "polynomial:5", "--out", "b.orthocas"],
@@ -25,15 +27,18 @@ def measure(words: list[str], folder: str) -> tuple[float, float]:
     return time.perf_counter() - start, usage.ru_maxrss / 1024
 
 
-def main(runs: int = 5) -> list[str]:
-    """Rows of a table."""
-    rows = ["| command | wall [s] | peak memory [MiB] |", "| --- | --- | --- |"]
+def row(words: list[str], folder: str, runs: int) -> str:
+    """Medians of one command."""
+    seconds, memory = zip(*(measure(words, folder) for _ in range(runs)), strict=True)
+    return f"| `orthocas {' '.join(words)}` | {median(seconds):.2f} | {median(memory):.0f} |"
+
+
+def main(quick: bool = False) -> list[str]:
+    """Print a table row by row; `quick` takes one run of each."""
     with tempfile.TemporaryDirectory() as folder:
-        for words in COMMANDS:
-            seconds, memory = zip(*(measure(words, folder) for _ in range(runs)), strict=True)
-            rows.append(f"| `orthocas {' '.join(words)}` | {median(seconds):.2f} | {median(memory):.0f} |")
-    return rows
+        rows = (row(words, folder, 1 if quick else 5) for words in COMMANDS)
+        return table("| command | wall [s] | peak memory [MiB] |\n| --- | --- | --- |", rows)
 
 
 if __name__ == "__main__":
-    print("\n".join(main()))
+    run(main, __doc__)

@@ -5,6 +5,7 @@ from statistics import median
 
 import casadi as ca
 import numpy as np
+from benchmark import run
 from c_timing import nanoseconds_per_call
 
 from orthocas.casadi_tools.columns import COLUMNS
@@ -14,8 +15,8 @@ from orthocas.fitting.loss.residuals import loss_columns
 BLOCKS = 16
 
 
-def main(rounds: int = 9) -> dict[str, float]:
-    """Nanoseconds per sample of both."""
+def main(quick: bool = False) -> dict[str, float]:
+    """Print nanoseconds per sample of both; `quick` takes one round of columns."""
     loss = Loss.of(Sizes(n=7, m=3, r=4, identity_metric=True), Weights.of((1000.0, 30.0)).by_name)
     J, data = loss.arguments()
     value = ca.sumsqr(loss.residuals(J, data)) / 2
@@ -24,13 +25,15 @@ def main(rounds: int = 9) -> dict[str, float]:
     inputs = [rng.normal(size=(BLOCKS, compiled.numel_in(i), COLUMNS)) for i in range(compiled.n_in())]
     columns(*inputs)
     times = []
-    for _ in range(rounds):
+    for _ in range(1 if quick else 9):
         start = time.perf_counter()
         columns(*inputs)
         times.append(time.perf_counter() - start)
-    return {**nanoseconds_per_call({"compiled": compiled}), "columns": 1e9 * median(times) / (BLOCKS * COLUMNS)}
+    found = {**nanoseconds_per_call({"compiled": compiled}), "columns": 1e9 * median(times) / (BLOCKS * COLUMNS)}
+    for name, value in found.items():
+        print(f"{name}: {value:.0f} ns per sample")
+    return found
 
 
 if __name__ == "__main__":
-    for name, value in main().items():
-        print(f"{name}: {value:.0f} ns per sample")
+    run(main, __doc__)

@@ -31,8 +31,8 @@ int plain_control(const double *q, const double *dq, const double *reference, co
 
 def laws(quick: bool) -> Iterator[tuple[str, oc.Chart, Controller]]:
     """Title, chart and controller."""
-    known = problems.get("iiwa")
-    inertial = oc.Problem(known.robot, known.task, "inertia", known.domain, "iiwa_M")
+    known = problems.get("planar_3r_xy" if quick else "iiwa")
+    inertial = oc.Problem(known.robot, known.task, "inertia", known.domain, f"{known.name}_M")
     for degree in (2,) if quick else (4, 5, 6):
         chart = oc.fit(inertial, oc.Polynomial(degree), samples=3000, weights=(1000, 30, 150, 1)).chart
         title = f"polynomial:{degree}"

@@ -9,14 +9,15 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 from adam.casadi import KinDynComputations
+from benchmark import run
 from c_timing import nanoseconds_per_call
 
 import orthocas as oc
 from orthocas.problems import iiwa
 
 
-def main() -> dict[str, float]:
-    """Nanoseconds per call, median of 9 alternating rounds in one process."""
+def main(quick: bool = False) -> dict[str, float]:
+    """Print nanoseconds per call, medians of 9 alternating rounds in one process; `quick`: few calls of Pinocchio."""
     robot = iiwa.robot()
     q, dq = ca.SX.sym("q", robot.n), ca.SX.sym("dq", robot.n)
     ours = [robot.function("mass_matrix")(q), robot.function("bias")(q, dq)]
@@ -38,8 +39,10 @@ def main() -> dict[str, float]:
     functions["generated_library"] = ca.Function("generated_library", [q, dq], [*ours, robot.function("gravity")(q)])
     with tempfile.TemporaryDirectory() as folder:
         times = nanoseconds_per_call(functions, sources={"generated_library": _generated(Path(folder))})
-    times["pinocchio_from_python"] = _pinocchio_nanoseconds(model)
+    times["pinocchio_from_python"] = _pinocchio_nanoseconds(model, 100 if quick else 20_000)
     times["ratio"] = times["orthocas"] / times["adam_robotics"]
+    for name, value in times.items():
+        print(f"{name:>22}: {value:8.2f}{'' if name == 'ratio' else ' ns'}")
     return times
 
 
@@ -55,7 +58,7 @@ int generated_library(const double** arg, double** res, long long* iw, double* w
 """
 
 
-def _pinocchio_nanoseconds(model: pin.Model, calls: int = 20_000) -> float:
+def _pinocchio_nanoseconds(model: pin.Model, calls: int) -> float:
     data, q = model.createData(), np.full(model.nq, 0.3)
     start = time.perf_counter()
     for _ in range(calls):
@@ -65,5 +68,4 @@ def _pinocchio_nanoseconds(model: pin.Model, calls: int = 20_000) -> float:
 
 
 if __name__ == "__main__":
-    for name, value in main().items():
-        print(f"{name:>22}: {value:8.2f}{'' if name == 'ratio' else ' ns'}")
+    run(main, __doc__)

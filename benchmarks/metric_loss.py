@@ -131,10 +131,12 @@ def largest_index(law: Controller, chart: oc.Chart) -> float:
     return float(np.nanmax(coupling_index(chart, reference, run).index[: chart.m, chart.m :]))
 
 
-def measured(arm: str, degree: int, regularity: float, quick: bool) -> Iterator[Measured]:
+def measured(
+    arm: str, degree: int, regularity: float, count: int, seeds: int, quick: bool = False
+) -> Iterator[Measured]:
     """Everything about one arm."""
-    for place, problem in enumerate(places(problem_of(arm), 1 if quick else 4)):
-        for seed in range(1 if quick else 2):
+    for place, problem in enumerate(places(problem_of(arm), 1 if quick else count)):
+        for seed in range(1 if quick else seeds):
             targets = goals(problem, 1 if quick else 2, 100 * place + seed)
             for angles in ANGLES:
                 weights = oc.Weights(regularity=regularity, folds=0.0, angles=angles)
@@ -184,13 +186,15 @@ def summary(rows: list[Measured]) -> dict[str, tuple[float, float, float, float,
     return found
 
 
-def main(quick: bool = False, arms: tuple[str, ...] = tuple(ARMS), regularity: float = 150.0) -> dict[str, float]:
+def main(
+    quick: bool = False, arms: tuple[str, ...] = tuple(ARMS), regularity: float = 150.0, count: int = 4, seeds: int = 2
+) -> dict[str, float]:
     """Print a table row by row; return the ratios by arm and figure."""
     print("| arm | figure | paper's loss | loss in the metric | ratio | better in |")
     print("| --- | --- | --- | --- | --- | --- |")
     found, everything = {}, []
     for arm in arms[:1] if quick else arms:
-        rows = list(measured(arm, 3 if quick else ARMS[arm], regularity, quick))
+        rows = list(measured(arm, 3 if quick else ARMS[arm], regularity, count, seeds, quick))
         everything += [
             Measured(r.arm, 10_000 * arms.index(arm) + r.place, r.seed, r.angles, r.what, r.value) for r in rows
         ]
@@ -212,5 +216,7 @@ if __name__ == "__main__":
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--arms", default=",".join(ARMS), help="Comma-separated, out of those built in.")
     parser.add_argument("--regularity", type=float, default=150.0, help="Weight lambda3 of both losses.")
+    parser.add_argument("--places", type=int, default=4, help="Boxes of each arm.")
+    parser.add_argument("--seeds", type=int, default=2, help="Fits with each loss in each box.")
     choice = parser.parse_args()
-    main(choice.quick, tuple(choice.arms.split(",")), choice.regularity)
+    main(choice.quick, tuple(choice.arms.split(",")), choice.regularity, choice.places, choice.seeds)

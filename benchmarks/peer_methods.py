@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import pinocchio as pin
 from peer_arms import TICK, Arm, Target
+from scipy.spatial import KDTree
 from textbook_law import TextbookLaw
 
 import orthocas as oc
@@ -20,6 +21,8 @@ from orthocas.control import PDPlus
 from orthocas.control.matched_stiffness import SPRING_FREQUENCY
 from orthocas.errors import RobotError, SimulationError
 from orthocas.simulation import MuJoCoPlant
+
+KNOWN, TRIED = 20_000, 10  # joint positions of an atlas, and how many of them are tried
 
 
 class Method(Protocol):
@@ -59,6 +62,38 @@ class OnChart:
     def solutions(self, commands: Array) -> Array:
         """With the wanted x, and xi as near as possible, (N, n), all at once."""
         return self.chart.solve(commands, inside=True).q
+
+
+class OnAtlas:
+    """An atlas with a position task, for targets only: in the charts of known positions whose tool is nearest."""
+
+    def __init__(self, arm: Arm, path: str) -> None:
+        self.atlas = oc.Atlas.load(path)
+        low, high = np.maximum(arm.robot.lower, -np.pi), np.minimum(arm.robot.upper, np.pi)
+        q = np.random.default_rng(0).uniform(low, high, (KNOWN, arm.robot.n))
+        charts = self.atlas.chart_at(q)
+        self.q, self.charts = q[charts >= 0], charts[charts >= 0]
+        self.xi, self.tree = self.atlas.xi(self.q, self.charts), KDTree(arm.chart.task(self.q))
+        self.robot, self.middle = arm.robot, arm.home
+
+    def command(self, target: Target) -> Array:
+        """The position of the tool."""
+        return target.x
+
+    def solutions(self, commands: Array) -> Array:
+        """With the wanted x, and xi as at a known position, (N, n), all at once; the middle where none is found."""
+        near = self.tree.query(commands, TRIED)[1]
+        q = np.tile(self.middle, (len(commands), 1))
+        left = np.arange(len(commands))
+        for known in near.T:
+            rows = known[left]
+            found = self.atlas.inverse(commands[left], self.xi[rows], self.charts[rows], self.q[rows])
+            good = ((found >= self.robot.lower) & (found <= self.robot.upper)).all(axis=1)  # NaN is not
+            q[left[good]] = found[good]
+            left = left[~good]
+            if not left.size:
+                break
+        return q
 
 
 class Pink:

@@ -24,24 +24,28 @@ Peers get whole postures where a chart gets xi: those of the chart's inverse map
 
 import argparse
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from peer_arms import MOVE, MOVE_TIME, TICK, Arm, Target, circles, lines, self_motion, smooth
-from peer_methods import SSIK, Method, Mink, OnChart, OperationalSpace, Pink, methods
+from peer_methods import SSIK, Method, Mink, OnAtlas, OnChart, OperationalSpace, Pink, methods
 
 from orthocas.checks import Array
 from orthocas.domains import sample_uniform
 
-ARMS, TASKS = ("iiwa", "panda", "xarm7"), ("position", "pose")
+ARMS, TASKS, PARTS = ("iiwa", "panda", "xarm7"), ("position", "pose"), ("motions", "shares")
 CLOSE, CLOSE_TURN = 1e-4, 1e-3  # a target is found: [m], [rad]
 FOLLOWED = 1e-3  # [m]
 SETTLING = 1.0  # of a simulated arm after the circles [s]
 STEPS, UNHURRIED = 100, 10.0  # of an iterative solver for one target; the time of each [s]
+AT_REST = 1e-9  # joint motion of a step after which others change nothing [rad]
+FEW = 50  # targets for simulations
 COLUMNS = (
     *("method", "drift [rad]", "tool error [mm]", "reached", "left [rad]", "lines", "outside limits"),
-    *("fastest joint [rad/s]", "targets of the domain", "of the joint range", "tick [us]"),
+    *("fastest joint [rad/s]", "tick [us]"),
 )
+SHARES = ("targets of the domain", "of the joint range", "targets")
 
 
 @dataclass(frozen=True)
@@ -88,10 +92,10 @@ def moved_by_ssik(method: SSIK, arm: Arm) -> tuple[float, float, float]:
     return max(errors), 1.0, float(np.abs(path[-1] - arm.home).max())
 
 
-def found(method: Method, arm: Arm, points: Array) -> float:
+def found(method: Method | OnAtlas, arm: Arm, points: Array) -> float:
     """Share of targets, those of joint positions (N, n), that are reached from home within the joint limits."""
     targets = [arm.target(q, posture=arm.home) for q in points]
-    if isinstance(method, OnChart):
+    if isinstance(method, OnChart | OnAtlas):
         reached = method.solutions(np.array([method.command(target) for target in targets]))
         return float(np.mean([is_found(arm, *pair) for pair in zip(reached, targets, strict=True)]))
     if isinstance(method, Pink | Mink):
@@ -104,10 +108,16 @@ def found(method: Method, arm: Arm, points: Array) -> float:
 def found_one(method: Method, arm: Arm, target: Target) -> bool:
     """Whether a target is reached from home."""
     method.start(arm.home)
-    command = method.command(target)
+    command, q = method.command(target), arm.home
     if isinstance(method, SSIK):
         return is_found(arm, method.solution(command), target)
-    return any(is_found(arm, method.tick(command), target) for _ in range(STEPS))
+    for _ in range(STEPS):
+        before, q = q, method.tick(command)
+        if is_found(arm, q, target):
+            return True
+        if not isinstance(method, OperationalSpace) and np.abs(q - before).max() < AT_REST:
+            break
+    return False
 
 
 def is_found(arm: Arm, q: Array, target: Target) -> bool:
@@ -121,8 +131,8 @@ def inside_limits(arm: Arm, q: Array) -> Array:
     return np.asarray(((q >= arm.robot.lower - 1e-9) & (q <= arm.robot.upper + 1e-9)).all(axis=1))
 
 
-def row(name: str, method: Method, arm: Arm, options: argparse.Namespace) -> str:
-    """All columns of a method."""
+def motion(name: str, method: Method, arm: Arm, options: argparse.Namespace) -> list[str]:
+    """The columns of motions."""
     settles = isinstance(method, OperationalSpace)
     rest = [arm.target(arm.home)] * round(SETTLING / TICK if settles else 0)
     turned = followed(method, arm, circles(arm, options.circles) + rest, arm.home)
@@ -133,18 +143,36 @@ def row(name: str, method: Method, arm: Arm, options: argparse.Namespace) -> str
     whole = sum(bool(run.errors.max() < FOLLOWED) for run in runs)
     outside = sum(int((~inside_limits(arm, run.q)).sum()) for run in runs)
     fastest = max(float(np.abs(np.diff(run.q, axis=0)).max()) / TICK for run in runs)
-    rng = np.random.default_rng(7)
-    everywhere = rng.uniform(
-        np.maximum(arm.robot.lower, -np.pi), np.minimum(arm.robot.upper, np.pi), (options.peer_targets, arm.robot.n)
-    )
-    near = sample_uniform(arm.domain, options.targets, 8)
     seconds = np.median(turned.seconds) / (method.calls if settles else 1)
+    columns = [name, f"{drift:.1e}", f"{1e3 * error:.2g}", f"{100 * reached:.0f} %", f"{left:.1e}"]
+    return [*columns, f"{whole} of {len(runs)}", f"{outside}", f"{fastest:.1f}", f"{1e6 * seconds:.0f}"]
+
+
+def shares(method: Method | OnAtlas, arm: Arm, options: argparse.Namespace) -> list[str]:
+    """The columns of targets that are found."""
     count = options.targets if isinstance(method, OnChart) else options.peer_targets
-    return (
-        f"| {name} | {drift:.1e} | {1e3 * error:.2g} | {100 * reached:.0f} % | {left:.1e} | {whole} of {len(runs)} "
-        f"| {outside} | {fastest:.1f} | {100 * found(method, arm, near[:count]):.1f} % "
-        f"| {100 * found(method, arm, everywhere):.1f} % | {1e6 * seconds:.0f} |"
-    )
+    count = min(count, FEW) if isinstance(method, OperationalSpace) else count
+    low, high = np.maximum(arm.robot.lower, -np.pi), np.minimum(arm.robot.upper, np.pi)
+    everywhere = np.random.default_rng(7).uniform(low, high, (count, arm.robot.n))
+    found_of = [found(method, arm, points) for points in (sample_uniform(arm.domain, count, 8), everywhere)]
+    return [*(f"{100 * share:.1f} %" for share in found_of), f"{count:,}"]
+
+
+def table(arm: Arm, options: argparse.Namespace) -> None:
+    """Print the table of an arm and a task."""
+    moves = "motions" in options.parts
+    columns = [*(COLUMNS if moves else COLUMNS[:1]), *(SHARES if "shares" in options.parts else ())]
+    print(f"\n**{arm.name}, {arm.task}**\n\n| {' | '.join(columns)} |\n" + "| --- " * len(columns) + "|")
+    rows: list[tuple[str, Callable[[], Method | OnAtlas]]] = [*methods(arm)]
+    if options.atlas and (arm.name, arm.task) == ("iiwa", "position"):
+        rows.append(("atlas", lambda: OnAtlas(arm, options.atlas)))
+    for label, build in rows:
+        if not options.methods or label.startswith(tuple(options.methods)):
+            method = build()
+            words = [label] if isinstance(method, OnAtlas) or not moves else motion(label, method, arm, options)
+            words += ["-"] * (len(COLUMNS) - 1 if moves and len(words) == 1 else 0)
+            words += shares(method, arm, options) if "shares" in options.parts else []
+            print(f"| {' | '.join(words)} |", flush=True)
 
 
 def main() -> None:
@@ -152,8 +180,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--circles", type=int, default=50)
     parser.add_argument("--lines", type=int, default=40)
-    parser.add_argument("--targets", type=int, default=10_000, help="of the domain, for charts")
-    parser.add_argument("--peer-targets", type=int, default=1000, help="of the domain for others, of the joint range")
+    parser.add_argument("--targets", type=int, default=10_000, help="for charts")
+    parser.add_argument("--peer-targets", type=int, default=10_000, help="for others")
+    parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS, help="motions, shares of targets found")
+    parser.add_argument("--atlas", help="file of an atlas, for a row of the 7-DoF arm's positions")
     parser.add_argument("--methods", nargs="+", help="rows by the beginnings of their names; default: all")
     parser.add_argument("--arms", nargs="+", default=ARMS, choices=ARMS)
     parser.add_argument("--tasks", nargs="+", default=TASKS, choices=TASKS)
@@ -163,12 +193,7 @@ def main() -> None:
         options.circles, options.lines, options.targets, options.peer_targets, options.arms = 1, 2, 20, 5, ARMS[:1]
     for task in options.tasks:
         for name in options.arms:
-            arm = Arm(name, task)
-            print(f"\n**{name}, {task}**\n")
-            print(f"| {' | '.join(COLUMNS)} |\n" + "| --- " * len(COLUMNS) + "|")
-            for label, build in methods(arm):
-                if not options.methods or label.startswith(tuple(options.methods)):
-                    print(row(label, build(), arm, options), flush=True)
+            table(Arm(name, task), options)
 
 
 if __name__ == "__main__":

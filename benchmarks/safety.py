@@ -4,6 +4,8 @@ Forces at elbow, wrist and tip in 26 directions, as strong as the motors could h
 400 N), for 0.05 to 0.5 s, from random postures in the inner 60 % of the domain. Two seconds after the push, the program
 asks the catcher for the law again, and the arm goes back at 0.3 rad/s of its fastest joint, which takes long for wrists
 that the push turned around. PD+ coupled with default gains and default settings, cubic coordinates.
+
+`--cases "iiwa pose:z euclidean, panda pose:z euclidean"` pushes others than position tasks with A = M.
 """
 
 import argparse
@@ -21,7 +23,7 @@ from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import ControlStatus, PDPlus
 from orthocas.simulation import MuJoCoPlant
 
-ARMS = ("iiwa", "panda", "xarm7")
+CASES = ("iiwa position inertia", "panda position inertia", "xarm7 position inertia")  # robot, task, metric
 PLACES = {"elbow": 3, "wrist": 5, "tip": None}
 DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 TICK, QUIET, AFTER, LONGEST = 1e-3, 0.3, 2.0, 60.0  # [s] without push, until the law is asked for, until the end
@@ -45,16 +47,20 @@ class Push:
 def main() -> None:
     """Print a table in Markdown."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", default=", ".join(CASES), help="robot, task and metric of each row")
     parser.add_argument("--runs", type=int, default=200, help="pushes of each arm")
     parser.add_argument("--quick", action="store_true", help="six pushes of one arm")
     options = parser.parse_args()
-    arms, runs = (ARMS[:1], 6) if options.quick else (ARMS, options.runs)
-    print("| arm | left | caught | below 2 rad/s after | at rest after | fastest joint | torque a tick | back, after |")
+    cases, runs = (CASES[:1], 6) if options.quick else (options.cases.split(","), options.runs)
+    print(
+        "| case | left | caught | below 2 rad/s after | at rest after | fastest joint | torque a tick | back, after |"
+    )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for name in arms:
-        found = pushes(chart_of(name, "position", "inertia"), runs)
+    for case in cases:
+        name, task, metric = case.split()
+        found = pushes(chart_of(name, task, metric), runs)
         print(
-            f"| {name} | {sum(p.left for p in found)} of {runs} | {sum(p.caught for p in found)} "
+            f"| {name}, {task}, {metric} | {sum(p.left for p in found)} of {runs} | {sum(p.caught for p in found)} "
             f"| {max(p.slow_after for p in found):.2f} s | {max(p.rest_after for p in found):.2f} s "
             f"| {max(p.fastest for p in found):.0f} rad/s | {max(p.change for p in found):.2f} N m "
             f"| {sum(p.back_after < np.inf for p in found)}, {max(p.back_after for p in found):.1f} s |",

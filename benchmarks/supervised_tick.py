@@ -18,7 +18,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import CompiledLibrary, Supervisor, check_c, compile_shared, time_ticks
 from orthocas.codegen.library import compilers
-from orthocas.control import Controller, PDPlus
+from orthocas.control import PDPlus
 from orthocas.simulation import MuJoCoPlant
 
 TICK = 1e-3
@@ -57,7 +57,7 @@ def main(quick: bool = False) -> dict[str, float]:
             ticks = [time.median for time in time_ticks([(law, library), (law, supervised)], 2000 if quick else 50_000)]
             proofs.append(max(check_c(generated, chart, law, 100 if quick else 1000).differences.values()))
             if coupling == "coupled":
-                paths.append(flange(chart, law, Supervisor(library, law), 1 if quick else 3))
+                paths.append(flange(chart, Supervisor(library, law), 1.0 if quick else 12.0))
             print(
                 f"| {coupling} | {library.precision.c_name} | {ticks[0]:.2f} | {ticks[1]:.2f} "
                 f"| {library.path.stat().st_size / 1024:.0f} | {generated.stack_bytes} | {sizes[0]} | {sizes[1]} "
@@ -73,19 +73,19 @@ def _supervised(folder: Path, library: CompiledLibrary) -> tuple[CompiledLibrary
     """A library whose control function is a tick of the supervised law, and the sizes of state and settings [bytes]."""
     source, target = folder / "supervised.c", folder / "libsupervised.so"
     source.write_text(_SUPERVISED)
-    number, sources = f"-DNUMBER={library.precision.c_name}", [str(source), str(folder / "arm.c")]
-    subprocess.run([compilers()[0], "-O2", "-fPIC", "-shared", number, *sources, "-o", str(target), "-lm"], check=True)
+    words = ["-O2", "-fPIC", "-shared", f"-DNUMBER={library.precision.c_name}", str(source), str(library.path)]
+    subprocess.run([compilers()[0], *words, f"-Wl,-rpath,{folder}", "-o", str(target), "-lm"], check=True)
     supervised = CompiledLibrary(target, "supervised", library.n, library.single_precision)
     return supervised, list((ctypes.c_int * 2).from_address(supervised.address("sizes")))
 
 
-def flange(chart: oc.Chart, law: Controller, supervisor: Supervisor, circles: int) -> np.ndarray:
-    """Positions of the flange on a circle in MuJoCo, (ticks, 3)."""
+def flange(chart: oc.Chart, supervisor: Supervisor, seconds: float) -> np.ndarray:
+    """Positions of the flange on a circle of 4 s in MuJoCo, (ticks, 3)."""
     plant, q = MuJoCoPlant(chart.problem.robot), chart.problem.domain.centre
     plant.reset(q)
     supervisor.start(q)
     home, path = chart.phi(q), []
-    for k in range(round(4 * circles / TICK)):
+    for k in range(round(seconds / TICK)):
         angle, rate = 2 * np.pi * k * TICK / 4, 2 * np.pi / 4
         reference = np.concatenate([home, np.zeros(2 * chart.n)])
         reference[[1, 2]] += 0.05 * np.array([1 - np.cos(angle), np.sin(angle)])
@@ -93,8 +93,8 @@ def flange(chart: oc.Chart, law: Controller, supervisor: Supervisor, circles: in
         reference[2 * chart.n + np.array([1, 2])] = 0.05 * rate**2 * np.array([np.cos(angle), -np.sin(angle)])
         command, _ = supervisor.step(plant.q, plant.dq, reference, TICK)
         plant.step(command, TICK)
-        path.append(chart.phi(plant.q)[: chart.m])
-    return np.array(path)
+        path.append(plant.q)
+    return chart.phi(np.array(path))[:, : chart.m]
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     report = oc.evaluate(fit.chart, samples=5_000 if quick else 100_000)
     fit.chart.save(out / "iiwa.orthocas")
     quality_figure(report).savefig(out / "iiwa_quality.png", dpi=150)
-    self_motion_figure(fit.chart).savefig(out / "iiwa_self_motion.png", dpi=150)
+    self_motion_figure(fit.chart, reach=None).savefig(out / "iiwa_self_motion.png", dpi=150)
     return {
         "task_std_deg": report.task_angle.std,
         "mutual_std_deg": report.mutual_angle.std,

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     )
     from orthocas.atlases.atlas import Atlas
     from orthocas.atlases.building import build_atlas
+    from orthocas.atlases.chart_along import chart_along
     from orthocas.atlases.corridor_problem import corridor_problem
     from orthocas.atlases.coverage import Coverage, evaluate_atlas
     from orthocas.atlases.part import AtlasPart
@@ -110,6 +111,7 @@ __all__ = [
     "build_atlas",
     "certified_box",
     "certify",
+    "chart_along",
     "charts",
     "check",
     "check_certificate",
@@ -155,6 +157,7 @@ __all__ = [
 _HOMES = {
     "orthocas.atlases.atlas": ["Atlas"],
     "orthocas.atlases.building": ["build_atlas"],
+    "orthocas.atlases.chart_along": ["chart_along"],
     "orthocas.atlases.corridor_problem": ["corridor_problem"],
     "orthocas.atlases.coverage": ["Coverage", "evaluate_atlas"],
     "orthocas.atlases.part": ["AtlasPart"],

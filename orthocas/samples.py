@@ -114,7 +114,8 @@ def samples_at(problem: Problem, points: Array) -> Samples:
     """Samples at given joint positions (N, n)."""
     J = task_jacobians(problem, points)
     kept = np.all((J**2).sum(axis=2) > 0, axis=1)
-    points, J = points[kept], J[kept]
+    if not kept.all():
+        points, J = points[kept], J[kept]
     inverse: Array | None = None
     if not problem.metric.is_identity:
         inverse = np.asarray(np.linalg.inv(metric_matrices(problem.metric, points)), dtype=float)

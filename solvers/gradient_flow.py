@@ -6,6 +6,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.cached import building
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array, require_at_least, require_count
 from orthocas.minimising.best_point import BestPoint
@@ -85,7 +86,7 @@ class _Run:
             status = self._start()
             if status is not None:
                 return status
-        with deferred():
+        with deferred(), building:
             node = self._flow_node()
             integrator = self._integrator(node)
         while best.iterations < limit and not self.converged:

@@ -6,6 +6,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.cached import building
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array, require_at_least, require_count
 from orthocas.minimising.best_point import BestPoint
@@ -83,7 +84,8 @@ class _Run:
             return self._outcome(Status.ITERATION_LIMIT)
         try:
             with deferred():
-                solver = self._solver()
+                with building:
+                    solver = self._solver()
                 solver(**start)
             for node in self._nodes:
                 node.reraise()

@@ -6,6 +6,7 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.domains import sample_uniform
 
 
 def with_metric(problem: oc.Problem, metric: str) -> oc.Problem:
@@ -29,3 +30,10 @@ def with_upper_limit(robot: oc.Robot, joint: int, upper: float, effort: float = 
     limits = robot.tree.upper.copy()
     limits[joint] = upper
     return oc.Robot(replace(robot.tree, upper=limits, effort_limits=np.full(robot.n, effort)))
+
+
+def beyond_domain(chart: oc.Chart, count: int, share: float) -> np.ndarray:
+    """Joint positions of a domain that is wider by a share."""
+    domain = chart.problem.domain
+    points: np.ndarray = domain.centre + share * (sample_uniform(domain, count, 3) - domain.centre)
+    return points

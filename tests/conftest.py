@@ -5,6 +5,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: threads of BLAS that spin take other processes' cores
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import json
 import signal
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -15,13 +16,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from charts import with_metric
+from matplotlib.figure import Figure
+from planar_atlas import built
 from programs import Run
+from simulate_command import SHORT
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.cli import main
-from orthocas.codegen import GeneratedC
-from orthocas.control import PDPlus
+from orthocas.checks import Array
+from orthocas.cli import main, simulate
+from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
+from orthocas.control import PDPlus, Reference
 from orthocas.fitting.fit import Fit
 from orthocas.reproduce import FIGURES, Drawing
 from orthocas.robots import files
@@ -103,6 +108,12 @@ def planar_for_control(planar_x: oc.Problem) -> oc.Chart:
 
 
 @pytest.fixture(scope="session")
+def planar_arm() -> oc.Chart:
+    """A planar arm with one coordinate, quickly fitted: for the inverse map."""
+    return oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(3), samples=300).chart
+
+
+@pytest.fixture(scope="session")
 def arm_chart() -> oc.Chart:
     """The 7-DoF arm with A = M, roughly fitted: laws have to be right for any regular chart."""
     problem = oc.problems.get("iiwa")
@@ -122,10 +133,61 @@ def way_atlas(planar_x: oc.Problem, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture(scope="session")
+def planar_atlas(tmp_path_factory: pytest.TempPathFactory) -> oc.Atlas:
+    """The whole joint range of the planar arm, A = I."""
+    return built(tmp_path_factory.mktemp("atlas") / "arm.orthocas-atlas")
+
+
+@pytest.fixture(scope="session")
+def covered(planar_atlas: oc.Atlas) -> Array:
+    """Positions that have a chart of it."""
+    q = np.random.default_rng(7).uniform(-np.pi, np.pi, (500, 3))
+    return np.asarray(q[planar_atlas.chart_at(q) >= 0])
+
+
+@pytest.fixture(scope="session")
 def pd_plus(planar_fit: Fit, tmp_path_factory: pytest.TempPathFactory) -> tuple[GeneratedC, PDPlus]:
     """A law on a box of the planar arm, and its C."""
     law = PDPlus(planar_fit.chart, np.linspace(20, 80, 3), 0.6, "decoupled", limit=90.0)
     return oc.generate_c(law.chart, tmp_path_factory.mktemp("pd_plus"), law, "arm"), law
+
+
+@pytest.fixture(scope="session")
+def planar_q0(planar_x: oc.Problem) -> Array:
+    """The middle of the domain of the planar arm."""
+    return planar_x.domain.centre
+
+
+@pytest.fixture(scope="session")
+def planar_steps(planar_chart: oc.Chart, planar_q0: Array) -> Reference:
+    """Interleaved steps in x and xi1, as in Sec. 8.1."""
+    phi = planar_chart.phi(planar_q0)
+    changes = [(0.3, {"x": phi[0] + 0.1}), (2.0, {"xi1": 0.05}), (4.0, {"x": phi[0]}), (6.0, {"xi1": 0.0})]
+    return Reference.steps(planar_chart.labels, phi, changes, 8.0)
+
+
+@pytest.fixture(scope="session")
+def supervised_law(planar_for_control: oc.Chart) -> PDPlus:
+    """A law on a box of the planar arm, to be supervised."""
+    return PDPlus.on_chart(planar_for_control, limit=120.0)
+
+
+@pytest.fixture(scope="session")
+def supervised_c(supervised_law: PDPlus, tmp_path_factory: pytest.TempPathFactory) -> GeneratedC:
+    """Its C."""
+    return oc.generate_c(supervised_law.chart, tmp_path_factory.mktemp("supervised"), supervised_law, "arm")
+
+
+@pytest.fixture(scope="session")
+def supervised_library(supervised_c: GeneratedC) -> CompiledLibrary:
+    """Its C, compiled."""
+    return CompiledLibrary(compile_shared(supervised_c, supervised_c.folder), "arm", 3)
+
+
+@pytest.fixture
+def supervisor(supervised_library: CompiledLibrary, supervised_law: PDPlus) -> Supervisor:
+    """Its state in C."""
+    return Supervisor(supervised_library, supervised_law)
 
 
 @pytest.fixture(scope="module")
@@ -149,6 +211,26 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureF
     return call
 
 
+@pytest.fixture
+def run_simulate(run: Run, planar_fit: Fit) -> Run:
+    """Run `orthocas simulate` in a folder with a.orthocas and short.json."""
+    planar_fit.chart.save("a.orthocas")
+    Path("short.json").write_text(json.dumps(SHORT))
+
+    def call(
+        controller: str, *words: str, steps: str = "short.json", chart: str = "a.orthocas"
+    ) -> tuple[int, str, str]:
+        return run("simulate", chart, "--controller", controller, "--steps", steps, "--out", "out", *words)
+
+    return call
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No curves in pictures of `orthocas simulate`, for tests of numbers: drawing takes longer than the runs."""
+    monkeypatch.setattr(simulate, "trajectory_figure", lambda run, units: Figure())
+
+
 _ONE_JOINT = """<robot name="r"><link name="base"/>
 <link name="a"><inertial><mass value="{mass}"/>
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
@@ -160,4 +242,11 @@ def one_joint(folder: Path, mass: str = "1", joint: str = "j", kind: str = "revo
     """The URDF of an arm of one joint."""
     path = folder / "arm.urdf"
     path.write_text(_ONE_JOINT.format(mass=mass, joint=joint, kind=kind, lower=lower))
+    return path
+
+
+@pytest.fixture
+def saved(planar_fit: Fit, tmp_path: Path) -> Path:
+    path = tmp_path / "chart.orthocas"
+    planar_fit.chart.save(path)
     return path

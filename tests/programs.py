@@ -1,9 +1,11 @@
 """Programs that tests start, and which of them a machine has."""
 
+import io
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import chdir, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -31,6 +33,14 @@ def python(code: str, folder: Path | None = None, *options: str) -> str:
     return output_of(sys.executable, *options, "-c", code, folder=folder)
 
 
+def printed_here(code: str, folder: Path) -> str:
+    """What some code prints in this process, which knows the package already; not for code that registers things."""
+    out = io.StringIO()
+    with chdir(folder), redirect_stdout(out):
+        exec(compile(code, "page", "exec"), {"__name__": "page"})
+    return out.getvalue()
+
+
 def built(generated: GeneratedC, program: str, out: Path, *flags: str, compiler: str | None = None) -> Path:
     """A program of tests/c with the generated code."""
     target = out / Path(program).stem
@@ -39,7 +49,7 @@ def built(generated: GeneratedC, program: str, out: Path, *flags: str, compiler:
         compiler or compilers()[0],
         "-std=c99",
         "-O1",
-        "-g",
+        "-g1",
         *flags,
         f"-I{generated.folder}",
         *sources,

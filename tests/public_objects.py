@@ -1,10 +1,11 @@
 """One of every public object, small and quick to build, and the numbers that tell whether two of them are equal."""
 
+import copy
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
-from functools import cache, singledispatch
+from functools import cache, partial, singledispatch
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,6 +15,9 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import control, problems, solvers
+from orthocas.atlases.asked_posture import AskedPosture
+from orthocas.atlases.hand_over import AtlasControl
+from orthocas.atlases.laws import BlendedImpedance, HandedOver
 from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array
 from orthocas.comparing.report import Comparison
@@ -166,6 +170,29 @@ def atlas() -> oc.Atlas:
 
 
 _folders: list[TemporaryDirectory[str]] = []
+IN_ATLAS = np.array([0.0, 0.9, 0.9])  #: a covered posture
+
+
+def handed_over() -> HandedOver:
+    """PD+ in the chart of the moment."""
+    return HandedOver(atlas(), partial(control.PDPlus, stiffness=60.0))
+
+
+def blended() -> BlendedImpedance:
+    return BlendedImpedance(atlas(), 60.0)
+
+
+def control_of_atlas() -> AtlasControl:
+    """In the middle of a motion."""
+    found = AtlasControl(handed_over())
+    found.start(IN_ATLAS)
+    found.tick(0.001, IN_ATLAS, 0 * IN_ATLAS, moved(found, 0.0))
+    return found
+
+
+def moved(found: AtlasControl, x: float) -> Array:
+    """Task values next to those of the start, with derivatives."""
+    return np.vstack([found.law.atlas.problem.task.batched(IN_ATLAS[None])[0] + x, [[0.1, -0.1], [0.0, 0.2]]])
 
 
 @cache
@@ -223,6 +250,9 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "atlas": atlas,
     "part of an atlas": lambda: oc.AtlasPart.whole(atlas()),
     "settings of an atlas": oc.AtlasSettings,
+    "law handed over": handed_over,
+    "blended impedance": blended,
+    "control of an atlas": control_of_atlas,
     "coverage": lambda: oc.evaluate_atlas(atlas(), 200),
     "certificate": certificate,
     "card of a ready chart": lambda: oc.charts.card("ur5-position"),
@@ -349,6 +379,19 @@ def _of_atlas(atlas: oc.Atlas) -> Iterator[Any]:
 @_numbers.register
 def _of_part(part: oc.AtlasPart) -> Iterator[Any]:
     yield from (part.charts, str(part))
+
+
+@_numbers.register
+def _of_atlas_law(law: HandedOver | BlendedImpedance) -> Iterator[Any]:
+    asked = AskedPosture(law.atlas)
+    asked.start(IN_ATLAS)
+    for q in (IN_ATLAS + 0.02, IN_ATLAS - 0.03):
+        yield from _numbers(law.command(q, 0.1 * q, asked))
+
+
+@_numbers.register
+def _of_atlas_control(found: AtlasControl) -> Iterator[Any]:
+    yield from _numbers(copy.deepcopy(found).tick(0.002, IN_ATLAS + 0.01, 0.1 * IN_ATLAS, moved(found, 1e-4)))
 
 
 @_numbers.register

@@ -11,6 +11,7 @@ import atlas_corridor
 import numpy as np
 import pytest
 from programs import built, needs_c, output_of
+from supervised import TICK, Arm
 
 import orthocas as oc
 from orthocas.checks import Array
@@ -21,7 +22,6 @@ from orthocas.errors import InvalidValueError
 
 pytestmark = needs_c
 
-TICK = 1e-3
 START, END = np.array([0.6, 2.7, 0.8]), np.array([0.6, 3.11, 0.1])
 
 
@@ -112,17 +112,45 @@ def test_hand_over_of_bad_numbers_changes_nothing(library: CompiledLibrary) -> N
         np.testing.assert_array_equal(reference.values, values)
 
 
-class Arm:
-    """The rigid body dynamics, integrated in small steps."""
+def room(atlas: oc.Atlas, q: Array) -> float:
+    """Distance to the border of the box that holds a position best, in its half-widths."""
+    found = []
+    for number in range(len(atlas)):
+        box = atlas.box(number, near=q)
+        share = 1 - np.abs(q - box.centre) / box.half_width
+        found.append(float(np.delete(share, list(box.unbounded)).min()))
+    return max(found)
 
-    def __init__(self, robot: oc.Robot, q: Array) -> None:
-        self.robot, self.q, self.dq = robot, q.copy(), np.zeros(robot.n)
 
-    def move(self, torque: Array) -> None:
-        for _ in range(2):
-            ddq = self.robot.forward_dynamics(self.q + TICK / 4 * self.dq, self.dq, torque)
-            self.dq = self.dq + TICK / 2 * ddq
-            self.q = self.q + TICK / 2 * self.dq
+def led(supervisor: Supervisor, library: CompiledLibrary, q: Array, dq: Array, ticks: int) -> list[ControlStatus]:
+    """Statuses of an arm that is exactly where its reference is, on a straight line, until it is caught."""
+    supervisor.start(q)
+    for _ in range(100):
+        supervisor.step(q, np.zeros(3), ChartReference.at(library, q, supervisor.chart), TICK)
+    statuses: list[ControlStatus] = []
+    while len(statuses) < ticks and ControlStatus.CAUGHT not in statuses:
+        here = q + len(statuses) * TICK * dq
+        statuses.append(supervisor.step(here, dq, ChartReference.at(library, here, supervisor.chart), TICK)[1])
+    return statuses
+
+
+def test_the_border_of_all_charts_has_a_zone_before_it_and_borders_between_charts_have_none(
+    way_atlas: oc.Atlas, law: Controller, library: CompiledLibrary
+) -> None:
+    supervisor = Supervisor(library, law)
+    within = led(supervisor, library, START, END - START, 1000)
+    assert supervisor.hand_overs >= 2
+    assert set(within) <= {ControlStatus.OK, ControlStatus.SATURATED}
+    start, out = START + np.array([0.0, -0.55, 0.14]), np.array([0.0, -0.4, 0.1])
+    statuses = led(Supervisor(library, law), library, start, out, 1000)
+    near, caught = (statuses.index(status) for status in (ControlStatus.NEAR_BORDER, ControlStatus.CAUGHT))
+    assert set(statuses[near:caught]) == {ControlStatus.NEAR_BORDER}
+    overlap = way_atlas.settings.overlap / (1 + way_atlas.settings.overlap)
+    margins = 0.6 * overlap, 0.1 * overlap
+    for k, margin, ahead in ((near, margins[0], 0.0), (caught, margins[1], 0.03)):  # caught before it gets there
+        before, after = (room(way_atlas, start + ((k - j) * TICK + ahead) * out) for j in (1, 0))
+        assert after < margin + 1e-9
+        assert before > margin - 1e-9
 
 
 def test_beyond_all_charts_the_arm_is_caught_and_returns_when_asked(

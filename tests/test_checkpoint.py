@@ -51,7 +51,7 @@ RESUMED = [
 NAMES = [f"{solver.name} in {stage} of {parametrisation.label}" for parametrisation, solver, stage in RESUMED]
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("parametrisation", "solver", "stage"), RESUMED, ids=NAMES)
 def test_killed_fit_ends_as_the_whole_one(
     planar_x: oc.Problem, tmp_path: Path, parametrisation: object, solver: Solver, stage: str, seed: int
@@ -237,14 +237,13 @@ oc.fit(problems.get("planar_3r_x"), {fit}, samples=2000, checkpoint={file!r}, mo
 """
 LONG = [
     "oc.Polynomial(8), solvers.GaussNewton(max_iterations=20, tolerance=0.0)",
-    "oc.MLP((16, 16)), solvers.Adam(epochs=20, steps=20, batch=300)",
-    "oc.MLP((16, 16)), solvers.GradientFlow(max_iterations=12)",
+    "oc.MLP((16, 16)), solvers.GradientFlow(max_iterations=8)",
     "oc.MLP((16, 16)), solvers.LBFGS(max_iterations=150)",
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fit", LONG, ids=["gauss_newton", "adam", "gradient_flow", "lbfgs"])
+@pytest.mark.parametrize("fit", LONG, ids=["gauss_newton", "gradient_flow", "lbfgs"])
 def test_process_killed_at_any_time_loses_nothing(planar_x: oc.Problem, tmp_path: Path, fit: str) -> None:
     """SIGKILL a random time after the first iteration, twice, in the middle of an iteration or of a write."""
     parametrisation, solver = eval(fit, {"oc": oc, "solvers": solvers})

@@ -9,9 +9,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from chart_files import header_of, resealed
 from numpy.typing import NDArray
 from programs import Run, needs_c
-from test_chart_file import header_of, resealed
 
 import orthocas as oc
 from orthocas import control

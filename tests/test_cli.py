@@ -43,6 +43,15 @@ def test_fit_json_is_one_object(run: Run) -> None:
     assert data["task_angle_deg"]["std"] > 0
 
 
+def test_precision_reaches_the_fit(run: Run) -> None:
+    """The same loss up to the seventh digit, but not the same digits; see tests/test_single_precision.py for more."""
+    words = ("planar_3r_xy", "--param", "polynomial:2", "--samples", "100", "--json")
+    fits = [json.loads(run("fit", *words, "--precision", kind, "--force")[1]) for kind in ("double", "single")]
+    double, single = (found["stages"][-1]["loss"] for found in fits)
+    assert single != double
+    assert single == pytest.approx(double, rel=1e-4)
+
+
 def test_evaluate_json_has_the_promised_keys(run: Run, saved: str) -> None:
     code, out, err = run("evaluate", saved, "--samples", "500", "--seed", "3", "--json")
     data = json.loads(out)
@@ -222,6 +231,8 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
             ["info", PANDA, "--tip", "panda_hand", "--tool", "0,1"],
             "shape of tool is (2,), expected (3,), (6,) or (4, 4)",
         ),
+        (["fit", "iiwa", "--precision", "half"], "unknown precision 'half', known: double, single"),
+        (["compare", "iiwa", "--precision", ""], "unknown precision '', known: double, single"),
         (["fit", "iiwa", "--seed", "-1"], "seed is -1, expected a whole number >= 0"),
         (["fit", "iiwa", "--weights", "1000,nan"], "lambda2 is nan"),
         (["fit", "iiwa", "--weights", "1000"], "two to five numbers"),

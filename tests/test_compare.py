@@ -295,9 +295,14 @@ def test_ctrl_c_raises_with_what_is_done(planar_x: oc.Problem) -> None:
 
 
 def test_same_cell_same_result(planar_x: oc.Problem) -> None:
-    cell = Cell(planar_x, oc.Polynomial(2), solvers.GaussNewton(), 3, Weights.of((1000.0, 30.0)), 150, 500, None)
+    cell = Cell(
+        planar_x, oc.Polynomial(2), solvers.GaussNewton(), 3, Weights.of((1000.0, 30.0)), 150, "double", 500, None
+    )
     first, second = (replace(r, seconds=0.0, history=()) for r in run_cells([cell, cell], InThisThread()))
     assert repr(first) == repr(second)  # NaN where nothing was measured, which equals nothing
+    (single,) = run_cells([replace(cell, precision="single")], InThisThread())
+    assert single.task_std_deg != first.task_std_deg
+    assert single.task_std_deg == pytest.approx(first.task_std_deg, rel=1e-2)  # solvers stop at a loose tolerance
     assert isinstance(run_cell(cell), CellResult)
 
 

@@ -1,11 +1,13 @@
 """Corridors: the surroundings of a path of postures, and one chart for a long motion there."""
 
+import json
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from programs import Run
 
 import orthocas as oc
 from orthocas import codegen, problems
@@ -176,3 +178,26 @@ def test_wrong_corridors_are_refused() -> None:
     iiwa = problems.get("iiwa")
     with pytest.raises(DomainError, match="range of joint"):
         oc.corridor_problem(iiwa, iiwa.domain.centre[None] + 10.0)
+
+
+def test_command_line_fits_along_postures(run: Run) -> None:
+    np.savetxt("path.csv", PATH, delimiter=",", header="q1,q2,q3", comments="")
+    words = ("fit", "planar_3r_xy", "--corridor", "path.csv", "--samples", "200", "--out", "a.orthocas", "--json")
+    code, out, err = run(*words, "--radius", "0.25")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["parametrisation"] == "polynomial:3:cyclic=q1"
+    domain = oc.load("a.orthocas").problem.domain
+    assert isinstance(domain, oc.Corridor)
+    assert domain.radius.tolist() == [np.inf, 0.25, 0.25]
+    assert domain.contains(PATH).all()
+    for others, word in (
+        (("--half-width", "0.4"), "none with --corridor"),
+        (("--domain", "auto"), "none with --corridor"),
+        (("--radius", "-1"), "radius"),
+    ):
+        code, out, err = run(*words, "--force", *others)
+        assert (code, out) == (2, "")
+        assert word in err
+    code, _, err = run("fit", "planar_3r_xy", "--radius", "0.2")
+    assert code == 2
+    assert "--corridor with it" in err

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from programs import Run, needs_c, needs_cmake, output_of, python
+from programs import Run, needs_c, needs_cmake, output_of, printed_here, python
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -56,7 +56,7 @@ def test_newcomers_path_from_a_urdf_to_c_runs(run: Run) -> None:
 @pytest.mark.slow
 def test_python_block_of_the_page_on_control_runs(tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "control.md").read_text(), flags=re.DOTALL)
-    first, coupling = python(code, tmp_path).splitlines()
+    first, coupling = printed_here(code, tmp_path).splitlines()
     assert first.endswith("] 0")  # no status but OK
     assert float(coupling) < 0.005
     assert (tmp_path / "run.npz").exists()
@@ -65,7 +65,7 @@ def test_python_block_of_the_page_on_control_runs(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_python_blocks_of_the_page_on_domains_run(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "domains.md").read_text(), flags=re.DOTALL)
-    printed = python("\n".join(blocks), tmp_path).splitlines()
+    printed = printed_here("\n".join(blocks), tmp_path).splitlines()
     assert printed[0].startswith("DomainSuggestion: half-width 3.142")
     assert printed[-2] == "('q1',) True"
     assert 0.81 < float(printed[-1]) < 0.84  # the share of the box that is clear
@@ -76,7 +76,7 @@ def test_python_blocks_of_the_page_on_atlases_run(tmp_path: Path) -> None:
     code, corridor = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "atlas.md").read_text(), flags=re.DOTALL)
     (tmp_path / "program.py").write_text(code)  # processes start by importing it
     assert output_of(sys.executable, "program.py", folder=tmp_path).splitlines() == ["('x', 'y', 'xi1') (1,)", "1.0"]
-    assert python(corridor, tmp_path) == "True True\n"
+    assert printed_here(corridor, tmp_path) == "True True\n"
 
 
 @pytest.mark.slow
@@ -93,7 +93,7 @@ def test_python_blocks_of_the_page_on_batches_run(run: Run, tmp_path: Path) -> N
 @pytest.mark.slow
 def test_python_blocks_of_the_page_on_the_inverse_run(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "inverse.md").read_text(), flags=re.DOTALL)
-    printed = python("\n".join(blocks), tmp_path).splitlines()
+    printed = printed_here("\n".join(blocks), tmp_path).splitlines()
     assert printed[0].startswith("Solutions: ")
     assert printed[0].endswith(" OUT_OF_REACH")
     assert printed[3:7] == ["True", "True True", "True", "LOST True"]
@@ -104,13 +104,13 @@ def test_python_blocks_of_the_page_on_the_inverse_run(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_python_block_of_the_page_on_circles_runs(tmp_path: Path) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "circle.md").read_text(), flags=re.DOTALL)
-    assert python(code, tmp_path).splitlines() == ["[0.   6.28] True", "True"]
+    assert printed_here(code, tmp_path).splitlines() == ["[0.   6.28] True", "True"]
 
 
 @pytest.mark.slow
 def test_python_blocks_of_the_page_on_paths_run(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "paths.md").read_text(), flags=re.DOTALL)
-    printed = python("\n".join(blocks), tmp_path)
+    printed = printed_here("\n".join(blocks), tmp_path)
     assert printed.startswith("Interval: xi1 in [")
     assert "SelfMotionCurve: curve of length" in printed
     assert "obstacle 0 are" in printed

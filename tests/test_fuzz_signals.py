@@ -8,8 +8,7 @@ from fuzz import signals
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["fit", "compare"])
-def test_stopped_commands_leave_nothing_broken(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stopped_command_leaves_nothing_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(signals, "KILLS", 3)
-    what = signals.judge(list(signals.COMMANDS).index(name))
+    what = signals.judge(list(signals.COMMANDS).index("fit"))
     assert what is None, what

@@ -66,6 +66,7 @@ def test_default_gains_of_a_pose_bear_5_ms_of_delay_although_the_flange_has_hard
     chart = oc.fit(problem, oc.Polynomial(2), weights=(1000, 30, 150, 1)).chart
     others = sample_uniform(arm.domain, 1000, 7)
     assert PDPlus.on_chart(chart).modes(others).delays.min() > 5e-3
+    assert any("the task pose:AXIS" in remark for remark in PDPlus.on_chart(chart).remarks())
     assert PDPlus(chart, matched_stiffness(chart, fastest=np.inf)).modes(others).delays.min() < 3e-3
 
 

@@ -16,8 +16,9 @@ def test_charts_close_circles_and_come_back_where_the_pseudo_inverse_drifts(task
     found = {}
     for name, build in peer_methods.methods(arm):
         if name in ("chart", "stereographic SEW", "pseudo-inverse"):
-            line = redundancy_peers.row(name, build(), arm, Namespace(circles=2, lines=1, targets=3, peer_targets=3))
-            found[name] = [float(cell.split()[0]) for cell in line.strip("| ").split("|")[1:]]
+            asked, method = Namespace(circles=2, lines=1, targets=3, peer_targets=3), build()
+            found[name] = [float(cell.split()[0]) for cell in redundancy_peers.motion(name, method, arm, asked)[1:]]
+            assert redundancy_peers.shares(method, arm, asked)[0] == "100.0 %"
     drift, error, reached, left = (
         dict(zip(found, column, strict=True)) for column in list(zip(*found.values(), strict=True))[:4]
     )

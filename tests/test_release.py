@@ -1,5 +1,7 @@
 """What a release needs agrees: version, dependencies, and contents of the archives."""
 
+from importlib.util import find_spec
+
 import pytest
 import release
 
@@ -14,6 +16,13 @@ def test_all_files_name_the_same_version(monkeypatch: pytest.MonkeyPatch) -> Non
     assert [fault for fault in release.texts() if "has version" in fault] == []
     monkeypatch.setattr(release, "VERSION", "9.9.9")
     assert sum("has version 0.1.0, expected 9.9.9" in fault for fault in release.texts()) == 2
+
+
+@pytest.mark.skipif(find_spec("rattler_build") is None, reason="no rattler_build: pip install 'orthocas[release]'")
+def test_recipe_renders(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert list(release.recipe()) == []
+    monkeypatch.setitem(release.PROJECT, "license", "MIT")
+    assert len(list(release.recipe())) == 1
 
 
 def test_contents_of_archives_are_judged() -> None:

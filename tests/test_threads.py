@@ -14,10 +14,13 @@ import numpy as np
 import pytest
 from programs import needs_c
 from public_objects import (
+    IN_ATLAS,
     atlas,
+    blended,
     circle,
     disk,
     fitted,
+    handed_over,
     impedance,
     network,
     numbers,
@@ -28,7 +31,10 @@ from public_objects import (
 )
 
 import orthocas as oc
+from orthocas import solvers
 from orthocas.atlases import atlas as atlas_module
+from orthocas.atlases.asked_posture import AskedPosture
+from orthocas.atlases.laws import AtlasLaw
 from orthocas.casadi_tools.batch import Batched
 from orthocas.casadi_tools.blas_graph import NumpyGraph
 from orthocas.casadi_tools.cached import cached_property
@@ -97,12 +103,27 @@ def calls_of_atlas(atlas: oc.Atlas) -> list[Call]:
     ]
 
 
+def calls_of_atlas_law(law: AtlasLaw) -> list[Call]:
+    """A law on an atlas in different charts; each call has a posture asked for of its own."""
+    q = IN_ATLAS + np.random.default_rng(8).uniform(-0.25, 0.25, (12, 3))
+
+    def command(k: int) -> Array:
+        asked = AskedPosture(law.atlas)
+        asked.start(q[k % 12])
+        said = law.command(q[k % 12] + 0.01, 0.1 * q[k % 12], asked)
+        return np.append(said.torque, [said.status, said.storage, said.dissipated])
+
+    return [command]
+
+
 SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 10,000 calls
     "polynomial": (lambda: calls_of_chart(copy.deepcopy(fitted().chart)), 4800),
     "network": (lambda: calls_of_chart(copy.deepcopy(network())), 2400),
     "circle": (lambda: calls_of_chart(copy.deepcopy(circle())), 120),
     "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 80),
     "atlas": (lambda: calls_of_atlas(copy.deepcopy(atlas())), 800),
+    "law handed over": (lambda: calls_of_atlas_law(copy.deepcopy(handed_over())), 240),
+    "blended impedance": (lambda: calls_of_atlas_law(copy.deepcopy(blended())), 240),
     "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 2600),
 }
 
@@ -203,10 +224,16 @@ def test_a_value_is_built_once() -> None:
 
 @pytest.mark.slow
 def test_fits_in_threads_are_those_of_one_thread() -> None:
+    """Also by solvers that build integrators and programs of CasADi, while simulations build theirs."""
+    families = [oc.Polynomial(2), oc.MLP((4,)), oc.Polynomial(1), oc.Polynomial(1)]
+    minimisers = [None, None, solvers.GradientFlow(max_iterations=3), solvers.Ipopt(max_iterations=5)]
+
     def theta(k: int) -> Array:
-        chart = oc.fit(planar(), [oc.Polynomial(2), oc.MLP((4,))][k % 2], samples=100).chart
+        if k % 5 == 4:
+            return numbers(simulate(impedance(), steps(), planar().domain.centre, control_rate=50.0))[0]
+        chart = oc.fit(planar(), families[k % 5], minimisers[k % 5], samples=100).chart
         return np.asarray(chart.coordinates.theta)  # type: ignore[attr-defined]
 
-    expected = [theta(0), theta(1)]
-    for k, found in enumerate(in_threads(theta, 4)):
-        np.testing.assert_array_equal(found, expected[k % 2])
+    expected = [theta(k) for k in range(5)]
+    for k, found in enumerate(in_threads(theta, 10)):
+        np.testing.assert_array_equal(found, expected[k % 5])

@@ -14,6 +14,7 @@ import tomllib
 import venv
 import zipfile
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -43,7 +44,7 @@ def texts() -> Iterator[str]:
     if f"## [{VERSION}]" not in (ROOT / "CHANGELOG.md").read_text():
         yield f"CHANGELOG.md has no section [{VERSION}]; rename [Unreleased] and add the date"
     if not {"Source", "Documentation"} <= set(PROJECT.get("urls", {})):
-        yield "pyproject.toml names no Source and Documentation in [project.urls]: where will they live?"
+        yield "pyproject.toml names no Source and Documentation in [project.urls]; add them once there are addresses"
     yield from dependencies()
 
 
@@ -57,6 +58,21 @@ def dependencies() -> Iterator[str]:
         wanted.add(f"{CONDA_NAMES.get(name, name)} >={least}")
     for text in sorted(wanted ^ listed):
         yield f"tools/recipe.yaml {'lacks' if text in wanted else 'has'} {text!r}, unlike pyproject.toml"
+
+
+def recipe() -> Iterator[str]:
+    """Render the conda recipe; differences of its name, version, licence and commands from those of pyproject.toml."""
+    (variant,) = import_module("rattler_build").Stage0Recipe.from_file(ROOT / "tools" / "recipe.yaml").render()
+    rendered = variant.recipe.to_dict()
+    commands = [f"{name} = {target}" for name, target in PROJECT["scripts"].items()]
+    for what, found, wanted in (
+        ("name", rendered["package"]["name"], PROJECT["name"]),
+        ("version", rendered["package"]["version"], VERSION),
+        ("licence", rendered["about"]["license"], PROJECT["license"]),
+        ("commands", rendered["build"]["python"]["entry_points"], commands),
+    ):
+        if found != wanted:
+            yield f"tools/recipe.yaml has the {what} {found}, expected {wanted}"
 
 
 def state_of_the_clone() -> Iterator[str]:
@@ -136,6 +152,7 @@ def main() -> int:
         folder = Path(name)
         dist = folder / "dist"
         faults = report("versions, changelog, links, recipe", texts)
+        faults += report("the conda recipe renders, and agrees with pyproject.toml", recipe)
         faults += report("the clone is clean", state_of_the_clone)
         faults += report("source distribution and wheel: build, twine check, contents, licence", lambda: packages(dist))
         faults += report(

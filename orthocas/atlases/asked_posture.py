@@ -67,7 +67,7 @@ class AskedPosture:
         for _ in range(_ITERATIONS):
             missing, J = self.phi[0] - phi(q).full()[:, 0], jacobian(q).full()
             error = np.abs(missing / chart.phi_sizes).max()
-            if error <= _ENOUGH or not np.linalg.cond(J) < _SINGULAR:
+            if error <= _ENOUGH or not (np.isfinite(J).all() and np.linalg.cond(J) < _SINGULAR):
                 break
             q = q + np.linalg.solve(J, missing)
         if not error <= _ENOUGH:

@@ -1,7 +1,7 @@
 """Atlases: many charts that cover the joint range of a robot, in one file (ours)."""
 
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike
 
 from orthocas.atlases.atlas_facts import data_of, facts_of
 from orthocas.atlases.atlas_file import Stock, read_stock, require_whole
-from orthocas.atlases.chart_of_box import chart_of, clipped, moved
+from orthocas.atlases.chart_of_box import chart_of, clipped, moved, part_near, steps_to
 from orthocas.atlases.evaluation import Evaluation
 from orthocas.atlases.index import Index
 from orthocas.atlases.inverse import inverse_in_charts
+from orthocas.atlases.local_task import is_turning
 from orthocas.atlases.plan import AtlasSettings, Plan
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.chart import Chart
@@ -31,8 +32,9 @@ from orthocas.domains import Box
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.problem import Problem
 from orthocas.showing import Shown
+from orthocas.tasks import Task
 
-Turns = tuple[int, ...]  #: full turns of each joint that boxes divide
+Turns = tuple[int, ...]  #: full turns of each joint that boxes divide; then steps of cyclic ones, for orientations
 _KEPT = 32  # charts that stay built, the last ones
 
 
@@ -201,12 +203,17 @@ class Atlas(Shown):
     def chart(self, number: int, near: ArrayLike | None = None) -> Chart:
         """A chart as all of orthocas takes it: its domain is the box, less what lies beyond the joint limits.
 
+        If the task compares orientations, the domain has all positions clear of singular ones, and so those far enough
+        from half a turn; in cyclic joints, it reaches about 1 rad to both sides of `near`.
+
         Args:
             number: the number of the chart.
             near: a joint position (n,). Boxes repeat every full turn of joints that can turn so far; this tells which.
 
         Raises:
             InvalidValueError: if there is no such chart.
+            DomainError: if the box lies beyond joint limits, as images of others may, or about half a turn from the
+                reference orientation; see `with_reference`.
         """
         which = self._numbered(number, near)
         chart = self._kept.get(which)
@@ -215,6 +222,20 @@ class Atlas(Shown):
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return chart
+
+    def with_reference(self, q: ArrayLike) -> Self:
+        """The same atlas, whose task compares the tip's orientation with that at q (n,).
+
+        Charts do not depend on the reference orientation, only the task's own coordinates do, and they end half a turn
+        away from it. Tasks without orientation stay as they are.
+        """
+        plan, at = self._stock.plan, as_point("q", q, self.problem.n)
+        known = plan.problem
+        if not is_turning(known.task):
+            return self
+        task = Task.named(known.robot, known.task.recipe["kind"], at)
+        plan = replace(plan, problem=Problem(known.robot, task, known.metric, known.domain, known.name))
+        return type(self)(replace(self._stock, plan=plan))
 
     def box(self, number: int, near: ArrayLike | None = None) -> Box:
         """The box of a chart within the joint limits; see `chart`."""
@@ -236,11 +257,10 @@ class Atlas(Shown):
         """The number of a chart, checked, and the full turns of its box towards a position."""
         number = require_count("number", number, least=0, most=len(self) - 1)
         plan = self._stock.plan
-        if near is None:
-            return number, (0,) * len(plan.joints)
-        q = as_point("near", near, plan.problem.n)[list(plan.joints)]
-        apart = (q - self._index.image_centres(np.array([number]))[0][0]) / (2 * np.pi)
-        return number, tuple(np.where(plan.lattice.endless, np.round(apart), 0.0).astype(int).tolist())
+        q = plan.problem.domain.centre if near is None else as_point("near", near, plan.problem.n)
+        apart = (q[list(plan.joints)] - self._index.image_centres(np.array([number]))[0][0]) / (2 * np.pi)
+        turns = tuple(np.where(plan.lattice.endless, np.round(apart), 0.0).astype(int).tolist())
+        return number, turns + (steps_to(plan, q) if is_turning(plan.problem.task) else ())
 
     def _made(self, number: int, turns: Turns) -> Chart:
         plan, index, numbers = self._stock.plan, self._index, np.array([number])
@@ -252,13 +272,12 @@ class Atlas(Shown):
         values = self._evaluation.turned(own[None], numbers)[0]
         if self._evaluation.turns is not None:
             values[:, 0] += self._evaluation.turns.constants[number]
-        low, high = self._borders(number, turns)
-        box = clipped(plan, low, high)
-        middle, half = (low + high) / 2, (high - low) / 2
-        joints, columns = list(plan.joints), [plan.active.index(i) for i in plan.joints]
-        shift, scale = np.zeros(len(plan.active)), np.ones(len(plan.active))
-        shift[columns] = (box.centre[joints] - middle) / half
-        scale[columns] = box.half_width[joints] / half
+        borders, active = self._borders(number, turns), list(plan.active)
+        whole, box = plan.box_around(*borders), clipped(plan, *borders)
+        if is_turning(plan.problem.task):
+            box = part_near(plan, box, turns[len(plan.joints) :])
+        shift = ((box.centre - whole.centre) / whole.half_width)[active]
+        scale = (box.half_width / whole.half_width)[active]
         if shift.any() or (scale != 1).any():
             values = moved(values, self._evaluation.basis.exponents.astype(int), shift, scale)
         clear = float(self._stock.records["clear"][self._stock.charts[fitted[0]]])
@@ -267,7 +286,9 @@ class Atlas(Shown):
     def _borders(self, number: int, turns: Turns) -> tuple[Array, Array]:
         """Borders of the box of a chart in the joints that boxes divide, also beyond the limits."""
         numbers = np.array([number])
-        centre = self._index.image_centres(numbers)[0][0] + 2 * np.pi * np.array(turns)
+        centre = self._index.image_centres(numbers)[0][0] + 2 * np.pi * np.array(
+            turns[: self._index.plan.lattice.low.size]
+        )
         half = self._index.box_half_widths[self._index.rows(numbers)[1]][0]
         return centre - half, centre + half
 

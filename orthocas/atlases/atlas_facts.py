@@ -18,7 +18,8 @@ def facts_of(stock: Stock, charts: int) -> dict[str, str]:
     asked = plan.settings
     return {
         "atlas": f"{charts} charts of {problem.heading}",
-        "fitted": f"{len(stock.charts)} charts; {len(plan.maps)} symmetries, the identity included",
+        "fitted": f"{len(stock.charts)} charts, {_proved(stock)} of them proved not to fold; "
+        f"{len(plan.maps)} symmetries, the identity included",
         "task": problem.task.heading,
         "metric": problem.metric.name,
         "boxes": f"divide {listed(names[i] for i in plan.joints)}; {counts} tiles",
@@ -50,6 +51,10 @@ def data_of(stock: Stock, charts: int) -> dict[str, Any]:
         "tile_half_widths": (plan.lattice.width / 2).tolist(),
         "settings": asdict(plan.settings),
         "boxes": {outcome.name.lower(): int(outcomes[outcome]) for outcome in Outcome},
-        "certified": int((stock.records["certified"][stock.charts] > 0).sum()),
+        "certified": _proved(stock),
         "fit_seconds": float(stock.records["seconds"].sum()),
     }
+
+
+def _proved(stock: Stock) -> int:
+    return int((stock.records["certified"][stock.charts] > 0).sum())

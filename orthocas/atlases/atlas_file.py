@@ -24,7 +24,7 @@ from orthocas.errors import AtlasFileError, InvalidValueError, OrthocasError
 from orthocas.files.blocks import BlockKind, Contents, append, scan
 from orthocas.files.json import part
 from orthocas.files.npy import Stored, from_npy, to_npy
-from orthocas.files.problem_parts import problem_from_data, problem_to_data
+from orthocas.files.problem_parts import FOREIGN, problem_from_data, problem_to_data
 
 ATLAS = BlockKind("atlas", b"\x93ORTHOCASATLAS\n", 1, AtlasFileError)
 _CELL, _TURN = b"CELL", b"TURN"
@@ -158,7 +158,7 @@ def read_stock(path: Path) -> Stock:
         raise
     except OrthocasError as error:
         raise AtlasFileError(f"{path} is inconsistent: {error}") from None
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
+    except FOREIGN as error:
         raise AtlasFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
 
 

@@ -79,7 +79,7 @@ class BoxFitter:
         plan, active = self.plan, list(self.plan.active)
         q = np.repeat(box.centre[None], len(u), axis=0)
         q[:, active] += box.half_width[active] * u
-        J = task_jacobians(plan.problem, q)
+        J = task_jacobians(plan.local, q)
         scaled = J / plan.scale[:, None]
         squares = np.linalg.eigvalsh(scaled @ scaled.transpose(0, 2, 1))[:, 0]
         clear: Mask = squares > plan.settings.least_singular_value**2
@@ -108,7 +108,7 @@ class BoxFitter:
     def _linear(self, box: Box) -> Array:
         """Coefficients of linear coordinates that are exact at the centre; of all such, those nearest to the frame."""
         active = list(self.plan.active)
-        here = samples_at(self.plan.problem, box.centre[None]).restricted_to(active)
+        here = samples_at(self.plan.local, box.centre[None]).restricted_to(active)
         Z = here.null_basis[0]
         covectors = Z if here.metric_inverse is None else np.linalg.solve(here.metric_inverse[0], Z)
         left, _, right = np.linalg.svd(covectors.T @ self._frame)
@@ -159,6 +159,6 @@ class BoxFitter:
         """The r covectors that are most nearly orthogonal to the task all over the region, (n, fitted)."""
         plan, active = self.plan, list(self.plan.active)
         points = sample_uniform(plan.problem.domain, _FRAME_SAMPLES, _SEED)
-        Z = samples_at(plan.problem, points).restricted_to(active).null_basis
+        Z = samples_at(plan.local, points).restricted_to(active).null_basis
         mean = (Z @ Z.transpose(0, 2, 1)).mean(axis=0)
         return np.asarray(np.linalg.eigh(mean)[1][:, -plan.fitted :])

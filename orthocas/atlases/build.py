@@ -143,6 +143,8 @@ class Building:
         own = lattice.centres(np.array([cell.tile]))[0]
         centres, signs = self._images[cell.tile]
         middle = centres + signs * (low[0] + width[0] / 2 - own)
+        turns = lattice.turns(self.region.low, self.region.high)
+        middle = (middle[:, None] + turns).reshape(-1, len(width[0]))
         return bool(self.region.touches(middle - width / 2, middle + width / 2).any())
 
     def _report(self) -> None:

@@ -1,20 +1,25 @@
 """From numbers in an atlas to boxes and charts as the rest of orthocas knows them (ours)."""
 
+from collections.abc import Sequence
 from functools import reduce
 
 import numpy as np
 
 from orthocas.atlases.cells import Cell
+from orthocas.atlases.local_task import is_turning
 from orthocas.atlases.plan import Plan
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import Box
+from orthocas.errors import DomainError
 from orthocas.files.json import plain
 from orthocas.files.problem_parts import problem_from_data, problem_to_data
 from orthocas.parametrisations import JointSpace, Polynomial
 from orthocas.postures.clear_box import ClearBox
 from orthocas.problem import Problem
+
+STEP = 0.6  # [rad]
 
 
 def box_of(plan: Plan, cell: Cell) -> Box:
@@ -33,10 +38,41 @@ def widened(plan: Plan, low: Array, high: Array) -> tuple[Array, Array]:
 
 
 def clipped(plan: Plan, low: Array, high: Array) -> Box:
-    """The part of a box within the joint limits."""
+    """The part of a box within the joint limits.
+
+    Raises:
+        DomainError: if there is none, as for images of boxes near limits that the symmetry does not keep.
+    """
     joints = list(plan.joints)
     robot = plan.problem.robot
-    return plan.box_around(np.maximum(low, robot.lower[joints]), np.minimum(high, robot.upper[joints]))
+    low, high = np.maximum(low, robot.lower[joints]), np.minimum(high, robot.upper[joints])
+    beyond = np.flatnonzero(low >= high)
+    if beyond.size:
+        name = robot.joint_names[joints[int(beyond[0])]]
+        raise DomainError(
+            f"the box of the chart lies beyond the limits of joint '{name}', expected one that chart_at finds"
+        )
+    return plan.box_around(low, high)
+
+
+def part_near(plan: Plan, box: Box, steps: Sequence[int]) -> Box:
+    """The part of a box where cyclic joints lie within 1.2 rad of so many steps of 0.6 rad from its middle.
+
+    There, a reference orientation in the middle is less than half a turn away.
+    """
+    cyclic = list(plan.cyclic)
+    middle = box.centre[cyclic] + STEP * np.array(steps)
+    low = np.maximum(middle - 2 * STEP, (box.centre - box.half_width)[cyclic])
+    high = np.minimum(middle + 2 * STEP, (box.centre + box.half_width)[cyclic])
+    centre, half_width = box.centre.copy(), box.half_width.copy()
+    centre[cyclic], half_width[cyclic] = (low + high) / 2, (high - low) / 2
+    return Box(centre, half_width, [i for i in box.unbounded if i not in cyclic])
+
+
+def steps_to(plan: Plan, q: Array) -> tuple[int, ...]:
+    """Steps of 0.6 rad from the middle of cyclic joints that come nearest to a position (n,)."""
+    cyclic = list(plan.cyclic)
+    return tuple(np.round((q - plan.problem.domain.centre)[cyclic] / STEP).astype(int).tolist())
 
 
 def chart_of(plan: Plan, box: Box, numbers: Array, clear: float, problem: Problem) -> Chart:
@@ -46,11 +82,13 @@ def chart_of(plan: Plan, box: Box, numbers: Array, clear: float, problem: Proble
         plan: plan of the atlas.
         box: the box.
         numbers: constants and coefficients.
-        clear: share of its samples that are clear of singular positions. If it is not 1, the domain is a ClearBox.
+        clear: share of its samples that are clear of singular positions. If it is not 1, or the task compares
+            orientations, the domain is a ClearBox.
         problem: that of the plan, or `without_limits` of it for a box beyond them.
     """
     base = problem
-    domain = ClearBox(box, base.task, plan.settings.least_singular_value, plan.scale) if clear < 1 else box
+    bound = plan.settings.least_singular_value
+    domain = ClearBox(box, base.task, bound, plan.scale) if clear < 1 or is_turning(base.task) else box
     problem = Problem(base.robot, base.task, base.metric, domain, base.name)
     parametrisation = Polynomial(plan.settings.degree, plan.cyclic_names)
     r = plan.fitted

@@ -163,7 +163,7 @@ def _quality(atlas: Atlas, q: Array, charts: Indices) -> tuple[Array, Array]:
     inside = np.flatnonzero(charts >= 0)
     for start in range(0, len(inside), _PIECE):
         rows = inside[start : start + _PIECE]
-        samples = samples_at(plan.problem, q[rows]).restricted_to(active)
+        samples = samples_at(plan.local, q[rows]).restricted_to(active)
         J = atlas.jacobian(q[rows], charts[rows])[:, : plan.fitted][:, :, active]
         sines, smallest, _ = in_the_metric(samples, J)
         leak[rows] = np.degrees(np.sqrt((np.arcsin(np.minimum(sines, 1.0)) ** 2).mean(axis=1)))

@@ -4,7 +4,8 @@ import numpy as np
 
 from orthocas.atlases.evaluation import Evaluation
 from orthocas.checks import Array, Indices
-from orthocas.inverting.newton import Newton, PhiMap, largest
+from orthocas.inverting.newton import Newton
+from orthocas.inverting.phi_map import PhiMap, largest
 
 _ACCEPTED = 1e-10  # [m], [rad] and units of xi
 

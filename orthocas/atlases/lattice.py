@@ -1,6 +1,7 @@
 """The lattice of an atlas: equal tiles in the joints that boxes divide, and which tiles are images of others (ours)."""
 
 from dataclasses import dataclass
+from itertools import product
 from math import ceil
 
 import numpy as np
@@ -41,6 +42,15 @@ class Lattice:
         strides = np.append(np.cumprod(self.counts[::-1])[-2::-1], 1)
         found = places @ strides.astype(float)
         return np.where(inside, found, -1.0).astype(np.int64)
+
+    def turns(self, low: Array, high: Array) -> Array:
+        """Full turns that bring the lattice over all of a range, which may reach beyond half a turn, (turns, k)."""
+        end = self.low + self.width * self.counts
+        steps = [
+            [-1] * bool(free and a < first - _SLACK) + [0] + [1] * bool(free and b > last + _SLACK)
+            for free, a, b, first, last in zip(self.endless, low, high, self.low, end, strict=True)
+        ]
+        return _TURN * np.array(list(product(*steps)), dtype=float)
 
     def centres(self, tiles: Indices) -> Array:
         """Centres of tiles, (tiles, k)."""

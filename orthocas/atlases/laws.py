@@ -1,7 +1,7 @@
 """Control laws on atlases: laws of charts with hand-overs, and an impedance whose potential is blended (ours)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +17,7 @@ from orthocas.control.controller import Controller
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
 from orthocas.control.status import ControlStatus
 from orthocas.errors import InvalidValueError
+from orthocas.showing import Shown, number_list
 
 _LAWS = 16  # built for charts, the last ones
 
@@ -49,8 +50,14 @@ class AtlasLaw(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
-class HandedOver:
+def require_atlas_law(law: AtlasLaw) -> None:
+    """Raise InvalidValueError for an object without the attributes of a law on an atlas."""
+    if isinstance(law, type) or not (isinstance(getattr(law, "atlas", None), Atlas) and hasattr(law, "command")):
+        raise InvalidValueError("law", f"a {type(law).__name__}", "a law on an atlas, such as BlendedImpedance")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HandedOver(Shown):
     """A law of charts, for example `lambda chart: oc.control.PDPlus(chart, 60.0)`, in the chart of the moment.
 
     References are mapped with velocity and acceleration at hand-overs. The torque changes there by the difference of
@@ -58,17 +65,25 @@ class HandedOver:
 
     Args:
         atlas: the atlas.
-        law: builds the law of a chart. Gains refer to the coordinates of the chart.
+        law: builds the law of a chart. Gains refer to the coordinates of the chart. For pickles, a function of a module
+            or `functools.partial(oc.control.PDPlus, stiffness=60.0)`.
+
+    Raises:
+        InvalidValueError: if `atlas` is no atlas, or `law` cannot be called.
     """
 
     atlas: Atlas
     law: Callable[[Chart], Controller]
-    _built: dict[int, Controller] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        require_kind("atlas", self.atlas, Atlas)
+        if not callable(self.law):
+            raise InvalidValueError("law", f"a {type(self.law).__name__}", "a function of a chart")
 
     @property
     def name(self) -> str:
         """The name of the law of charts."""
-        return next(iter(self._built.values())).name if self._built else "law of charts"
+        return next(iter(self._laws.values())).name if self._laws else "law of charts"
 
     def command(self, q: Array, dq: Array, asked: AskedPosture) -> Command:
         """The torque of the law of the chart."""
@@ -78,21 +93,29 @@ class HandedOver:
         storage, power = (0.0, 0.0) if law.energy is None else (float(v) for v in law.energy.call([*inputs]))
         return Command(np.array(torque).ravel(), int(status), storage, power)
 
+    def facts(self) -> dict[str, str]:
+        """The law of charts, and the atlas."""
+        return {"law": self.name, **self.atlas.facts()}
+
+    @cached_property
+    def _laws(self) -> dict[int, Controller]:
+        return {}
+
     def _of(self, asked: AskedPosture) -> Controller:
         with building:  # threads may share the law
-            law = self._built.get(asked.number)
+            law = self._laws.get(asked.number)
             if law is None:
                 law = self.law(asked.chart)
                 if law.command != "torque":
                     raise InvalidValueError("law", f"one that commands {law.command}", "a torque law")
-                while len(self._built) >= _LAWS:
-                    self._built.pop(next(iter(self._built)))
-                self._built[asked.number] = law
+                while len(self._laws) >= _LAWS:
+                    self._laws.pop(next(iter(self._laws)))
+                self._laws[asked.number] = law
             return law
 
 
-@dataclass(frozen=True, eq=False)
-class BlendedImpedance:
+@dataclass(frozen=True, eq=False, repr=False)
+class BlendedImpedance(Shown):
     """tau = g - J_x^T K_x e_x - sum_k (w_k J_k^T K e_k + V_k grad w_k) - D dq on overlapping charts k.
 
     The potential V(q) = 1/2 e_x^T K_x e_x + sum_k w_k(q) V_k(q), with V_k = 1/2 e_k^T K e_k, e_k = xi_k(q) - xi_k(q_d)
@@ -161,6 +184,11 @@ class BlendedImpedance:
         slope = J_x.T @ (K_x * e) + np.einsum("k,kri,kr->i", weights, J, K * errors) + energies @ rises
         S = (J_x.T * K_x) @ J_x + np.einsum("k,kri,r,krj->ij", weights, J, K, J)
         return float(V), slope, S
+
+    def facts(self) -> dict[str, str]:
+        """Gains, limits and the atlas."""
+        gains = {"stiffness": number_list(self.stiffness), "damping ratio": f"{self.damping_ratio:g}"}
+        return {"law": self.name, **gains, "limit": number_list(self.limit), **self.atlas.facts()}
 
     @cached_property
     def _blend(self) -> Blend:

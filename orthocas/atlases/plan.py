@@ -5,12 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocas.atlases.lattice import Lattice, make_lattice
+from orthocas.atlases.local_task import is_turning, local_problem
 from orthocas.atlases.symmetry import Symmetries, find_symmetries, identity_only
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_number, require_at_least, require_count, require_kind
 from orthocas.domains import Box, sample_uniform
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.idle_joints import idle_joints
-from orthocas.parametrisations.cyclic_joints import cyclic_joints, over_cyclic_joints
+from orthocas.parametrisations.cyclic_joints import leaf_cyclic_joints, over_cyclic_joints
 from orthocas.postures.row_scale import row_scale
 from orthocas.problem import Problem, task_jacobians
 from orthocas.robots import Robot
@@ -37,8 +39,8 @@ class AtlasSettings:
         overlap: how far a box reaches into its neighbours, as a share of its half-widths.
         splits: how often a tile may be halved.
         symmetric: fit one of several boxes that are images of each other.
-        certify_seconds: time limit for the proof that a chart does not fold; 0 for no proofs. A box without a proof is
-            halved while splits are left.
+        certify_seconds: processor time for the proof that a chart does not fold; 0 for no proofs. A box without a
+            proof is halved while splits are left.
     """
 
     degree: int = 3
@@ -104,9 +106,14 @@ class Plan:
 
     def singular_values(self, points: Array) -> Array:
         """Relative singular values of the task at points (N, n), (N,)."""
-        J = task_jacobians(self.problem, points) / self.scale[:, None]
+        J = task_jacobians(self.local, points) / self.scale[:, None]
         squares = np.linalg.eigvalsh(J @ J.transpose(0, 2, 1))[:, 0]
         return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+
+    @cached_property
+    def local(self) -> Problem:
+        """The problem with gradients that do not depend on a reference orientation."""
+        return local_problem(self.problem)
 
     def box_around(self, low: Array, high: Array) -> Box:
         """The box of all joints with these borders in the joints that boxes divide, (k,) each."""
@@ -128,23 +135,27 @@ def make_plan(problem: Problem, settings: AtlasSettings, margin_deg: float) -> P
 
     Raises:
         DomainError: if a joint has no range left.
-        InvalidValueError: if boxes would divide no joint, or too many tiles would be needed.
+        InvalidValueError: if boxes would divide no joint, too many tiles would be needed, or a proof is asked for
+            charts of an orientation task.
     """
     require_kind("problem", problem, Problem)
+    if settings.certify_seconds and is_turning(problem.task):
+        raise InvalidValueError("certify_seconds", settings.certify_seconds, "0 for a task that compares orientations")
     region = joint_range(problem.robot, margin_deg)
     problem = Problem(problem.robot, problem.task, problem.metric, region, problem.name)
     names = problem.robot.joint_names
-    cyclic_names = cyclic_joints(problem)
+    cyclic_names = leaf_cyclic_joints(local_problem(problem))
     problem = over_cyclic_joints(problem, cyclic_names)
-    idle = tuple(idle_joints(problem, sample_problem(problem, _FIRST_SAMPLES, _SEED))[-problem.r :])
+    local = local_problem(problem)
+    idle = tuple(idle_joints(problem, sample_problem(local, _FIRST_SAMPLES, _SEED))[-problem.r :])
     cyclic = tuple(names.index(name) for name in cyclic_names)
     active = tuple(i for i in range(problem.n) if i not in idle)
     joints = tuple(i for i in active if i not in cyclic)
     if not joints or problem.r == len(idle):
         raise InvalidValueError("problem", f"one whose chart holds everywhere ({problem.name})", "one for oc.fit")
-    maps = find_symmetries(problem, active, cyclic) if settings.symmetric else identity_only(active)
+    maps = find_symmetries(local, active, cyclic) if settings.symmetric else identity_only(active)
     points = sample_uniform(problem.domain, _SCALE_SAMPLES, _SEED)
-    scale = row_scale(task_jacobians(problem, points), problem.task.units)
+    scale = row_scale(task_jacobians(local, points), problem.task.units)
     return Plan(problem, settings, idle, cyclic, _lattice(problem, region, joints, maps, settings), maps, scale)
 
 

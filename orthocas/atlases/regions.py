@@ -59,8 +59,9 @@ class JointRange:
                 "region", f"one of {lattice.size} boxes", "wider boxes, or the surroundings of postures"
             )
         tiles = np.arange(lattice.size)
-        centres = lattice.centres(tiles)
-        return tiles[self.touches(centres - lattice.width / 2, centres + lattice.width / 2)]
+        centres, half = lattice.centres(tiles), lattice.width / 2
+        turns = lattice.turns(self.low, self.high)
+        return tiles[np.any([self.touches(centres + turn - half, centres + turn + half) for turn in turns], axis=0)]
 
     def touches(self, low: Array, high: Array) -> NDArray[np.bool_]:
         """Whether boxes reach into the range."""

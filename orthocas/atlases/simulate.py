@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.atlases.hand_over import AtlasControl, HandOver
-from orthocas.atlases.laws import AtlasLaw, Command
+from orthocas.atlases.laws import AtlasLaw, Command, require_atlas_law
 from orthocas.checks import Array, Indices, as_number, as_point, require_kind
 from orthocas.control.reference import Reference
 from orthocas.control.status import FROM_THE_LAW
@@ -96,6 +96,7 @@ def simulate_in_atlas(
         PathError: if the motion leaves the charts or what the arm can reach.
         SimulationError: if the state diverges.
     """
+    require_atlas_law(law)
     times = _checked_times(law, motion, plant, control_rate)
     q, wanted = as_point("q_start", q_start, law.atlas.problem.n), np.stack(motion.sample(times), axis=1)
     loads, seconds = Loads(plant.robot.tree, pushes), 1 / control_rate

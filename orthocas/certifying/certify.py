@@ -77,10 +77,8 @@ def certify(
     limits = Limits(seconds=checked_options(chart, time_limit, executor))
     bound = checked_bound(chart, bound)
     rows = chart_rows(chart)
-    _require_independent(chart, rows.variables)
-    judge = judge_of(chart, rows, bound)
     base = whole_domain(chart.problem.domain) if resume is None else _resumed(chart, bound, resume)
-    search = Search(judge, base, limits, largest_first(base), executor)
+    search = _regularity_search(chart, rows, bound, base, limits, executor)
     injective: Subdivision | None = None
 
     def so_far() -> Certificate:
@@ -95,6 +93,22 @@ def certify(
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
     return so_far()
+
+
+def folds_nowhere(chart: Chart, time_limit: float) -> bool:
+    """Whether a processor time [s] is enough to prove that a chart does not fold. No one-to-one box is looked for."""
+    base, limits = whole_domain(chart.problem.domain), Limits(time_limit, time.thread_time)
+    search = _regularity_search(chart, chart_rows(chart), 0.0, base, limits, None)
+    search.visit(_suspects(chart))
+    search.run(lambda _: None)
+    return search.finished
+
+
+def _regularity_search(
+    chart: Chart, rows: ChartRows, bound: float, base: Subdivision, limits: Limits, executor: Executor | None
+) -> Search:
+    _require_independent(chart, rows.variables)
+    return Search(judge_of(chart, rows, bound), base, limits, largest_first(base), executor)
 
 
 def certified_box(
@@ -232,7 +246,7 @@ def _one_to_one(
     while low < high:
         middle = (low + high) // 2
         part = _scaled(base, _SCALES[middle])
-        limits = Limits(max(end - time.monotonic(), 0.0), _INJECTIVE_BOXES)
+        limits = Limits(max(end - time.monotonic(), 0.0), boxes=_INJECTIVE_BOXES)
         judge = injectivity_judge(rows, chart.problem.domain.centre, part)
         search = Search(judge, part, limits, largest_first(part), executor)
         search.run(_shown(monitor, "one-to-one"))

@@ -22,7 +22,7 @@ def in_singular_basis(J: TaylorModel) -> tuple[TaylorModel, Array]:
     nonsingular, and the sign of their determinants is that of the computed ones.
     """
     Ut, V = singular_vectors(J)
-    signs = np.nan_to_num(np.sign(np.linalg.det(Ut) * np.linalg.det(V))) * (_is_orthogonal(Ut) & _is_orthogonal(V))
+    signs = np.nan_to_num(np.sign(np.linalg.det(Ut) * np.linalg.det(V))) * (is_orthogonal(Ut) & is_orthogonal(V))
     return between(Ut, J, V), signs
 
 
@@ -34,7 +34,8 @@ def singular_vectors(J: TaylorModel) -> tuple[Array, Array]:
     return np.where(finite, U.transpose(0, 2, 1), np.nan), Vt.transpose(0, 2, 1)
 
 
-def _is_orthogonal(matrices: Array) -> NDArray[np.bool_]:
+def is_orthogonal(matrices: Array) -> NDArray[np.bool_]:
+    """Whether matrices (boxes, n, n) are orthogonal up to 1e-9 in their products."""
     difference = matrices.transpose(0, 2, 1) @ matrices - np.eye(matrices.shape[1])
     return np.asarray(np.abs(difference).max(axis=(1, 2)) < 1e-9)
 

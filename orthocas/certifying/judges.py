@@ -91,7 +91,7 @@ class InjectivityJudge:
         symmetric = product + transposed
         vectors = np.linalg.eigh(np.nan_to_num(np.moveaxis(symmetric.centre, -1, 0)))[1][:, :, ::-1]
         turned = between(vectors.transpose(0, 2, 1), symmetric, vectors)
-        proved: Array = np.asarray(_all_positive(pivots(turned)) & self._within_a_turn(J))
+        proved: Array = np.asarray(_all_positive(pivots(turned)) & self._within_a_turn(J), dtype=np.bool_)
         return proved, proved, np.zeros(boxes), np.zeros(boxes), _influences(turned)
 
     def _within_a_turn(self, J: TaylorModel) -> NDArray[np.bool_]:
@@ -114,10 +114,9 @@ def _all_positive(found: list[TaylorModel]) -> NDArray[np.bool_]:
 
 
 def _influences(turned: TaylorModel) -> Array:
-    """How much each variable changes the matrix, relative to its singular values, (boxes, variables)."""
+    """How much halving each variable narrows the matrix, relative to its singular values, (boxes, variables)."""
     middle = np.sqrt(np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))])) + 1e-300)
-    linear = np.abs(turned.coefficients[1 : 1 + len(turned.variables)])
-    influences: Array = (linear / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T
+    influences: Array = (turned.gains() / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T
     return np.nan_to_num(influences)
 
 

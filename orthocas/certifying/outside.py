@@ -9,19 +9,20 @@ import numpy as np
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.certifying.chart_rows import ChartRows, GraphRows, joint_models
-from orthocas.certifying.elimination import between, singular_vectors
+from orthocas.certifying.elimination import between, is_orthogonal, singular_vectors
 from orthocas.certifying.graph import TaylorGraph
 from orthocas.certifying.judges import Judge, RegularityJudge, Verdicts
 from orthocas.certifying.monomials import Variables
 from orthocas.certifying.rounding import UP
 from orthocas.certifying.task_rows import task_rows
+from orthocas.certifying.taylor import TaylorModel
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.postures.clear_box import ClearBox
 from orthocas.postures.corridor import Corridor
 
 _ROUNDING = 1e-6  # of distances, far above that of floating-point numbers
-_LENGTH = 1e-9  # of singular vectors: their deviation from 1 is far smaller
+_LENGTHS = 1e-7  # of squares: far above what singular vectors miss that are orthogonal up to 1e-9
 _GUARDS = 1e-12  # of |J_x|^2: elimination in floating-point numbers is exact to less, so guards agree
 
 
@@ -29,8 +30,9 @@ _GUARDS = 1e-12  # of |J_x|^2: elimination in floating-point numbers is exact to
 class OutsideJudge:
     """Counts boxes as proved, without a sign, that lie outside a ClearBox: s(q) <= bound all over the box.
 
-    s(q) <= |v^T D^-1 J_x(q)| for every unit vector v; v is the singular vector of the smallest singular value at the
-    middle of the box. Another judge judges the other boxes, and their det J must have the sign of the middle of the
+    s(q) <= |v^T D^-1 J_x(q)| for all |v| >= 1. Here v(q) is the singular vector of the smallest singular value at the
+    middle of the box, plus as much of the others, linear in q, as cancels the change of v^T D^-1 J_x along them to
+    first order. Another judge judges the other boxes, and their det J must have the sign of the middle of the
     domain: a box with the other sign is halved until its parts lie outside, or a fold shows.
     """
 
@@ -60,13 +62,26 @@ class OutsideJudge:
         """Whether boxes lie outside, and the joint to halve to find out."""
         J = self.rows(joint_models(low, high, self.variables)[0])
         left, right = singular_vectors(J)
-        across = between(left, J, np.broadcast_to(np.eye(right.shape[1]), right.shape))[-1]
-        with np.errstate(invalid="ignore", over="ignore"):
-            squared = (across.magnitude() ** 2).sum(axis=0) * UP
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            least = _least_row(between(left, J, right))
+            sizes = least.magnitude()
+            squared = (sizes**2).sum(axis=0) * UP
             squared += _GUARDS * (J.magnitude() ** 2).sum(axis=(0, 1))
-        outside: Array = squared <= self.domain.least_singular_value**2 * (1 - _LENGTH)
-        influences = np.abs(across.coefficients[1 : 1 + len(across.variables)]).sum(axis=1)
-        return outside, np.array(across.variables)[np.argmax(np.nan_to_num(influences), axis=0)]
+            influences = np.nan_to_num((least.gains() * sizes).sum(axis=1))
+        small = squared <= self.domain.least_singular_value**2 * (1 - _LENGTHS)
+        outside: Array = small & is_orthogonal(left) & is_orthogonal(right)
+        return outside, np.array(least.variables)[np.argmax(influences, axis=0)]
+
+
+def _least_row(turned: TaylorModel) -> TaylorModel:
+    """v^T times a matrix in its singular basis, for v = (a_1, ..., a_m-1, 1) with a_j = -(linear part) / s_j."""
+    row = turned[-1]
+    linear = slice(1, 1 + len(turned.variables))
+    for j in range(len(turned.remainder) - 1):
+        share = np.zeros_like(turned.coefficients[:, -1, j])
+        share[linear] = -turned.coefficients[linear, -1, j] / turned.centre[j, j]
+        row = row + TaylorModel(turned.variables, share[:, None], np.zeros(share[:1].shape)) * turned[j]
+    return row
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ class Limits:
     """When a search ends before all is proved."""
 
     seconds: float = np.inf
+    clock: Callable[[], float] = time.monotonic  #: of the seconds
     boxes: int = MOST_BOXES // 4
     smallest: float = 2.0**-12  #: share of the width of the whole below which a joint's interval is not halved
     first_failure: bool = False  #: whether boxes that rank behind one that is too small to halve do not matter
@@ -66,11 +67,12 @@ class Search:
 
     def run(self, look: Look) -> None:
         """Search until all is proved, a fold is found, or a limit is reached. An interrupted search keeps its state."""
-        end = time.monotonic() + self.limits.seconds
+        clock = self.limits.clock
+        end = clock() + self.limits.seconds
         pending: dict[Future[Verdicts], list[tuple[float, int, Array, Array]]] = {}
         try:
             while self._waiting or pending:
-                if self._decided or time.monotonic() > end or self.judged >= self.limits.boxes:
+                if self._decided or clock() > end or self.judged >= self.limits.boxes:
                     break
                 self._step(pending)
                 look(self)

@@ -6,11 +6,12 @@ see `orthocas.certifying.rounding`. Infinite or undefined remainders stand for "
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Self
 
 import numpy as np
 
-from orthocas.certifying.monomials import Variables, order_starts, places, product
+from orthocas.certifying.monomials import Variables, monomials, order_starts, places, product
 from orthocas.certifying.rounding import SUM, TINY, UNIT, UP
 from orthocas.checks import Array
 
@@ -132,6 +133,24 @@ class TaylorModel:
         """A bound of the distance from the centre, (..., boxes)."""
         bound: Array = (np.abs(self.coefficients[1:]).sum(axis=0) + self.remainder) * UP
         return bound
+
+    def gains(self) -> Array:
+        """How much halving the interval of each variable takes from the bound of the values, (variables, ..., boxes).
+
+        A coefficient shrinks by 2^-power; the remainder is shared out like the cubic terms, which it is most like.
+        """
+        taken = _taken(self.variables)
+        size = np.abs(self.coefficients)
+        cubic = slice(order_starts(len(self.variables))[3], None)
+        known, last = (np.einsum("kv,k...->v...", taken[part], size[part]) for part in (slice(None), cubic))
+        gains: Array = known + last / (last.sum(axis=0) + TINY) * self.remainder
+        return gains
+
+
+@cache
+def _taken(variables: Variables) -> Array:
+    """1 - 2^-power of each variable in each monomial, (monomials, variables)."""
+    return np.array([[1 - 0.5 ** powers.count(v) for v in variables] for powers in monomials(variables)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,16 +16,7 @@ from orthocas.atlases.regions import read_postures
 from orthocas.certifying.scheduler import scheduler_executor
 from orthocas.checks import require_count
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
-from orthocas.cli.problem_argument import (
-    Locks,
-    MetricName,
-    ProblemName,
-    ProblemOptions,
-    TaskName,
-    TipName,
-    ToolText,
-    build_problem,
-)
+from orthocas.cli.problem_argument import CHAIN, ProblemName, ProblemOptions, build_problem, with_options
 from orthocas.cli.progress import terminal_monitor
 from orthocas.errors import Interrupted
 from orthocas.files.atomic import output_folder
@@ -41,9 +32,11 @@ _ASKED = AtlasSettings()
 
 
 @atlas.command("build")
+@with_options(*CHAIN)
 def build(
     problem: ProblemName,
     out: Annotated[Path, typer.Option("--out", help="Atlas file; if it exists, the build goes on from it.")],
+    words: ProblemOptions,
     region: Annotated[
         str,
         typer.Option(
@@ -56,11 +49,6 @@ def build(
     margin_deg: Annotated[
         float, typer.Option("--margin-deg", parser=number, help="Distance of the joint range to the limits [deg].")
     ] = MARGIN_DEG,
-    tip: TipName = None,
-    lock: Locks = None,
-    tool: ToolText = None,
-    task: TaskName = None,
-    metric: MetricName = None,
     degree: Annotated[int, typer.Option("--degree", parser=whole_number, help="Of the polynomials.")] = _ASKED.degree,
     leak_deg: Annotated[
         float, typer.Option("--leak-deg", parser=number, help="Largest root mean square leak of a chart [deg].")
@@ -82,7 +70,9 @@ def build(
     ] = _ASKED.splits,
     certify: Annotated[
         float,
-        typer.Option("--certify", metavar="SECONDS", parser=number, help="Time limit of each proof; 0 for no proofs."),
+        typer.Option(
+            "--certify", metavar="SECONDS", parser=number, help="Processor time for each proof; 0 for no proofs."
+        ),
     ] = _ASKED.certify_seconds,
     share: Annotated[float, typer.Option("--share", parser=number, help="Build this share of the tiles only.")] = 1.0,
     seconds: Annotated[
@@ -100,7 +90,7 @@ def build(
     """Fit charts of overlapping boxes over the joint range of an arm; a build that was killed goes on."""
     if workers is not None:
         require_count("--workers", workers)
-    built = build_problem(problem, ProblemOptions(tip, tuple(lock or ()), tool, task, metric))
+    built = build_problem(problem, words)
     asked = AtlasSettings(
         degree, leak_deg, conditioning, least_singular_value, half_width, splits=splits, certify_seconds=certify
     )

@@ -33,7 +33,7 @@ from orthocas.cli.output import AsJson, Force, note, number, print_json, print_r
 from orthocas.codegen import GeneratedC, Proof, check_c, check_c_of_atlas, generate_c
 from orthocas.control import Controller
 from orthocas.errors import InvalidValueError
-from orthocas.files.blocks import begins_as
+from orthocas.files.blocks import begins
 
 _NONE = "none"
 
@@ -104,7 +104,7 @@ def codegen(
 
 def _opened(path: Path, along: Path | None, radius: float | None) -> tuple[AtlasPart | None, Chart]:
     """The part of an atlas, or None for the file of a chart; and the chart, or the first one of the part."""
-    if not begins_as(path, ATLAS):
+    if not begins(path, ATLAS):
         for name, value in (("--along", along), ("--radius", radius)):
             if value is not None:
                 raise InvalidValueError(name, value, "an atlas file to take a part of")

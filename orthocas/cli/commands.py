@@ -20,7 +20,7 @@ COMMANDS = {
     "follow": "Follow a tool path; write joint positions, velocities and accelerations on time stamps.",
     "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",
     "export": "Write task, xi, phi and Jacobian of a chart as one Python module that needs the library only.",
-    "view": "Show a chart, a robot or a motion in the browser, until Ctrl-C.",
+    "view": "Show a chart, an atlas, a robot or a motion in the browser, until Ctrl-C.",
     "charts": "List the ready charts of known arms, show the card of one, or write it to a file.",
     "atlas": "Build, evaluate and show atlases: charts that cover the joint range of an arm.",
 }  #: names of the commands, modules of this package, and the first lines of their help

@@ -5,27 +5,23 @@ from typing import Annotated
 
 import typer
 
-from orthocas.cli.fit import WEIGHTS_TEXT, AnglesName, parse_weights
-from orthocas.cli.output import AsJson, Force, note, print_json, print_table, whole_number
-from orthocas.cli.problem_argument import (
-    CentreText,
-    HalfWidth,
-    HomeName,
-    Locks,
-    MetricName,
-    ProblemName,
-    ProblemOptions,
-    TaskName,
-    TipName,
-    ToolText,
-    build_problem,
+from orthocas.cli.fit_argument import (
+    WEIGHTS_TEXT,
+    AnglesName,
+    PrecisionName,
+    SampleCount,
+    WeightsText,
+    parse_weights,
 )
+from orthocas.cli.output import AsJson, Force, note, print_json, print_table, whole_number
+from orthocas.cli.problem_argument import CHAIN, DOMAIN, ProblemName, ProblemOptions, build_problem, with_options
 from orthocas.cli.progress import terminal_monitor
 from orthocas.comparing.compare import compare as compare_fits
 from orthocas.comparing.figures import convergence_figure, front_figure
 from orthocas.comparing.report import Comparison
 from orthocas.errors import Interrupted, printable
 from orthocas.files.atomic import output_folder, published, require_replaceable_files
+from orthocas.fitting.settings import PRECISIONS
 from orthocas.parametrisations import parse_parametrisation
 from orthocas.solvers import get as get_solver
 
@@ -33,13 +29,10 @@ _FILES = ("comparison.csv", "comparison.json", "front.png", "convergence.png")
 _PARAMETRISATIONS = ["linear", "polynomial:2", "polynomial:3", "polynomial:4", "mlp:32x32"]
 
 
+@with_options(*CHAIN, *DOMAIN)
 def compare(
     problem: ProblemName,
-    tip: TipName = None,
-    lock: Locks = None,
-    tool: ToolText = None,
-    task: TaskName = None,
-    metric: MetricName = None,
+    words: ProblemOptions,
     param: Annotated[
         list[str] | None, typer.Option("--param", help="Parametrisation; repeat for more. Default: a small selection.")
     ] = None,
@@ -47,25 +40,16 @@ def compare(
         list[str] | None, typer.Option("--solver", help="Solver; repeat for more. Default: one that suits each.")
     ] = None,
     seeds: Annotated[int, typer.Option("--seeds", parser=whole_number, help="Number of seeds per fit.")] = 1,
-    centre: CentreText = None,
-    home: HomeName = None,
-    half_width: HalfWidth = None,
-    samples: Annotated[
-        int | None,
-        typer.Option(
-            "--samples", parser=whole_number, help="Number of training samples; default: from the problem size."
-        ),
-    ] = None,
+    samples: SampleCount = None,
     held_out: Annotated[
         int,
         typer.Option(
             "--held-out", parser=whole_number, help="Number of held-out samples that every fit is evaluated on."
         ),
     ] = 100_000,
-    weights: Annotated[
-        str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3, lambda4 and lambda5.')
-    ] = WEIGHTS_TEXT,
+    weights: WeightsText = WEIGHTS_TEXT,
     angles: AnglesName = None,
+    precision: PrecisionName = PRECISIONS[0],
     jobs: Annotated[
         int | None,
         typer.Option("--jobs", parser=whole_number, help="Number of processes, one thread each; default: all cores."),
@@ -75,7 +59,6 @@ def compare(
     json: AsJson = False,
 ) -> None:
     """Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts."""
-    words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width)
     built = build_problem(problem, words)
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers = [get_solver(name) for name in solver] if solver else None
@@ -91,6 +74,7 @@ def compare(
                     seeds=seeds,
                     weights=loss,
                     samples=samples,
+                    precision=precision,
                     held_out=held_out,
                     jobs=jobs,
                     charts=charts,

@@ -1,26 +1,28 @@
 """`orthocas fit`: from a robot to a chart file."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from orthocas.cli.corridor_argument import CorridorPath, CorridorRadius, corridor_or_box
+from orthocas.cli.fit_argument import (
+    WEIGHTS_TEXT,
+    AnglesName,
+    PrecisionName,
+    SampleCount,
+    WeightsText,
+    parse_weights,
+)
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, report_rows, whole_number
 from orthocas.cli.problem_argument import (
-    CentreText,
+    CHAIN,
+    DOMAIN,
     DomainText,
-    HalfWidth,
-    HomeName,
-    Locks,
-    MetricName,
     ProblemName,
     ProblemOptions,
-    TaskName,
-    TipName,
-    ToolText,
-    build_problem,
-    parse_numbers,
+    with_options,
 )
 from orthocas.cli.progress import terminal_monitor
 from orthocas.cli.suggested_problem import suggested
@@ -29,7 +31,7 @@ from orthocas.files.archive import require_free
 from orthocas.files.chart_file import CHART
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
-from orthocas.fitting.loss import DEFAULT_WEIGHTS, Weights
+from orthocas.fitting.settings import PRECISIONS
 from orthocas.minimising.solver import Status
 from orthocas.parametrisations import parse_parametrisation
 from orthocas.postures.probe import Bounds
@@ -39,30 +41,19 @@ from orthocas.quality import Report, evaluate
 from orthocas.showing import number_list
 from orthocas.solvers import get as get_solver
 
-AnglesName = Annotated[
-    str | None,
-    typer.Option(
-        "--angles",
-        help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia.",
-    ),
-]
-_NUMBERS = ("task", "mutual", "regularity", "length", "folds")
-WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _NUMBERS)
+_IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 
 
+@with_options(*CHAIN, *DOMAIN, "least_singular_value")
 def fit(
     problem: ProblemName,
-    tip: TipName = None,
-    lock: Locks = None,
-    tool: ToolText = None,
-    task: TaskName = None,
-    metric: MetricName = None,
+    words: ProblemOptions,
     param: Annotated[
         str | None,
         typer.Option(
             "--param",
             help="Parametrisation: polynomial:5, polynomial:5:cyclic, fourier:2, mlp:64x64, linear or sew; "
-            "default: polynomial:5, or polynomial:4 for more than seven joints.",
+            "default: polynomial:5, or polynomial:4 for more than seven joints; polynomial:3:cyclic with --corridor.",
         ),
     ] = None,
     solver: Annotated[
@@ -73,18 +64,9 @@ def fit(
             "default: one that suits the parametrisation.",
         ),
     ] = None,
-    centre: CentreText = None,
-    home: HomeName = None,
-    half_width: HalfWidth = None,
-    least_singular_value: Annotated[
-        float | None,
-        typer.Option(
-            "--least-singular-value",
-            parser=number,
-            help="Leave positions out of the domain where the task's relative singular value is smaller, such as 0.1.",
-        ),
-    ] = None,
     domain: DomainText = None,
+    corridor: CorridorPath = None,
+    radius: CorridorRadius = None,
     leak_deg: Annotated[
         float | None, typer.Option("--leak-deg", parser=number, help="Largest leak for --domain auto [deg]; default 8.")
     ] = None,
@@ -92,19 +74,13 @@ def fit(
         float | None,
         typer.Option("--conditioning", parser=number, help="Smallest conditioning for --domain auto; default 0.2."),
     ] = None,
-    samples: Annotated[
-        int | None,
-        typer.Option(
-            "--samples", parser=whole_number, help="Number of training samples; default: from the problem size."
-        ),
-    ] = None,
+    samples: SampleCount = None,
     seed: Annotated[
         int, typer.Option("--seed", parser=whole_number, help="Seed of the samples and of random starts.")
     ] = 0,
-    weights: Annotated[
-        str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3, lambda4 and lambda5.')
-    ] = WEIGHTS_TEXT,
+    weights: WeightsText = WEIGHTS_TEXT,
     angles: AnglesName = None,
+    precision: PrecisionName = PRECISIONS[0],
     max_mutual_deg: Annotated[
         float | None,
         typer.Option(
@@ -126,11 +102,11 @@ def fit(
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
-    words = ProblemOptions(tip, tuple(lock or ()), tool, task, metric, centre, home, half_width, least_singular_value)
-    bounds = _bounds(domain, leak_deg, conditioning)
-    built = build_problem(problem, words) if bounds is None else None
+    bounds = _bounds(domain, leak_deg, conditioning, corridor)
+    built = corridor_or_box(problem, words, corridor, radius) if bounds is None else None
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
     require_free(target, CHART, force)
+    param = _IN_CORRIDOR if param is None and corridor is not None else param
     parametrisation = None if param is None else parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
     loss = parse_weights(weights, angles)
@@ -150,6 +126,7 @@ def fit(
                 monitor=monitor,
                 max_mutual_deg=max_mutual_deg,
                 checkpoint=checkpoint,
+                precision=precision,
             )
     except Interrupted as stop:
         result = stop.result
@@ -164,8 +141,12 @@ def fit(
         raise typer.Exit(130)
 
 
-def _bounds(domain: str | None, leak_deg: float | None, conditioning: float | None) -> Bounds | None:
+def _bounds(
+    domain: str | None, leak_deg: float | None, conditioning: float | None, corridor: Path | None
+) -> Bounds | None:
     """What --domain auto asks for; None without it."""
+    if domain is not None and corridor is not None:
+        raise InvalidValueError("--domain", repr(domain), "none with --corridor, which is the domain")
     given = {"--leak-deg": leak_deg, "--conditioning": conditioning}
     if domain is None:
         for option, value in given.items():
@@ -175,14 +156,6 @@ def _bounds(domain: str | None, leak_deg: float | None, conditioning: float | No
     if domain != "auto":
         raise InvalidValueError("--domain", repr(domain), "auto, or --centre and --half-width for a box of your own")
     return Bounds(LEAK_DEG if leak_deg is None else leak_deg, CONDITIONING if conditioning is None else conditioning)
-
-
-def parse_weights(text: str, angles: str | None) -> Weights:
-    """Read two to five numbers, such as "1000,30" or "1000,30,150,0.01,1000", with the kind of angles."""
-    numbers = parse_numbers("--weights", text).tolist()
-    if not 2 <= len(numbers) <= 5:
-        raise InvalidValueError("--weights", repr(text), "two to five numbers")
-    return replace(Weights.of(numbers), angles=angles)
 
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any
 from orthocas import problems
 from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.cli.problem_argument import (
-    Locks,
+    ROBOT,
     ProblemName,
     ProblemOptions,
-    TipName,
-    ToolText,
     build_problem,
     build_robot,
     is_robot_file,
+    with_options,
 )
 from orthocas.coordinates.map import InvertibleMap
 from orthocas.domains import Domain
@@ -30,11 +29,9 @@ if TYPE_CHECKING:
     from orthocas.chart import Chart
 
 
-def info(
-    target: ProblemName, tip: TipName = None, lock: Locks = None, tool: ToolText = None, json: AsJson = False
-) -> None:
+@with_options(*ROBOT)
+def info(target: ProblemName, words: ProblemOptions, json: AsJson = False) -> None:
     """Show a chart file, a named problem, or a robot file."""
-    words = ProblemOptions(tip, tuple(lock or ()), tool)
     if is_robot_file(target):
         data = _robot(build_robot(target, words))
     elif target in problems.names():

@@ -1,14 +1,18 @@
 """Builds a problem from command-line options: a named problem or a robot file, with overrides."""
 
+import inspect
+from collections.abc import Callable
 from dataclasses import astuple, dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 from orthocas import problems
 from orthocas.checks import Array
+from orthocas.cli.output import number
 from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, UnknownNameError
 from orthocas.postures.regular_box import regular_box
@@ -17,38 +21,56 @@ from orthocas.robots import Robot
 from orthocas.tasks import Task
 
 ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem or a URDF file.")]
-TipName = Annotated[str | None, typer.Option("--tip", help="Tip frame of a robot file; default: the end of its chain.")]
-Locks = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--lock", metavar="JOINT=VALUE", help="Lock a joint of a robot file at a value [rad or m]; repeat for more."
-    ),
-]
-ToolText = Annotated[
-    str | None,
-    typer.Option("--tool", help='Pose of a tool on the tip, "x,y,z" or "x,y,z,roll,pitch,yaw" [m, rad].'),
-]
-TaskName = Annotated[
-    str | None,
-    typer.Option(
-        "--task", help="Task: position, position:xy, polar, orientation, pose, pose:z, axis or position+axis."
-    ),
-]
-MetricName = Annotated[str | None, typer.Option("--metric", help="Metric: euclidean or inertia.")]
-CentreText = Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')]
-HomeName = Annotated[
-    str | None,
-    typer.Option("--home", help="Named posture as centre of the domain, from an MJCF file or the SRDF beside a URDF."),
-]
 DomainText = Annotated[
     str | None,
     typer.Option(
         "--domain", help="auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning."
     ),
 ]
-HalfWidth = Annotated[
-    str | None, typer.Option("--half-width", help='Half-width of the domain, "0.4" or one per joint [rad or m].')
-]
+_OPTIONS: dict[str, Any] = {
+    "tip": Annotated[
+        str | None, typer.Option("--tip", help="Tip frame of a robot file; default: the end of its chain.")
+    ],
+    "lock": Annotated[
+        list[str] | None,
+        typer.Option(
+            "--lock", metavar="JOINT=VALUE", help="Lock a joint of a robot file at a value [rad or m]; repeat for more."
+        ),
+    ],
+    "tool": Annotated[
+        str | None,
+        typer.Option("--tool", help='Pose of a tool on the tip, "x,y,z" or "x,y,z,roll,pitch,yaw" [m, rad].'),
+    ],
+    "task": Annotated[
+        str | None,
+        typer.Option(
+            "--task", help="Task: position, position:xy, polar, orientation, pose, pose:z, axis or position+axis."
+        ),
+    ],
+    "metric": Annotated[str | None, typer.Option("--metric", help="Metric: euclidean or inertia.")],
+    "centre": Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')],
+    "home": Annotated[
+        str | None,
+        typer.Option(
+            "--home", help="Named posture as centre of the domain, from an MJCF file or the SRDF beside a URDF."
+        ),
+    ],
+    "half_width": Annotated[
+        str | None, typer.Option("--half-width", help='Half-width of the domain, "0.4" or one per joint [rad or m].')
+    ],
+    "least_singular_value": Annotated[
+        float | None,
+        typer.Option(
+            "--least-singular-value",
+            parser=number,
+            help="Leave positions out of the domain where the task's relative singular value is smaller, such as 0.1.",
+        ),
+    ],
+}  #: command-line options of the fields of `ProblemOptions`
+ROBOT = ("tip", "lock", "tool")
+CHAIN = (*ROBOT, "task", "metric")
+DOMAIN = ("centre", "home", "half_width")
+_WORDS = "words"  # the parameter of a command that takes its `ProblemOptions`
 
 
 @dataclass(frozen=True)
@@ -74,6 +96,31 @@ class ProblemOptions:
         for option, value in (("tip", self.tip), ("lock", ", ".join(self.lock) or None), ("tool", self.tool)):
             if value is not None:
                 raise InvalidValueError(f"--{option}", value, f"no {option} for {owner}, which has its own robot")
+
+
+def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator of commands: options of these names take the place of the parameter `words`, a `ProblemOptions`."""
+
+    def decorated(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command).parameters.values()
+        options = [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=_OPTIONS[name])
+            for name in names
+        ]
+        spread = [[*options] if part.name == _WORDS else [part.replace(kind=part.KEYWORD_ONLY)] for part in own]
+
+        @wraps(command)
+        def called(**given: Any) -> None:
+            chosen = {name: given.pop(name) for name in names}
+            chosen["lock"] = tuple(chosen.get("lock") or ())
+            command(words=ProblemOptions(**chosen), **given)
+
+        parameters = [part for parts in spread for part in parts]
+        vars(called)["__signature__"] = inspect.Signature(parameters)
+        called.__annotations__ = {part.name: part.annotation for part in parameters}
+        return called
+
+    return decorated
 
 
 def is_robot_file(name: str) -> bool:

@@ -8,19 +8,21 @@ from typing import Annotated, Any
 import typer
 
 from orthocas import problems
+from orthocas.atlases.atlas import Atlas
+from orthocas.atlases.atlas_file import ATLAS
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.chart import Chart
 from orthocas.cli.output import AsJson, Force, note, print_json, print_rows, whole_number
 from orthocas.cli.problem_argument import (
-    Locks,
+    ROBOT,
     ProblemOptions,
-    TipName,
-    ToolText,
     build_robot,
     is_robot_file,
     locked_joints,
+    with_options,
 )
 from orthocas.errors import InvalidValueError
+from orthocas.files.blocks import begins
 from orthocas.following.path_file import read_path
 from orthocas.robots import Robot
 from orthocas.viewing import View, cyclic_motions, export_page
@@ -42,21 +44,20 @@ class _Asked:
     locked: dict[str, float]
 
 
+@with_options(*ROBOT)
 def view(
     target: Annotated[
         str,
         typer.Argument(
-            metavar="CHART|RUN|FILE.urdf",
-            help="A chart file; trajectory.npz or a folder of simulate; a CSV file of follow; a robot file or problem.",
+            metavar="CHART|ATLAS|RUN|FILE.urdf",
+            help="A chart or atlas file; trajectory.npz or folder of simulate; CSV file of follow; robot or problem.",
         ),
     ],
+    words: ProblemOptions,
     chart: Annotated[Path | None, typer.Option("--chart", help="For runs: a chart of the robot that moved.")] = None,
     robot: Annotated[
         Path | None, typer.Option("--robot", metavar="FILE.urdf", help="Robot file with the meshes of the links.")
     ] = None,
-    tip: TipName = None,
-    lock: Locks = None,
-    tool: ToolText = None,
     compare: Annotated[
         bool,
         typer.Option("--compare", help="Play a closed path with constant xi beside the pseudo-inverse, which drifts."),
@@ -75,7 +76,7 @@ def view(
     force: Force = False,
     json: AsJson = False,
 ) -> None:
-    """Show a chart, a robot or a motion in the browser, until Ctrl-C."""
+    """Show a chart, an atlas, a robot or a motion in the browser, until Ctrl-C."""
     if export is None:
         require_free(host, port)
     else:
@@ -83,7 +84,7 @@ def view(
     if not compare and path is not None:
         raise InvalidValueError("--path", path, "--compare as well, which follows the path")
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
-        asked = _asked(target, chart, robot, ProblemOptions(tip, tuple(lock or ()), tool))
+        asked = _asked(target, chart, robot, words)
     if compare:
         asked = _compared(asked, path, cycles)
     if export is not None:
@@ -110,7 +111,7 @@ def _asked(target: str, chart: Path | None, meshes: Path | None, words: ProblemO
         return _Asked(motion, owner, meshes, locked)
     if chart is not None:
         raise InvalidValueError("--chart", chart, f"no chart beside the chart {target}")
-    return _Asked(Chart.load(place), None, meshes, locked)
+    return _Asked(Atlas.load(place) if begins(place, ATLAS) else Chart.load(place), None, meshes, locked)
 
 
 def _owner(chart: Path | None, meshes: Path | None, words: ProblemOptions) -> Robot | Chart:

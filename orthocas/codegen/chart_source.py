@@ -10,6 +10,7 @@ import numpy as np
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
+from orthocas.codegen.border_condition import border_units
 from orthocas.codegen.description import chart_values
 from orthocas.codegen.filling import filled
 from orthocas.codegen.numbers import flags, numbers
@@ -18,6 +19,7 @@ from orthocas.codegen.words import words
 from orthocas.control import Controller, Safety
 from orthocas.domains import Conditioned, Domain, borders, contains, reach
 from orthocas.errors import InvalidValueError
+from orthocas.postures.corridor import Corridor
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,7 @@ class ChartSource:
         bordered = np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None)
         values = {
             "domain_half_width": numbers(domain.half_width),
+            "border_unit": numbers(border_units(domain)),
             "bordered": flags(bordered),
             "law_mem": "0",
             "law_now": "state->law[i]",
@@ -110,7 +113,10 @@ def condition_code(domain: Conditioned, values: Mapping[str, str]) -> str:
 
 
 def position_within(domain: Domain) -> Array:
-    """A joint position of a domain between its centre and a corner, (n,)."""
+    """A joint position of a domain between its centre and a corner, (n,); of a corridor one on the path."""
+    if isinstance(domain, Corridor):
+        inside = domain.postures[domain.contains(domain.postures)]
+        return np.asarray(inside[len(inside) // 2])
     shares = [0.5**k for k in range(1, 20) if contains(domain, domain.centre + 0.5**k * domain.half_width)]
     return np.round(domain.centre + (shares[0] if shares else 0.0) * domain.half_width, 3)
 

@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.chart import Chart
+from orthocas.codegen.border_condition import BorderCondition, border_condition
 from orthocas.codegen.check import check_values
 from orthocas.codegen.control_values import control_values
 from orthocas.codegen.description import description_values
@@ -12,7 +13,7 @@ from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.numbers import numbers
 from orthocas.codegen.precision import Precision
 from orthocas.codegen.source import Source
-from orthocas.codegen.supervision import clear_border, supervision_values
+from orthocas.codegen.supervision import supervision_values
 from orthocas.codegen.words import words
 from orthocas.control import Controller, Safety
 from orthocas.version import VERSION
@@ -54,14 +55,19 @@ def template_values(
     }
     values |= source.values(values, precision)
     if controller is not None and safety is not None:
-        clear = clear_border(source, controller)
-        values |= control_values(controller) | supervision_values(controller, safety, clear)
-        values["clearance_c"] = "" if clear is None else filled("clearance.c", values)
+        condition = border_condition(source, controller)
+        values |= control_values(controller) | supervision_values(controller, safety, condition)
+        values["clearance_c"] = "" if condition is None else _clearance(condition, values)
         values |= source.law_values(controller, values)
         values["compose"] = filled(f"compose_{controller.command}.c", values)
     for template in ("control.h", "control.c", "check_control.c", "control.md", "supervisor.h", "supervisor.c"):
         values[template.replace(".", "_")] = "" if controller is None else filled(template, values)
     return values
+
+
+def _clearance(condition: BorderCondition, values: dict[str, str]) -> str:
+    """Code that tells how far a position is inside the condition of the domain, here and after a time."""
+    return filled("clearance.c", {**values, "condition_border": filled(condition.template, values)})
 
 
 def _sizes(chart: Chart) -> dict[str, str]:

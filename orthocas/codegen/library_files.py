@@ -11,6 +11,7 @@ import numpy as np
 from orthocas.casadi_tools.scalar_code import fast_form, scalar_code
 from orthocas.chart import Chart
 from orthocas.checks import as_path, require_kind, require_shape
+from orthocas.codegen.border_condition import border_condition
 from orthocas.codegen.filling import filled
 from orthocas.codegen.generated import GeneratedC
 from orthocas.codegen.interface import template_values
@@ -18,7 +19,7 @@ from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
 from orthocas.codegen.rows import names_of_files, rows_files
 from orthocas.codegen.source import Source
-from orthocas.codegen.supervision import clear_border, supervision_kernels
+from orthocas.codegen.supervision import supervision_kernels
 from orthocas.control import Controller, Safety
 from orthocas.control.controller import require_controller
 from orthocas.errors import ArchiveError, InvalidValueError
@@ -87,8 +88,8 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
     if controller is not None:
         graph = source.graph(precision.graph(controller))
         inputs = graph.mx_in()
-        clear = clear_border(source, controller)
-        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, clear)]
+        condition = border_condition(source, controller)
+        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, condition)]
     return found
 
 

@@ -36,6 +36,7 @@ class Cell:
     seed: int
     weights: Weights
     samples: int | None
+    precision: str
     held_out: int
     chart_file: Path | None  #: file to save the chart in
     force: bool = False  #: replace a file there that is not a chart
@@ -103,6 +104,7 @@ def run_cell(cell: Cell) -> CellResult:
             cell.solver,
             weights=cell.weights,
             samples=cell.samples,
+            precision=cell.precision,
             seed=cell.seed,
             monitor=record,
         )

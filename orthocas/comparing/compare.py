@@ -6,7 +6,7 @@ from concurrent.futures import Executor
 from itertools import product
 from pathlib import Path
 
-from orthocas.checks import as_path, require_count, require_kind
+from orthocas.checks import as_path, require_count, require_kind, require_known
 from orthocas.comparing.cells import Cell, CellResult, run_cells
 from orthocas.comparing.report import Comparison
 from orthocas.comparing.ticks import with_control_ticks
@@ -15,7 +15,7 @@ from orthocas.files.archive import require_free
 from orthocas.files.atomic import require_writable
 from orthocas.files.chart_file import CHART
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers, Weights
-from orthocas.fitting.settings import default_solver
+from orthocas.fitting.settings import PRECISIONS, default_solver
 from orthocas.minimising.solver import Solver
 from orthocas.minimising.watch import Monitor, silent
 from orthocas.parametrisations import Parametrisation, require_savable
@@ -31,6 +31,7 @@ def compare(
     seeds: int = 1,
     weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
     samples: int | None = None,
+    precision: str = PRECISIONS[0],
     held_out: int = 100_000,
     executor: Executor | None = None,
     jobs: int | None = None,
@@ -53,6 +54,7 @@ def compare(
         seeds: number of seeds 0, 1, ... of samples and random starts.
         weights: weights of the loss; see `fit`.
         samples: number of training samples. Default: grows with the number of parameters.
+        precision: 'double' or 'single', as in `orthocas.fit`.
         held_out: number of held-out samples.
         executor: any `concurrent.futures.Executor` (processes, threads, Dask, MPI, ...). Default: processes on this
             machine with one thread each, so that seconds are those of one core.
@@ -87,6 +89,7 @@ def compare(
     count, loss = require_count("seeds", seeds), Weights.of(weights)
     jobs = None if jobs is None else require_count("jobs", jobs)
     held_out = require_count("held_out", held_out)
+    require_known("precision", precision, PRECISIONS)
     _require_grid(parametrisations, solvers)
     folder = None if charts is None else as_path("charts", charts)
     if folder is not None:
@@ -96,7 +99,7 @@ def compare(
     elif control_ticks:
         raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
     cells = [
-        Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file, force)
+        Cell(problem, parametrisation, solver, seed, loss, samples, precision, held_out, file, force)
         for parametrisation, solver, seed, file in _fits(problem, parametrisations, solvers, count, folder)
     ]
     for cell in cells:

@@ -126,7 +126,7 @@ def _draw_front(axes: Axes, summaries: Sequence[Summary], single: bool) -> None:
 
 
 def _label(axes: Axes, summaries: Sequence[Summary], single: bool, colours: Mapping[str, Colour]) -> None:
-    """Write each parametrisation once, beside its least task angle; labels that would touch move up."""
+    """Write each parametrisation once, beside its least task angle; labels that would touch move up or down."""
     best: dict[str, Summary] = {}
     for summary in summaries:
         best.setdefault(summary.parametrisation, summary)
@@ -135,22 +135,35 @@ def _label(axes: Axes, summaries: Sequence[Summary], single: bool, colours: Mapp
     scale = 72 / axes.figure.dpi
     points = {(s.parametrisation, s.solver): scale * axes.transData.transform(_place(s, single)) for s in summaries}
     boxes = [(x - _HIGH / 2, x + _HIGH / 2, y) for x, y in points.values()]  # left, right and height of what is there
+    frame = axes.get_window_extent()
+    low, high, end = scale * frame.y0 + _HIGH / 2, scale * frame.y1 - _HIGH / 2, scale * frame.x1
     for name, summary in sorted(best.items(), key=lambda entry: points[_key(entry[1])][1]):
         x, y = points[_key(summary)]
-        left, right, height = x + _ASIDE, x + _ASIDE + _LETTER * len(name), y
-        while any(left < other[1] and other[0] < right and abs(height - other[2]) < _HIGH for other in boxes):
-            height += 1.0
+        wide = _LETTER * len(name)
+        side = 1 if x + _ASIDE + wide < end else -1
+        left, right = sorted((x + side * _ASIDE, x + side * (_ASIDE + wide)))
+        height = _free_height(y, low, high, [box[2] for box in boxes if left < box[1] and box[0] < right])
         boxes.append((left, right, height))
         axes.annotate(
             name,
             _place(summary, single),
-            xytext=(_ASIDE, height - y),
+            xytext=(side * _ASIDE, height - y),
             textcoords="offset points",
             fontsize=9,
             color=colours[name],
+            horizontalalignment="left" if side > 0 else "right",
             verticalalignment="center",
-            arrowprops={"arrowstyle": "-", "color": colours[name], "linewidth": 0.7, "relpos": (0, 0.5)},
+            arrowprops={"arrowstyle": "-", "color": colours[name], "linewidth": 0.7, "relpos": (side < 0, 0.5)},
         )
+
+
+def _free_height(y: float, low: float, high: float, taken: Sequence[float]) -> float:
+    """The height nearest to y, from low to high, that keeps its distance from taken ones; y if there is none."""
+    for shift in range(round(high - low)):
+        for height in (y + shift, y - shift):
+            if low <= height <= high and all(abs(height - other) >= _HIGH for other in taken):
+                return height
+    return y
 
 
 def _scale(axes: Axes, *values: Sequence[float]) -> None:

@@ -1,11 +1,14 @@
 """The second-order low-pass filter, in closed form. It turns steps into references with two derivatives."""
 
+from functools import lru_cache
+
 import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import dense_function
 
 
+@lru_cache(32)
 def low_pass_response(k: int, natural_frequency: float, damping_ratio: float) -> ca.Function:
     """Response of k equal low-pass filters to a constant target, from any start.
 

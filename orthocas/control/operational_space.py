@@ -38,6 +38,7 @@ from orthocas.control.run_time_model import RunTimeModel
 from orthocas.control.turns import without_turns
 from orthocas.domains import sample_uniform
 from orthocas.problem import Problem
+from orthocas.robots.tip_turn import TipTurn
 from orthocas.showing import Shown
 
 Coupling = Literal["coupled", "decoupled"]
@@ -162,7 +163,11 @@ class _OperationalSpace(Shown):
         return {"stiffness": STIFFNESS, "damping_ratio": DAMPING_RATIO, "limit": LIMIT, **design, **self.model.units}
 
     def remarks(self) -> list[str]:
-        """Warnings if the metric does not decouple task and extra coordinates, or D is not positive semi-definite."""
+        """Warnings.
+
+        The metric does not decouple task and extra coordinates, D is not positive semi-definite, or the task describes
+        an orientation by a rotation vector.
+        """
         found, metric = [], self.problem.metric.name
         if metric != "inertia":
             found.append(
@@ -173,6 +178,12 @@ class _OperationalSpace(Shown):
             found.append(
                 f"the damping matrix (29) is indefinite in {share:.1%} of the domain with these gains; "
                 "the damping design double_diagonal never is"
+            )
+        turn = TipTurn.of_kind(kind := self.problem.task.recipe["kind"])
+        if turn is not None and turn.whole and turn.axis is None:
+            found.append(
+                f"all components of a rotation vector turn a light wrist; the task {kind}:AXIS, with AXIS along the "
+                "last joint, keeps that turn apart, and such arms then hold more unknown mass"
             )
         return found + self.model.remarks()
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import factorial
 from typing import Self
 
@@ -72,17 +73,17 @@ class Reference(Shown):
         """
         names = _names(labels)
         value = frozen_array("start", start, (len(labels),))
-        _require_number("natural_frequency", natural_frequency, above=0.0)
+        omega0 = _require_number("natural_frequency", natural_frequency, above=0.0)
         _require_number("duration", duration, above=0.0)
-        _require_number("damping_ratio", damping_ratio, above=-np.finfo(float).tiny)
+        zeta = _require_number("damping_ratio", damping_ratio, above=-np.finfo(float).tiny)
         times, targets = _stairs(names, value, changes, duration)
-        profile = low_pass_response(len(names), natural_frequency, damping_ratio)
+        profile = low_pass_response(len(names), omega0, zeta)
         run = Batched(profile)
         parameters = [np.concatenate([targets[0], value, np.zeros_like(value)])]
         for target, lasted in zip(targets[1:], np.diff(times)[:-1], strict=True):
             position, velocity, _ = (out[0] for out in run(np.array([[lasted]]), parameters[-1][None]))
             parameters.append(np.concatenate([target, position, velocity]))
-        return cls(names, times, targets, value, np.array(parameters), profile, min(_GRID, _SWING / natural_frequency))
+        return cls(names, times, targets, value, np.array(parameters), profile, min(_GRID, _SWING / omega0))
 
     @classmethod
     def through(cls, labels: Sequence[str], times: ArrayLike, points: ArrayLike) -> Self:
@@ -185,6 +186,7 @@ def _stairs(labels: tuple[str, ...], start: Array, changes: Sequence[Change], du
     return np.array([*times, float(duration)]), np.array(targets)
 
 
+@lru_cache(32)
 def _polynomial(k: int) -> ca.Function:
     """Time and coefficients of k polynomials, highest power first -> value and two derivatives."""
     t, coefficients = ca.SX.sym("t"), ca.SX.sym("coefficients", k * (_DEGREE + 1))

@@ -28,8 +28,9 @@ class Safety:
     """Settings of the supervised law; `Safety.of(controller)` gives the default ones.
 
     Margins are distances to the border in half-widths of the domain. On a `ClearBox`, the bound on the relative
-    singular value s is a border too, at the distance (s - bound) / (s at the centre - bound). Lists hold one number
-    per joint (n,), or per controlled quantity (k,) where that is said. The meanings are those of the generated header.
+    singular value s is a border too, at the distance (s - bound) / (s at the centre - bound). In a `Corridor`, the path
+    is 1 and the border 0, and the other borders of its joints count in radii as well. Lists hold one number per joint
+    (n,), or per controlled quantity (k,) where that is said. The meanings are those of the generated header.
     """
 
     command_rate: Annotated[Array, "largest change of the command [N m/s], [rad/s^2]; in a tick: times its period"]

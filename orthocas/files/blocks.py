@@ -121,15 +121,6 @@ def append(path: Path, tag: bytes, head: bytes, body: bytes, kind: BlockKind) ->
         raise kind.error(f"cannot write {path}: {error.strerror}") from None
 
 
-def begins_as(path: Path, kind: BlockKind) -> bool:
-    """Whether a file can be read and begins like one of a kind."""
-    try:
-        with path.open("rb") as stream:
-            return stream.read(len(kind.magic)) == kind.magic
-    except OSError:
-        return False
-
-
 @contextmanager
 def owned(path: Path, kind: BlockKind) -> Iterator[None]:
     """Be the only process that appends to a file. The system ends this with the process, however it dies.

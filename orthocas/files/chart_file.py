@@ -18,7 +18,7 @@ from orthocas.files.archive import Kind, read_archive, write_archive
 from orthocas.files.certificate_parts import certificate_from_data, certificate_to_data
 from orthocas.files.json import part
 from orthocas.files.npy import Stored, to_npy
-from orthocas.files.problem_parts import problem_from_data, problem_to_data
+from orthocas.files.problem_parts import FOREIGN, problem_from_data, problem_to_data
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.parametrisations import (
     MLP,
@@ -94,7 +94,7 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
         raise
     except OrthocasError as error:
         raise ChartFileError(f"{path} is inconsistent: {error}") from None
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
+    except FOREIGN as error:
         raise ChartFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
 
 

@@ -20,6 +20,9 @@ from orthocas.problem import Problem
 from orthocas.robots import KinematicTree, Robot
 from orthocas.tasks import Task
 
+#: what reading a header that may be anything raises, beside errors of our own
+FOREIGN = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError)
+
 
 def problem_to_data(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Parts 'robot' and 'problem' of a header, and arrays whose names begin with robot_ and domain_."""

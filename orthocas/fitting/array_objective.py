@@ -13,6 +13,7 @@ from orthocas.checks import Array
 from orthocas.fitting.loss import Loss, Sizes, Weights
 from orthocas.fitting.loss.residuals import loss_columns, value_columns
 from orthocas.parametrisations import ArrayFamily
+from orthocas.parametrisations.array_memory import ArrayMemory, Memories
 from orthocas.samples import Draw, Samples, even_parts
 
 _ORIENTING = 200  # samples that determine the orientation of the start
@@ -56,6 +57,7 @@ class ArrayObjective:
         m, self.n = samples.task_jacobian.shape[1:]
         self.r, self._family, self._draw = family.outputs, family, draw
         self._single = single
+        self._memories = Memories()
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name)
         self._orientation: float | None = None
         if self._loss.oriented or weights.folds > 0:
@@ -75,22 +77,27 @@ class ArrayObjective:
         """L(theta) and dL/dtheta."""
         small, columns = self._rounded(theta), loss_columns(self._loss)
 
-        def part(run: Run, piece: _Piece) -> tuple[float, Array]:
-            J, back = self._family.pullback(piece.points, small)
+        def part(tools: tuple[Run, ArrayMemory], work: tuple[_Piece, Array]) -> float:
+            (run, memory), (piece, result) = tools, work
+            J, back = self._family.pullback(piece.points, small, memory)
             entries = blocked(J)
             losses, slopes = np.empty(piece.shares.shape), np.empty_like(entries)
             for b, block in enumerate(entries):
                 run([block, *(array[b] for array in piece.data)], [losses[b], slopes[b]])
             slopes *= piece.shares[:, None]
             by_entry = slopes.reshape(-1, self.n, self.r, slopes.shape[2])
-            return float(np.vdot(losses, piece.shares)), back(by_sample(by_entry, len(J)))
+            back(by_sample(by_entry, len(J)), result)
+            return float(np.vdot(losses, piece.shares))
 
-        with columns.borrowed(min(thread_count(), len(self._pieces))) as runs:
-            parts = in_threads_with(runs, part, self._pieces)
-        gradient = parts[0][1].astype(np.float64)
-        for _, slope in parts[1:]:
-            gradient += slope
-        return sum(value for value, _ in parts), gradient
+        threads = min(thread_count(), len(self._pieces))
+        with columns.borrowed(threads) as runs, self._memories.borrowed(threads + 1) as (results, *memories):
+            gradients = [results.array(f"piece {k}", small.shape, small.dtype) for k in range(len(self._pieces))]
+            tools, work = list(zip(runs, memories, strict=True)), list(zip(self._pieces, gradients, strict=True))
+            value = sum(in_threads_with(tools, part, work))
+            gradient = gradients[0].astype(np.float64)
+            for slopes in gradients[1:]:
+                gradient += slopes
+        return value, gradient
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each."""

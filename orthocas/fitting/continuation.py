@@ -71,7 +71,7 @@ class Continuation:
     def _solve(self, step: Parametrisation, label: str, final: bool) -> None:
         """Run a stage, and search the worst points of its result."""
         runner, degree = self._runner, step.degree if isinstance(step, GradedParametrisation) else 0
-        family = step.family(runner.space, self._r)
+        family = runner.family(step, self._r)
         solver = runner.settings.solver if final else runner.settings.solver.coarser()
         stage = runner.run(Plan(label, family, self._start(family), solver, degree, final))
         self._stages.append(stage)

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.fitting.loss import Pairs, coordinates_of
 from orthocas.parametrisations import JointSpace, LinearFamily
@@ -61,6 +62,16 @@ class Mirror:
 
     def kept(self, family: LinearFamily) -> NDArray[np.bool_] | None:
         """The coefficients (r, K) that the components may have; None if a basis function is neither even nor odd."""
+        if family not in self._kept:
+            self._kept[family] = self._allowed(family)
+        return self._kept[family]
+
+    @cached_property
+    def _kept(self) -> dict[LinearFamily, NDArray[np.bool_] | None]:
+        """Results of `kept` so far."""
+        return {}
+
+    def _allowed(self, family: LinearFamily) -> NDArray[np.bool_] | None:
         q = ca.SX.sym("q", self.space.n)
         basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
         u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (self.space.n, _POINTS))

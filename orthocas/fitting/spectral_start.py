@@ -13,7 +13,12 @@ _MIXING_ANGLE = np.radians(10)
 _RIDGE = 1e-10  # relative; keeps the pencil definite if basis functions coincide on the samples
 
 
-def spectral_start(family: LinearFamily, samples: Samples, kept: NDArray[np.bool_] | None = None) -> Array:
+def spectral_start(
+    family: LinearFamily,
+    samples: Samples,
+    kept: NDArray[np.bool_] | None = None,
+    gradients: BasisGradients | None = None,
+) -> Array:
     """Coefficients (r K,) of coordinates, found one after the other from generalised eigenproblems.
 
     Each coordinate minimises E |Pi_x grad xi|^2 subject to E |grad xi|^2 = 1, with the A-orthogonal projector Pi_x on
@@ -24,12 +29,13 @@ def spectral_start(family: LinearFamily, samples: Samples, kept: NDArray[np.bool
         family: the coordinates.
         samples: samples of the family's joints.
         kept: the coefficients (r, K) that may differ from zero. Default: all.
+        gradients: gradients of the basis, if there are some already. Default: those of the family.
 
     Source:
         ours, docs/derivations.md#spectral-start.
     """
-    gradients = BasisGradients(family, samples.points.shape[1])
-    G = gradients.dense(gradients.at(samples.points), len(samples))  # (N, n, K)
+    basis = BasisGradients(family, samples.points.shape[1]) if gradients is None else gradients
+    G = basis.dense(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)
     N, _, K = G.shape
     along_task = (samples.task_basis @ G).reshape(-1, K)  # e_i^T d psi, the components along the task gradients
     S = along_task.T @ along_task / N

@@ -27,7 +27,14 @@ from orthocas.fitting.spectral_start import spectral_start
 from orthocas.minimising.objective import Objective
 from orthocas.minimising.solver import Solver, SolveResult, Status
 from orthocas.minimising.watch import Monitor, Progress, Watch
-from orthocas.parametrisations import ArrayFamily, Family, GradedParametrisation, JointSpace, LinearFamily
+from orthocas.parametrisations import (
+    ArrayFamily,
+    Family,
+    GradedParametrisation,
+    JointSpace,
+    LinearFamily,
+    Parametrisation,
+)
 from orthocas.problem import Problem
 from orthocas.samples import Samples, sample_problem, samples_at
 from orthocas.solvers import GaussNewton
@@ -76,8 +83,30 @@ class StageRunner:
         target = self.settings.parametrisation
         if found is None or not isinstance(target, GradedParametrisation):
             return found
-        family = target.of_degree(min(target.degree, _TRIAL_DEGREE)).family(self.space, len(found.parities))
+        family = self.family(target.of_degree(min(target.degree, _TRIAL_DEGREE)), len(found.parities))
+        assert isinstance(family, LinearFamily)
         return min(found.choices(), key=lambda mirror: self._trial(family, mirror))
+
+    def family(self, parametrisation: Parametrisation, r: int) -> Family:
+        """The family on the active joints: the same object every time, so that what it needs is built once."""
+        key = parametrisation.label, r
+        if key not in self._families:
+            self._families[key] = parametrisation.family(self.space, r)
+        return self._families[key]
+
+    @cached_property
+    def _families(self) -> dict[tuple[str, int], Family]:
+        return {}
+
+    @cached_property
+    def _bases(self) -> dict[LinearFamily, BasisGradients]:
+        """Gradients of the bases so far."""
+        return {}
+
+    @cached_property
+    def _starts(self) -> dict[tuple[LinearFamily, int], Array]:
+        """Spectral starts so far, by family and number of samples."""
+        return {}
 
     def run(self, plan: Plan) -> Stage:
         """Draw samples, find a start if none is given, and minimise. A finished stage comes from the checkpoint.
@@ -160,11 +189,17 @@ class StageRunner:
             theta = mirror.components(theta)
         theta = theta if kept is None else theta.reshape(kept.shape)[kept]
         exchanged = () if mirror is None else mirror.exchanged
-        gradients = BasisGradients(family, self.space.n, np.float32 if self.settings.single else np.float64)
         objective = BasisObjective(
-            family, samples, self.settings.weights, theta, self._draw, kept, exchanged, gradients
+            family, samples, self.settings.weights, theta, self._draw, kept, exchanged, self._gradients(family)
         )
         return objective, theta
+
+    def _gradients(self, family: LinearFamily) -> BasisGradients:
+        """Those of a basis, built once."""
+        if family not in self._bases:
+            number = np.float32 if self.settings.single else np.float64
+            self._bases[family] = BasisGradients(family, self.space.n, number)
+        return self._bases[family]
 
     def _trial(self, family: LinearFamily, mirror: Mirror) -> float:
         """The loss that a family reaches with these symmetric coordinates."""
@@ -192,8 +227,11 @@ class StageRunner:
 
     def _spectral_start(self, family: LinearFamily, count: int, kept: NDArray[np.bool_] | None) -> Array:
         """A start that does not depend on the seed: eigenvalues are close, so other samples would mix coordinates."""
-        points = sample_evenly(self.problem.domain, count, _START_SEED)
-        return spectral_start(family, samples_at(self.problem, points).restricted_to(self.active), kept)
+        if (family, count) not in self._starts:
+            points = sample_evenly(self.problem.domain, count, _START_SEED)
+            samples = samples_at(self.problem, points).restricted_to(self.active)
+            self._starts[family, count] = spectral_start(family, samples, kept, self._gradients(family))
+        return self._starts[family, count]
 
     def _samples(self, count: int, tag: int) -> Samples:
         points = sample_evenly(self.problem.domain, count, (self.settings.seed, tag))

@@ -7,7 +7,8 @@ import numpy as np
 
 from orthocas.casadi_tools.batch import Batched
 from orthocas.checks import Array
-from orthocas.inverting.newton import Newton, largest
+from orthocas.inverting.newton import Newton
+from orthocas.inverting.phi_map import largest
 
 if TYPE_CHECKING:
     from orthocas.chart import Chart

@@ -11,7 +11,7 @@ import numpy as np
 
 from orthocas.checks import Array
 from orthocas.coordinates.turns import shortest
-from orthocas.inverting.newton import ROUNDING
+from orthocas.inverting.phi_map import ROUNDING
 
 _TOLERANCE = 1e-9  # the largest relative error of a solution
 _OPTIONS: dict[str, Any] = {

@@ -8,15 +8,17 @@ import numpy as np
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, Indices
 from orthocas.domains import borders
+from orthocas.inverting.boxed import BoxedPhi
+from orthocas.inverting.inside import Inside
 from orthocas.inverting.nearest import Nearest
-from orthocas.inverting.newton import Attempt, LocalSolver, PhiMap, largest
+from orthocas.inverting.newton import Attempt, LocalSolver
+from orthocas.inverting.phi_map import PhiMap, largest
 from orthocas.inverting.solutions import InverseStatus, Solutions
 from orthocas.inverting.starts import Starts
 from orthocas.problem import Problem
 
 _ROWS = 16_384  # solved at once
 _RESTARTS = 8  # from points of the table, where neither the rough inverse nor the centre leads to a solution inside
-_TASK_STARTS = 3  # for the nearest coordinates, after the best q so far
 _MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, InverseStatus.OUT_OF_REACH)
 _MANY = 1024  # starts of the search for all solutions
 _SAME = 1e-6  # of the half-widths: distance up to which two solutions count as one
@@ -94,30 +96,40 @@ class Inverse:
     def _searched(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
         """What the search finds from given starts, or from the rough inverse and, where that fails, from others."""
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance)
-        rows = best.missing
-        if inside or starts is None:
-            for start in self._other_starts(targets[rows]):
-                left = best.status[rows] != InverseStatus.FOUND
-                if not left.any():
-                    break
-                best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
-        if inside and self.nearest is not None:
-            self._move_inside(self.nearest, targets, best, tolerance)
+        if inside and self._inside is not None:
+            self._search_inside(self._inside, targets, best, tolerance)
+        elif starts is None:
+            self._restart(targets, best, best.missing, tolerance)
         return best
 
-    def _move_inside(self, nearest: Nearest, targets: Array, best: Found, tolerance: float) -> None:
-        """Replace what is missing by the nearest coordinates inside the domain."""
-        rows = np.flatnonzero(np.isin(best.status, _MOVED))
-        starts = self.starts.nearest(targets[rows], _TASK_STARTS, self.problem.m) if rows.size else ()
-        for start in (best.q[rows], *starts):
-            left = best.status[rows] != InverseStatus.NEAREST
-            into = rows[left]
-            if not into.size:
+    def _restart(self, targets: Array, best: Found, rows: Indices, tolerance: float) -> None:
+        """Search again from other starts in some rows, until a solution lies inside the domain."""
+        for start in self._other_starts(targets[rows]):
+            left = best.status[rows] != InverseStatus.FOUND
+            if not left.any():
                 break
-            best.q[into] = nearest.search(targets[into], start[left])
-            best.residual[into] = self.phi_map.residual(targets[into], best.q[into])
-            kept = nearest.keeps_task(targets[into], best.q[into], tolerance)
-            best.status[into] = np.where(kept, InverseStatus.NEAREST, InverseStatus.OUT_OF_REACH)
+            best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
+
+    def _search_inside(self, inside: Inside, targets: Array, best: Found, tolerance: float) -> None:
+        """Replace what is not found by other solutions, or the nearest coordinates, inside the domain."""
+        rows = best.missing
+        q, in_reach = inside.with_task(targets[rows], best.q[rows])
+        self._replace(targets, best, rows[~in_reach], q[~in_reach], tolerance)
+        rows, q = rows[in_reach], q[in_reach]
+        self._restart(targets, best, rows, tolerance)
+        moved = np.isin(best.status[rows], _MOVED)
+        self._replace(targets, best, rows[moved], inside.nearest(targets[rows[moved]], q[moved]), tolerance)
+
+    def _replace(self, targets: Array, best: Found, rows: Indices, q: Array, tolerance: float) -> None:
+        """Put points of the box into some rows, with their status; singular solutions stay."""
+        moved = np.isin(best.status[rows], _MOVED)
+        rows, q = rows[moved], q[moved]
+        residual = self.phi_map.residual(targets[rows], q)
+        kept = (largest(residual[:, : self.problem.m]) <= tolerance) & self.problem.domain.contains(q)
+        whole = kept & (largest(residual) <= tolerance)
+        status = np.where(kept, InverseStatus.NEAREST, InverseStatus.OUT_OF_REACH)
+        best.q[rows], best.residual[rows] = q, residual
+        best.status[rows] = np.where(whole, InverseStatus.FOUND, status)
 
     def _other_starts(self, targets: Array) -> Iterator[Array]:
         """The centre of the domain, and points of the table near the targets, (N, n) each."""
@@ -162,6 +174,13 @@ class Inverse:
         difference = (residual * self.phi_map.scale(targets))[:, self.problem.m :]
         distance = np.sqrt((difference**2).sum(axis=1))
         return np.where(np.isfinite(distance), distance, np.inf)
+
+    @cached_property
+    def _inside(self) -> Inside | None:
+        """Searches inside the domain, for fitted coordinates."""
+        if self.nearest is None:
+            return None
+        return Inside(BoxedPhi(self.problem.task, self.problem.domain, self.phi_map), self.starts, self.nearest)
 
     @cached_property
     def starts(self) -> Starts:

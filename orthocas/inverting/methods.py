@@ -23,8 +23,9 @@ from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError, Si
 from orthocas.inverting.implicit import inverse_function
 from orthocas.inverting.inverse import Inverse
 from orthocas.inverting.nearest import Nearest
-from orthocas.inverting.newton import LocalSolver, Newton, PhiMap
+from orthocas.inverting.newton import LocalSolver, Newton
 from orthocas.inverting.own_inverse import OwnInverse
+from orthocas.inverting.phi_map import PhiMap
 from orthocas.inverting.point import FewRows, PointFunctions
 from orthocas.inverting.solutions import Solutions
 from orthocas.inverting.tracker import Tracker
@@ -78,8 +79,8 @@ class InverseMethods(PhiFunctions):
             q_start: initial guess (n,), or (N, n) with one guess per row of phi.
             tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
             inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
-                other starts, get the q inside with the same x and the nearest xi that Ipopt finds (10 ms a row),
-                status NEAREST, or OUT_OF_REACH if none has that x. Not for grown coordinates.
+                other starts, get the q inside with the same x and the nearest xi that is found, a local minimum, with
+                the status NEAREST, or OUT_OF_REACH if none has that x. Not for grown coordinates.
             local: another solver of phi(q) = phi near given starts; `orthocas.compile_inverse` has one.
 
         Returns:
@@ -190,7 +191,9 @@ class InverseMethods(PhiFunctions):
         if isinstance(self.coordinates, InvertibleMap):
             return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map))
         local = FewRows(phi_map, self._point_functions, Newton(phi_map))
-        return Inverse(self.problem, phi_map, local, Nearest(self.problem, self.function("phi"), phi_map))
+        return Inverse(
+            self.problem, phi_map, local, Nearest(self.problem.domain, self.m, self.function("phi"), phi_map)
+        )
 
     @cached_property
     def _inverse_function(self) -> ca.Function:

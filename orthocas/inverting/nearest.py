@@ -1,11 +1,10 @@
-"""The nearest coordinates inside the domain at given task values (ours).
+"""The nearest coordinates inside the domain at given task values, by Ipopt, one row at a time (ours).
 
 Where no q inside the domain has phi(q) = (x, xi), the nearest one that keeps the task solves
 
     minimise |xi(q) - xi|^2 / 2   subject to   h(q) = x,  q in the domain.
 
-Ipopt finds a local minimum, from the point of the domain nearest to the best q so far, and where that fails, from
-points of a table whose task values are near.
+Ipopt finds a local minimum in 10 to 50 ms; `nearest_xi` treats all rows at once, and leaves few to Ipopt.
 """
 
 from dataclasses import dataclass
@@ -20,10 +19,9 @@ from orthocas.casadi_tools.batch import evaluate_columns
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.coordinates.turns import shortest
-from orthocas.domains import Conditioned, borders
-from orthocas.inverting.newton import PhiMap, largest
+from orthocas.domains import Conditioned, Domain, borders
+from orthocas.inverting.phi_map import PhiMap, largest
 from orthocas.postures.clear_box import ClearBox
-from orthocas.problem import Problem
 
 _OPTIONS: dict[str, Any] = {
     "print_time": False,
@@ -43,13 +41,14 @@ _one_at_a_time = Lock()  # Ipopt's linear solver is not made for threads
 class Nearest:
     """Finds the nearest coordinates in the domain that keep the task."""
 
-    problem: Problem
+    domain: Domain
+    m: int  #: number of task components
     phi: ca.Function  #: of a column q (n, 1)
     phi_map: PhiMap
 
     def search(self, targets: Array, starts: Array) -> Array:
         """Where the search from starts (N, n) ends, (N, n); see `keeps_task`."""
-        low, high = borders(self.problem.domain)
+        low, high = borders(self.domain)
         with _one_at_a_time:
             q = evaluate_columns(self._search, 1, np.clip(starts, low, high), targets)[0]
         q = np.clip(q, low, high)  # NaN stays
@@ -58,14 +57,14 @@ class Nearest:
 
     def keeps_task(self, targets: Array, q: Array, tolerance: float) -> NDArray[np.bool_]:
         """Whether points (N, n) lie in the domain and have the task values of the targets, (N,)."""
-        error = largest(self.phi_map.residual(targets, q)[:, : self.problem.m])
-        return np.asarray((error <= tolerance) & self.problem.domain.contains(q))
+        error = largest(self.phi_map.residual(targets, q)[:, : self.m])
+        return np.asarray((error <= tolerance) & self.domain.contains(q))
 
     @cached_property
     def _search(self) -> ca.Function:
         """start (n, 1), target (n, 1) -> q (n, 1)."""
-        m, domain = self.problem.m, self.problem.domain
-        q, target = ca.MX.sym("q", self.problem.n), ca.MX.sym("phi", self.problem.n)
+        m, domain, n = self.m, self.domain, len(self.domain.centre)
+        q, target = ca.MX.sym("q", n), ca.MX.sym("phi", n)
         difference = shortest(self.phi(q) - target, self.phi_map.turns)
         constraints = [difference[:m] / ca.DM(self.phi_map.sizes[:m])]
         upper = np.zeros(m)
@@ -85,7 +84,7 @@ class Nearest:
         }
         solver = ca.nlpsol("nearest", "ipopt", equations, _OPTIONS)
         low, high = (ca.DM(bound) for bound in borders(domain))
-        start = ca.MX.sym("start", self.problem.n)
+        start = ca.MX.sym("start", n)
         found = solver(x0=start, p=target, lbx=low, ubx=high, lbg=ca.DM(lower), ubg=ca.DM(upper))
         return ca.Function("nearest", [start, target], [found["x"]])
 

@@ -4,7 +4,6 @@ All rows share the evaluations of phi and J, and those that are done drop out. A
 steps with it reduce the error tenfold: evaluating J takes several times as long as evaluating phi.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,57 +12,16 @@ from numpy.typing import NDArray
 
 from orthocas.casadi_tools.threads import in_threads
 from orthocas.checks import Array, Indices
-from orthocas.coordinates.turns import shortest
+from orthocas.inverting.phi_map import PhiMap, largest
 
 MAX_ITERATIONS = 50
 _PATIENCE = 8  # iterations after which the error must have halved
 GOAL = 1e-12  #: error at which the iteration stops
-ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
 _KEEP = 0.1  # J is evaluated again if a step leaves more of the error
 _DECREASE = 1e-4  # of the error, relative to the part of the step taken
 _HALVINGS, _SOLVED = 10, 1e-10  # of a step; below this error only rounding stops the decrease
 _PIECE = 2048  # matrices that a thread inverts at once
-_SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
 SUSPICIOUS = 1e6  #: |J| |J^-1| above which singular values are computed
-
-
-@dataclass(frozen=True)
-class PhiMap:
-    """phi at many points. Points are finite, values need not be."""
-
-    phi: Callable[[Array], Array]  #: (N, n) -> (N, n)
-    jacobian: Callable[[Array], Array]  #: (N, n) -> (N, n, n)
-    sizes: Array  #: sizes of the components, (n,)
-    turns: Array  #: periods of the components, (n,); 0 for those that have none
-
-    def scale(self, targets: Array) -> Array:
-        """Scale of errors (N, n): the sizes of the components, and more where rounding of phi exceeds them."""
-        scale: Array = self.sizes + ROUNDING * np.abs(targets)
-        return scale
-
-    def residual(self, targets: Array, q: Array) -> Array:
-        """(phi - phi(q)) / scale, (N, n), by the shorter way around for periodic components."""
-        residual: Array = self.difference(targets, self.phi(q)) / self.scale(targets)
-        return residual
-
-    def difference(self, targets: Array, values: Array) -> Array:
-        """Targets - values, (N, n), without whole turns of periodic components."""
-        difference: Array = shortest(targets - values, self.turns)
-        return difference
-
-    def is_singular(self, q: Array) -> NDArray[np.bool_]:
-        """Whether J is singular or undefined at points (N, n), (N,)."""
-        J = self.jacobian(q) / self.sizes[:, None]
-        known = np.asarray(np.isfinite(J).all(axis=(1, 2)))
-        J[~known] = 0.0
-        values = np.linalg.svd(J, compute_uv=False)
-        return np.asarray(~known | (values[:, -1] <= _SINGULAR * values[:, 0]))
-
-
-def largest(residual: Array) -> Array:
-    """The largest entries of residuals (N, n), (N,): infinite where phi is undefined."""
-    error = np.abs(residual).max(axis=1)
-    return np.where(np.isfinite(error), error, np.inf)
 
 
 @dataclass(frozen=True)

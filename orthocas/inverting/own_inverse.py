@@ -6,7 +6,8 @@ import numpy as np
 
 from orthocas.checks import Array
 from orthocas.coordinates.map import InvertibleMap
-from orthocas.inverting.newton import Attempt, PhiMap
+from orthocas.inverting.newton import Attempt
+from orthocas.inverting.phi_map import PhiMap
 
 
 @dataclass(frozen=True)

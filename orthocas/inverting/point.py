@@ -16,7 +16,8 @@ from orthocas.casadi_tools.batch import dense_function
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 from orthocas.coordinates.turns import shortest
-from orthocas.inverting.newton import GOAL, ROUNDING, SUSPICIOUS, Attempt, LocalSolver, PhiMap
+from orthocas.inverting.newton import GOAL, SUSPICIOUS, Attempt, LocalSolver
+from orthocas.inverting.phi_map import ROUNDING, PhiMap
 
 _FEW = 4  # rows that are solved one by one
 STEPS = 3  #: with the same Jacobian

@@ -8,7 +8,7 @@ from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, Indices
 from orthocas.domains import Domain, sample_uniform
 from orthocas.errors import SingularTaskError
-from orthocas.inverting.newton import PhiMap
+from orthocas.inverting.phi_map import PhiMap
 
 _POINTS, _SEED = 4096, 0  # of the table
 _DEGREES, _MOST_TERMS = (3, 2, 1), 500  # of the rough inverse: the first degree with so few terms

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Protocol, Self, TypeVar, runtime_checkable
 import casadi as ca
 
 from orthocas.checks import Array
+from orthocas.parametrisations.array_memory import ArrayMemory
 
 if TYPE_CHECKING:
     from orthocas.problem import Problem
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)
+Pulled = Callable[[Array, Array], Array]  #: a derivative that is pulled back, and the array that takes the result
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +86,17 @@ class Family(Protocol):
 class ArrayFamily(Family, Protocol):
     """A family whose coordinate gradients NumPy computes, with their derivative, in any precision."""
 
-    def pullback(self, points: Array, theta: Array) -> tuple[Array, Callable[[Array], Array]]:
+    def pullback(self, points: Array, theta: Array, memory: ArrayMemory | None = None) -> tuple[Array, Pulled]:
         """J_xi at points, and the derivative of any function L of it.
 
         Args:
             points: joint positions, (N, n).
             theta: parameters, (size,). Products are computed with numbers of its type.
+            memory: arrays of earlier calls, which this one overwrites. Nobody else may use them meanwhile.
 
         Returns:
-            J_xi, (N, r, n), and the map from dL/dJ_xi (N, r, n) to dL/dtheta (size,).
+            J_xi, (N, r, n), and the map from dL/dJ_xi (N, r, n) to dL/dtheta. It writes to an array (size,) of theta's
+            type and returns it.
         """
         ...
 

@@ -1,6 +1,6 @@
 """Multilayer perceptron of sines and cosines of the joints, or of the joints themselves ([AS2023] Sec. 6, Fig. 16)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, ClassVar
@@ -10,7 +10,8 @@ import numpy as np
 
 from orthocas.checks import Array, require_count, require_kind
 from orthocas.errors import InvalidValueError
-from orthocas.parametrisations.family import Expression, JointSpace
+from orthocas.parametrisations.array_memory import ArrayMemory
+from orthocas.parametrisations.family import Expression, JointSpace, Pulled
 from orthocas.parametrisations.mlp_arrays import NetworkArrays
 
 if TYPE_CHECKING:
@@ -119,21 +120,21 @@ class MLPFamily:
         stacked = ca.vertcat(by_angle, gradients[2 * t :, :])[rows, :]
         return [stacked[:, j * N : (j + 1) * N] for j in range(self.outputs)]
 
-    def pullback(self, points: Array, theta: Array) -> tuple[Array, Callable[[Array], Array]]:
+    def pullback(self, points: Array, theta: Array, memory: ArrayMemory | None = None) -> tuple[Array, Pulled]:
         """J_xi at points (N, n), (N, r, n), and the map from dL/dJ_xi to dL/dtheta; see `ArrayFamily`."""
         angles, t = points[:, self._turning], len(self._turning)
         sin, cos = np.sin(angles).astype(theta.dtype), np.cos(angles).astype(theta.dtype)
         inputs = np.concatenate([sin, cos, points[:, self._direct_joints].astype(theta.dtype)], axis=1)
-        network = NetworkArrays(theta, self.widths, inputs)
+        network = NetworkArrays(theta, self.widths, inputs, memory or ArrayMemory())
         g = network.gradients().transpose(1, 0, 2)  # (N, r, inputs)
         J = np.empty((len(points), self.outputs, self.space.n))
         J[:, :, self._turning] = g[:, :, :t] * cos[:, None] - g[:, :, t : 2 * t] * sin[:, None]
         J[:, :, self._direct_joints] = g[:, :, 2 * t :]
 
-        def back(slopes: Array) -> Array:
+        def back(slopes: Array, result: Array) -> Array:
             by_angle, direct = slopes[:, :, self._turning].astype(theta.dtype), slopes[:, :, self._direct_joints]
             parts = [by_angle * cos[:, None], -by_angle * sin[:, None], direct.astype(theta.dtype)]
-            return network.pulled_back(np.concatenate(parts, axis=2).transpose(1, 0, 2))
+            return network.pulled_back(np.concatenate(parts, axis=2).transpose(1, 0, 2), result)
 
         return J, back
 

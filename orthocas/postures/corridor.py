@@ -68,7 +68,7 @@ class Corridor(Box):
     @property
     def heading(self) -> str:
         """The condition in one line."""
-        sizes = number_list(self.radius[self._counted])
+        sizes = number_list(self.radius[self.counted])
         return f"distance to a path of {len(self.postures)} postures at most 1 in units of {sizes}"
 
     def within(self, box: Box) -> Self:
@@ -92,9 +92,9 @@ class Corridor(Box):
     def pivots(self) -> ca.Function:
         """q (n, 1) -> 1 - (distance to the path)^2, positive inside."""
         q = ca.SX.sym("q", len(self.centre))
-        z = q[self._counted.tolist()] / ca.DM(self.radius[self._counted])
+        z = q[self.counted.tolist()] / ca.DM(self.radius[self.counted])
         squares = []
-        for start, axis, square in zip(*self._lines, strict=True):
+        for start, axis, square in zip(*self.lines, strict=True):
             apart, length = z - ca.DM(start), float(np.sqrt(square))
             along = ca.fmin(ca.fmax(ca.dot(apart, ca.DM(axis)), 0), length)
             squares.append(ca.sumsqr(apart - along * ca.DM(axis)))
@@ -108,16 +108,16 @@ class Corridor(Box):
         """
         u = rng.uniform(-1.0, 1.0, (count, len(self.centre)))
         q = self.centre + self.half_width * np.sign(u) * np.abs(u) ** power
-        q[:, self._counted] = self._in_cylinders(rng, count, power) * self.radius[self._counted]
+        q[:, self.counted] = self._in_cylinders(rng, count, power) * self.radius[self.counted]
         q = q[self.contains(q)]
         along, across = self._parts(q)
-        length = np.sqrt(self._lines[2])
+        length = np.sqrt(self.lines[2])
         held = (across <= 1) & (along * length >= -1) & ((along - 1) * length <= 1)
         return np.asarray(q[rng.uniform(size=len(q)) * held.sum(axis=1) < 1])
 
     def _in_cylinders(self, rng: np.random.Generator, count: int, power: float) -> Array:
         """Points of cylinders of radius 1 around the lines, which are longer by 1 at both ends."""
-        starts, axes, squares = self._lines
+        starts, axes, squares = self.lines
         length, d = np.sqrt(squares), starts.shape[1]
         k = rng.choice(len(length), size=count, p=(length + 2) / (length + 2).sum())
         direction = rng.normal(size=(count, d))
@@ -131,7 +131,7 @@ class Corridor(Box):
         """Squared distance of points (N, n) from the path in radii, (N,)."""
         along, across = self._parts(points)
         beyond = along - np.clip(along, 0.0, 1.0)
-        return np.asarray((across + beyond**2 * self._lines[2]).min(axis=1))
+        return np.asarray((across + beyond**2 * self.lines[2]).min(axis=1))
 
     def lengths(self, steps: Array) -> Array:
         """Lengths of steps (N, n) in radii, (N,)."""
@@ -139,20 +139,21 @@ class Corridor(Box):
 
     def _parts(self, points: Array) -> tuple[Array, Array]:
         """Place of points (N, n) along every line, from 0 to 1 on it, and squared distance from it, (N, lines) each."""
-        starts, axes, squares = self._lines
-        z = points[:, self._counted] / self.radius[self._counted]
+        starts, axes, squares = self.lines
+        z = points[:, self.counted] / self.radius[self.counted]
         along = z @ axes.T - (starts * axes).sum(axis=1)
         total = (z**2).sum(axis=1)[:, None] - 2 * z @ starts.T + (starts**2).sum(axis=1)
         return along / np.sqrt(squares), total - along**2
 
     @cached_property
-    def _counted(self) -> Any:
+    def counted(self) -> Any:
+        """The joints whose distance to the path counts, ascending."""
         return np.flatnonzero(np.isfinite(self.radius))
 
     @cached_property
-    def _lines(self) -> tuple[Array, Array, Array]:
+    def lines(self) -> tuple[Array, Array, Array]:
         """Start, unit direction and squared length of every line, in joints that count and units of the radius."""
-        z = (self.postures / self.radius)[:, self._counted]
+        z = (self.postures / self.radius)[:, self.counted]
         starts, steps = (z[:-1], np.diff(z, axis=0)) if len(z) > 1 else (z, np.zeros_like(z))
         squares = np.maximum((steps**2).sum(axis=1), 1e-24)
         return starts, steps / np.sqrt(squares)[:, None], squares

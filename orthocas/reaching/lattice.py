@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from orthocas.checks import Array, Indices
-from orthocas.inverting.newton import Newton, largest
+from orthocas.inverting.newton import Newton
+from orthocas.inverting.phi_map import largest
 from orthocas.reaching.intervals import XiRange
 
 if TYPE_CHECKING:

@@ -1,7 +1,8 @@
 """The right-hand side of a closed loop: controller, plant and disturbances as one CasADi function."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -17,6 +18,8 @@ from orthocas.errors import SimulationError
 from orthocas.robots import Robot, dynamics
 from orthocas.simulation.disturbances import Friction, Stops
 from orthocas.simulation.loads import Loads
+
+KEPT = 32  #: functions of each kind that a process remembers
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +55,9 @@ class ClosedLoop:
     @cached_property
     def plant_rate(self) -> ca.Function:
         """state, command (n, 1), load (`Loads.size`, 1) -> rate of the state."""
-        state, command, load, _ = self.plant_of_numbers.sx_in()
-        rate = self.plant_of_numbers.call([state, command, load, ca.SX(ca.DM(self.plant_numbers))])
+        plant = _plant_of_numbers(Keyed(self.plant_key, self))
+        state, command, load, _ = plant.sx_in()
+        rate = plant.call([state, command, load, ca.SX(ca.DM(self.plant_numbers))])
         return ca.Function("plant", [state, command, load], rate)
 
     @property
@@ -109,13 +113,37 @@ class ClosedLoop:
         return command, status
 
     def rate(self, reference: Reference) -> ca.Function:
-        """state, time since the start of a segment, parameters of the segment, load -> rate of the state."""
-        state = ca.MX.sym("state", self.plant_rate.size1_in(0))
-        t, parameters = ca.MX.sym("t"), ca.MX.sym("parameters", reference.profile.size1_in(1))
-        load = ca.MX.sym("load", self.loads.size)
-        command, _ = self.commanded(state, reference.profile.call([t, parameters]))
-        rate = ca.Function("rate", [state, t, parameters, load], [self.plant_rate(state, command, load)])
-        return scalar_code(rate) if self.controller.function.is_a("SXFunction") else rate
+        """state, time since the start of a segment, parameters of the segment, load -> rate of the state.
+
+        A process remembers it, so runs that differ in start, targets or size of loads build it once.
+        """
+        gains = tuple(gain.tobytes() for gain in self.controller.gains.values())
+        plant = (self.plant_key, self.plant_numbers.tobytes())
+        return _rate(Keyed((self.controller.function, gains, plant), self), reference.profile)
+
+
+@dataclass(frozen=True)
+class Keyed:
+    """A loop that counts as equal to others with the same key."""
+
+    key: Hashable
+    loop: ClosedLoop = field(compare=False)
+
+
+@lru_cache(KEPT)
+def _plant_of_numbers(keyed: Keyed) -> ca.Function:
+    return keyed.loop.plant_of_numbers
+
+
+@lru_cache(KEPT)
+def _rate(keyed: Keyed, profile: ca.Function) -> ca.Function:
+    loop = keyed.loop
+    state = ca.MX.sym("state", loop.size)
+    t, parameters = ca.MX.sym("t"), ca.MX.sym("parameters", profile.size1_in(1))
+    load = ca.MX.sym("load", loop.loads.size)
+    command, _ = loop.commanded(state, profile.call([t, parameters]))
+    rate = ca.Function("rate", [state, t, parameters, load], [loop.plant_rate(state, command, load)])
+    return scalar_code(rate) if loop.controller.function.is_a("SXFunction") else rate
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,7 @@ Law and plant are compiled on their own. Gains, masses and friction are argument
 share one library.
 """
 
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from importlib import import_module
 from typing import Any
@@ -18,9 +17,7 @@ from orthocas.casadi_tools.scalar_code import scalar_code
 from orthocas.checks import Array
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
-from orthocas.simulation.closed_loop import ClosedLoop
-
-_KEPT = 32  # compiled functions that a process remembers
+from orthocas.simulation.closed_loop import KEPT, ClosedLoop, Keyed
 
 
 class CompiledLoop:
@@ -37,7 +34,7 @@ class CompiledLoop:
     def __init__(self, loop: ClosedLoop, reference: Reference) -> None:
         with deferred(), building:  # CasADi may lose Ctrl-C while it builds functions
             self._law = _law(loop.controller)
-            self._plant = _plant(_Keyed(loop.plant_key, loop))
+            self._plant = _plant(Keyed(loop.plant_key, loop))
             self._profile = _profile(reference.profile)
         self._loop, self._gains = loop, list(loop.controller.gains.values())
 
@@ -65,31 +62,23 @@ class CompiledLoop:
         return _codegen("integrator").Integrator(kernels, sizes, tolerance, step)
 
 
-@dataclass(frozen=True)
-class _Keyed:
-    """A loop that counts as equal to others with the same key."""
-
-    key: Hashable
-    loop: ClosedLoop = field(compare=False)
-
-
 def _law(controller: Controller) -> Any:
     """`command`, `measured` and `energy` of a law, compiled."""
     return _law_of(controller.graph, controller.measured, controller.energy_graph)
 
 
-@lru_cache(_KEPT)
+@lru_cache(KEPT)
 def _law_of(graph: ca.Function, measured: ca.Function, energy: ca.Function | None) -> Any:
     functions = {"command": graph, "measured": measured, **({} if energy is None else {"energy": energy})}
     return _compiled([_renamed(name, function) for name, function in functions.items()])
 
 
-@lru_cache(_KEPT)
-def _plant(keyed: _Keyed) -> Any:
+@lru_cache(KEPT)
+def _plant(keyed: Keyed) -> Any:
     return _compiled([_with_shared_parts(keyed.loop.plant_of_numbers)])
 
 
-@lru_cache(_KEPT)
+@lru_cache(KEPT)
 def _profile(profile: ca.Function) -> Any:
     return _compiled([_renamed("profile", profile)])
 

@@ -7,10 +7,10 @@ import numpy as np
 from orthocas.checks import Array
 from orthocas.robots import Robot
 from orthocas.viewing.body_poses import BodyPoses
-from orthocas.viewing.solids import COARSE, joined
+from orthocas.viewing.solids import COARSE, by_colour, joined
 from orthocas.viewing.stick_arm import Look, stick_arm
 
-GHOSTS = 11  #: arms of a fan
+GHOSTS = 9  #: arms of a fan
 _SLIM = 0.32  # thickness of a ghost, as a share of the arm's
 _LOW, _MIDDLE, _HIGH = (24, 92, 214), (64, 168, 116), (245, 118, 10)  # colours along a coordinate
 _TRACE = 0.004  # thickness of a line, as a share of the size of the arm
@@ -34,7 +34,7 @@ class Arm:
         self._frames = []
         for i, solids in enumerate(look):
             self._frames.append(scene.add_frame(f"{name}/{i}", show_axes=False))
-            for j, solid in enumerate(solids):
+            for j, solid in enumerate(by_colour(solids)):
                 scene.add_mesh_simple(
                     f"{name}/{i}/{j}",
                     solid.vertices,

@@ -13,7 +13,7 @@ from orthocas.viewing.loop import Loop
 from orthocas.viewing.panel import ChartPanel
 from orthocas.viewing.session import Session
 from orthocas.viewing.stick_arm import Look, chain_length
-from orthocas.viewing.window import place_camera, place_floor
+from orthocas.viewing.window import place_camera, place_floor, place_lights
 
 _STEP = 1e-3  # of the sliders
 _SWEEP = 6.0  # [s] there and back
@@ -25,16 +25,17 @@ _NONE = "none"
 class ChartPage:
     """The page of a chart on a viser server."""
 
-    def __init__(self, server: Any, chart: Chart, look: Look) -> None:
-        self.session = Session(chart)
-        self._server, self._chart = server, chart
-        self._panel = ChartPanel(chart)
+    def __init__(self, server: Any, session: Session, look: Look) -> None:
+        self.session = session
+        self._server = server
+        self._panel = ChartPanel(session.chart, session.place)
         self._loop = Loop(self._settle, self._failed)
         self._gesture = self._dragging = self._sweeping = False
         self._fans: list[Fan] = []
-        robot = chart.problem.robot
+        robot = session.chart.problem.robot
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
         place_floor(server, robot)
+        place_lights(server, robot)
         place_camera(server, robot, self.session.home[None])
         self._handle = self._add_handle()
         self._readings = self._add_readings()
@@ -43,6 +44,10 @@ class ChartPage:
         self._show()
         self._settle()
         self._loop.start()
+
+    @property
+    def _chart(self) -> Chart:
+        return self.session.chart
 
     def close(self) -> None:
         """End the thread of the page."""
@@ -188,6 +193,9 @@ class ChartPage:
     def _show(self, moved: Any = ()) -> None:
         """Draw the arm and the readings, and move the sliders that the user does not hold."""
         readings = self.session.readings
+        if self._panel.chart is not self._chart:
+            self._rest()
+            self._panel = ChartPanel(self._chart, self.session.place)
         with self._server.atomic():
             self._arm.show(readings.q)
             self._readings.content = self._panel.html(readings)
@@ -207,7 +215,11 @@ class ChartPage:
         self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
         for fan in self._fans:
             slider = self._sliders[fan.label]
-            low, high = np.ceil(fan.xi[0] / _STEP) * _STEP, np.floor(fan.xi[-1] / _STEP) * _STEP
+            room = self.session.beyond * (fan.xi[-1] - fan.xi[0])
+            low, high = (
+                np.ceil((fan.xi[0] - room) / _STEP) * _STEP,
+                np.floor((fan.xi[-1] + room) / _STEP) * _STEP,
+            )
             slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
         self._show()
         self._show_fan()

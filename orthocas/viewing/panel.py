@@ -34,17 +34,18 @@ padding:8px 10px;margin-top:10px}
 class ChartPanel:
     """Writes the readings of one chart."""
 
-    def __init__(self, chart: Chart) -> None:
+    def __init__(self, chart: Chart, place: str = "") -> None:
+        self.chart = chart
         problem = chart.problem
         robot, domain = problem.robot, problem.domain
         self._joints = JointBars(robot.joint_names, robot.tree.prismatic, robot.lower, robot.upper, *borders(domain))
         self._labels, self._units = chart.labels, problem.task.units
         self._half_width = float(domain.half_width.min())
         task = ", ".join(map(escape, chart.labels[: chart.m]))
-        self._head = (
-            f'<div class="name">{escape(problem.name)}</div><div class="about">{escape(chart.coordinates.label)}, '
-            f"{chart.n} joints<br>task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}</div>"
-        )
+        lines = [place] if place else []
+        lines += [f"{escape(chart.coordinates.label)}, {chart.n} joints"]
+        lines += [f"task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}"]
+        self._head = f'<div class="name">{escape(problem.name)}</div><div class="about">{"<br>".join(lines)}</div>'
 
     def html(self, readings: Readings) -> str:
         """The page."""

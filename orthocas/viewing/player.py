@@ -12,7 +12,7 @@ from orthocas.viewing.loop import Loop
 from orthocas.viewing.motion import Motion
 from orthocas.viewing.panel import PlayerPanel
 from orthocas.viewing.stick_arm import Look, chain_length
-from orthocas.viewing.window import direction_of_camera, place_camera, place_floor, up_of
+from orthocas.viewing.window import direction_of_camera, place_camera, place_floor, place_lights, up_of
 
 PATHS = ((31, 95, 168), (217, 95, 2), (27, 158, 119))  #: colours of the tool paths
 _APART = 0.9  # of arms that are side by side, as a share of their length
@@ -60,6 +60,7 @@ class PlayerPage:
         self._loop = Loop(lambda: None, lambda error: None)
         self._now = 0.0
         place_floor(server, robot)
+        place_lights(server, robot)
         place_camera(server, robot, np.concatenate([few(motion.q) for motion in motions]), self._stage.shifts)
         panel = server.gui.add_panel()
         with panel.add_tab("Readings", "gauge"):

@@ -13,7 +13,7 @@ from orthocas.viewing.arm import GHOSTS, Arm, Ghosts
 from orthocas.viewing.motion import Motion
 from orthocas.viewing.player import Stage, few
 from orthocas.viewing.stick_arm import Look, chain_length
-from orthocas.viewing.window import LOCAL, close_window, open_window, place_camera, place_floor, up_of
+from orthocas.viewing.window import LOCAL, close_window, open_window, place_camera, place_floor, place_lights, up_of
 
 _RATE = 30  # pictures a second
 _SWEEP = 5.0  # [s] of one coordinate
@@ -29,7 +29,6 @@ def recorded(build: Scene) -> str:
     server = open_window(LOCAL, 0, "orthocas")
     try:
         duration, show = build(server)
-        server.scene.configure_default_lights()
         show(0.0)
         serializer = server.get_scene_serializer()
         for t in np.linspace(0.0, duration, round(_RATE * duration) + 1)[: None if duration else 0]:
@@ -48,6 +47,7 @@ def chart_scene(chart: Chart, look: Look) -> Scene:
         fans = [fan_along(chart, home, k) for k in range(chart.r)]
         arm, ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
         place_floor(server, robot)
+        place_lights(server, robot)
         place_camera(server, robot, np.concatenate([fan.spread(5) for fan in fans]))
         above = robot.joint_points(home).max(axis=0) @ up_of(robot) + 0.12 * chain_length(robot.tree)
         label = server.scene.add_label("/label", "", position=tuple(above * up_of(robot)), anchor="bottom-center")
@@ -74,6 +74,7 @@ def motion_scene(robot: Robot, look: Look, motions: Sequence[Motion]) -> Scene:
     def build(server: Any) -> tuple[float, Callable[[float], None]]:
         stage = Stage(server.scene, robot, look, motions)
         place_floor(server, robot)
+        place_lights(server, robot)
         place_camera(server, robot, np.concatenate([few(motion.q) for motion in motions]), stage.shifts)
         speed = max(1.0, stage.duration / _LONGEST)
         return stage.duration / speed, lambda seconds: stage.show(speed * seconds)
@@ -87,6 +88,7 @@ def robot_scene(robot: Robot, look: Look) -> Scene:
     def build(server: Any) -> tuple[float, Callable[[float], None]]:
         arm = Arm(server.scene, "/arm", robot, look)
         place_floor(server, robot)
+        place_lights(server, robot)
         place_camera(server, robot, robot.tree.middle[None])
         return 0.0, lambda seconds: arm.show(robot.tree.middle)
 

@@ -9,7 +9,7 @@ from orthocas.viewing.arm import Arm
 from orthocas.viewing.loop import Loop
 from orthocas.viewing.panel import RobotPanel
 from orthocas.viewing.stick_arm import Look
-from orthocas.viewing.window import place_camera, place_floor
+from orthocas.viewing.window import place_camera, place_floor, place_lights
 
 _ENDLESS = np.pi  # [rad] or [m] of a slider without limits
 _STEP = 1e-3
@@ -25,6 +25,7 @@ class RobotPage:
         self._robot = robot
         self._loop = Loop(lambda: None, lambda error: None)
         place_floor(server, robot)
+        place_lights(server, robot)
         place_camera(server, robot, self._home[None])
         panel = server.gui.add_panel()
         with panel.add_tab("Readings", "gauge"):

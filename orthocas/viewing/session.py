@@ -12,7 +12,7 @@ from orthocas.inverting import TrackerStatus
 from orthocas.reaching.stops import Walls
 from orthocas.viewing.readings import Readers, Readings
 
-_MOST_STEPS = 200  # of the tracker towards one wish
+MOST_STEPS = 200  # of the tracker towards one wish
 _SHORTEST = 1e-4  # share of the way to a wish below which there is no way on
 _REACHED = 1e-10  # of the sizes of the components
 _MOST_UNDONE = 100
@@ -34,15 +34,19 @@ class Session:
         InvalidValueError: if q lies outside the domain, or J is singular there.
     """
 
+    beyond = 0.0  #: how far a wish for a coordinate may lie beyond its ends in the chart, as a share of their distance
+    _wished: Array  #: phi, (n,)
+
     def __init__(self, chart: Chart, q: Array | None = None) -> None:
         require_kind("chart", chart, Chart)
-        home = chart.problem.domain.centre if q is None else as_point("q", q, chart.n)
-        self.chart, self.home = chart, home
-        self._tracker = chart.tracker(home)
-        self._readers, self._walls = Readers(chart), Walls(chart.problem)
+        self.home: Array = chart.problem.domain.centre if q is None else as_point("q", q, chart.n)
         self._past: list[Array] = []
-        self._wished: Array = chart.phi(home)
-        self.stop = ""  #: what stopped the last motion, or ""
+        self._use(chart, self.home)
+
+    @property
+    def place(self) -> str:
+        """Where the chart belongs, if there are several."""
+        return ""
 
     @property
     def q(self) -> Array:
@@ -75,7 +79,7 @@ class Session:
             wished[self.chart.labels.index(label)] = number
         self._wished = wished
 
-    def follow(self, most_steps: int = _MOST_STEPS) -> bool:
+    def follow(self, most_steps: int = MOST_STEPS) -> bool:
         """Move towards the wish. Returns whether q has moved; afterwards the wish is met, given up, or still ahead."""
         moved = False
         for _ in range(most_steps):
@@ -129,6 +133,14 @@ class Session:
         if self._tracker.status is TrackerStatus.OUTSIDE_DOMAIN:
             return str(self._walls.worst(self.q))
         return "a fold of the chart or a singular position"
+
+    def _use(self, chart: Chart, q: Array) -> None:
+        """Go on in a chart, at rest at a joint position."""
+        self.chart = chart
+        self._tracker = chart.tracker(q)
+        self._readers, self._walls = Readers(chart), Walls(chart.problem)
+        self._wished = chart.phi(q)
+        self.stop = ""  #: what stopped the last motion, or ""
 
     def _place(self, q: Array) -> None:
         self._tracker.reset(q)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
+from orthocas.atlases.atlas import Atlas
 from orthocas.chart import Chart, GrownChart
 from orthocas.checks import as_path
 from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError
@@ -14,11 +15,13 @@ from orthocas.files.ours import require_replaceable
 from orthocas.following.joint_motion import JointMotion
 from orthocas.robots import Robot
 from orthocas.simulation.trajectory import Trajectory
+from orthocas.viewing.atlas_session import AtlasSession
 from orthocas.viewing.chart_page import ChartPage
 from orthocas.viewing.motion import Motion, require_joints
 from orthocas.viewing.player import PlayerPage
 from orthocas.viewing.recording import Scene, chart_scene, motion_scene, recorded, robot_scene
 from orthocas.viewing.robot_page import RobotPage
+from orthocas.viewing.session import Session
 from orthocas.viewing.stick_arm import Look, stick_arm
 from orthocas.viewing.urdf_look import urdf_look
 from orthocas.viewing.window import LOCAL, close_window, open_window, url_of
@@ -79,11 +82,11 @@ def view(
     host: str = LOCAL,
     port: int = PORT,
 ) -> View:
-    """Open a page for the browser: a chart to play with, a robot, or a motion.
+    """Open a page for the browser: a chart to play with, an atlas from chart to chart, a robot, or a motion.
 
     Args:
-        shown: a fitted chart, a robot, a `Trajectory` of `simulate`, a `JointMotion` of `follow`, or a sequence of
-            `Motion` of one robot, which move side by side.
+        shown: a fitted chart, an atlas, a robot, a `Trajectory` of `simulate`, a `JointMotion` of `follow`, or a
+            sequence of `Motion` of one robot, which move side by side.
         robot: for motions: whose they are, or a chart of that robot.
         robot_file: URDF file of the robot with its meshes. Default: drums and rods, made from the kinematic tree.
         locked: joints that were locked when the robot was built from that file, with their positions [rad] or [m].
@@ -107,7 +110,9 @@ def view(
         if motions:
             page = PlayerPage(server, arm, shape.look, motions)
         elif isinstance(shown, Chart):
-            page = ChartPage(server, shown, shape.look)
+            page = ChartPage(server, Session(shown), shape.look)
+        elif isinstance(shown, Atlas):
+            page = ChartPage(server, AtlasSession(shown), shape.look)
         else:
             page = RobotPage(server, arm, shape.look)
     except BaseException:
@@ -130,7 +135,7 @@ def export_page(
     A chart moves each coordinate to its ends and back. Sliders need `view`.
 
     Args:
-        shown: as in `view`.
+        shown: as in `view`, but no atlas: sliders lead through it.
         path: the file.
         robot: as in `view`.
         robot_file: as in `view`.
@@ -142,6 +147,8 @@ def export_page(
     """
     target = as_path("path", path)
     require_page(target, force)
+    if isinstance(shown, Atlas):
+        raise InvalidValueError("shown", "an atlas", "one of its charts, a robot or a motion; `view` shows atlases")
     arm, motions = subject(shown, robot)
     shape = shape_of(arm, robot_file, locked)
     scene: Scene
@@ -172,7 +179,7 @@ def subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequence[Mo
     """The robot to draw, and what moves it; no motions for a chart and a robot."""
     if isinstance(shown, GrownChart):
         raise NoExpressionError("a view needs coordinates with a CasADi expression; received grown coordinates")
-    if isinstance(shown, Chart):
+    if isinstance(shown, Chart | Atlas):
         return shown.problem.robot, ()
     if isinstance(shown, Robot):
         return shown, ()
@@ -193,7 +200,9 @@ def _motions(shown: Any) -> tuple[Motion, ...]:
         return (Motion.of_path(shown),)
     several = shown if isinstance(shown, list | tuple) else [shown]
     if not several or not all(isinstance(part, Motion) for part in several):
-        raise InvalidValueError("shown", f"a {type(shown).__name__}", "a chart, a robot, a run or a joint motion")
+        raise InvalidValueError(
+            "shown", f"a {type(shown).__name__}", "a chart, an atlas, a robot, a run or a joint motion"
+        )
     return tuple(several)
 
 

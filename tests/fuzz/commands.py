@@ -76,6 +76,8 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose:z", "position:xx", "position+axis", ""),
     "--metric": ("euclidean", "inertia", "identity"),
     "--param": _WORDS,
+    **dict.fromkeys(("--corridor", "--along"), ("postures.csv", "path.csv", "nothing.csv", "steps.json", "")),
+    "--radius": (*NUMBERS, "0.2"),
     "--log": ("path.csv", "nothing.csv", "steps.json", ""),
     "--chart": (*_FILES, "grown.orthocas", "cut.orthocas"),
     "--solver": _SOLVERS,
@@ -120,6 +122,11 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         ("planar_3r_xy", *_PROBLEMS),
         {"--param": "polynomial:1", "--samples": "30", "--out": "new.orthocas"},
         (*_PROBLEM_OPTIONS, "--task", "--metric", "--home", "--leak-deg", "--conditioning", "--seed"),
+    ),
+    "fit --corridor postures.csv": (
+        ("planar_3r_xy", *_PROBLEMS),
+        {"--param": "polynomial:1", "--samples": "30", "--out": "new.orthocas"},
+        (*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, *_AUTO_OPTIONS, "--corridor", "--radius"),
     ),
     "certify": (_FILES, {"--seconds": "0.5", "--out": "new.orthocas"}, ("--bound", "--workers")),
     "evaluate": (_FILES, {"--samples": "50"}, ("--seed",)),
@@ -219,6 +226,7 @@ def _files() -> Path:
     plan = json.dumps({"start": start, "duration": 0.2, "steps": steps})
     (folder / "steps.json").write_text(plan)
     x = float(chart.task(chart.problem.domain.centre)[0])
+    (folder / "postures.csv").write_text("q1,q2,q3\n0,0.6,0.8\n0.1,0.8,0.8\n")
     joint_motion().save_csv(folder / "q.csv")
     (folder / "path.csv").write_text(f"x\n{x}\n{x + 0.02}\n{x}\n")
     return folder

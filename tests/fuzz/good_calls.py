@@ -9,13 +9,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from public_objects import (
+    IN_ATLAS,
     atlas,
     circle,
     clear,
+    control_of_atlas,
     fitted,
     impedance,
     joint_motion,
     link_distances,
+    moved,
     planar,
     steps,
     trajectory,
@@ -23,6 +26,8 @@ from public_objects import (
 
 import orthocas as oc
 from orthocas import control, parametrisations, plotting, problems, simulation, solvers, viewing
+from orthocas.atlases.hand_over import AtlasControl
+from orthocas.atlases.laws import BlendedImpedance, HandedOver
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
 from orthocas.viewing.session import Session
@@ -33,7 +38,24 @@ Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments th
 @cache
 def good_calls() -> dict[str, Call]:
     """What can be called, with arguments that work and take little time."""
-    return {**_makers(), **_functions(), **_methods(), **_control(), **_physics(), **_supervised(), **_views()}
+    physics, laws = {**_physics(), **_supervised()}, {**_control(), **_on_atlas()}
+    return {**_makers(), **_functions(), **_methods(), **laws, **physics, **_views()}
+
+
+def _on_atlas() -> dict[str, Call]:
+    """Laws on an atlas."""
+    running = control_of_atlas()
+    q, x = IN_ATLAS, moved(running, 1e-4)
+    return {
+        "HandedOver": (HandedOver, {"atlas": atlas(), "law": control.PDPlus}),
+        "BlendedImpedance": (
+            BlendedImpedance,
+            {"atlas": atlas(), "stiffness": 60.0, "damping_ratio": 0.7, "limit": 90.0},
+        ),
+        "AtlasControl": (AtlasControl, {"law": running.law}),
+        "control.start": (lambda **given: AtlasControl(running.law).start(**given), {"q": q, "time": 0.0}),
+        "control.tick": (lambda **given: control_of_atlas().tick(**given), {"time": 0.002, "q": q, "dq": q, "x": x}),
+    }
 
 
 def _physics() -> dict[str, Call]:
@@ -51,6 +73,7 @@ def _physics() -> dict[str, Call]:
         "atlas.inverse": (atlas().inverse, {"x": q[:2], "xi": q[2:], "charts": 0, "q_start": q}),
         "atlas.handed_over": (atlas().handed_over, {"q": q, "dq": q, "ddq": q, "number": 0}),
         "evaluate_atlas": (oc.evaluate_atlas, {"atlas": atlas(), "samples": 20, "seed": 0}),
+        "chart_along": (oc.chart_along, {"atlas": atlas(), "x": [[1.0, 1.0]], "q_start": q, "radius": 0.2}),
         "Stops": (lambda **given: _stopped(robot, simulation.Stops(**given)), {"stiffness": 1e4, "damping": [1.0] * 3}),
         "Payload": (simulation.Payload, {"mass": 1.0, "centre": q, "inertia": np.eye(3)}),
         "Wall": (simulation.Wall, {"point": q, "normal": q, "tip_radius": 0.1, "size": 1.0, "time_constant": 0.01}),

@@ -1,0 +1,55 @@
+"""What tests of supervised laws share: an arm, and runs of it."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+import orthocas as oc
+from orthocas.checks import Array
+from orthocas.codegen import Supervisor
+from orthocas.control import ControlStatus
+
+TICK = 1e-3
+
+
+def at_rest(chart: oc.Chart, q: Array) -> Array:
+    return np.concatenate([chart.phi(q), np.zeros(2 * chart.n)])
+
+
+def moving(chart: oc.Chart, q: Array, dq: Array) -> Array:
+    """The reference of a joint motion without acceleration."""
+    curvature = chart.function("second_derivative")(q, dq, dq).full().ravel()
+    return np.concatenate([chart.phi(q), chart.jacobian(q) @ dq, curvature])
+
+
+class Arm:
+    """The rigid body dynamics, integrated in small steps."""
+
+    def __init__(self, robot: oc.Robot, q: Array, dq: Array | None = None) -> None:
+        self.robot, self.q, self.dq = robot, q.copy(), np.zeros(robot.n) if dq is None else dq.copy()
+
+    def move(self, torque: Array, seconds: float = TICK, steps: int = 2) -> None:
+        h = seconds / steps
+        for _ in range(steps):
+            middle = self.q + h / 2 * self.dq
+            ddq = self.robot.forward_dynamics(middle, self.dq, torque)
+            self.dq = self.dq + h * ddq
+            self.q = self.q + h * self.dq
+
+
+def run(
+    supervisor: Supervisor,
+    arm: Arm,
+    reference: Array,
+    seconds: float,
+    load: Callable[[float], Array] | None = None,
+) -> tuple[list[ControlStatus], Array, Array]:
+    """Statuses, commands and speeds of a run."""
+    statuses, commands, speeds = [], [], []
+    for k in range(round(seconds / TICK)):
+        command, status = supervisor.step(arm.q, arm.dq, reference, TICK)
+        arm.move(command + (0 if load is None else load(k * TICK)))
+        statuses.append(status)
+        commands.append(command)
+        speeds.append(np.abs(arm.dq).max())
+    return statuses, np.array(commands), np.array(speeds)

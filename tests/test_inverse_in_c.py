@@ -1,0 +1,69 @@
+"""The inverse map in compiled C."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from charts import beyond_domain
+from programs import needs_c
+from public_objects import circle, clear
+
+import orthocas as oc
+from orthocas.errors import CompileError, InvalidValueError, NoExpressionError
+from orthocas.fitting.fit import Fit
+
+FOUND = oc.InverseStatus.FOUND
+
+
+@needs_c
+def test_compiled_c_gives_the_same_solutions(iiwa_fit: Fit, tmp_path: Path) -> None:
+    """Of all kinds: found, outside, out of reach and without numbers, with starts and without."""
+    chart = iiwa_fit.chart
+    compiled = oc.compile_inverse(chart, tmp_path / "cache")
+    q = beyond_domain(chart, 600, 1.15)
+    phi = chart.phi(q)
+    phi[5, 0], phi[9, 2] = 9.0, np.nan
+    for start, most in ((None, 0), (q + 0.05, 0), (chart.problem.domain.centre, 6)):  # the last one is far away
+        mine, theirs = chart.solve(phi, start), compiled.solve(phi, start)
+        assert {0, 2, 5, 6} <= set(mine.statuses)
+        same = theirs.status == mine.status
+        assert np.count_nonzero(~same) <= most
+        np.testing.assert_allclose(theirs.q[same], mine.q[same], atol=1e-9)
+        assert theirs.error[theirs.found].max() <= 1e-9
+
+
+@needs_c
+def test_a_library_is_compiled_once(planar_arm: oc.Chart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = oc.compile_inverse(planar_arm)
+    (library,) = (tmp_path / "orthocas").iterdir()
+    written = library.stat().st_mtime_ns
+    again = oc.compile_inverse(planar_arm)
+    assert (again.library, library.stat().st_mtime_ns) == (first.library, written)
+    assert oc.compile_inverse(clear()).library != library
+    copy = pickle.loads(pickle.dumps(first))
+    phi = planar_arm.phi(planar_arm.problem.domain.centre)
+    np.testing.assert_array_equal(copy.solve(phi).q, first.solve(phi).q)
+
+
+@needs_c
+def test_singular_solutions_of_compiled_c_are_named(tmp_path: Path) -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    task = oc.Task.custom(robot, "square", lambda q: q[0] ** 2)
+    chart = oc.fit(oc.Problem(robot, task, domain=oc.Box([0.5, 0.0], 0.6)), oc.Polynomial(1)).chart
+    phi = chart.phi([[0.0, 0.1], [0.5, 0.1]])
+    solutions = oc.compile_inverse(chart, tmp_path).solve(phi, [[0.0, 0.1], [0.4, 0.1]])
+    assert solutions.statuses == (oc.InverseStatus.SINGULAR, FOUND)
+
+
+@needs_c
+def test_a_damaged_library_and_grown_charts_are_refused(planar_arm: oc.Chart, tmp_path: Path) -> None:
+    compiled = oc.compile_inverse(planar_arm, tmp_path)
+    compiled.library.write_bytes(b"damaged")
+    with pytest.raises(CompileError, match="delete it"):
+        oc.compile_inverse(planar_arm, tmp_path).solve(planar_arm.phi(planar_arm.problem.domain.centre))
+    with pytest.raises(NoExpressionError):
+        oc.compile_inverse(circle(), tmp_path)
+    with pytest.raises(InvalidValueError, match="local"):
+        planar_arm.solve(planar_arm.phi(planar_arm.problem.domain.centre), local=3)  # type: ignore[arg-type]

@@ -1,0 +1,104 @@
+"""Rows that are kept inside the domain: the nearest coordinates at the same task values."""
+
+from itertools import product
+
+import numpy as np
+from charts import beyond_domain
+from public_objects import clear
+
+import orthocas as oc
+from orthocas.domains import sample_uniform
+from orthocas.fitting.fit import Fit
+from orthocas.inverting.box_programs import Programs, minimum
+
+FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
+
+
+def test_inside_gives_the_nearest_coordinates_that_keep_the_task(planar_arm: oc.Chart) -> None:
+    """No point of a fine net of self-motions inside the domain is nearer, and rows without such points say so."""
+    domain = planar_arm.problem.domain
+    phi = planar_arm.phi(beyond_domain(planar_arm, 60, 1.25))
+    solutions = planar_arm.solve(phi, inside=True)
+    assert {FOUND, NEAREST} <= set(solutions.statuses)
+    kept = np.isin(solutions.status, (FOUND, NEAREST))
+    assert domain.contains(solutions.q).all()
+    np.testing.assert_allclose(planar_arm.task(solutions.q[kept]), phi[kept, :2], atol=1e-8)
+    np.testing.assert_allclose(solutions.distance, np.abs(planar_arm.xi(solutions.q) - phi[:, 2:])[:, 0], atol=1e-9)
+    for k in np.flatnonzero(solutions.status != FOUND):
+        inner = self_motion(planar_arm, phi[k, :2])
+        if solutions.status[k] == NEAREST:
+            least = np.abs(planar_arm.xi(inner) - phi[k, 2]).min() if len(inner) else np.inf
+            assert solutions.distance[k] <= least + 1e-7  # Ipopt stays a little off the border
+        else:
+            assert len(inner) == 0
+
+
+def self_motion(planar_arm: oc.Chart, x: np.ndarray) -> np.ndarray:
+    """Joint positions of the planar arm inside the domain with the tip at x, in closed form for 4,001 last joints."""
+    domain = planar_arm.problem.domain
+    wrist_angle = np.linspace(*(domain.centre[2] + domain.half_width[2] * np.array([-1, 1])), 4001)
+    reach = np.hypot(1 + np.cos(wrist_angle), np.sin(wrist_angle))  # of links 2 and 3 as one
+    bend = np.arctan2(np.sin(wrist_angle), 1 + np.cos(wrist_angle))
+    cosine = (x @ x - 1 - reach**2) / (2 * reach)
+    found = []
+    for sign in (-1, 1):
+        with np.errstate(invalid="ignore"):
+            elbow = sign * np.arccos(cosine)
+        shoulder = np.arctan2(x[1], x[0]) - np.arctan2(reach * np.sin(elbow), 1 + reach * np.cos(elbow))
+        found.append(np.stack([shoulder, elbow - bend, wrist_angle], axis=1))
+    q = np.concatenate(found)
+    q = q[np.isfinite(q).all(axis=1)]
+    return q[domain.contains(q)]
+
+
+def test_inside_keeps_clear_of_singular_positions() -> None:
+    """The part of a box that is clear counts as inside, and no other."""
+    chart = clear()
+    box = oc.Box(chart.problem.domain.centre, 1.2 * chart.problem.domain.half_width)
+    solutions = chart.solve(chart.phi(sample_uniform(box, 150, 1)), inside=True)
+    kept = np.isin(solutions.status, (FOUND, NEAREST))
+    assert (solutions.status == NEAREST).sum() > 5
+    assert chart.problem.domain.contains(solutions.q[kept]).all()
+
+
+def test_the_search_for_all_rows_agrees_with_ipopt(iiwa_fit: Fit) -> None:
+    """From the same starts, both end at the same distance; Ipopt stays a little off the border."""
+    chart = iiwa_fit.chart
+    phi = chart.phi(beyond_domain(chart, 60, 1.3))
+    inside = chart._inverse._inside
+    assert inside is not None
+    q, in_reach = inside.with_task(phi, np.tile(chart.problem.domain.centre, (60, 1)))
+    assert 20 < in_reach.sum() < 60
+    phi, q = phi[in_reach], q[in_reach]
+    mine, theirs = inside.nearest(phi, q), inside.by_ipopt.search(phi, q)
+    for found in (mine, theirs):
+        assert inside.by_ipopt.keeps_task(phi, found, 1e-9).all()
+    away, theirs_away = (np.linalg.norm(chart.xi(found) - phi[:, chart.m :], axis=1) for found in (mine, theirs))
+    np.testing.assert_allclose(away, theirs_away, atol=1e-6)
+
+
+def test_boxed_programs_have_the_least_of_all_active_sets() -> None:
+    """With 4 variables there are 81 guesses which bounds hold; the least allowed value is the minimum."""
+    rng, n = np.random.default_rng(3), 4
+    root = rng.standard_normal((50, n, n))
+    A = rng.standard_normal((50, 1, n))
+    H, g, high = root @ root.transpose(0, 2, 1), 3 * rng.standard_normal((50, n)), rng.uniform(0, 1, (50, n))
+    programs = Programs(H, g, A, -rng.uniform(0, 1, (50, n)), high)
+    found = minimum(programs, *np.zeros((2, 50, n), dtype=bool))
+    assert found.solved.mean() >= 0.98
+    for k in np.flatnonzero(found.solved):
+        values = [value(programs, k, np.array(held)) for held in product((-1, 0, 1), repeat=n)]
+        d = found.d[k]
+        assert abs(A[k] @ d) < 1e-9
+        assert np.isclose(d @ programs.H[k] @ d / 2 + programs.g[k] @ d, min(values), atol=1e-9)
+
+
+def value(programs: Programs, k: int, held: np.ndarray) -> float:
+    """The least value of a program with some variables at their low (-1) or high (1) bounds, or infinity."""
+    H, g, A, low, high = (getattr(programs, name)[k] for name in ("H", "g", "A", "low", "high"))
+    rows = [*A, *np.eye(len(g))[held != 0]]
+    bounds = np.concatenate([np.zeros(len(A)), np.where(held < 0, low, high)[held != 0]])
+    K = np.block([[H, np.transpose(rows)], [np.array(rows), np.zeros((len(rows), len(rows)))]])
+    d = np.linalg.lstsq(K, np.concatenate([-g, bounds]), rcond=None)[0][: len(g)]
+    allowed = np.abs(np.array(rows) @ d - bounds).max() < 1e-9 and (d >= low - 1e-9).all() and (d <= high + 1e-9).all()
+    return float(d @ H @ d / 2 + g @ d) if allowed else np.inf

@@ -1,0 +1,43 @@
+"""Proofs next to singular positions: boxes that are said to lie outside a clear box do, and few are needed."""
+
+import importlib
+
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas.certifying.chart_rows import chart_rows
+from orthocas.certifying.outside import judge_of
+from orthocas.certifying.search import Limits, Search, largest_first
+
+certifying = importlib.import_module("orthocas.certifying.certify")  # a function has the name of the module
+BOUND = 0.1
+
+
+@pytest.fixture(scope="module")
+def chart(iiwa: oc.Problem) -> oc.Chart:
+    """Of a part of the 7-DoF arm's range at whose border the elbow is stretched."""
+    box = oc.Box([0.0, 0.6, 0.2, -0.4, 0.2, 0.5, 0.0], [0.3, 0.3, 0.3, 0.4, 0.3, 0.3, 0.3])
+    problem = oc.Problem(iiwa.robot, iiwa.task, iiwa.metric, box, least_singular_value=BOUND)
+    return oc.fit(problem, oc.Polynomial(3), samples=2000).chart
+
+
+def test_boxes_without_a_proof_of_their_own_hold_no_clear_position(chart: oc.Chart) -> None:
+    domain, rng = chart.problem.domain, np.random.default_rng(0)
+    middle = domain.centre + domain.half_width * rng.uniform(-1, 1, (3000, 7))
+    half = rng.uniform(0.01, 0.2, (3000, 1)) * np.ones(7)
+    found = judge_of(chart, chart_rows(chart), 0.0)(middle - half, middle + half)
+    outside = found.proved & ~found.regular
+    assert outside.sum() > 50
+    points = middle[outside, None] + half[outside, None] * rng.uniform(-1, 1, (int(outside.sum()), 400, 7))
+    assert domain.singular_values(points.reshape(-1, 7)).max() <= BOUND
+    singular = domain.singular_values(middle) < BOUND / 2
+    assert found.proved[singular & (half[:, 0] < 0.05)].mean() > 0.9
+
+
+def test_a_chart_next_to_singular_positions_needs_few_boxes(chart: oc.Chart) -> None:
+    base = certifying.whole_domain(chart.problem.domain)
+    search = Search(judge_of(chart, chart_rows(chart), 0.0), base, Limits(), largest_first(base))
+    search.run(lambda _: None)
+    assert search.finished
+    assert search.judged < 400  # 177; with singular vectors that stay and boxes halved by linear terms alone 2,421

@@ -1,0 +1,150 @@
+"""Settings of the supervised law, integral action, stops, and references in C."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from programs import needs_c
+from supervised import TICK, Arm, at_rest, run
+
+import orthocas as oc
+from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
+from orthocas.codegen.generated import GeneratedC
+from orthocas.control import Controller, Kinematic, Projector, Reference, Safety
+from orthocas.errors import InvalidValueError, ShapeError
+
+pytestmark = needs_c
+
+
+def test_settings_are_checked(supervised_law: Controller, planar_for_control: oc.Chart, tmp_path: Path) -> None:
+    with pytest.raises(InvalidValueError, match="setting is 'speed'"):
+        Safety.of(supervised_law, speed=1.0)
+    with pytest.raises(ShapeError, match="error_limit has shape"):
+        Safety.of(supervised_law, error_limit=[1.0, 2.0])
+    with pytest.raises(InvalidValueError, match="catch_margin < near_margin"):
+        Safety.of(supervised_law, near_margin=0.5)
+    with pytest.raises(InvalidValueError, match="fade_in is nan"):
+        Safety.of(supervised_law, fade_in=np.nan)
+    with pytest.raises(ShapeError, match="error_limit"):
+        oc.generate_c(
+            planar_for_control,
+            tmp_path,
+            supervised_law,
+            "arm",
+            safety=Safety.of(Projector.on_chart(planar_for_control)),
+        )
+
+
+def test_settings_in_c_are_those_of_python(
+    supervised_c: GeneratedC, supervised_law: Controller, supervised_library: CompiledLibrary
+) -> None:
+    ours, theirs = (
+        Supervisor(supervised_library, supervised_law),
+        Supervisor(supervised_library, supervised_law, Safety.of(supervised_law)),
+    )
+    rng = np.random.default_rng(3)
+    q = supervised_law.problem.domain.centre
+    for supervisor in (ours, theirs):
+        supervisor.start(q)
+    for _ in range(200):
+        state = (q + 0.1 * rng.normal(size=3) * 0.01, 0.1 * rng.normal(size=3), 0.1 * rng.normal(size=9))
+        first, second = ours.step(*state), theirs.step(*state)
+        np.testing.assert_array_equal(first[0], second[0])
+        assert first[1] == second[1]
+
+
+def test_margins_at_run_time_decide_where_the_law_starts(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
+) -> None:
+    domain = planar_for_control.problem.domain
+    q = domain.centre + 0.8 * domain.half_width
+    for margin, wanted in ((0.1, 0), (0.3, 1)):
+        supervisor = Supervisor(supervised_library, supervised_law, Safety.of(supervised_law, return_margin=margin))
+        supervisor.start(q)
+        supervisor.step(q, np.zeros(3), at_rest(planar_for_control, q), TICK)
+        assert supervisor.mode == wanted  # the law, the catcher
+        np.testing.assert_allclose(np.abs(supervisor.safe - domain.centre) <= (1 - margin) * domain.half_width, True)
+    assert np.abs(supervisor.safe - domain.centre).max() < np.abs(q - domain.centre).max()
+
+
+def test_velocity_laws_carry_no_settings_of_torques(planar_for_control: oc.Chart, tmp_path: Path) -> None:
+    law = Kinematic.on_chart(planar_for_control)
+    generated = oc.generate_c(planar_for_control, tmp_path, law, "arm")
+    header = (tmp_path / "arm.h").read_text()
+    for name in ("brake_stiffness", "brake_yield", "stop_zone", "stop_damping"):
+        assert name not in header
+    library, q = (
+        CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3),
+        planar_for_control.problem.domain.centre,
+    )
+    commands = []
+    for safety in (None, Safety.of(law), Safety.of(law, return_speed=0.1, damping=1.0)):
+        supervisor = Supervisor(library, law, safety)
+        supervisor.take_over(q, np.zeros(3))
+        for k in range(60):  # the catcher after speeds beyond the limit
+            command, _ = supervisor.step(
+                q + 1e-4 * k, np.full(3, 20.0 * (k == 30)), at_rest(planar_for_control, q), TICK
+            )
+        assert supervisor.mode == 1  # the catcher
+        commands.append(command)
+    np.testing.assert_array_equal(commands[0], commands[1])
+    assert np.abs(commands[2] - commands[0]).max() > 1e-4
+
+
+@pytest.mark.slow
+def test_integral_action_removes_sag_and_does_not_wind_up(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
+) -> None:
+    q, heavier = planar_for_control.problem.domain.centre, planar_for_control.problem.robot.with_scaled_masses(1.2)
+    sag = {}
+    for rate in (0.0, 3.0):
+        supervisor = Supervisor(supervised_library, supervised_law, Safety.of(supervised_law, integral_rate=rate))
+        supervisor.start(q)
+        arm = Arm(heavier, q)
+        run(supervisor, arm, at_rest(planar_for_control, q), 5.0)
+        sag[rate] = np.abs(arm.q - q).max()
+        assert (np.abs(supervisor.integral) <= Safety.of(supervised_law).integral_limit + 1e-15).all()
+    assert sag[3.0] < 0.01 * sag[0.0]
+    assert sag[0.0] > 1e-3
+
+
+def test_springs_and_dampers_keep_away_from_joint_limits(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
+) -> None:
+    q, speed = planar_for_control.problem.domain.centre, np.array([0.0, 0.1, 0.0])
+    upper = q + np.array([1.0, 0.02, 1.0])
+    settings, commands = Safety.of(supervised_law), []
+    for safety in (settings, Safety.of(supervised_law, upper=upper, stop_zone=0.05)):
+        supervisor = Supervisor(supervised_library, supervised_law, safety)
+        supervisor.take_over(q, planar_for_control.problem.robot.gravity(q))
+        for _ in range(400):  # until the limit of change is no matter any more
+            towards, _ = supervisor.step(q, speed, at_rest(planar_for_control, q), TICK)
+        for _ in range(400):
+            away, _ = supervisor.step(q, -speed, at_rest(planar_for_control, q), TICK)
+        commands += [towards, away]
+    spring, damper = settings.stop_stiffness[1] * 0.03, settings.stop_damping[1] * 0.1
+    np.testing.assert_allclose(commands[0] - commands[2], [0.0, spring + damper, 0.0], atol=1e-9)
+    np.testing.assert_allclose(commands[1] - commands[3], [0.0, spring, 0.0], atol=1e-9)
+
+
+def test_references_equal_those_of_python(supervised_library: CompiledLibrary, planar_for_control: oc.Chart) -> None:
+    start, target = planar_for_control.phi(planar_for_control.problem.domain.centre), np.array([0.3, -0.1, 0.2])
+    for zeta in (0.4, 1.0, 1.6):
+        reference = np.concatenate([start, np.zeros(6)])
+        wanted = Reference.steps(
+            planar_for_control.labels,
+            start,
+            [(0.0, dict(zip(planar_for_control.labels, target, strict=True)))],
+            1.0,
+            6.0,
+            zeta,
+        )
+        for _ in range(500):
+            supervised_library.low_pass(reference, target, 6.0, zeta, TICK)
+        np.testing.assert_allclose(reference, np.hstack(wanted.sample([0.5])).ravel(), atol=1e-9)
+    moving = np.array([0.1, 0.2, 0.3, 1.0, -1.0, 0.5, 2.0, 0.0, -3.0])
+    for time, want in ((0.0, moving), (0.8, np.concatenate([target, np.zeros(6)]))):
+        np.testing.assert_allclose(supervised_library.spline(moving, target, 0.8, time), want, atol=1e-12)
+    h = 1e-5
+    low, middle, high = (supervised_library.spline(moving, target, 0.8, 0.3 + t) for t in (-h, 0.0, h))
+    np.testing.assert_allclose((high - low)[:6] / (2 * h), middle[3:], rtol=1e-6)
