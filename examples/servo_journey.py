@@ -2,8 +2,8 @@
 
 The law of Sec. 9 of [AS2023] gives joint velocities, and their integral is what the servos are asked for. Each servo is
 a spring and a damper between the wanted and the actual motor, plus the gravity torque at the wanted posture. Gears are
-rigid, or give way: then the servos hold the rotors where the joints should be, as a robot does that measures its motors
-only, and the joints hang and swing on springs. The motion is logged as a lab would log it, and drawn from the log.
+rigid, or give way: then the servos measure the rotors only, hold them where the springs carry the weight of the wanted
+posture, and the joints swing on their springs. The motion is logged as a lab would log it, and drawn from the log.
 """
 
 import argparse
@@ -28,6 +28,7 @@ VISCOUS = (2.0, 2.0, 1.0, 1.0, 0.5, 0.2, 0.2)  # [N m s/rad]
 GEARS = Elasticity(  # of the order of light arms with strain wave gears; those of the paper's arm are not published
     stiffness=(10e3, 10e3, 8e3, 8e3, 6e3, 4e3, 4e3), inertia=(3.0, 3.0, 2.0, 2.0, 1.0, 0.5, 0.5), damping=10.0
 )
+RESTING = 150  # rows of the log
 SECONDS = 5.0  # of the quick run
 
 
@@ -44,6 +45,7 @@ def servo_run(
     plant = MuJoCoPlant(robot, friction=friction, timestep=TICK, elasticity=gears)
     plant.reset(wanted[0])
     # what a joint feels while the others are free: the diagonal of M is too much, as A1 and A3 are nearly parallel
+    sag = np.zeros(robot.n)
     inertia = 1 / np.diagonal(np.linalg.inv(np.array(robot.function("mass_matrix")(wanted[0]))))
     if gears is not None:
         inertia = gears.numbers(robot.n)[1]  # a servo feels its rotor first
@@ -54,9 +56,21 @@ def servo_run(
         if k % LOGGED == 0:
             rows.append(plant.q)
         gravity = np.asarray(robot.gravity(wanted[k]), dtype=float).ravel()
-        error, rate = wanted[k] - plant.motor_q, rates[k] - plant.motor_dq
+        if gears is not None:
+            sag = gravity / gears.numbers(robot.n)[0]
+        error, rate = wanted[k] + sag - plant.motor_q, rates[k] - plant.motor_dq
         plant.step(stiffness * error + damping * rate + gravity, TICK)
     return np.array(rows)
+
+
+def coupling(chart: Chart, q: Array, desired: Array) -> dict[str, float]:
+    """Largest error of each component of phi while its reference has not moved for 1.5 s, at rows of the log."""
+    phi, found = chart.phi(q), {}
+    for k, label in enumerate(chart.labels):
+        still = 1e-5 * max(1.0, float(np.ptp(desired[:, k])))
+        rests = [np.ptp(desired[max(0, i - RESTING) : i + 1, k]) < still for i in range(len(q))]
+        found[f"coupling_{label}"] = float(np.abs(phi[rests, k] - desired[rests, k]).max(initial=0.0))
+    return found
 
 
 def write_log(path: Path, chart: Chart, times: Array, q: Array, desired: Array) -> None:
@@ -99,7 +113,7 @@ def main(out: Path, quick: bool = False) -> dict[str, dict[str, float]]:
         write_log(path, chart, times[logged], q, desired[logged])
         drawing = draw_log(path, chart)
         drawing.figures[""].savefig(path.with_suffix(".png"), dpi=110)
-        found[name] = dict(drawing.numbers)
+        found[name] = dict(drawing.numbers) | coupling(chart, q, desired[logged])
     return found
 
 
