@@ -45,7 +45,8 @@ SCHEDULES = (  # steps, batch, learning rate
     (1500, 64, 1e-2),
     (1000, 100, 2e-2),
 )
-DESCENTS = ((16, 1000, 100), (16, 2000, 150), (32, 1000, 60), (32, 2000, 60), (32, 2000, 100))  # hidden, samples, steps
+# widths, samples, steps of L-BFGS
+DESCENTS = ((16, 2000, 150), (32, 1000, 200), (32, 2000, 150), (32, 2000, 200), (32, 2000, 300))
 SEEDS, QUICK_SEEDS = (0, 1, 2), (0,)
 HEADER = (
     "| method | CPU seconds | times ours | settings | task, mutual std [deg] | reached it |\n"
