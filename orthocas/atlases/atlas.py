@@ -1,6 +1,5 @@
 """Atlases: many charts that cover the joint range of a robot, in one file (ours)."""
 
-from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -67,7 +66,7 @@ class Atlas(Shown):
     """
 
     _stock: Stock
-    _kept: "OrderedDict[tuple[int, Turns], Chart]" = field(default_factory=OrderedDict)
+    _kept: dict[tuple[int, Turns], Chart] = field(default_factory=dict)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -219,8 +218,8 @@ class Atlas(Shown):
         chart = self._kept.get(which)
         if chart is None:  # other threads may make it as well, or throw it out
             chart = self._kept[which] = self._made(*which)
-            while len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
+            for oldest in list(self._kept)[:-_KEPT]:
+                self._kept.pop(oldest, None)
         return chart
 
     def with_reference(self, q: ArrayLike) -> Self:
