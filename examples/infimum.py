@@ -273,9 +273,9 @@ def draw(rows: dict[str, dict[str, float]]) -> Figure:
         if numbers["infimum"] > 0:
             axes.axvline(as_angle(numbers["infimum"]), color="C3", label="best of even coordinates (splines)")
         axes.set(title=name, xlabel="angle, root mean square [deg]", xscale="log")
-        axes.xaxis.set(
-            major_locator=LogLocator(subs=(1, 2, 3, 5)), major_formatter="{x:g}", minor_formatter=NullFormatter()
-        )
+        wide = max(numbers.values()) > 1e4 * min(abs(value) for value in numbers.values())
+        subs = (1,) if wide else (1, 2, 3, 5)
+        axes.xaxis.set(major_locator=LogLocator(subs=subs), major_formatter="{x:g}", minor_formatter=NullFormatter())
         axes.grid(alpha=0.3)
     panels[0].invert_yaxis()
     handles, words = panels[-1].get_legend_handles_labels()
