@@ -194,6 +194,35 @@ def test_joints_off_the_way_are_locked_next_to_zero_and_those_of_the_user_where_
     assert np.abs(opened - want).max() > 1e-5
 
 
+def robot_with_arms(arms: int) -> tuple[oc.Robot, pin.Model]:
+    """A torso with arms of three joints."""
+    model, rng = pin.Model(), np.random.default_rng(4)
+
+    def add(parent: int, axis: int) -> int:
+        name, joint = f"j{model.njoints}", pin.JointModelRevoluteUnaligned(np.eye(3)[axis])
+        joint_id = int(model.addJoint(parent, joint, pin.SE3(np.eye(3), rng.normal(size=3)), name))
+        model.appendBodyToJoint(joint_id, pin.Inertia.Random(), pin.SE3.Identity())
+        return joint_id
+
+    torso = add(0, 2)
+    for _ in range(arms):
+        hand = add(add(add(torso, 2), 1), 0)
+    model.addFrame(pin.Frame("tip", hand, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+    return oc.Robot.from_model(model, "tip"), model
+
+
+def test_operations_of_forward_dynamics_grow_linearly_with_the_branches() -> None:
+    operations = []
+    for arms in (1, 3, 5):
+        robot, model = robot_with_arms(arms)
+        function = robot.function("forward_dynamics").expand()
+        operations.append(function.n_instructions())
+        state = np.random.default_rng(5).normal(size=(3, robot.n))
+        want = pin.aba(model, model.createData(), *state)
+        np.testing.assert_allclose(robot.forward_dynamics(*state), want, rtol=1e-10, atol=1e-10 * np.abs(want).max())
+    assert operations[2] - operations[1] == pytest.approx(operations[1] - operations[0], rel=0.05)
+
+
 def test_locked_joint_on_the_way_to_the_tip_stays_where_it_is() -> None:
     path = robot_data("tiago_description/robots/tiago.urdf")
     free = oc.Robot.from_file(path, "arm_tool_link")

@@ -62,12 +62,12 @@ def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> 
     regular = ca.logic_and(volume > smallest, _all_finite(command))
     status = ca.if_else(regular, float(ControlStatus.OK), float(ControlStatus.SINGULAR))
     status = ca.if_else(_is_inside(domain, q), status, float(ControlStatus.OUTSIDE_DOMAIN))
-    meant = ca.logic_and(_all_finite(inputs), ca.logic_all(limit > 0))
+    meant = ca.logic_and(_all_finite(inputs), _all(limit > 0))
     status = ca.if_else(meant, status, float(ControlStatus.NOT_FINITE))
     from_law = status == float(ControlStatus.OK)
     chosen = _chosen(from_law, command, fallback)
     cut = _cut(chosen, limit, keep_direction)
-    saturated = ca.logic_and(from_law, ca.logic_not(ca.logic_all(ca.fabs(chosen) <= limit)))
+    saturated = ca.logic_and(from_law, ca.logic_not(_all(ca.fabs(chosen) <= limit)))
     status = ca.if_else(saturated, float(ControlStatus.SATURATED), status)
     given = [command, fallback, limit, q, inputs, volume, smallest]
     names = ["command", "fallback", "limit", "q", "inputs", "volume", "smallest"]
@@ -92,7 +92,7 @@ def _cut(command: ca.SX, limit: ca.SX, keep_direction: bool) -> ca.SX:
 
 def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
     """Whether q (n, 1) lies in the domain: between its borders, and where its condition holds, if it has one."""
-    clear = ca.logic_all(domain.pivots(q) > 0) if isinstance(domain, Conditioned) else ca.SX(1)
+    clear = _all(domain.pivots(q) > 0) if isinstance(domain, Conditioned) else ca.SX(1)
     return ca.logic_and(_is_between_borders(domain, q), clear)
 
 
@@ -102,7 +102,7 @@ def _is_between_borders(domain: Domain | None, q: ca.SX) -> ca.SX:
     bounded = np.flatnonzero(np.isfinite(widths)).tolist()
     if domain is None or not bounded:
         return ca.SX(1)
-    return ca.logic_all(ca.fabs(q[bounded] - ca.DM(domain.centre[bounded])) <= ca.DM(widths[bounded]))
+    return _all(ca.fabs(q[bounded] - ca.DM(domain.centre[bounded])) <= ca.DM(widths[bounded]))
 
 
 def _is_finite(value: ca.SX) -> ca.SX:
@@ -111,4 +111,9 @@ def _is_finite(value: ca.SX) -> ca.SX:
 
 
 def _all_finite(values: ca.SX) -> ca.SX:
-    return ca.logic_all(_is_finite(values))
+    return _all(_is_finite(values))
+
+
+def _all(conditions: ca.SX) -> ca.SX:
+    """Whether all conditions hold. Their sum needs no branches, and less code than `ca.logic_all`."""
+    return ca.sum1(conditions) == conditions.shape[0]

@@ -102,9 +102,15 @@ def inverse_dynamics(
 def forward_dynamics(
     tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, gravity: Array, inertials: ca.SX | None = None
 ) -> ca.SX:
-    """ddq = M^-1 (tau - C dq - g), (n, 1), with M = L D L^T."""
-    D, LT, order = ca.ldl(mass_matrix(tree, q, inertials=inertials), False)
-    return ca.ldl_solve(tau - bias(tree, q, dq, gravity, inertials=inertials), D, LT, order)
+    """ddq = M^-1 (tau - C dq - g), (n, 1), with M = L^T D L, from the tips to the base.
+
+    In this order L keeps the zeros of M between joints of different branches ([F2008] Sec. 6.5).
+    """
+    tips_first = list(reversed(range(tree.n)))
+    M = mass_matrix(tree, q, inertials=inertials)[tips_first, tips_first]
+    D, LT, order = ca.ldl(M, False)
+    force = (tau - bias(tree, q, dq, gravity, inertials=inertials))[tips_first]
+    return ca.ldl_solve(force, D, LT, order)[tips_first]
 
 
 def bias(
