@@ -113,7 +113,7 @@ def sample_problem(problem: Problem, samples: int, seed: int | tuple[int, ...]) 
 def samples_at(problem: Problem, points: Array) -> Samples:
     """Samples at given joint positions (N, n)."""
     J = task_jacobians(problem, points)
-    kept = np.all((J**2).sum(axis=2) > 0, axis=1)
+    kept = np.all(np.einsum("sij,sij->si", J, J) > 0, axis=1)
     if not kept.all():
         points, J = points[kept], J[kept]
     inverse: Array | None = None

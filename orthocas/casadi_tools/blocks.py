@@ -21,25 +21,26 @@ MANY = 64  #: joint positions from which blocks pay off
 _PIECE = 8 * COLUMNS  # joint positions that a thread takes at once
 
 #: A function of contiguous columns (n, c) with its own scratch memory; it may return the same array at every call.
-BlockFunction = Callable[[Array], Array]
+BlockFunction = Callable[..., Array]
 
 
-def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction]) -> None:
+def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction], *others: Array) -> None:
     """Write a function's values at points (N, n) to `results`, (N, ...), which may be part of a larger array.
 
     Args:
         results: the values; entries of one sample in row-major order.
         points: joint positions.
         make: makes the function (n, c) -> (entries, c), once for each thread.
+        others: further arguments of the function, (N, k) each.
     """
     starts = range(0, len(points), _PIECE)
     functions = [make() for _ in range(min(thread_count(), len(starts)))]  # not in the threads, see ColumnFunction
 
     def one_piece(function: BlockFunction, start: int) -> None:
         for first in range(start, min(start + _PIECE, len(points)), COLUMNS):
-            part = points[first : first + COLUMNS]
-            values = function(_columns(part))
-            by_entry = values.reshape(*results.shape[1:], COLUMNS)[..., : len(part)]
+            count = min(COLUMNS, len(points) - first)
+            values = function(*(_columns(array[first : first + COLUMNS]) for array in (points, *others)))
+            by_entry = values.reshape(*results.shape[1:], COLUMNS)[..., :count]
             results[first : first + COLUMNS] = np.moveaxis(by_entry, -1, 0)
 
     in_threads_with(functions, one_piece, starts)
