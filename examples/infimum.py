@@ -269,12 +269,12 @@ def draw(rows: dict[str, dict[str, float]]) -> Figure:
     panels = figure.subplots(1, len(rows), sharey=True, squeeze=False)[0]
     for axes, (name, numbers) in zip(panels, rows.items(), strict=True):
         labels = [label for label in numbers if ":" in label or label == "linear"]
-        axes.plot([as_angle(numbers[label]) for label in labels], labels, "o", color="C0", label="fitted")
-        if numbers["infimum"] > 0:
-            axes.axvline(as_angle(numbers["infimum"]), color="C3", label="best of even coordinates (splines)")
+        angles = [as_angle(numbers[label]) for label in labels]
+        axes.plot(angles, labels, "o", color="C0", label="fitted")
+        finest = [value for label, value in numbers.items() if label.startswith("grid")][-1]
+        axes.axvline(as_angle(finest), color="C3", label="splines on the finest grid")
         axes.set(title=name, xlabel="angle, root mean square [deg]", xscale="log")
-        wide = max(numbers.values()) > 1e4 * min(abs(value) for value in numbers.values())
-        subs = (1,) if wide else (1, 2, 3, 5)
+        subs = (1,) if max(angles) > 50 * min(angles) else (1, 2, 3, 5)  # of labelled ticks
         axes.xaxis.set(major_locator=LogLocator(subs=subs), major_formatter="{x:g}", minor_formatter=NullFormatter())
         axes.grid(alpha=0.3)
     panels[0].invert_yaxis()
