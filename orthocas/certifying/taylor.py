@@ -139,10 +139,11 @@ class TaylorModel:
 
         A coefficient shrinks by 2^-power; the remainder is shared out like the cubic terms, which it is most like.
         """
-        taken = _taken(self.variables)
-        size = np.abs(self.coefficients)
-        cubic = slice(order_starts(len(self.variables))[3], None)
-        known, last = (np.einsum("kv,k...->v...", taken[part], size[part]) for part in (slice(None), cubic))
+        taken, size = _taken(self.variables).T, np.abs(self.coefficients)
+        cubic = order_starts(len(self.variables))[3]
+        flat, shape = size.reshape(len(size), -1), (len(taken), *size.shape[1:])
+        last = (taken[:, cubic:] @ flat[cubic:]).reshape(shape)
+        known = (taken[:, :cubic] @ flat[:cubic]).reshape(shape) + last
         gains: Array = known + last / (last.sum(axis=0) + TINY) * self.remainder
         return gains
 
