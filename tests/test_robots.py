@@ -223,6 +223,18 @@ def test_operations_of_forward_dynamics_grow_linearly_with_the_branches() -> Non
     assert operations[2] - operations[1] == pytest.approx(operations[1] - operations[0], rel=0.05)
 
 
+def test_coriolis_product_of_many_joints_is_two_calls_of_the_bias() -> None:
+    robot, model = robot_with_arms(5)
+    q, v, w = np.random.default_rng(6).normal(size=(3, robot.n))
+    want = pin.computeCoriolisMatrix(model, model.createData(), q, v) @ w
+    np.testing.assert_allclose(robot.coriolis_product(q, v, w), want, atol=1e-10 * np.abs(want).max())
+    payload = np.array([2.0, 0.1, 0.2, 0.3, 0.5, 0.0, 0.0, 0.5, 0.0, 0.5])
+    found = robot.function("coriolis_product_with_payload")(q, v, w, payload).full().ravel()
+    want = robot.with_payload(payload).coriolis_product(q, v, w)
+    np.testing.assert_allclose(found, want, atol=1e-10 * np.abs(want).max())
+    assert robot.function("coriolis_product").n_instructions() < 20
+
+
 def test_locked_joint_on_the_way_to_the_tip_stays_where_it_is() -> None:
     path = robot_data("tiago_description/robots/tiago.urdf")
     free = oc.Robot.from_file(path, "arm_tool_link")

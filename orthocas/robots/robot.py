@@ -278,7 +278,7 @@ class Robot(Shown):
         result = self._coriolis_product(*arguments) if by_bias else expression(self.tree, *arguments)
         return dense_function(name, arguments, [result], names)
 
-    def _coriolis_product(self, q: ca.MX, v: ca.MX, w: ca.MX, *payload: ca.MX) -> ca.MX:
+    def _coriolis_product(self, q: Any, v: Any, w: Any, *payload: Any) -> Any:
         """C(q, v) w by two calls of the bias, in which gravity cancels: no further code in generated C."""
         bias = self._functions["bias_with_payload" if payload else "bias"]
         return (bias(q, v + w, *payload) - bias(q, v - w, *payload)) / 4
