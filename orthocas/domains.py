@@ -332,7 +332,7 @@ def _drawn(domain: Domain, rng: np.random.Generator, count: int, power: float) -
     if isinstance(domain, SelfDrawing):
         return domain.draw(rng, count, power)
     u = rng.uniform(-1.0, 1.0, (count, len(domain.centre)))
-    return _scaled(domain, np.sign(u) * np.abs(u) ** power)
+    return _scaled(domain, u if power == 1 else np.sign(u) * np.abs(u) ** power)
 
 
 def _scaled(domain: Domain, u: Array) -> Array:

@@ -219,7 +219,7 @@ def _report(chart: Chart, points: Array, seed: int | None, worst: WorstPoints | 
     idle = _idle_coordinates(chart, judged)
     others = [j for j in range(chart.r) if j not in idle]
     angles, without_idle = Angles.of(judged, [range(chart.r), others])
-    short, long = np.quantile(np.linalg.norm(judged.jacobian, axis=2), [0.01, 0.99], axis=0)
+    short, long = np.quantile(_lengths(judged.jacobian), [0.01, 0.99], axis=0)
     return Report(
         n=chart.n,
         m=chart.m,
@@ -262,5 +262,10 @@ def _idle_coordinates(chart: Chart, judged: Judged) -> dict[int, str]:
 
 def _functions_of(joint: int, J: Array) -> NDArray[np.int_]:
     """Coordinates whose gradients, rows of J (N, r, n), have entries for one joint only."""
-    others = np.abs(np.delete(J, joint, axis=2)).max(axis=2, initial=0.0) <= _ALONE * np.linalg.norm(J, axis=2)
+    others = np.abs(np.delete(J, joint, axis=2)).max(axis=2, initial=0.0) <= _ALONE * _lengths(J)
     return np.flatnonzero(others.all(axis=0))
+
+
+def _lengths(J: Array) -> Array:
+    """Norms of the rows of J (N, r, n), (N, r)."""
+    return np.asarray(np.sqrt(np.einsum("sij,sij->si", J, J)))
