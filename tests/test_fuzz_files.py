@@ -22,7 +22,7 @@ def test_mutated_charts_are_usable_or_refused_in_one_line() -> None:
 
 @pytest.mark.slow
 def test_mutated_checkpoints_are_resumed_or_refused_in_one_line() -> None:
-    assert checkpoints(60) == []
+    assert checkpoints(30) == []
 
 
 @pytest.mark.slow
@@ -32,7 +32,7 @@ def test_mutated_motions_are_usable_or_refused_in_one_line() -> None:
 
 @pytest.mark.slow
 def test_mutated_paths_are_usable_or_refused_in_one_line() -> None:
-    assert paths(120) == []
+    assert paths(60) == []
 
 
 @pytest.mark.slow
