@@ -13,6 +13,9 @@ import orthocas as oc
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.fitting.fit import Fit
+from orthocas.judging.by_lapack import judge_by_lapack
+from orthocas.judging.formulas import judge_by_columns
+from orthocas.samples import samples_at
 
 
 def leaks_by_hand(chart: oc.Chart, q: np.ndarray) -> np.ndarray:
@@ -46,6 +49,16 @@ def test_leaks_are_those_of_a_least_squares_projection(charts: dict[str, oc.Char
     np.testing.assert_allclose(leak.max, want.max(), atol=1e-5)
     assert leak.histogram.sum() == want.size
     assert leak.histogram[round(10 * want.max())] >= 1
+
+
+@pytest.mark.parametrize("name", ["iiwa", "iiwa, A = M", "planar_x", "planar_xy"])
+def test_formulas_of_one_sample_agree_with_lapack(charts: dict[str, oc.Chart], name: str) -> None:
+    chart = charts[name]
+    points = sample_uniform(chart.problem.domain, 300, 5)
+    samples, J = samples_at(chart.problem, points), chart.coordinates.jacobian(points)
+    found, wanted = judge_by_columns(samples, J), judge_by_lapack(samples, J)
+    for key, values in found.items():
+        np.testing.assert_allclose(values, wanted[key], rtol=0, atol=1e-11, err_msg=key)
 
 
 def test_leak_does_not_depend_on_task_coordinates_but_the_papers_angle_does(planar_xy: oc.Problem) -> None:

@@ -27,33 +27,28 @@ def law(planar_chart: oc.Chart) -> PDPlus:
 
 
 @pytest.fixture(scope="module")
-def q0(planar_x: oc.Problem) -> Array:
-    return planar_x.domain.centre
-
-
-@pytest.fixture(scope="module")
-def steps(planar_chart: oc.Chart, q0: Array) -> Reference:
-    phi = planar_chart.phi(q0)
+def steps(planar_chart: oc.Chart, planar_q0: Array) -> Reference:
+    phi = planar_chart.phi(planar_q0)
     return Reference.steps(planar_chart.labels, phi, [(0.1, {"x": phi[0] + 0.05}), (0.3, {"xi1": 0.03})], 0.6)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("friction", [None, Friction(0.8)])
-def test_run_is_that_of_cvodes(law: PDPlus, steps: Reference, q0: Array, friction: Friction | None) -> None:
+def test_run_is_that_of_cvodes(law: PDPlus, steps: Reference, planar_q0: Array, friction: Friction | None) -> None:
     """The same sampled loop with pushes at the tip, at a link and at joints, heavier than the model, with noise.
 
     What is left is the tolerance of CVODES.
     """
     heavier = law.problem.robot.with_scaled_masses(1.2)
     common = {"control_rate": 1000.0, "pushes": PUSHES, "friction": friction, "noise": Noise(1e-4, 1e-3, 3)}
-    cvodes = simulate(law, steps, q0, plant=heavier, tolerance=1e-13, **common)  # type: ignore[arg-type]
-    ours = simulate(law, steps, q0, plant=MuJoCo(heavier), **common)  # type: ignore[arg-type]
+    cvodes = simulate(law, steps, planar_q0, plant=heavier, tolerance=1e-13, **common)  # type: ignore[arg-type]
+    ours = simulate(law, steps, planar_q0, plant=MuJoCo(heavier), **common)  # type: ignore[arg-type]
     assert ours.outcome is Outcome.COMPLETE
     np.testing.assert_array_equal(ours.times, cvodes.times)
     np.testing.assert_allclose(ours.q, cvodes.q, rtol=0, atol=1e-9)
     np.testing.assert_allclose(ours.dq, cvodes.dq, rtol=0, atol=1e-9)
     np.testing.assert_allclose(ours.command, cvodes.command, rtol=0, atol=1e-7)
-    assert np.abs(ours.q - q0).max() > 0.03
+    assert np.abs(ours.q - planar_q0).max() > 0.03
 
 
 @pytest.mark.slow
@@ -72,13 +67,13 @@ def test_run_of_the_iiwa_is_that_of_cvodes() -> None:
     assert np.abs(ours.dq).max() > 0.2
 
 
-def test_payload_makes_the_arm_sag_and_a_wall_holds_it(law: PDPlus, planar_chart: oc.Chart, q0: Array) -> None:
+def test_payload_makes_the_arm_sag_and_a_wall_holds_it(law: PDPlus, planar_chart: oc.Chart, planar_q0: Array) -> None:
     robot = planar_chart.problem.robot
-    rest = Reference.steps(planar_chart.labels, planar_chart.phi(q0), [], 0.3)
-    below = robot.tip_position(q0) - np.array([0.0, 0.03, 0.0])
+    rest = Reference.steps(planar_chart.labels, planar_chart.phi(planar_q0), [], 0.3)
+    below = robot.tip_position(planar_q0) - np.array([0.0, 0.03, 0.0])
     wall = Wall(below, [0.0, 1.0, 0.0], tip_radius=0.02)
     sagging, held = (
-        robot.tip_position(simulate(law, rest, q0, control_rate=1000, plant=scene).q)[:, 1]
+        robot.tip_position(simulate(law, rest, planar_q0, control_rate=1000, plant=scene).q)[:, 1]
         for scene in (MuJoCo(payload=Payload(1.0)), MuJoCo(payload=Payload(1.0), wall=wall))
     )
     assert sagging[-1] < sagging[0] - 0.05
@@ -86,16 +81,16 @@ def test_payload_makes_the_arm_sag_and_a_wall_holds_it(law: PDPlus, planar_chart
 
 
 @pytest.mark.slow
-def test_stops_hold_a_pushed_joint_in_both_plants(law: PDPlus, planar_chart: oc.Chart, q0: Array) -> None:
+def test_stops_hold_a_pushed_joint_in_both_plants(law: PDPlus, planar_chart: oc.Chart, planar_q0: Array) -> None:
     """A torque of 60 N m pushes joint 2 against its limit for half a second."""
-    limit = float(q0[1]) + 0.1
+    limit = float(planar_q0[1]) + 0.1
     tight = with_upper_limit(planar_chart.problem.robot, 1, limit)
-    rest = Reference.steps(planar_chart.labels, planar_chart.phi(q0), [], 0.6)
+    rest = Reference.steps(planar_chart.labels, planar_chart.phi(planar_q0), [], 0.6)
     common = {"control_rate": 1000.0, "pushes": [Push(0.0, 0.5, torque=[0.0, 60.0, 0.0])]}
-    free = simulate(law, rest, q0, plant=tight, tolerance=1e-12, **common)  # type: ignore[arg-type]
-    stopped = simulate(law, rest, q0, plant=tight, stops=Stops(), **common)  # type: ignore[arg-type]
-    ours = simulate(law, rest, q0, plant=MuJoCo(tight), **common)  # type: ignore[arg-type]
-    without = simulate(law, rest, q0, plant=MuJoCo(tight, stops=False), **common)  # type: ignore[arg-type]
+    free = simulate(law, rest, planar_q0, plant=tight, tolerance=1e-12, **common)  # type: ignore[arg-type]
+    stopped = simulate(law, rest, planar_q0, plant=tight, stops=Stops(), **common)  # type: ignore[arg-type]
+    ours = simulate(law, rest, planar_q0, plant=MuJoCo(tight), **common)  # type: ignore[arg-type]
+    without = simulate(law, rest, planar_q0, plant=MuJoCo(tight, stops=False), **common)  # type: ignore[arg-type]
     assert free.q[:, 1].max() > limit + 0.2
     np.testing.assert_allclose(without.q, free.q, rtol=0, atol=1e-6)
     for run in (stopped, ours):
@@ -104,43 +99,43 @@ def test_stops_hold_a_pushed_joint_in_both_plants(law: PDPlus, planar_chart: oc.
     np.testing.assert_allclose(stopped.q[500], ours.q[500], rtol=0, atol=0.005)  # in between they bounce differently
 
 
-def test_motors_saturate_at_the_plants_efforts(law: PDPlus, planar_chart: oc.Chart, q0: Array) -> None:
+def test_motors_saturate_at_the_plants_efforts(law: PDPlus, planar_chart: oc.Chart, planar_q0: Array) -> None:
     """Too weak to hold itself, the arm falls, while the controller still asks for more."""
     robot = planar_chart.problem.robot
     weak = with_upper_limit(robot, 1, np.inf, effort=5.0)
-    rest = Reference.steps(planar_chart.labels, planar_chart.phi(q0), [], 0.2)
-    run = simulate(law, rest, q0, control_rate=1000, plant=MuJoCo(weak))
-    assert np.abs(run.q[-1] - q0).max() > 0.1
+    rest = Reference.steps(planar_chart.labels, planar_chart.phi(planar_q0), [], 0.2)
+    run = simulate(law, rest, planar_q0, control_rate=1000, plant=MuJoCo(weak))
+    assert np.abs(run.q[-1] - planar_q0).max() > 0.1
     assert np.abs(run.command).max() > 5.0
-    strong = simulate(law, rest, q0, control_rate=1000, plant=MuJoCo(weak, effort_limits=False))
-    np.testing.assert_allclose(strong.q[-1], q0, atol=1e-6)
+    strong = simulate(law, rest, planar_q0, control_rate=1000, plant=MuJoCo(weak, effort_limits=False))
+    np.testing.assert_allclose(strong.q[-1], planar_q0, atol=1e-6)
 
 
-def test_ctrl_c_keeps_the_run_so_far(law: PDPlus, steps: Reference, q0: Array) -> None:
+def test_ctrl_c_keeps_the_run_so_far(law: PDPlus, steps: Reference, planar_q0: Array) -> None:
     def stop(progress: Progress) -> None:
         if progress.fraction > 0.3:
             raise KeyboardInterrupt
 
     with pytest.raises(Interrupted) as caught:
-        simulate(law, steps, q0, control_rate=1000, plant="mujoco", monitor=stop)
+        simulate(law, steps, planar_q0, control_rate=1000, plant="mujoco", monitor=stop)
     run = caught.value.result
     assert run.outcome is Outcome.INTERRUPTED
     assert 0.1 < run.times[-1] < 0.4
 
 
 def test_what_mujoco_does_not_simulate_is_refused_by_name(
-    law: PDPlus, planar_chart: oc.Chart, steps: Reference, q0: Array
+    law: PDPlus, planar_chart: oc.Chart, steps: Reference, planar_q0: Array
 ) -> None:
     with pytest.raises(InvalidValueError, match="control_rate is None, expected a number, because MuJoCo"):
-        simulate(law, steps, q0, plant="mujoco")
+        simulate(law, steps, planar_q0, plant="mujoco")
     with pytest.raises(InvalidValueError, match="plant is 'bullet', expected a Robot, 'mujoco' or a MuJoCo"):
-        simulate(law, steps, q0, plant="bullet", control_rate=1000)  # type: ignore[arg-type]
+        simulate(law, steps, planar_q0, plant="bullet", control_rate=1000)  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match=r"stops is given, expected none with MuJoCo"):
-        simulate(law, steps, q0, plant="mujoco", control_rate=1000, stops=Stops())
+        simulate(law, steps, planar_q0, plant="mujoco", control_rate=1000, stops=Stops())
     with pytest.raises(InvalidValueError, match="plant is mujoco, expected no MuJoCo with a velocity controller"):
-        simulate(Kinematic(planar_chart), steps, q0, plant="mujoco", control_rate=1000)
+        simulate(Kinematic(planar_chart), steps, planar_q0, plant="mujoco", control_rate=1000)
     with pytest.raises(InvalidValueError, match="joints of the plant is 2, expected 3"):
-        simulate(law, steps, q0, plant=MuJoCo(oc.Robot.planar([1, 1], [1, 1])), control_rate=1000)
+        simulate(law, steps, planar_q0, plant=MuJoCo(oc.Robot.planar([1, 1], [1, 1])), control_rate=1000)
     with pytest.raises(InvalidValueError, match="robot is 'arm', expected a Robot"):
         MuJoCo("arm")  # type: ignore[arg-type]
 
@@ -154,7 +149,7 @@ def test_what_mujoco_does_not_simulate_is_refused_by_name(
 )
 @pytest.mark.parametrize("plant", [None, "mujoco"])
 def test_links_that_the_robot_lacks_are_named(
-    law: PDPlus, steps: Reference, q0: Array, link: str | int, error: type[Exception], message: str, plant: Plant
+    law: PDPlus, steps: Reference, planar_q0: Array, link: str | int, error: type[Exception], message: str, plant: Plant
 ) -> None:
     with pytest.raises(error, match=message):
-        simulate(law, steps, q0, plant=plant, control_rate=1000, pushes=[Push(0.0, 0.1, [1.0, 0, 0], link=link)])
+        simulate(law, steps, planar_q0, plant=plant, control_rate=1000, pushes=[Push(0.0, 0.1, [1.0, 0, 0], link=link)])
