@@ -104,8 +104,8 @@ class StageRunner:
         return {}
 
     @cached_property
-    def _starts(self) -> dict[tuple[LinearFamily, int], Array]:
-        """Spectral starts so far, by family and number of samples."""
+    def _starts(self) -> dict[tuple[LinearFamily, int, bool], Array]:
+        """Spectral starts so far, by family, number of samples, and whether a mirror is used."""
         return {}
 
     def run(self, plan: Plan) -> Stage:
@@ -227,11 +227,12 @@ class StageRunner:
 
     def _spectral_start(self, family: LinearFamily, count: int, kept: NDArray[np.bool_] | None) -> Array:
         """A start that does not depend on the seed: eigenvalues are close, so other samples would mix coordinates."""
-        if (family, count) not in self._starts:
+        key = family, count, kept is not None
+        if key not in self._starts:
             points = sample_evenly(self.problem.domain, count, _START_SEED)
             samples = samples_at(self.problem, points).restricted_to(self.active)
-            self._starts[family, count] = spectral_start(family, samples, kept, self._gradients(family))
-        return self._starts[family, count]
+            self._starts[key] = spectral_start(family, samples, kept, self._gradients(family))
+        return self._starts[key]
 
     def _samples(self, count: int, tag: int) -> Samples:
         points = sample_evenly(self.problem.domain, count, (self.settings.seed, tag))
