@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.batch import dense_function
+from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.casadi_tools.blas_graph import NumpyGraph
 from orthocas.casadi_tools.blocks import MANY, BlockedFunction, fill
 from orthocas.casadi_tools.cached import BuiltOnUse, cached_property
@@ -104,6 +104,12 @@ class Coordinates:
     def jacobian(self, points: Array) -> Array:
         """J_xi (N, r, n) at points (N, n)."""
         return self.into("jacobian", np.empty((len(points), self.r, self.space.n)), points)
+
+    def once(self, name: str, points: Array) -> Array:
+        """The values of `xi` or `jacobian` where no more will be asked for: builds no code that makes calls fast."""
+        if self.as_matrices:
+            return self.xi(points) if name == "xi" else self.jacobian(points)
+        return Batched(self.functions[name])(points)[0]
 
     def into(self, name: str, results: Array, points: Array) -> Array:
         """Write xi or the Jacobian at points (N, n) to `results`, which may be part of a larger array; return it."""

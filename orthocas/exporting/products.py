@@ -13,7 +13,7 @@ from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.exporting.form import Form, idle_part
 from orthocas.exporting.tapes import function_code
-from orthocas.parametrisations.product_basis import ProductFamily, Term
+from orthocas.parametrisations.product_basis import ProductFamily, Term, split, with_parts
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Plan:
     @classmethod
     def of(cls, terms: Iterable[Term], of_derivatives: Iterable[Term]) -> Self:
         """The plan for these terms, with what they are made of."""
-        every, lower = _with_parts(terms), _with_parts(of_derivatives)
+        every, lower = with_parts(terms), with_parts(of_derivatives)
         every |= {_split(term)[1] for term in every}
         lower = lower or {min(term for term in every if np.count_nonzero(term) == 1)}
         ordered = sorted(every, key=lambda term: (term not in lower, term))
@@ -103,23 +103,10 @@ def _slopes(coordinates: Coordinates, slopes: Array, plan: Plan, rows: dict[Term
     return {"T": T.reshape(r * n, -1), "D": D[:, :, None]}
 
 
-def _with_parts(terms: Iterable[Term]) -> set[Term]:
-    """The terms, and what is left of each without its last factors."""
-    found: set[Term] = set()
-    waiting = list(terms)
-    while waiting:
-        term = waiting.pop()
-        if any(term) and term not in found:
-            found.add(term)
-            waiting.append(_split(term)[0])
-    return found
-
-
 def _split(term: Term) -> tuple[Term, Term]:
     """A term without its last factor, and that factor alone."""
-    last = int(np.flatnonzero(term)[-1])
-    alone = tuple(index if k == last else 0 for k, index in enumerate(term))
-    return (*term[:last], 0, *term[last + 1 :]), alone
+    rest, joint, index = split(term)
+    return rest, tuple(index if k == joint else 0 for k in range(len(term)))
 
 
 def _tuple(values: Iterable[int]) -> str:

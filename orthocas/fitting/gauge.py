@@ -38,11 +38,11 @@ def normalised(raw: Coordinates, origin: Array, samples: Samples) -> Coordinates
     """
     r = len(raw.offset)
     if isinstance(raw.family, CircleFamily):  # an angle keeps its period
-        return replace(raw, theta=raw.family.turned(raw.theta, raw.xi(origin[None, :])[0, :r]))
-    lengths = np.linalg.norm(raw.jacobian(samples.points)[:, :r], axis=2).mean(axis=0)
+        return replace(raw, theta=raw.family.turned(raw.theta, raw.once("xi", origin[None, :])[0, :r]))
+    lengths = np.linalg.norm(raw.once("jacobian", samples.points)[:, :r], axis=2).mean(axis=0)
     if not lengths.min() > 0:
         raise OrthocasError(f"coordinate {int(np.argmin(lengths))} has a vanishing gradient on the domain")
-    return replace(raw, offset=raw.xi(origin[None, :])[0, :r], scale=1 / lengths)
+    return replace(raw, offset=raw.once("xi", origin[None, :])[0, :r], scale=1 / lengths)
 
 
 def in_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
@@ -53,7 +53,7 @@ def in_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
     the positive direction. Coordinates that change places in the arm's mirror have the same mean; the one that moves
     the first joint on which they differ further comes first. Idle joints stay last.
     """
-    g = coordinates.jacobian(centre[None, :])[0, : len(coordinates.offset)]
+    g = coordinates.once("jacobian", centre[None, :])[0, : len(coordinates.offset)]
     size = (g**2).sum(axis=1)
     moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)  # g = 0: a fold at the centre
     largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]

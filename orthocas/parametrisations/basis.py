@@ -41,8 +41,16 @@ class BasisFamily:
 
     def basis(self, q: Expression) -> Expression:
         """psi(q), (K, N), for q (n, N)."""
+        if isinstance(q, ca.SX) and q.shape[1] == 1:
+            return self._of_one(q)
         values: Expression = self.functions(q)
         return values
+
+    @cached_property
+    def _of_one(self) -> ca.Function:
+        """psi for one joint position: built once, since expressions take longer to build than to copy."""
+        q = ca.SX.sym("q", self.space.n)
+        return ca.Function("basis", [q], [self.functions(q)])
 
     def expression(self, q: Expression, theta: Expression) -> Expression:
         """xi_theta(q), (r, N), for q (n, N)."""

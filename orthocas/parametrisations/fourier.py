@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import comb, sqrt
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -76,13 +76,10 @@ class Fourier:
             )
         linear = cyclic_choice.indices(self.cyclic, space)
 
-        def waves(i: int, q: ca.SX) -> list[ca.SX]:
-            if i in linear:
-                return [1 + 0 * q, q - space.centre[i]]
-            out = [1 + 0 * q]
-            for k in range(1, self.degree + 1):
-                out += [sqrt(2) * ca.cos(k * q), sqrt(2) * ca.sin(k * q)]
-            return out
+        def waves(q: Any) -> list[Any]:
+            out = [sqrt(2) * wave(k * q) for k in range(1, self.degree + 1) for wave in (ca.cos, ca.sin)]
+            rows = (q[i, :] - space.centre[i] if i in linear else out[0][i, :] for i in range(space.n))
+            return [ca.vertcat(*rows), *out[1:]]
 
         def derivatives(i: int) -> Array:
             """cos(k q)' = -k sin(k q), sin(k q)' = k cos(k q); a linear function has the derivative 1."""

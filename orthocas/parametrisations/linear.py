@@ -1,7 +1,7 @@
 """Linear coordinates: stacks of parallel planes ([AS2023] Sec. 4)."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import casadi as ca
 import numpy as np
@@ -62,8 +62,8 @@ class Linear:
         """Linear functions of q. The parameters are the normals, row by row."""
         terms = tuple(tuple(int(i == k) for i in range(space.n)) for k in range(space.n))
 
-        def displacement(i: int, q: ca.SX) -> list[ca.SX]:
-            return [1 + 0 * q, q - space.centre[i]]
+        def displacement(q: Any) -> list[Any]:
+            return [q - ca.repmat(ca.DM(space.centre), 1, q.shape[1])]
 
         return product_family(space, outputs, terms, displacement, lambda i: np.array([[0.0, 0.0], [1.0, 0.0]]))
 

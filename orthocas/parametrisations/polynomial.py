@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from math import comb, sqrt
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -65,12 +65,13 @@ class Polynomial:
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Polynomials in u_i = (q_i - centre_i) / half_width_i."""
 
-        def legendre(i: int, q: ca.SX) -> list[ca.SX]:
-            u = (q - space.centre[i]) / space.half_width[i]
+        def legendre(q: Any) -> list[Any]:
+            centre, half_width = (ca.repmat(ca.DM(v), 1, q.shape[1]) for v in (space.centre, space.half_width))
+            u = (q - centre) / half_width
             P = [1 + 0 * u, u]
             for k in range(2, self.degree + 1):
                 P.append(((2 * k - 1) * u * P[k - 1] - (k - 1) * P[k - 2]) / k)
-            return [sqrt(2 * k + 1) * p for k, p in enumerate(P[: self.degree + 1])]
+            return [sqrt(2 * k + 1) * P[k] for k in range(1, self.degree + 1)]
 
         def derivatives(i: int) -> Array:
             """P_a' = sum of (2 b + 1) P_b over b = a - 1, a - 3, ..., here for normalised polynomials."""

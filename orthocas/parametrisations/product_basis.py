@@ -1,6 +1,6 @@
 """Bases of products of one-joint functions: polynomials and Fourier terms."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,7 +60,7 @@ def product_family(
     space: JointSpace,
     outputs: int,
     terms: tuple[Term, ...],
-    one_joint_functions: Callable[[int, Any], list[Any]],
+    one_joint_functions: Callable[[Any], list[Any]],
     one_joint_derivatives: Callable[[int], Array],
 ) -> ProductFamily:
     """The family of the given terms.
@@ -69,28 +69,59 @@ def product_family(
         space: the joints.
         outputs: number of components.
         terms: the terms. None is constant, and the terms of their derivatives are included.
-        one_joint_functions: f_i,0 = 1, f_i,1, ... of joint i at its position.
+        one_joint_functions: f_1, f_2, ... of all joints at once, (n, N) each, for q (n, N).
         one_joint_derivatives: D of joint i, with f_i,a' = sum_b D_ab f_i,b.
     """
 
     def basis(q: Any) -> Any:
-        tables = [one_joint_functions(i, q[i, :]) for i in range(space.n)]
-        products: dict[Term, Any] = {}
-        for term in terms:
-            _product(term, tables, products)
-        return ca.vertcat(*(products[term] for term in terms))
+        return _products(terms, ca.vertcat(*one_joint_functions(q)))
 
     return ProductFamily(space, outputs, basis, terms=terms, one_joint_derivatives=one_joint_derivatives)
 
 
-def _product(term: Term, tables: list[list[Any]], products: dict[Term, Any]) -> Any:
-    """Value of a term: the product of all factors but the last, times the last."""
-    if term not in products:
-        last = int(np.flatnonzero(term)[-1])
-        rest = (*term[:last], 0, *term[last + 1 :])
-        factor = tables[last][term[last]]
-        products[term] = _product(rest, tables, products) * factor if any(rest) else factor
-    return products[term]
+def _products(terms: tuple[Term, ...], factors: Any) -> Any:
+    """Values of terms, (K, N), from those of the one-joint functions f_1 of all joints, then f_2 and so on.
+
+    All terms with as many factors are one product of columns: to build them one by one takes CasADi ten times as long.
+    """
+    n = len(terms[0])
+    levels: list[Any] = []
+    rows: list[dict[Term, int]] = []  # of the terms in their levels
+    for level in by_factors(terms):
+        parts = [split(term) for term in level]
+        values = factors[[n * (index - 1) + joint for _, joint, index in parts], :]
+        levels.append(levels[-1][[rows[-1][rest] for rest, *_ in parts], :] * values if levels else values)
+        rows.append({term: k for k, term in enumerate(level)})
+    places = {term: k for k, term in enumerate(term for level in rows for term in level)}
+    return ca.vertcat(*levels)[[places[term] for term in terms], :]
+
+
+def by_factors(terms: Iterable[Term]) -> list[list[Term]]:
+    """Terms and what they are made of, by the number of factors; each level is sorted."""
+    levels: dict[int, list[Term]] = {}
+    for term in sorted(with_parts(terms)):
+        levels.setdefault(len(term) - term.count(0), []).append(term)
+    return [levels[k] for k in sorted(levels)]
+
+
+def with_parts(terms: Iterable[Term]) -> set[Term]:
+    """The terms, and what is left of each without its last factors."""
+    found: set[Term] = set()
+    waiting = list(terms)
+    while waiting:
+        term = waiting.pop()
+        if any(term) and term not in found:
+            found.add(term)
+            waiting.append(split(term)[0])
+    return found
+
+
+def split(term: Term) -> tuple[Term, int, int]:
+    """A term without its last factor, the joint of this factor, and the index of its function."""
+    joint = len(term) - 1
+    while not term[joint]:
+        joint -= 1
+    return (*term[:joint], 0, *term[joint + 1 :]), joint, term[joint]
 
 
 def reduced_terms(degrees: list[list[int]], total: int, linear: list[int]) -> tuple[Term, ...]:
