@@ -67,7 +67,7 @@ class Samples:
     def null_basis(self) -> Array:
         """An A-orthonormal basis z_1..z_r of ker J_x, (N, n, r), oriented so that det [J_x; Z^T] > 0."""
         m = self.task_jacobian.shape[1]
-        Z = np.linalg.svd(self.task_jacobian)[2][:, m:].transpose(0, 2, 1)
+        Z = np.linalg.qr(self.task_jacobian.transpose(0, 2, 1), mode="complete")[0][:, :, m:]
         if self.metric_inverse is not None:
             gram = Z.transpose(0, 2, 1) @ np.linalg.solve(self.metric_inverse, Z)
             Z = Z @ np.linalg.inv(np.linalg.cholesky(gram)).transpose(0, 2, 1)

@@ -75,9 +75,13 @@ class LBFGSRun:
             before = self.value
             if not self._step():
                 return Status.STALLED
-            self.converged = before - self.value <= self.least_gain(before)
+            self.converged = self.has_converged(before)
             best.next_iteration(limit, **self.state())
         return Status.CONVERGED if self.converged else Status.ITERATION_LIMIT
+
+    def has_converged(self, before: float) -> bool:
+        """Whether the step from this value gained as little as one at the end."""
+        return before - self.value <= self.least_gain(before)
 
     def least_gain(self, before: float) -> float:
         """The gain of a step from this value below which a run has converged."""

@@ -26,7 +26,7 @@ class QuasiNewton(LBFGS):
 
     Args:
         max_iterations: largest number of iterations.
-        tolerance: stop when an iteration reduces the loss by less than this fraction.
+        tolerance: stop when two iterations in a row reduce the loss by less than this fraction each.
         memory: number of stored correction pairs.
 
     Source:
@@ -34,14 +34,14 @@ class QuasiNewton(LBFGS):
     """
 
     max_iterations: int = 200
-    tolerance: float = 2e-4
+    tolerance: float = 1e-3
     memory: int = 20
     name: str = "quasi_newton"
 
     def coarser(self) -> "QuasiNewton":
-        """The same solver with at most 15 iterations, which stops when a step gains less than 0.2 per cent."""
+        """The same solver with at most 15 iterations, which stops when two steps gain less than half a per cent each."""
         limit = min(15, self.max_iterations)
-        return replace(self, max_iterations=limit, tolerance=max(2e-3, self.tolerance))
+        return replace(self, max_iterations=limit, tolerance=max(5e-3, self.tolerance))
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
         """Minimise from theta0.
@@ -67,11 +67,19 @@ class _Run(LBFGSRun):
         kept: State = self.best.restored or {}
         self._place = np.array(kept.get("place", self.theta))  # of the matrix
         self._height = float(kept.get("height", np.inf))  # the loss there
+        self._gained_little = bool(kept.get("gained_little", False))  # in the last step
         self._factor: tuple[Array, bool] | None = None
 
     def state(self) -> dict[str, Array | float]:
         """All that a run needs to go on, besides the best point. The matrix is computed again."""
-        return {**super().state(), "place": self._place, "height": self._height}
+        own = {"place": self._place, "height": self._height, "gained_little": float(self._gained_little)}
+        return {**super().state(), **own}
+
+    def has_converged(self, before: float) -> bool:
+        """Whether two steps in a row gained little: a single one may have been short."""
+        little = super().has_converged(before)
+        twice, self._gained_little = little and self._gained_little, little
+        return twice
 
     def least_gain(self, before: float) -> float:
         """A fraction of the loss."""
@@ -91,7 +99,8 @@ class _Run(LBFGSRun):
     def _solved(self, vector: Array) -> Array:
         """The inverse of the matrix times a vector."""
         if self._factor is None:
-            self._height = min(self._height, self.value)
+            if not np.isfinite(self._height):  # a resumed run knows it already
+                self._height = self.value
             self._factor = _factored(self._objective.curvature_estimate(self._place))
         return np.asarray(scipy.linalg.cho_solve(self._factor, vector), dtype=float)
 

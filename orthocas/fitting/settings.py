@@ -18,7 +18,7 @@ from orthocas.samples import sample_problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt, QuasiNewton
 
 PRECISIONS = ("double", "single")  #: of the large products of a fit
-_MANY_TERMS = 1000  # where a Gauss-Newton matrix takes much longer than a gradient: degree 6 for seven joints
+_MANY_TERMS = 300  # where a Gauss-Newton matrix takes longer than ten gradients: degree 4 for seven joints
 _TELLTALE = (20, (0, 1000))  # number and seed of the samples that identify a problem
 _LEAST_BOUND = 1e-6  # deg; rounding hides smaller angles
 
