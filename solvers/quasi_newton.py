@@ -39,7 +39,7 @@ class QuasiNewton(LBFGS):
     name: str = "quasi_newton"
 
     def coarser(self) -> "QuasiNewton":
-        """The same solver with at most 15 iterations, which stops when two steps gain less than half a per cent each."""
+        """The same solver with at most 15 iterations, which stops when two steps gain less than 0.5 % each."""
         limit = min(15, self.max_iterations)
         return replace(self, max_iterations=limit, tolerance=max(5e-3, self.tolerance))
 
@@ -72,8 +72,8 @@ class _Run(LBFGSRun):
 
     def state(self) -> dict[str, Array | float]:
         """All that a run needs to go on, besides the best point. The matrix is computed again."""
-        own = {"place": self._place, "height": self._height, "gained_little": float(self._gained_little)}
-        return {**super().state(), **own}
+        numbers = {"height": self._height, "gained_little": float(self._gained_little)}
+        return {**super().state(), "place": self._place, **numbers}
 
     def has_converged(self, before: float) -> bool:
         """Whether two steps in a row gained little: a single one may have been short."""

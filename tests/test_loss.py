@@ -10,8 +10,8 @@ import orthocas as oc
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import graph_objective
 from orthocas.fitting.array_objective import ArrayObjective
-from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.gradients_of import gradients_of
 from orthocas.fitting.graph_objective import GraphObjective
 from orthocas.fitting.loss import REGULAR_VOLUME, Loss, Sizes, Weights, mutual_cosines, pairs, task_cosines
 from orthocas.fitting.spectral_start import spectral_start
@@ -153,10 +153,10 @@ def test_arrays_of_prismatic_joints_agree_with_their_graph() -> None:
 
 def test_single_precision_of_a_basis_changes_the_last_digits(problem: oc.Problem) -> None:
     family = oc.Polynomial(3).family(JointSpace.of(problem), problem.r)
-    theta, gradients = family.initial(3), BasisGradients(family, problem.n, np.float32)
+    theta, gradients = family.initial(3), gradients_of(family, problem.n, np.float32)
     settings = (family, sample_problem(problem, 300, 9), EVEN, theta, draw_from(problem))
     double, single = BasisObjective(*settings), BasisObjective(*settings, gradients=gradients)
-    assert 2 * single.G.nbytes == double.G.nbytes
+    assert 2 * single.X.nbytes == double.X.nbytes
     value, gradient, H = double.normal_equations(theta)
     found, slopes, matrix = single.normal_equations(theta)
     assert 0 < abs(found / value - 1) < 1e-5

@@ -6,9 +6,12 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
+from orthocas.casadi_tools.columns import COLUMNS, by_sample
 from orthocas.coordinates.point_functions import point_functions
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
 from orthocas.fitting.basis_gradients import BasisGradients
+from orthocas.fitting.product_gradients import BoxGradients, ProductGradients
+from orthocas.fitting.sparse_gradients import SparseGradients
 from orthocas.parametrisations import JointSpace, ProductFamily, component_gradients, parse_parametrisation
 
 SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))
@@ -126,9 +129,15 @@ def test_embedding_keeps_the_function() -> None:
     np.testing.assert_allclose(got, values(oc.Polynomial(2), SPACE, points, theta), atol=1e-12)
 
 
-def test_basis_gradients_match_differences_of_the_basis() -> None:
-    family: ProductFamily = oc.Polynomial(3).family(SPACE, 1)
-    gradients = BasisGradients(family, 3)
+FORMS = [SparseGradients, ProductGradients]
+BASES = [oc.Polynomial(3), oc.Polynomial(3, cyclic=["b"]), oc.Fourier(2, cyclic=["a"]), oc.Linear()]
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("parametrisation", BASES, ids=lambda p: p.label)
+def test_basis_gradients_match_differences_of_the_basis(form: type[BasisGradients], parametrisation: object) -> None:
+    family: ProductFamily = parametrisation.family(SPACE, 1)
+    gradients = form(family, 3)
     point = np.array([0.2, 0.1, -0.1])
     q = ca.SX.sym("q", 3)
     psi = ca.Function("psi", [q], [family.basis(q)])
@@ -136,10 +145,49 @@ def test_basis_gradients_match_differences_of_the_basis() -> None:
     step = 1e-6
     want = [np.array(psi(point + step * e) - psi(point - step * e)).ravel() / (2 * step) for e in np.eye(3)]
     np.testing.assert_allclose(G, want, atol=1e-7)
-    for i, places in enumerate(gradients.terms_of_joints):
-        others = np.setdiff1d(np.arange(len(family.terms)), places)
-        assert not np.any(G[i, others])
-        assert np.all(np.array(family.terms)[places, i] > 0)
+    elsewhere = np.array(family.terms).T == 0  # (n, K): functions that do not depend on the joint
+    assert not G[elsewhere].any()
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("parametrisation", BASES, ids=lambda p: p.label)
+def test_products_with_basis_gradients_are_those_with_all_entries(
+    form: type[BasisGradients], parametrisation: object
+) -> None:
+    family, rng = parametrisation.family(SPACE, 2), np.random.default_rng(5)
+    points = rng.uniform(-0.5, 0.5, (300, 3))
+    gradients = form(family, 3)
+    X, C = gradients.at(points), rng.normal(size=(2, family.width))
+    G = gradients.dense(X, 300)  # (N, n, K)
+    J = by_sample((gradients.table(C) @ X).reshape(len(X), 3, 2, -1), 300)
+    np.testing.assert_allclose(J, C @ G.transpose(0, 2, 1), atol=1e-12)
+    slopes = np.zeros((len(X) * COLUMNS, 6))  # dL/dJ_xi, joint by joint
+    slopes[:300] = rng.normal(size=(300, 6))
+    by_block = slopes.reshape(len(X), COLUMNS, *gradients.table(C).shape[:2]).transpose(0, 2, 3, 1)
+    found = gradients.collected((by_block @ X.transpose(0, 1, 3, 2)).sum(axis=0))
+    np.testing.assert_allclose(found, np.einsum("snr,snk->rk", slopes[:300].reshape(300, 3, 2), G), atol=1e-11)
+    kept = rng.uniform(size=family.width) < 0.6
+    some = gradients.dense_part(X, 300, kept, 4, np.float32)
+    assert some.dtype == np.float32
+    np.testing.assert_allclose(some, G[::4][:, :, kept], rtol=1e-6, atol=1e-6)
+
+
+def test_box_gradients_are_those_of_the_cube_in_other_units() -> None:
+    names, half_width = ("a", "b", "c"), np.array([0.5, 0.2, 0.8])
+    cube = JointSpace(np.zeros(3), np.ones(3), (False,) * 3, names)
+    box = JointSpace(np.zeros(3), half_width, (False,) * 3, names)
+    u, rng = np.random.default_rng(5).uniform(-1, 1, (40, 3)), np.random.default_rng(6)
+    on_cube = ProductGradients(oc.Polynomial(3).family(cube, 2), 3)
+    known = on_cube.at(u)
+    ours = BoxGradients(on_cube, half_width, u, known)
+    assert ours.at(u) is known
+    theirs = ProductGradients(oc.Polynomial(3).family(box, 2), 3)
+    X, C = theirs.at(u * half_width), rng.normal(size=(2, on_cube.family.width))
+    np.testing.assert_allclose(ours.dense(known, 40), theirs.dense(X, 40), atol=1e-12)
+    np.testing.assert_allclose(ours.table(C) @ known, theirs.table(C) @ X, atol=1e-12)
+    slopes = rng.normal(size=(6, COLUMNS))
+    pulled = [form.collected(slopes @ Y[0].transpose(0, 2, 1)) for form, Y in ((ours, known), (theirs, X))]
+    np.testing.assert_allclose(*pulled, atol=1e-11)
 
 
 def test_linear_normals_of_the_paper() -> None:

@@ -13,9 +13,9 @@ from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.checks import Array
 from orthocas.domains import Box, sample_evenly, sample_heavily, sample_uniform
-from orthocas.fitting.basis_gradients import BoxGradients
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.loss import Weights
+from orthocas.fitting.product_gradients import BoxGradients
 from orthocas.metrics import metric_matrices
 from orthocas.minimising.solver import Status
 from orthocas.postures.probe import leak_and_conditioning

@@ -9,7 +9,7 @@ from orthocas.casadi_tools.blocks import BlockFunction, fill
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.columns import ColumnFunction
 from orthocas.checks import Array
-from orthocas.fitting.basis_gradients import BasisGradients
+from orthocas.fitting.product_gradients import ProductGradients
 from orthocas.parametrisations import JointSpace, Polynomial, ProductFamily
 
 
@@ -35,9 +35,9 @@ class CubeBasis:
         return self.family.width
 
     @cached_property
-    def gradients(self) -> BasisGradients:
+    def gradients(self) -> ProductGradients:
         """dpsi/du."""
-        return BasisGradients(self.family, len(self.names))
+        return ProductGradients(self.family, len(self.names))
 
     def values(self, u: Array) -> Array:
         """psi(u), (N, K), at points (N, n)."""

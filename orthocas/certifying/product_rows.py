@@ -11,7 +11,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from orthocas.casadi_tools.batch import dense_function
@@ -121,8 +120,7 @@ class ProductRows:
 
 def _orders(family: ProductFamily, terms: Array, C: Array) -> tuple[Derivatives, ...]:
     n = family.space.n
-    place = {tuple(term): k for k, term in enumerate(terms.tolist())}
-    steps = [_one_derivative(terms, place, i, family.one_joint_derivatives(i)) for i in range(n)]
+    steps = [family.derivative_matrix(i) for i in range(n)]
     known: dict[Monomial, tuple[Any, Any]] = {(): (C, np.abs(C))}
     orders = []
     for order in range(1, DEGREE + 3):
@@ -136,17 +134,6 @@ def _orders(family: ProductFamily, terms: Array, C: Array) -> tuple[Derivatives,
         rounding = 4 * UNIT * (len(terms) + 64 * order)
         orders.append(Derivatives(used, table[:, used], sizes[:, used] * UP, rounding))
     return tuple(orders)
-
-
-def _one_derivative(terms: Array, place: dict[Monomial, int], joint: int, D: Array) -> Any:
-    """The matrix that takes coefficients of xi to those of d xi / d q_joint."""
-    rows, columns, values = [], [], []
-    for k, term in enumerate(map(tuple, terms.tolist())):
-        for b in np.flatnonzero(D[term[joint]]):
-            rows.append(k)
-            columns.append(place[(*term[:joint], int(b), *term[joint + 1 :])])
-            values.append(D[term[joint], b])
-    return scipy.sparse.csr_array((values, (rows, columns)), shape=(len(terms),) * 2)
 
 
 @cache

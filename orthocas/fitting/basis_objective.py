@@ -11,6 +11,7 @@ from orthocas.casadi_tools.columns import COLUMNS, Run, blocked, by_sample, shar
 from orthocas.casadi_tools.threads import in_threads, in_threads_with, thread_count
 from orthocas.checks import Array
 from orthocas.fitting.basis_gradients import BasisGradients
+from orthocas.fitting.gradients_of import gradients_of
 from orthocas.fitting.loss import Loss, Pairs, Sizes, Weights
 from orthocas.fitting.loss.residuals import curvature_columns, loss_columns, residual_columns, value_columns
 from orthocas.fitting.normal_blocks import normal_matrix
@@ -27,12 +28,12 @@ _ROUGH = 12  # residuals per coefficient in a rough estimate
 class BasisObjective:
     """Mean loss (25) of xi = C psi(q) on fixed samples, with gradient, Gauss-Newton matrix and Hessian.
 
-    With the basis gradients G = d psi / dq sampled once, the coordinate gradients are J_xi = C G^T. The loss of one
-    sample and its derivatives with respect to J_xi come from CasADi. The residual of task i and coordinate j depends
-    only on row j of C, so the Gauss-Newton matrix is built block by block from few rows per sample.
+    With the numbers X of the basis gradients sampled once, the coordinate gradients are J_xi = T X, with a table T that
+    is linear in C, see `BasisGradients`. The loss of one sample and its derivatives with respect to J_xi come from
+    CasADi. The residual of task i and coordinate j depends only on row j of C, so the Gauss-Newton matrix is built
+    block by block from few rows per sample.
 
-    Samples are stored in the blocks of `orthocas.casadi_tools.columns`. Of G only the entries of terms that depend on a
-    joint are stored. So G is (B, n, W, c) and J_xi is (B, n, r, c).
+    Samples are stored in the blocks of `orthocas.casadi_tools.columns`: X is (B, g, S, c) and J_xi is (B, n r, c).
 
     Args:
         family: the coordinates.
@@ -62,7 +63,7 @@ class BasisObjective:
         self.r, self.K = family.outputs, family.width
         self.kept = np.ones((self.r, self.K), dtype=bool) if kept is None else kept
         m, self.n = samples.task_jacobian.shape[1:]
-        self._gradients = BasisGradients(family, self.n) if gradients is None else gradients
+        self._gradients = gradients_of(family, self.n) if gradients is None else gradients
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name, exchanged)
         self._begin(samples, start)
 
@@ -73,7 +74,7 @@ class BasisObjective:
         self._describe(samples)
 
     def _put(self, samples: Samples) -> None:
-        self.N, self.G = len(samples), self._gradients.at(samples.points)
+        self.N, self.X = len(samples), self._gradients.at(samples.points)
         self._share = shares(self.N)
         self._expanded: dict[str, Array] = {}
 
@@ -96,7 +97,7 @@ class BasisObjective:
 
     def coordinate_jacobians(self, theta: Array) -> Array:
         """J_xi at every sample, (N, r, n)."""
-        return by_sample(self._jacobian_entries(theta).reshape(-1, self.n, self.r, self.G.shape[3]), self.N)
+        return by_sample(self._jacobian_entries(theta).reshape(-1, self.n, self.r, COLUMNS), self.N)
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
@@ -105,10 +106,11 @@ class BasisObjective:
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        C, columns, parts = self._by_joint(theta), loss_columns(self._loss), self._parts
+        T, columns, parts = self._table(theta), loss_columns(self._loss), self._parts
         with columns.borrowed(min(thread_count(), len(parts))) as runs:
-            sums = in_threads_with(runs, lambda run, part: self._sums(C, run, part), parts)
-        return sum(value for value, _ in sums), self._collected(np.sum([gradient for _, gradient in sums], axis=0))
+            sums = in_threads_with(runs, lambda run, part: self._sums(T, run, part), parts)
+        slopes = self._gradients.collected(np.sum([gradient for _, gradient in sums], axis=0))
+        return sum(value for value, _ in sums), slopes[self.kept]
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """L(theta), its gradient, and the Gauss-Newton matrix, computed with products in single precision."""
@@ -185,52 +187,43 @@ class BasisObjective:
 
     @property
     def _dense(self) -> Array:
-        """G sample by sample, (N, n, K)."""
+        """Gradients sample by sample, (N, n, K)."""
         if "all" not in self._expanded:
-            self._expanded["all"] = self._gradients.dense(self.G, self.N)
+            self._expanded["all"] = self._gradients.dense(self.X, self.N)
         return self._expanded["all"]
 
     def _thinned(self, stride: int) -> list[Array]:
-        """G of the coefficients of each coordinate at some samples, (N / stride, n, K_j), in single precision."""
+        """Gradients of the functions of each coordinate at some samples, (N / stride, n, K_j), in single precision."""
         names = [f"{stride} {row.tobytes().hex()}" for row in self.kept]
         for name, row in zip(names, self.kept, strict=True):
             if name not in self._expanded:
-                self._expanded[name] = self._gradients.dense_part(self.G, self.N, row, stride, np.float32)
+                self._expanded[name] = self._gradients.dense_part(self.X, self.N, row, stride, np.float32)
         return [self._expanded[name] for name in names]
 
-    def _by_joint(self, theta: Array) -> Array:
-        """Coefficients of the terms that depend on each joint, (n, r, W)."""
-        C = expanded(theta, self.kept).reshape(self.r, self.K)[:, self._gradients.terms_of_joints]
-        return np.ascontiguousarray(C.transpose(1, 0, 2), dtype=self.G.dtype)
-
-    def _collected(self, gradient: Array) -> Array:
-        """Gradient with respect to theta, (size,), from the gradient with respect to `_by_joint`."""
-        total = np.zeros((self.r, self.K))
-        for places, slopes in zip(self._gradients.terms_of_joints, gradient, strict=True):
-            known = places >= 0
-            total[:, places[known]] += slopes[:, known]
-        return total[self.kept]
+    def _table(self, theta: Array) -> Array:
+        """T, (g, n r / g, S)."""
+        return self._gradients.table(expanded(theta, self.kept).reshape(self.r, self.K))
 
     @property
     def _parts(self) -> list[slice]:
         """The blocks of samples in parts."""
-        return [slice(start, start + _BLOCKS) for start in range(0, len(self.G), _BLOCKS)]
+        return [slice(start, start + _BLOCKS) for start in range(0, len(self.X), _BLOCKS)]
 
-    def _sums(self, C: Array, run: Run, part: slice) -> tuple[float, Array]:
-        """Share of some blocks in the loss, and in its slopes with respect to the coefficients of `_by_joint`."""
-        value, gradient = 0.0, np.zeros(C.shape)
+    def _sums(self, T: Array, run: Run, part: slice) -> tuple[float, Array]:
+        """Share of some blocks in the loss, and in its slopes with respect to T."""
+        value, gradient = 0.0, np.zeros(T.shape)
         losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
-        arrays = (self.G, self._share, *self._data)
-        for G, share, *data in zip(*(array[part] for array in arrays), strict=True):  # G leaves memory only once
-            run([_double(C @ G), *data], [losses, slopes])
+        arrays = (self.X, self._share, *self._data)
+        for X, share, *data in zip(*(array[part] for array in arrays), strict=True):  # X leaves memory only once
+            run([_double(T @ X), *data], [losses, slopes])
             value += float(losses @ share)
-            gradient += (slopes * share).astype(G.dtype, copy=False).reshape(self.n, self.r, -1) @ G.transpose(0, 2, 1)
+            gradient += (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1) @ X.transpose(0, 2, 1)
         return value, gradient
 
     def _jacobian_entries(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
-        C = self._by_joint(theta)
-        J = _double(np.concatenate(in_threads(lambda part: C @ self.G[part], self._parts)))
+        T = self._table(theta)
+        J = _double(np.concatenate(in_threads(lambda part: T @ self.X[part], self._parts)))
         return J.reshape(len(J), self.n * self.r, -1)
 
     def _matrix(self, theta: Array, stride: int) -> Array:
@@ -261,7 +254,7 @@ class BasisObjective:
         """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
         block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
         D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
-        chosen: Array = self.G[block, :, :, column]  # (active, n, W)
+        chosen: Array = self.X[block, :, :, column]  # (active, g, S)
         G = self._gradients.dense(chosen.transpose(1, 2, 0)[None], len(chosen))
         rows = (D @ G.astype(np.float32))[:, self.kept]
         product: Array = (rows.T @ rows).astype(float) / self.N

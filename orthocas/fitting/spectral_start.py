@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from orthocas.checks import Array
 from orthocas.fitting.basis_gradients import BasisGradients
+from orthocas.fitting.gradients_of import gradients_of
 from orthocas.parametrisations import LinearFamily
 from orthocas.samples import Samples
 
@@ -34,7 +35,7 @@ def spectral_start(
     Source:
         ours, docs/derivations.md#spectral-start.
     """
-    basis = BasisGradients(family, samples.points.shape[1]) if gradients is None else gradients
+    basis = gradients_of(family, samples.points.shape[1]) if gradients is None else gradients
     G = basis.dense(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)
     N, _, K = G.shape
     along_task = (samples.task_basis @ G).reshape(-1, K)  # e_i^T d psi, the components along the task gradients

@@ -19,6 +19,7 @@ from orthocas.fitting.basis_objective import BasisObjective, expanded
 from orthocas.fitting.bounded_mutual import BoundedMutual
 from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.fold_search import FoldSearch
+from orthocas.fitting.gradients_of import gradients_of
 from orthocas.fitting.graph_objective import GraphObjective
 from orthocas.fitting.loss import DEFAULT_WEIGHTS, pairs
 from orthocas.fitting.mirror import Mirror, find_mirror
@@ -198,7 +199,7 @@ class StageRunner:
         """Those of a basis, built once."""
         if family not in self._bases:
             number = np.float32 if self.settings.single else np.float64
-            self._bases[family] = BasisGradients(family, self.space.n, number)
+            self._bases[family] = gradients_of(family, self.space.n, number)
         return self._bases[family]
 
     def _trial(self, family: LinearFamily, mirror: Mirror) -> float:

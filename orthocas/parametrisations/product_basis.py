@@ -6,7 +6,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
+from numpy.typing import NDArray
 
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.parametrisations.basis import BasisFamily
 from orthocas.parametrisations.family import JointSpace
@@ -42,17 +45,35 @@ class ProductFamily(BasisFamily):
         wide[:, [place[term] for term in coarser.terms]] = theta.reshape(self.outputs, coarser.width)
         return wide.ravel()
 
-    def derivative_tables(self, theta: Array) -> Array:
-        """C_i with d xi / d q_i = C_i (1, psi), (n, r, 1 + K)."""
-        n, C = self.space.n, theta.reshape(self.outputs, self.width)
-        places = {(0,) * n: 0} | {term: 1 + k for k, term in enumerate(self.terms)}
-        tables = np.zeros((n, self.outputs, 1 + self.width))
-        for i in range(n):
+    @cached_property
+    def derivatives(self) -> list[tuple[Array, NDArray[np.int_], NDArray[np.int_]]]:
+        """Entries of D_i with d (1, psi) / d q_i = D_i (1, psi): values, rows and columns for every joint."""
+        terms = ((0,) * self.space.n, *self.terms)
+        places = {term: k for k, term in enumerate(terms)}
+        found = []
+        for i in range(self.space.n):
             D = self.one_joint_derivatives(i)
             parts = [np.flatnonzero(row).tolist() for row in D]
-            for k, term in enumerate(self.terms):
-                for b in parts[term[i]]:
-                    tables[i, :, places[(*term[:i], b, *term[i + 1 :])]] += D[term[i], b] * C[:, k]
+            entries = [
+                (k, places[(*term[:i], b, *term[i + 1 :])], D[term[i], b])
+                for k, term in enumerate(terms)
+                for b in parts[term[i]]
+            ]
+            rows, columns, values = np.array(entries, dtype=float).reshape(-1, 3).T
+            found.append((values, rows.astype(int), columns.astype(int)))
+        return found
+
+    def derivative_matrix(self, joint: int) -> Any:
+        """D_i as a sparse matrix, (1 + K, 1 + K)."""
+        values, rows, columns = self.derivatives[joint]
+        return scipy.sparse.csr_array((values, (rows, columns)), shape=(1 + self.width,) * 2)
+
+    def derivative_tables(self, theta: Array) -> Array:
+        """C_i with d xi / d q_i = C_i (1, psi), (n, r, 1 + K)."""
+        C = np.hstack([np.zeros((self.outputs, 1)), theta.reshape(self.outputs, self.width)])
+        tables = np.zeros((self.space.n, self.outputs, 1 + self.width))
+        for table, (values, rows, columns) in zip(tables, self.derivatives, strict=True):
+            np.add.at(table.T, columns, (C[:, rows] * values).T)
         return tables
 
 

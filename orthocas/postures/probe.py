@@ -13,8 +13,8 @@ from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import Box, sample_evenly, sample_heavily
-from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.gradients_of import gradients_of
 from orthocas.fitting.loss import DEFAULT_WEIGHTS
 from orthocas.fitting.spectral_start import spectral_start
 from orthocas.judging.gradients import in_the_metric
@@ -91,7 +91,7 @@ class Prober:
             C = self._fitted(problem, family).reshape(self.outputs, family.width)
 
             def jacobian(points: Array) -> Array:
-                basis = BasisGradients(family, len(self.active))
+                basis = gradients_of(family, len(self.active))
                 G = basis.dense(basis.at(points[:, self.active]), len(points))
                 J: Array = (G @ C.T).transpose(0, 2, 1)
                 return J
