@@ -7,7 +7,6 @@ import numpy as np
 import scipy
 from numpy.typing import DTypeLike, NDArray
 
-from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.parametrisations import ProductFamily
@@ -25,27 +24,26 @@ class ProductGradients(BasisGradients):
         super().__init__(family, n, dtype)
         matrices = [family.derivative_matrix(i)[1:] for i in range(n)]
         self._places = np.unique(np.concatenate([D.indices for D in matrices]))  # of psi' in (1, psi)
-        self._matrices = [D[:, self._places].astype(self.dtype) for D in matrices]  # D_i, (K, S)
+        matrices = [D[:, self._places] for D in matrices]
+        self._upright = scipy.sparse.vstack(matrices).tocsr()  # all D_i, (n K, S)
+        self._lying = scipy.sparse.vstack([D.T for D in matrices]).tocsr()  # all D_i^T, (n S, K)
+        self._back = self._lying.T.tocsr()
+        self._parts: dict[tuple[bytes, str], Any] = {}  # of all D_i, for some of the functions
 
     @property
     def groups(self) -> int:
         """One."""
         return 1
 
-    @cached_property
-    def _together(self) -> Any:
-        """All D_i^T, one below the other, (n S, K)."""
-        return scipy.sparse.vstack([D.T for D in self._matrices]).tocsr().astype(float)
-
     def table(self, C: Array) -> Array:
         """T = C D_i, (1, n r, S)."""
-        rows = (self._together @ C.T).reshape(self.n, -1, len(C)).transpose(0, 2, 1)
+        rows = (self._lying @ C.T).reshape(self.n, -1, len(C)).transpose(0, 2, 1)
         return np.ascontiguousarray(rows, dtype=self.dtype).reshape(1, self.n * len(C), -1)
 
     def collected(self, slopes: Array) -> Array:
         """The sum over the joints of dL/dT D_i^T."""
         by_joint = slopes.reshape(self.n, -1, slopes.shape[2]).transpose(0, 2, 1)
-        found: Array = (self._together.T @ by_joint.reshape(-1, by_joint.shape[2])).T
+        found: Array = (self._back @ by_joint.reshape(-1, by_joint.shape[2])).T
         return found
 
     def dense_part(
@@ -55,11 +53,15 @@ class ProductGradients(BasisGradients):
         assert X.shape[3] % every == 0
         kind = X.dtype if dtype is None else np.dtype(dtype)
         values = X[:, 0, :, ::every].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, : -(-samples // every)]
-        dense = np.empty((values.shape[1], self.n, int(kept.sum())), dtype=kind)
-        values = values.astype(kind, copy=False)
-        for i, D in enumerate(self._matrices):
-            dense[:, i] = (D[kept].astype(kind) @ values).T
-        return dense
+        found = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
+        return np.ascontiguousarray(found.T).reshape(found.shape[1], self.n, -1)
+
+    def _part(self, kept: NDArray[np.bool_], kind: "np.dtype[Any]") -> Any:
+        """The rows of some functions in all D_i, (n kept, S)."""
+        key = kept.tobytes(), kind.str
+        if key not in self._parts:
+            self._parts[key] = self._upright[np.tile(kept, self.n)].astype(kind)
+        return self._parts[key]
 
     def _numbers(self, q: ca.SX) -> ca.SX:
         return ca.vertcat(1, self.family.basis(q))[self._places.tolist()]
