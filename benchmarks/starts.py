@@ -19,7 +19,7 @@ HEADER = (
 )
 ADAM = solvers.Adam(epochs=40, learning_rate=5e-3)
 CASES: tuple[tuple[oc.Polynomial | oc.MLP, Sequence[Solver]], ...] = (
-    (oc.Polynomial(4), (solvers.GaussNewton(),)),
+    (oc.Polynomial(4), (solvers.QuasiNewton(), solvers.GaussNewton())),
     (oc.Polynomial(3), (solvers.GaussNewton(), solvers.LBFGS(), solvers.Ipopt(), ADAM)),
     (oc.Polynomial(2), (solvers.GradientFlow(),)),
     (oc.MLP((16, 16)), (solvers.LBFGS(), ADAM)),

@@ -12,7 +12,7 @@ from orthocas.minimising.objective import LeastSquaresObjective, Objective
 from orthocas.minimising.solver import SolveResult, Status
 from orthocas.minimising.watch import UNWATCHED, Watch
 
-_MAX_REJECTIONS = 10
+_MAX_REJECTIONS = 16  # the damping may grow from its least to 400
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class GaussNewton:
 
     Args:
         max_iterations: largest number of accepted steps.
-        tolerance: stop when a step reduces the loss by less than this fraction.
+        tolerance: stop when two steps in a row reduce the loss by less than this fraction each.
     """
 
     max_iterations: int = 100
@@ -35,7 +35,7 @@ class GaussNewton:
         require_at_least("tolerance", self.tolerance, 0)
 
     def coarser(self) -> "GaussNewton":
-        """The same solver with at most 10 iterations, which stops when a step gains less than half a per cent."""
+        """The same solver with at most 10 iterations, which stops when two steps gain less than 0.5 % each."""
         return replace(self, max_iterations=min(10, self.max_iterations), tolerance=max(5e-3, self.tolerance))
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
@@ -62,6 +62,7 @@ class _Run:
         kept = self.best.restored or {}
         self.damping = float(kept.get("damping", 1e-3))
         self.converged = bool(kept.get("converged", False))
+        self._gained_little = bool(kept.get("gained_little", False))  # in the last step
 
     def iterate(self) -> Status:
         best = self.best
@@ -75,8 +76,10 @@ class _Run:
             if not self._step(gradient, H):
                 return Status.STALLED if np.any(gradient) else Status.CONVERGED
             cautious = self.damping > damping  # a step after rejections is short: a small gain is no convergence
-            self.converged = not cautious and before - best.value <= self.settings.tolerance * before
-            best.next_iteration(self.settings.max_iterations, damping=self.damping, converged=self.converged)
+            little = not cautious and before - best.value <= self.settings.tolerance * before
+            self.converged, self._gained_little = little and self._gained_little, little
+            state = {"damping": self.damping, "converged": self.converged, "gained_little": little}
+            best.next_iteration(self.settings.max_iterations, **state)
         return Status.CONVERGED if self.converged else Status.ITERATION_LIMIT
 
     def _step(self, gradient: Array, H: Array) -> bool:

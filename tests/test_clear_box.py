@@ -178,13 +178,13 @@ def test_fits_offer_the_bound_that_helps() -> None:
     box = oc.Box(arm.domain.centre, 1.0)
     fit = oc.fit(oc.Problem(arm.robot, arm.task, domain=box), oc.Polynomial(3), samples=800)
     assert fit.worst is not None
-    assert fit.worst.least < 0
+    assert fit.worst.least < 0.05
     offer = fit.clear_part
     assert offer is not None
     assert f"least singular value {offer.least_singular_value:g} stays clear" in repr(fit)
-    folded = fit.worst.below(0.0)
+    failed = fit.worst.below(0.05)
     clear = oc.ClearBox(box, arm.task, offer.least_singular_value)
-    assert clear.contains(folded).mean() <= 0.1
+    assert clear.contains(failed).mean() <= 0.1
     assert offer.share == clear.share > 0.5
     healthy = oc.fit(oc.Problem(arm.robot, arm.task, domain=oc.Box(box.centre, 0.3)), oc.Polynomial(1), samples=100)
     assert healthy.clear_part is None

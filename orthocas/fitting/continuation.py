@@ -35,8 +35,8 @@ class Continuation:
     """Solves a low degree from a spectral start, embeds the result, and solves the next degree.
 
     The worst points of each degree join the loss of the next one. The last degree is solved again until its least
-    conditioning is large enough, or no longer grows. If folds remain, the domain forces them: then the last stage
-    leaves the fold term out.
+    conditioning is large enough or, without a fold, no longer grows. If folds remain after some rounds, the domain
+    forces them: then the last stage leaves the fold term out.
 
     Args:
         runner: runs single stages.
@@ -94,9 +94,9 @@ class Continuation:
 
     def _unfold(self, step: Parametrisation) -> None:
         """Solve the last step again until there is no point of small conditioning."""
-        folds, before = self._runner.folds, -1.0
+        folds, before = self._runner.folds, 0.0
         for k in range(2, 2 + _ROUNDS):
-            if folds.least >= LEAST_CONDITIONING or folds.least < before + _LEAST_GAIN:
+            if folds.least >= LEAST_CONDITIONING or 0 <= folds.least < before + _LEAST_GAIN:
                 break
             before = folds.least
             self._solve(step, f"{step.label}, round {k}", final=True)

@@ -54,7 +54,7 @@ class ProductGradients(BasisGradients):
         kind = X.dtype if dtype is None else np.dtype(dtype)
         values = X[:, 0, :, ::every].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, : -(-samples // every)]
         found = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
-        return np.ascontiguousarray(found.T).reshape(found.shape[1], self.n, -1)
+        return np.ascontiguousarray(found.T).reshape(found.shape[1], self.n, int(kept.sum()))
 
     def _part(self, kept: NDArray[np.bool_], kind: "np.dtype[Any]") -> Any:
         """The rows of some functions in all D_i, (n kept, S)."""

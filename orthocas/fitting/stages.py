@@ -15,7 +15,7 @@ from orthocas.domains import sample_evenly
 from orthocas.errors import CheckpointError, InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.array_objective import ArrayObjective
 from orthocas.fitting.basis_gradients import BasisGradients
-from orthocas.fitting.basis_objective import BasisObjective, expanded
+from orthocas.fitting.basis_objective import STRIDE, BasisObjective, expanded
 from orthocas.fitting.bounded_mutual import BoundedMutual
 from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.fold_search import FoldSearch
@@ -31,10 +31,12 @@ from orthocas.minimising.watch import Monitor, Progress, Watch
 from orthocas.parametrisations import (
     ArrayFamily,
     Family,
+    Fourier,
     GradedParametrisation,
     JointSpace,
     LinearFamily,
     Parametrisation,
+    Polynomial,
 )
 from orthocas.problem import Problem
 from orthocas.samples import Samples, sample_problem, samples_at
@@ -263,7 +265,8 @@ class StageRunner:
         K = target.term_count(n)
         N = self._linear_sample_count(K, r) / half
         of_a_joint = K - target.term_count(n - 1) if n > 1 else K
-        gradients = n * (2 * (4 if self.settings.single else 8) * of_a_joint + 4 * K)  # twice while they are built
+        numbers = 1 + K if isinstance(target, Polynomial | Fourier) else n * of_a_joint  # see BasisGradients
+        gradients = 2 * (4 if self.settings.single else 8) * numbers + 4 * n * K / STRIDE  # twice while they are built
         curvature = 16 * (n * r) ** 2 if self.settings.max_mutual is not None else 0
         needed = N * (gradients + curvature) + 32 * (r * K / half) ** 2
         require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)

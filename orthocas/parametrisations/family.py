@@ -169,7 +169,7 @@ class Parametrisation(Protocol):
 
     @property
     def linear(self) -> bool:
-        """Whether its families are linear in their parameters. Then Gauss-Newton is the default solver."""
+        """Whether its families are linear in their parameters. Then `fit` minimises by Gauss-Newton or QuasiNewton."""
         ...
 
     @property
