@@ -19,7 +19,7 @@ from public_objects import CHARTS, circle, fitted
 import orthocas as oc
 from orthocas import problems
 from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.casadi_tools.tape import _BINARY, _UNARY, to_tape
+from orthocas.casadi_tools.tape import BINARY, CODES, UNARY, to_tape
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.domains import sample_uniform
@@ -119,9 +119,9 @@ def every_operation(q: ca.SX) -> ca.SX:
     """All operations of tapes, where they are defined, some with constants in either place."""
     a, b = 0.3 + 0.1 * ca.sin(q[0]), 0.6 + 0.1 * ca.cos(q[1])
     shift = {"acosh": 1.0}
-    entries = [function(a + shift.get(name, 0.0)) for name, function in _UNARY.items()]
-    for function in _BINARY.values():
-        entries += [function(a, b), function(a, 0.25), function(1.5, b)]
+    entries = [ca.SX.unary(CODES[name], a + shift.get(name, 0.0)) for name in UNARY]
+    for name in BINARY:
+        entries += [ca.SX.binary(CODES[name], *pair) for pair in ((a, b), (a, 0.25), (1.5, b))]
     return ca.vertcat(*(entry + 0.5 * q[2] for entry in entries), -3.0, ca.inf * q[0])
 
 
