@@ -116,7 +116,9 @@ def draw(points: list[Point], file: Path) -> None:
             axes.plot(seconds, values, marker=marker, label=family, markersize=8 if family == PEER else 5)
             for point, value in zip(own, values, strict=True):
                 short = point.label.split(":", 1)[-1].removesuffix(":cyclic")
-                axes.annotate(short, (point.seconds, value), xytext=(4, height), textcoords="offset points", fontsize=7)
+                side = (-6, "right") if family == PEER else (4, "left")  # long labels would leave the picture
+                place = {"xytext": (side[0], height), "textcoords": "offset points", "ha": side[1]}
+                axes.annotate(short, (point.seconds, value), **place, fontsize=7)
         axes.axhline(paper, color="0.7", linestyle="--", zorder=0)
         axes.set(xscale="log", xlabel="seconds of one thread", title=f"{name} angle, std [deg]")
         axes.margins(x=0.15)

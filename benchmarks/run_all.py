@@ -1,7 +1,7 @@
 """Runs every benchmark in turn (about an hour on 2 cores), and sums up in a table which ones ran, and for how long.
 
-The results are in docs/performance.md. Names on the command line choose some; `--quick` takes small cases, to see that
-all of them run. A benchmark that fails does not stop the others.
+The results are in docs/. Names on the command line choose some; `--quick` takes small cases, to see that all of them
+run. A benchmark that fails does not stop the others. `browser_view.py` needs Chromium and is left out.
 """
 
 import argparse
@@ -21,8 +21,11 @@ SCRIPTS = (
     "fits",
     "folds",
     "quality_and_time",
+    "threads",
     "clear_boxes",
     "certificates",
+    "atlas",
+    "atlas_c",
     "suggested_domains",
     "choices",
     "scaling",
