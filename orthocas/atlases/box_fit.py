@@ -28,7 +28,7 @@ _EVEN, _HEAVY = 384, 128  # training samples, and those of them near faces and c
 _UNIFORM, _JUDGES = 600, 300  # held-out samples, and those near faces and corners
 _FRAME_SAMPLES, _SEED = 500, 0
 _WEIGHTS = Weights(angles="metric")  # what is asked of charts is their leak
-_SOLVER = GaussNewton(max_iterations=25, tolerance=5e-3)
+_SOLVER = GaussNewton(max_iterations=25, tolerance=1e-2)
 
 
 @dataclass(frozen=True, eq=False)
