@@ -40,7 +40,7 @@ FOLLOWED = 1e-3  # [m]
 SETTLING = 1.0  # of a simulated arm after the circles [s]
 STEPS, UNHURRIED = 100, 10.0  # of an iterative solver for one target; the time of each [s]
 AT_REST = 1e-9  # joint motion of a step after which others change nothing [rad]
-FEW = 50  # targets for simulations
+FEW = 500  # targets for simulations
 COLUMNS = (
     *("method", "drift [rad]", "tool error [mm]", "reached", "left [rad]", "lines", "outside limits"),
     *("fastest joint [rad/s]", "tick [us]"),
