@@ -22,7 +22,7 @@ class QuasiNewton(LBFGS):
 
     A matrix of K coefficients and N samples takes N K^2 operations, a gradient N K. So one matrix and many gradients
     cost less than a few Gauss-Newton steps, and L-BFGS learns what the matrix misses. The matrix is renewed where the
-    loss has fallen by a fifth. At degree 6 of the 7-DoF arm this takes a third of the time of `GaussNewton`.
+    loss has fallen by a fifth. At degree 6 of the 7-DoF arm this takes a fifth of the time of `GaussNewton`.
 
     Args:
         max_iterations: largest number of iterations.

@@ -106,7 +106,7 @@ class Coordinates:
         return self.into("jacobian", np.empty((len(points), self.r, self.space.n)), points)
 
     def once(self, name: str, points: Array) -> Array:
-        """The values of `xi` or `jacobian` where no more will be asked for: builds no code that makes calls fast."""
+        """Values of `xi` or `jacobian`, without building what makes later calls fast."""
         if self.as_matrices:
             return self.xi(points) if name == "xi" else self.jacobian(points)
         return Batched(self.functions[name])(points)[0]

@@ -67,7 +67,7 @@ class ProductGradients(BasisGradients):
         return ca.vertcat(1, self.family.basis(q))[self._places.tolist()]
 
 
-class BoxGradients(ProductGradients):
+class BoxGradients(BasisGradients):
     """Those of a family on the cube [-1, 1]^n in the units of one box: d psi / dq_i = d psi / du_i / half_width_i.
 
     Boxes share the compiled basis, and the numbers at points of the cube that all of them use.
@@ -80,8 +80,13 @@ class BoxGradients(ProductGradients):
     """
 
     def __init__(self, cube: ProductGradients, half_width: Array, shared: Array, known: Array) -> None:
-        self.family, self.n, self.dtype = cube.family, cube.n, cube.dtype
+        super().__init__(cube.family, cube.n, cube.dtype)
         self._cube, self._scale, self._shared, self._known = cube, 1 / half_width, shared, known
+
+    @property
+    def groups(self) -> int:
+        """As on the cube."""
+        return self._cube.groups
 
     def at(self, points: Array) -> Array:
         """The numbers at points of the cube (N, n)."""
@@ -104,3 +109,6 @@ class BoxGradients(ProductGradients):
         dense = self._cube.dense_part(X, samples, kept, every, dtype)
         dense *= self._scale[:, None].astype(dense.dtype)
         return dense
+
+    def _numbers(self, q: ca.SX) -> ca.SX:
+        return self._cube._numbers(q)

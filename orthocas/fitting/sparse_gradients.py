@@ -23,8 +23,7 @@ class SparseGradients(BasisGradients):
     @cached_property
     def terms_of_joints(self) -> NDArray[np.int_]:
         """Indices of the functions that depend on each joint, (n, S). Shorter rows are padded with -1."""
-        q = ca.SX.sym("q", self.n)
-        functions, joints = ca.jacobian(self.family.basis(q), q).sparsity().get_triplet()
+        functions, joints = self._jacobian.sparsity_out(0).get_triplet()
         rows: list[list[int]] = [[] for _ in range(self.n)]
         for k, i in zip(functions, joints, strict=True):
             rows[i].append(k)
@@ -59,5 +58,10 @@ class SparseGradients(BasisGradients):
         return dense.reshape(-1, *dense.shape[2:])[: -(-samples // every)]
 
     def _numbers(self, q: ca.SX) -> ca.SX:
-        J = ca.jacobian(self.family.basis(q), q)
+        J = self._jacobian(q)
         return ca.vertcat(*(J[int(k), i] if k >= 0 else 0 for i, row in enumerate(self.terms_of_joints) for k in row))
+
+    @cached_property
+    def _jacobian(self) -> ca.Function:
+        q = ca.SX.sym("q", self.n)
+        return ca.Function("jacobian", [q], [ca.jacobian(self.family.basis(q), q)])
