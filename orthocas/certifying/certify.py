@@ -10,7 +10,8 @@ import numpy as np
 from orthocas.certificates.certificate import METHOD, Certificate
 from orthocas.certificates.subdivision import OPEN, Subdivision
 from orthocas.certifying.chart_rows import ChartRows, chart_rows
-from orthocas.certifying.judges import RegularityJudge, injectivity_judge
+from orthocas.certifying.judges import RegularityJudge
+from orthocas.certifying.one_to_one import one_to_one_judge
 from orthocas.certifying.outside import judge_of
 from orthocas.certifying.search import Limits, Look, Search, distances, largest_first, nearest_first
 from orthocas.chart import Chart
@@ -247,7 +248,7 @@ def _one_to_one(
         middle = (low + high) // 2
         part = _scaled(base, _SCALES[middle])
         limits = Limits(max(end - time.monotonic(), 0.0), boxes=_INJECTIVE_BOXES)
-        judge = injectivity_judge(rows, chart.problem.domain.centre, part)
+        judge = one_to_one_judge(chart, rows, part)
         search = Search(judge, part, limits, largest_first(part), executor)
         search.run(_shown(monitor, "one-to-one"))
         if search.finished:

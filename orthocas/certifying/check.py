@@ -9,7 +9,8 @@ from orthocas.certificates.certificate import Certificate
 from orthocas.certificates.subdivision import PROVED, Subdivision
 from orthocas.certifying.certify import checked_options, require_same
 from orthocas.certifying.chart_rows import chart_rows
-from orthocas.certifying.judges import Judge, Verdicts, injectivity_judge
+from orthocas.certifying.judges import Judge, Verdicts
+from orthocas.certifying.one_to_one import one_to_one_judge
 from orthocas.certifying.outside import judge_of
 from orthocas.chart import Chart
 from orthocas.checks import Array
@@ -58,7 +59,7 @@ def check_certificate(
     holds = all(verdicts.proved.all() for verdicts in regular) and len(signs) < 2 and least >= certificate.conditioning
     if certificate.injective is None or not holds:
         return holds
-    judge = injectivity_judge(rows, chart.problem.domain.centre, certificate.injective)
+    judge = one_to_one_judge(chart, rows, certificate.injective)
     found = _judged(judge, certificate.injective, mapped, monitor)
     return certificate.injective.complete and all(verdicts.proved.all() for verdicts in found)
 

@@ -7,11 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.casadi_tools.threads import one_blas_thread
-from orthocas.certificates.subdivision import Subdivision
 from orthocas.certifying.chart_rows import ChartRows
-from orthocas.certifying.elimination import between, in_singular_basis, lower_bound, pivots
+from orthocas.certifying.elimination import in_singular_basis, lower_bound, pivots
 from orthocas.certifying.monomials import Variables
-from orthocas.certifying.rounding import UP
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.certifying.volume import conditioning_bound
 from orthocas.checks import Array
@@ -54,66 +52,20 @@ class RegularityJudge:
     def _few(self, J: TaylorModel) -> tuple[Array, ...]:
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):  # boxes where bounds are infinite
             turned, signs = in_singular_basis(J)
-            regular = _all_positive(pivots(turned)) & (signs != 0)
+            regular = all_positive(pivots(turned)) & (signs != 0)
         conditioning = np.zeros(len(signs))
         if self.bound > 0 and regular.any():
             conditioning[regular] = conditioning_bound(_chosen(J, regular), self.rows.m)
         proved = regular & (conditioning >= self.bound)
-        return proved, regular, signs, conditioning, _influences(turned)
+        return proved, regular, signs, conditioning, influences(turned)
 
 
-@dataclass(frozen=True, eq=False)
-class InjectivityJudge:
-    """Proves that the symmetric part of P J is positive definite, for one P on all boxes.
-
-    On a convex set this makes phi one-to-one: (q - p)^T P (phi(q) - phi(p)) is the integral of (q - p)^T P J (q - p)
-    over the segment, which is positive. For circle-valued coordinates that holds for angles that count on, so they must
-    also change by less than a turn on the segment.
-    """
-
-    rows: ChartRows
-    inverse: Array  #: P, (active, active)
-    widths: Array  #: of the convex set, (active,)
-
-    def __call__(self, low: Array, high: Array) -> Verdicts:
-        """Judge boxes between corners (boxes, n)."""
-        with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            J = self.rows(low, high)
-            return _joined([self._few(part) for part in _parts(J)], J.variables)
-
-    def _few(self, J: TaylorModel) -> tuple[Array, ...]:
-        boxes = J.remainder.shape[-1]
-        unit = np.broadcast_to(np.eye(len(self.inverse)), (boxes, *self.inverse.shape))
-        product = between(np.broadcast_to(self.inverse, unit.shape), J, unit)
-        transposed = TaylorModel(
-            product.variables, product.coefficients.swapaxes(1, 2), product.remainder.swapaxes(0, 1)
-        )
-        symmetric = product + transposed
-        vectors = np.linalg.eigh(np.nan_to_num(np.moveaxis(symmetric.centre, -1, 0)))[1][:, :, ::-1]
-        turned = between(vectors.transpose(0, 2, 1), symmetric, vectors)
-        proved: Array = np.asarray(_all_positive(pivots(turned)) & self._within_a_turn(J), dtype=np.bool_)
-        return proved, proved, np.zeros(boxes), np.zeros(boxes), _influences(turned)
-
-    def _within_a_turn(self, J: TaylorModel) -> NDArray[np.bool_]:
-        """Whether rows with a period change by less than it, over the widths at their largest slopes, (boxes,)."""
-        circles = np.flatnonzero(self.rows.turns)
-        change = (J.magnitude()[circles] * self.widths[:, None]).sum(axis=1)
-        return np.asarray((change * UP < self.rows.turns[circles, None]).all(axis=0))
-
-
-def injectivity_judge(rows: ChartRows, centre: Array, base: Subdivision) -> InjectivityJudge:
-    """The judge for a box, with the inverse of J at a point as its P."""
-    J = rows(centre[None], centre[None]).centre[:, :, 0]
-    widths = (base.high - base.low)[list(rows.active)] * UP
-    return InjectivityJudge(rows, np.asarray(np.linalg.pinv(J), dtype=float), widths)
-
-
-def _all_positive(found: list[TaylorModel]) -> NDArray[np.bool_]:
+def all_positive(found: list[TaylorModel]) -> NDArray[np.bool_]:
     """Whether all pivots have one sign on the box and the pivots of the middle are positive."""
     return np.asarray(np.all([lower_bound(pivot) > 0 for pivot in found], axis=0))
 
 
-def _influences(turned: TaylorModel) -> Array:
+def influences(turned: TaylorModel) -> Array:
     """How much halving each variable narrows the matrix, relative to its singular values, (boxes, variables)."""
     middle = np.sqrt(np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))])) + 1e-300)
     influences: Array = (turned.gains() / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T

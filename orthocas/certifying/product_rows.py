@@ -5,8 +5,6 @@ polynomial of J_xi to degree 3 needs the tables up to order 4; those of order 5 
 """
 
 from dataclasses import dataclass
-from functools import cache
-from math import factorial, prod
 from typing import Any
 
 import casadi as ca
@@ -15,7 +13,17 @@ from numpy.typing import NDArray
 
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.certifying.graph import TaylorGraph
-from orthocas.certifying.monomials import DEGREE, Monomial, Variables, monomials
+from orthocas.certifying.jets import (
+    HIGHEST,
+    Around,
+    Jets,
+    largest_average,
+    multi_indices,
+    neighbours,
+    power_weights,
+    powers,
+)
+from orthocas.certifying.monomials import DEGREE, Monomial, Variables
 from orthocas.certifying.rounding import SUM, TINY, UNIT, UP
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.checks import Array
@@ -40,10 +48,10 @@ class ProductRows:
     terms: Array  #: (1 + K, n): the one-joint function of each joint
     functions: TaylorGraph  #: q -> the one-joint functions that are not constant
     numbers: Array  #: (n, functions of one joint): where each is among them
-    orders: tuple[Derivatives, ...]  #: orders 1 to 5
+    orders: tuple[Derivatives, ...]  #: orders 1 to 5, or 6 for jets
 
     @classmethod
-    def of(cls, family: ProductFamily, theta: Array) -> "ProductRows":
+    def of(cls, family: ProductFamily, theta: Array, highest: int = DEGREE + 2) -> "ProductRows":
         """The tables of a family with its parameters."""
         n, r = family.space.n, family.outputs
         terms = np.array([(0,) * n, *family.terms])
@@ -56,47 +64,61 @@ class ProductRows:
             numbers[joint, terms[k, joint]] = place
         graph = TaylorGraph.of(dense_function("functions", [q], [values]), "the coordinates")
         C = np.hstack([np.zeros((r, 1)), theta.reshape(r, -1)])
-        return cls(r, terms, graph, numbers, _orders(family, terms, C))
+        return cls(r, terms, graph, numbers, _orders(family, terms, C, highest))
 
     def __call__(self, boxes: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
         """J_xi, (r, n, boxes), for models of the joints on boxes of the given half-widths (n, boxes)."""
         points = [TaylorModel.constant(box.centre) for box in boxes]
         values, errors = self._basis(self.functions(points))
         parts, left_out = [], np.zeros((self.r, len(boxes), half_widths.shape[1]))
-        for order, derivatives in enumerate(self.orders[:-1], 1):
-            used = derivatives.used
-            found = derivatives.table @ values[used]
-            doubt = derivatives.sizes @ (errors[used] + derivatives.rounding * np.abs(values[used]))
-            weights = _weights(half_widths, order - 1)
-            coefficients = self._spread(found, order) * weights
-            left_out += (self._spread(doubt, order) * weights + SUM * np.abs(coefficients)).sum(axis=2)
+        for order in range(1, DEGREE + 2):
+            found, doubt = self._derivatives(order, values, errors)
+            weights = powers(half_widths, order - 1)
+            coefficients = found * weights
+            left_out += (doubt * weights + SUM * np.abs(coefficients)).sum(axis=2)
             parts.append(coefficients)
-        left_out += self._rest(boxes, half_widths)
+        left_out += (self._largest(DEGREE + 2, boxes) * powers(half_widths, DEGREE + 1)).sum(axis=2)
         coefficients = np.concatenate(parts, axis=2).transpose(2, 0, 1, 3)
         return TaylorModel(variables, coefficients, left_out * UP + TINY)
 
     def dependences(self) -> set[int]:
         """The joints that J_xi depends on."""
         changing = self.orders[1]  # of J_xi
-        indices = _multi_indices(self.terms.shape[1], 2)
+        indices = multi_indices(self.terms.shape[1], 2)
         sizes = np.asarray(changing.sizes.reshape(len(indices), self.r * len(changing.used)).any(axis=1))
         return {i for index, there in zip(indices, sizes.tolist(), strict=True) if there for i in index}
 
-    def _rest(self, boxes: list[TaylorModel], half_widths: Array) -> Array:
-        """Lagrange's bound of the terms of J_xi above degree 3, (r, n, boxes)."""
-        last = self.orders[-1]
+    def jets(self, around: Around) -> Jets:
+        """The derivatives of J_xi at the middles of boxes. By Lagrange, order 5 bounds the rest of the average."""
+        points = [TaylorModel.constant(np.ascontiguousarray(c)) for c in around.centre]
+        values, errors = self._basis(self.functions(points))
+        known = [self._derivatives(order, values, errors) for order in range(1, HIGHEST + 2)]
+        linear = np.stack([around.centre, around.reach, *np.zeros((2, *around.centre.shape))], axis=1)
+        boxes = [TaylorModel((k,), each, np.zeros(each.shape[1:])) for k, each in enumerate(linear)]
+        left_out = self._largest(HIGHEST + 2, boxes) * largest_average(power_weights(around, HIGHEST + 1))
+        derivatives, doubts = zip(*known, strict=True)
+        return Jets(derivatives, doubts, left_out.sum(axis=2) * UP + TINY)
+
+    def _derivatives(self, order: int, values: Array, errors: Array) -> tuple[Array, Array]:
+        """Those of J_xi at points, of one order less, and bounds of their errors."""
+        one = self.orders[order - 1]
+        found = one.table @ values[one.used]
+        doubt = one.sizes @ (errors[one.used] + one.rounding * np.abs(values[one.used]))
+        return self._spread(found, order), self._spread(doubt, order)
+
+    def _largest(self, order: int, boxes: list[TaylorModel]) -> Array:
+        """Bounds of the derivatives of J_xi of one order less on boxes, (r, n, multi-indices, boxes)."""
+        last = self.orders[order - 1]
         if last.used.any():
             highest = self._products([box.magnitude() for box in self.functions(boxes)], last.used)
         else:  # constants only
-            highest = np.ones((len(last.used), half_widths.shape[1]))
-        bounds = self._spread(last.sizes @ highest * (1 + last.rounding), DEGREE + 2)
-        rest: Array = (bounds * _weights(half_widths, DEGREE + 1)).sum(axis=2)
-        return rest
+            highest = np.ones((len(last.used), boxes[0].remainder.shape[-1]))
+        return self._spread(last.sizes @ highest * (1 + last.rounding), order)
 
     def _spread(self, found: Array, order: int) -> Array:
         """Derivatives by multi-index as those of J_xi: (r, n, multi-indices of one order less, boxes)."""
         n = self.terms.shape[1]
-        values: Array = found.reshape(-1, self.r, found.shape[1])[_neighbours(n, order)].transpose(2, 0, 1, 3)
+        values: Array = found.reshape(-1, self.r, found.shape[1])[neighbours(n, order)].transpose(2, 0, 1, 3)
         return values
 
     def _basis(self, functions: list[TaylorModel]) -> tuple[Array, Array]:
@@ -118,13 +140,13 @@ class ProductRows:
         return out
 
 
-def _orders(family: ProductFamily, terms: Array, C: Array) -> tuple[Derivatives, ...]:
+def _orders(family: ProductFamily, terms: Array, C: Array, highest: int) -> tuple[Derivatives, ...]:
     n = family.space.n
     steps = [family.derivative_matrix(i) for i in range(n)]
     known: dict[Monomial, tuple[Any, Any]] = {(): (C, np.abs(C))}
     orders = []
-    for order in range(1, DEGREE + 3):
-        indices = _multi_indices(n, order)
+    for order in range(1, highest + 1):
+        indices = multi_indices(n, order)
         for index in indices:
             values, sizes = known[index[:-1]]
             step = steps[index[-1]]
@@ -134,24 +156,3 @@ def _orders(family: ProductFamily, terms: Array, C: Array) -> tuple[Derivatives,
         rounding = 4 * UNIT * (len(terms) + 64 * order)
         orders.append(Derivatives(used, table[:, used], sizes[:, used] * UP, rounding))
     return tuple(orders)
-
-
-@cache
-def _multi_indices(n: int, order: int) -> list[Monomial]:
-    return [m for m in monomials(tuple(range(n)), order) if len(m) == order]
-
-
-@cache
-def _neighbours(n: int, order: int) -> Array:
-    """Where the multi-index m + e_i of an order stands among those of that order, (n, multi-indices m)."""
-    index = {m: k for k, m in enumerate(_multi_indices(n, order))}
-    lower = _multi_indices(n, order - 1) if order > 1 else [()]
-    return np.array([[index[tuple(sorted((*m, i)))] for m in lower] for i in range(n)])
-
-
-def _weights(half_widths: Array, degree: int) -> Array:
-    """r^m / m! for the monomials m of one degree, (monomials, boxes)."""
-    n = len(half_widths)
-    indices = _multi_indices(n, degree) if degree else [()]
-    sizes = [half_widths[list(m)].prod(axis=0) / prod(factorial(m.count(i)) for i in {*m}) for m in indices]
-    return np.stack(sizes)

@@ -1,0 +1,167 @@
+"""Proofs that phi is one-to-one on a box (ours).
+
+Two points q = c + d and p = c - d of the box have phi(q) - phi(p) = 2 Jm(c, d) d, see `orthocas.certifying.jets`. So phi
+is one-to-one if Jm(c, d) d != 0 for all of them. Near its faces, the middles c of two points of a box leave little room
+for d; in its centre, J is usually best. The middles are divided into parts, and on each part Jm is proved nonsingular.
+Rows of x may be replaced by others that vanish with them, such as those of the rotation that x stands for.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import takewhile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.casadi_tools.threads import one_blas_thread
+from orthocas.certificates.subdivision import Subdivision
+from orthocas.certifying.chart_rows import ChartRows, CoordinateRows, joint_models
+from orthocas.certifying.elimination import between, is_orthogonal, pivots, singular_vectors
+from orthocas.certifying.jets import HIGHEST, Around, Jets, of_model
+from orthocas.certifying.judges import Verdicts, all_positive, influences
+from orthocas.certifying.product_rows import ProductRows
+from orthocas.certifying.rounding import SUM, TINY, UNIT, UP
+from orthocas.certifying.task_rows import TipRows, chain_of
+from orthocas.certifying.taylor import TaylorModel
+from orthocas.certifying.tip_jets import TipJets
+from orthocas.chart import Chart
+from orthocas.checks import Array
+from orthocas.coordinates.fitted import Coordinates
+from orthocas.parametrisations.product_basis import ProductFamily
+
+AT_ONCE = 32  #: boxes, whose terms fit into the cache of a processor
+_ROUNDS = 2  # of bounds of the differences by the coordinates
+RowJets = Callable[[Array, Around], Jets]  #: joint positions (n, boxes), and boxes of the active joints
+
+
+@dataclass(frozen=True, eq=False)
+class OneToOneJudge:
+    """Proves that Jm(c, d) is nonsingular, for middles c in a box and all d that two points of the whole can have."""
+
+    task: RowJets
+    coordinates: RowJets | None
+    active: tuple[int, ...]
+    still: tuple[int, ...]  #: columns of joints that Jm does not depend on in the middle; they may have wide ranges
+    turns: Array  #: periods of the rows; 0 for those that have none
+    low: Array  #: of the whole, (n,)
+    high: Array
+
+    def __call__(self, low: Array, high: Array) -> Verdicts:
+        """Judge boxes between corners (boxes, n)."""
+        found = []
+        with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            for k in range(0, len(low), AT_ONCE):
+                found.append(self._few(low[k : k + AT_ONCE], high[k : k + AT_ONCE]))
+        proved, widest = (np.concatenate(each) for each in zip(*found, strict=True))
+        nothing = np.zeros(len(low))
+        return Verdicts(proved, proved, nothing, nothing, widest)
+
+    def _few(self, low: Array, high: Array) -> tuple[Array, Array]:
+        q = (low + high).T / 2
+        around = self._around(low, high)
+        for _ in range(_ROUNDS if self.still and self.coordinates else 0):
+            around = self._bounded(around, self.coordinates(q, around))
+        jets = Jets.joined([rows(q, around) for rows in (self.task, self.coordinates) if rows])
+        model, terms = jets.average(around, self.active)
+        left, right = singular_vectors(model)
+        turned = between(left, model, right)
+        spread = np.abs(left[:, None] @ terms.transpose(3, 2, 0, 1) @ right[:, None]).sum(axis=1)
+        spread = spread + SUM * (np.abs(left) @ np.abs(terms).sum(axis=2).transpose(2, 0, 1) @ np.abs(right))
+        turned = replace(turned, remainder=(turned.remainder + spread.transpose(1, 2, 0)) * UP)
+        proved = all_positive(pivots(turned)) & is_orthogonal(left) & is_orthogonal(right)
+        proved &= self._within_a_turn(model, terms, around)
+        gains = influences(turned)
+        gains[:, self.still] = 0
+        return proved, np.array(self.active)[np.argmax(gains, axis=1)]
+
+    def _around(self, low: Array, high: Array) -> Around:
+        """Middles of the boxes, and the largest differences that two points of the whole with such middles have."""
+        rounding = 8 * UNIT * (np.abs(self.low) + np.abs(self.high))
+        centre, outer = (self.low + self.high) / 2, (self.high - self.low) / 2
+        nearest = np.maximum(np.maximum(low - centre, centre - high), 0)
+        room = np.maximum(outer - nearest, 0) * UP + rounding
+        half = (high - low) / 2 * UP + rounding
+        columns = list(self.active)
+        middles = np.ascontiguousarray(half.T[columns])
+        middles[list(self.still)] = 0
+        return Around((low + high).T[columns] / 2, middles, np.ascontiguousarray(room.T[columns]))
+
+    def _bounded(self, around: Around, own: Jets) -> Around:
+        """Smaller differences: for xi(q) = xi(p), each row w of a combination of coordinates has w Jm d = 0."""
+        model, terms = own.average(around, self.active)
+        centre = model.centre.transpose(2, 0, 1)
+        doubt = (model.deviation() + np.abs(terms).sum(axis=2) * UP).transpose(2, 0, 1)
+        r = centre.shape[1]
+        projected = np.linalg.pinv(np.nan_to_num(centre))[:, list(self.still)]
+        D = around.differences.copy()
+        for rows in (projected, np.broadcast_to(np.eye(r), (len(centre), r, r))):
+            sizes, least = _combined(rows, centre, doubt)
+            for row in range(sizes.shape[1]):
+                for k in self.still:
+                    others = (sizes[:, row] * D.T).sum(axis=1) - sizes[:, row, k] * D[k]
+                    bound = np.maximum(others, 0) * UP * UP / least[:, row, k]
+                    D[k] = np.where((least[:, row, k] > 0) & (bound < D[k]), bound * UP + TINY, D[k])
+        return replace(around, differences=D)
+
+    def _within_a_turn(self, model: TaylorModel, terms: Array, around: Around) -> NDArray[np.bool_]:
+        """Whether coordinates with a period change by less than it between two points, (boxes,)."""
+        circles = np.flatnonzero(self.turns)
+        size = model.magnitude()[circles] + np.abs(terms[circles]).sum(axis=2) * UP
+        change = 2 * (size * around.differences).sum(axis=1)
+        return np.asarray((change * UP < self.turns[circles, None]).all(axis=0))
+
+
+def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneJudge:
+    """The judge for a box in the domain of a chart, with rows whose vanishing differences are those of phi."""
+    problem, active, coordinates = chart.problem, rows.active, chart.coordinates
+    task: RowJets
+    tip, still = TipRows.of(problem.task), ()
+    if tip is not None:
+        task = TipJets.of(tip, problem.robot.tree, active, problem.domain)
+        leading = takewhile(lambda i: i not in rows.variables, chain_of(problem.robot.tree))
+        still = tuple(active.index(i) for i in leading if i in active)
+    else:
+        task = ModelJets(rows.task, tuple(range(chart.n)), active)
+    own: RowJets | None = None
+    if isinstance(rows.coordinates, ProductRows):
+        assert isinstance(coordinates, Coordinates) and isinstance(coordinates.family, ProductFamily)
+        own = ProductJets(ProductRows.of(coordinates.family, coordinates.theta, HIGHEST + 2))
+    elif rows.coordinates is not None:
+        own = ModelJets(rows.coordinates, active, active)
+    return OneToOneJudge(task, own, active, still, rows.turns, base.low, base.high)
+
+
+def _combined(rows: Array, centre: Array, doubt: Array) -> tuple[Array, Array]:
+    """Upper and lower bounds of the sizes of rows @ J for |J - centre| <= doubt, (boxes, rows, columns)."""
+    middle = np.abs(rows @ centre)
+    error = (np.abs(rows) @ (doubt + SUM * np.abs(centre))) * UP
+    return (middle + error) * UP, (middle - error) / UP
+
+
+@dataclass(frozen=True, eq=False)
+class ProductJets:
+    """The jets of coordinates in a product basis."""
+
+    rows: ProductRows
+
+    def __call__(self, q: Array, around: Around) -> Jets:
+        """Jets at the middles of boxes."""
+        return self.rows.jets(around)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelJets:
+    """The jets of rows that have Taylor models only."""
+
+    rows: CoordinateRows
+    joints: tuple[int, ...]  #: of the robot that the rows take
+    columns: tuple[int, ...]
+
+    def __call__(self, q: Array, around: Around) -> Jets:
+        """Jets at joint positions q (n, boxes)."""
+        reach, middle = np.zeros_like(q), q.copy()
+        reach[list(self.columns)] = around.reach * UP
+        low, high = (middle - reach).T, (middle + reach).T
+        joints, half = joint_models(low, high, self.columns)
+        model = self.rows([joints[i] for i in self.joints], half[list(self.joints)], self.columns)
+        return of_model(model, self.columns, half[list(self.columns)])

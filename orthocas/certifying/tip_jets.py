@@ -1,0 +1,154 @@
+"""Derivatives of the tip's motion at points, in closed form, with bounds that hold everywhere (ours).
+
+For joints i <= j <= ... <= l along the chain, d^k p / dq_i dq_j ... dq_l = a_i x (a_j x ... (a_l x (p - o_l))), with the
+axes a and origins o of the joints: each factor is a product with a unit vector, so its length is at most |p - o_l|.
+For the rotation R of the tip, [a_i]x [a_j]x ... [a_l]x R, of norm 1; R(q) - R(p) is taken to the frame of the middle
+by R(c)^T, and of the result its skew part is used. Where x(q) = x(p), these differences vanish too.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthocas.certifying.elementary import sine_and_cosine
+from orthocas.certifying.jets import HIGHEST, Around, Jets, multi_indices, neighbours
+from orthocas.certifying.rounding import UP
+from orthocas.certifying.task_rows import TipRows, chain_of, longest_reach, rotation_deviation
+from orthocas.checks import Array
+from orthocas.domains import Domain
+from orthocas.robots.tree import KinematicTree
+
+
+@dataclass(frozen=True, eq=False)
+class TipJets:
+    """The rows of a tip task in the axes of the world, for columns of some joints in increasing order."""
+
+    rows: TipRows
+    tree: KinematicTree
+    columns: tuple[int, ...]
+    lengths: Array  #: bounds of the distance from each joint's origin to the tip, 1 for prismatic joints, (columns,)
+    doubt: float  #: bound of the error of an entry, from rounding and rotations that are none
+
+    @classmethod
+    def of(cls, rows: TipRows, tree: KinematicTree, columns: tuple[int, ...], domain: Domain) -> "TipJets":
+        """For boxes within a domain."""
+        doubt = 64 * (tree.n + 8) * rotation_deviation(tree) * longest_reach(tree, domain)
+        chain = chain_of(tree)
+        slides = np.where(tree.prismatic, np.abs(domain.centre) + domain.half_width, 0.0)
+        steps = np.linalg.norm(tree.translations, axis=1) + slides
+        beyond = float(np.linalg.norm(tree.tip_translation))
+        lengths = dict.fromkeys(columns, 0.0)
+        for i in reversed(chain):
+            lengths[i] = 1.0 if tree.prismatic[i] else beyond
+            beyond += float(steps[i])
+        return cls(rows, tree, columns, np.array([lengths[i] for i in columns]) * (1 + 1e-9), doubt)
+
+    def __call__(self, q: Array, around: Around) -> Jets:
+        """Jets at joint positions q (all joints, boxes), the columns of which are the middles of the boxes."""
+        axes, arms, R = self._geometry(q)
+        turning = np.array([not self.tree.prismatic[i] for i in self.columns])
+        carried = np.array([i in chain_of(self.tree) for i in self.columns])
+        outer = axes * (turning & carried)[:, None, None]
+        parts, rests = [], []
+        if self.rows.position:
+            first = np.where(turning[:, None, None], np.cross(axes, arms, axis=1), axes) * carried[:, None, None]
+            parts.append(_nested(outer, first))
+            rests.append(np.repeat(_rest(around, self.lengths)[None], 3, axis=0))
+        if self.rows.rotation:
+            parts.append(_rotated(outer))
+            rests.append(np.repeat(self._rest_of_turns(around, turning & carried)[None], 3, axis=0))
+        if self.rows.axis is not None:
+            u = R[:, :, self.rows.axis]
+            across = R[:, :, [k for k in range(3) if k != self.rows.axis]]
+            nested = _nested(outer, np.cross(outer, np.broadcast_to(u.T[None], outer.shape), axis=1))
+            parts.append([np.einsum("bxk,mxb->mkb", across, each) for each in nested])
+            rests.append(np.repeat(self._rest_of_turns(around, turning & carried)[None], 2, axis=0))
+        n = len(self.columns)
+        derivatives = tuple(
+            np.concatenate([part[order][neighbours(n, order + 1)] for part in parts], axis=2).transpose(2, 0, 1, 3)
+            for order in range(HIGHEST + 1)
+        )
+        doubt = np.full((1, 1, 1, 1), self.doubt)
+        return Jets(derivatives, (doubt,) * (HIGHEST + 1), np.concatenate(rests) * UP)
+
+    def _rest_of_turns(self, around: Around, turning: Array) -> Array:
+        """The rest for vectors of length 1 that prismatic joints leave alone."""
+        still = ~np.asarray(turning)[:, None]
+        part = Around(around.centre, np.where(still, 0, around.middles), np.where(still, 0, around.differences))
+        return _rest(part, np.asarray(turning, dtype=float))
+
+    def _geometry(self, q: Array) -> tuple[Array, Array, Array]:
+        """Axes of the columns' joints and arms from their origins to the tip, (columns, 3, boxes); R, (boxes, 3, 3)."""
+        boxes = q.shape[1]
+        R, p = np.broadcast_to(np.eye(3), (boxes, 3, 3)), np.zeros((boxes, 3))
+        axes, origins = {}, {}
+        for i in chain_of(self.tree):
+            p = p + R @ self.tree.translations[i]
+            R = R @ self.tree.rotations[i]
+            if self.tree.prismatic[i]:
+                p = p + R[:, :, 2] * q[i][:, None]
+            else:
+                R = R @ _turns(q[i])
+            axes[i], origins[i] = R[:, :, 2], p
+        tip = p + R @ self.tree.tip_translation
+        nothing = np.zeros((boxes, 3))
+        own = np.stack([axes.get(i, nothing).T for i in self.columns])
+        arms = np.stack([(tip - origins.get(i, tip)).T for i in self.columns])
+        return own, arms, R @ self.tree.tip_rotation
+
+
+def _turns(angles: Array) -> Array:
+    """Rz, (boxes, 3, 3)."""
+    (s, _), (c, _) = sine_and_cosine(angles)
+    zero, one = np.zeros_like(s), np.ones_like(s)
+    return np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
+
+
+def _nested(axes: Array, first: Array) -> list[Array]:
+    """a_i x (a_j x ... first_l) for multi-indices i <= j <= ... <= l of orders 1 to 5, (multi-indices, 3, boxes)."""
+    found = [first]
+    for order in range(2, HIGHEST + 2):
+        outer, inner = _split(len(axes), order)
+        found.append(np.cross(axes[outer], found[-1][inner], axis=1))
+    return found
+
+
+def _rotated(axes: Array) -> list[Array]:
+    """The skew part of [a_i]x [a_j]x ... [a_l]x as a vector, for multi-indices of orders 1 to 5."""
+    n, _, boxes = axes.shape
+    crosses = np.zeros((n, 3, 3, boxes))
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        crosses[:, j, i], crosses[:, i, j] = axes[:, k], -axes[:, k]
+    found, product = [], crosses
+    for order in range(1, HIGHEST + 2):
+        if order > 1:
+            outer, inner = _split(n, order)
+            product = np.einsum("mijb,mjkb->mikb", crosses[outer], product[inner])
+        skew = [(product[:, (k + 2) % 3, (k + 1) % 3] - product[:, (k + 1) % 3, (k + 2) % 3]) / 2 for k in range(3)]
+        found.append(np.stack(skew, axis=1))
+    return found
+
+
+def _split(n: int, order: int) -> tuple[Array, Array]:
+    """The first joint of each multi-index of an order, and the place of the others among those of one order less."""
+    index = {m: k for k, m in enumerate(multi_indices(n, order - 1))}
+    indices = multi_indices(n, order)
+    return np.array([m[0] for m in indices]), np.array([index[m[1:]] for m in indices])
+
+
+def _rest(around: Around, lengths: Array) -> Array:
+    """What derivatives of J up to order 4 leave out of the average, (columns, boxes).
+
+    Of order 5 at the middle, the terms that are odd in d cancel; order 6 is bounded everywhere between the points. The
+    length of a derivative depends on the last of its joints: sums over joints up to each, weighted by their steps.
+    """
+    c, s = np.cumsum(around.middles, axis=0), np.cumsum(around.differences, axis=0)
+    fifth = (c**5 + 10 / 3 * c**3 * s**2 + c * s**4) / 120
+    sixth = sum((c + s) ** k * c ** (6 - k) for k in range(7)) / (7 * 720)
+    upto = (fifth + sixth) * UP
+    steps = np.diff(upto, axis=0, prepend=0.0) * lengths[:, None]
+    later = np.cumsum(steps[::-1], axis=0)[::-1]  # of the joint itself and those after it
+    before = upto - np.diff(upto, axis=0, prepend=0.0)
+    rest: Array = (later + before * lengths[:, None]) * UP
+    return rest
