@@ -121,7 +121,7 @@ def test_the_command_certifies_checks_and_shows(tmp_path: Path) -> None:
     assert "no fold everywhere" in command("certify", path, "--check").stdout
     assert json.loads(command("info", path, "--json").stdout)["certificate"]["proved"] is True
     oc.generate_c(oc.load(path), tmp_path / "c", name="arm")
-    assert "no fold everywhere on the domain (taylor-3/1" in (tmp_path / "c" / "arm.h").read_text()
+    assert "no fold everywhere on the domain (taylor-3/2" in (tmp_path / "c" / "arm.h").read_text()
 
 
 def test_the_command_fails_for_a_chart_that_folds(tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ from orthocas.checks import Array, require_kind, require_text
 from orthocas.errors import CertifyError, InvalidValueError
 from orthocas.showing import Shown, number_list
 
-METHOD = "taylor-3/1"  #: of this version; certificates of other methods cannot be checked
+#: Of this version; certificates of other methods cannot be checked. The one-to-one part of taylor-3/1 was unsound.
+METHOD = "taylor-3/2"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -18,7 +19,8 @@ class Certificate(Shown):
     """A proof about the chart with this fingerprint; see `orthocas.certify`.
 
     The parts of `regular` that are proved cover a share of the domain on which det J has one sign and, if `bound` is
-    above 0, the conditioning is at least `bound`. On the box `injective`, two different q never share phi.
+    above 0, the conditioning is at least `bound`. On the box `injective`, two different q never share phi. Certificates
+    of other methods have no such box: theirs is void.
     """
 
     fingerprint: str  #: of all that defines J
@@ -31,6 +33,7 @@ class Certificate(Shown):
     boxes: int = 0  #: judged to find the proof
     seconds: float = field(default=0.0)
     least_singular_value: float = 0.0  #: of a ClearBox; parts proved to lie outside it count as proved. 0: no ClearBox
+    dead: int = 0  #: number of unproved parts that are too small to halve: a longer search does not help there
 
     def __post_init__(self) -> None:
         for name in ("fingerprint", "method"):
@@ -38,6 +41,8 @@ class Certificate(Shown):
         require_kind("regular", self.regular, Subdivision)
         if not 0 <= self.bound < 1 or not 0 <= self.conditioning <= 1:
             raise InvalidValueError("bound and conditioning", (self.bound, self.conditioning), "numbers from 0 to 1")
+        if self.method != METHOD:
+            object.__setattr__(self, "injective", None)
 
     def require_for(self, fingerprint: str) -> None:
         """Raise CertifyError if the certificate is not one of the chart with this fingerprint."""
@@ -67,6 +72,8 @@ class Certificate(Shown):
         if self.injective is not None:
             half = (self.injective.high - self.injective.low) / 2
             facts["one-to-one"] = f"on the box of half-width {number_list(half)} around the centre"
+        elif self.method != METHOD:
+            facts["one-to-one"] = f"void, of an older method ({self.method}): certify the chart again"
         if self.least_singular_value > 0:
             facts["left out"] = f"where the task's relative singular value is at most {self.least_singular_value:g}"
         low, high = self.unproved
@@ -74,6 +81,10 @@ class Certificate(Shown):
             largest = int(np.argmax((high - low).prod(axis=1)))
             at = number_list((low[largest] + high[largest]) / 2)
             facts["not proved"] = f"{len(low)} boxes, the largest at q = ({at})"
+        if self.dead and not self.fold:
+            facts["given up"] = (
+                f"{self.dead} boxes are too small to halve: J is nearly singular there, or folds; more time does not help"
+            )
         facts["boxes"] = f"{self.regular.proved_count} proved, {self.boxes} judged, {self.seconds:.3g} s"
         facts["method"] = f"{self.method}, chart {self.fingerprint[:12]}"
         return facts
@@ -89,6 +100,7 @@ class Certificate(Shown):
             "boxes": self.boxes,
             "parts": self.regular.proved_count,
             "unproved": self.regular.open_count,
+            "dead": self.dead,
             "seconds": self.seconds,
             "one_to_one_half_width": None if one is None else ((one.high - one.low) / 2).tolist(),
             "fold": [list(point) for point in self.fold],

@@ -23,8 +23,8 @@ from orthocas.minimising.watch import Monitor, Progress, silent
 from orthocas.parametrisations import CyclicParametrisation
 
 _SAMPLES = 20_000  # points where folds are looked for before the proof
-_INJECTIVE_BOXES = 500  # for each scale of the domain that is tried
-_SCALES = tuple(0.9**k for k in range(25, -1, -1))
+_SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
+_FEW_BOXES, _MANY_BOXES, _HOPELESS = 300, 50_000, 2_000  # for one scale; then a search that goes too slowly ends
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
 
@@ -42,8 +42,9 @@ def certify(
     The domain is halved again and again, until J is proved nonsingular on each part: by Taylor models of degree 3 with
     remainders that include all rounding, taken to the singular vectors of their centre, and elimination. The robot's
     numbers and those of the chart are taken as they are in the file. Samples are no part of the proof; they only find
-    folds early. Also proved is the largest box, a scaled copy of the domain, on which phi is one-to-one by a
-    sufficient condition: the symmetric part of J(centre)^-1 J(q) is positive definite.
+    folds early. Also proved is a large box around the centre on which phi is one-to-one: the average of J between any
+    two of its points is nonsingular, see `orthocas.certifying.one_to_one`. It has the domain's proportions, but a joint
+    on which J does not depend keeps its whole range if it can.
 
     In a `ClearBox`, parts need no proof that are proved, by the same arithmetic, to lie outside: the relative singular
     value of the task is at most the bound there. They count as proved in the share of the box. So do parts of the box
@@ -188,7 +189,7 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
     """Raise CertifyError unless a certificate is one of this chart and of this version's method."""
     require_kind("certificate", certificate, Certificate)
     if certificate.method != METHOD:
-        raise CertifyError(f"the certificate is of method {certificate.method}, expected {METHOD}")
+        raise CertifyError(f"the certificate is of method {certificate.method}, expected {METHOD}: certify it again")
     certificate.require_for(fingerprint(chart.problem, chart.coordinates))
     domain = whole_domain(chart.problem.domain)
     if not (
@@ -240,27 +241,47 @@ def _suspects(chart: Chart) -> Array:
 def _one_to_one(
     chart: Chart, rows: ChartRows, base: Subdivision, seconds: float, executor: Executor | None, monitor: Monitor
 ) -> Subdivision | None:
-    """The largest of some boxes around the centre with a proof, and its parts; None if there is no proof for any."""
+    """The largest of some boxes around the centre with a proof, and its parts; None if there is no proof for any.
+
+    Joints that the first bounds of the differences hold keep their whole range. A few boxes are enough for most
+    scales; from there, larger ones are tried with more, until one of them would take too many.
+    """
     end = time.monotonic() + seconds
-    best = None
-    low, high = 0, len(_SCALES)  # the scales before `low` are proved, those from `high` on are not
-    while low < high:
-        middle = (low + high) // 2
-        part = _scaled(base, _SCALES[middle])
-        limits = Limits(max(end - time.monotonic(), 0.0), boxes=_INJECTIVE_BOXES)
-        judge = one_to_one_judge(chart, rows, part)
-        search = Search(judge, part, limits, largest_first(part), executor)
+    judge = one_to_one_judge(chart, rows, base)
+    best: Subdivision | None = None
+
+    def proved(share: Array, most: int) -> bool:
+        nonlocal best
+        part = _scaled(base, share)
+        middle, own = (part.low + part.high)[None] / 2, judge.on(part)
+        if not own(middle, middle).proved.all():  # the middle of points that may be farthest apart
+            return False
+        limits = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=_HOPELESS)
+        search = Search(own, part, limits, largest_first(part), executor)
         search.run(_shown(monitor, "one-to-one"))
         if search.finished:
-            best, low = search.subdivision(), middle + 1
-        else:
-            high = middle
+            best = search.subdivision()
+        return search.finished
+
+    for held in [judge.still_joints, ()] if judge.still_joints else [()]:
+        shares = [np.where(np.isin(np.arange(chart.n), held), 1.0, scale) for scale in _SCALES]
+        low, high = 0, len(shares)  # the scales before `low` are proved, those from `high` on are not with few boxes
+        while low < high:
+            middle = (low + high) // 2
+            low, high = (middle + 1, high) if proved(shares[middle], _FEW_BOXES) else (low, middle)
+        while best is not None and low < len(shares) and proved(shares[low], _MANY_BOXES):
+            low = min(low + 2, len(shares) - 1) if low + 1 < len(shares) else len(shares)
+        if best is not None:
+            break
     return best
 
 
-def _scaled(base: Subdivision, scale: float) -> Subdivision:
+def _scaled(base: Subdivision, share: Array) -> Subdivision:
+    """A box about the same centre, with so much of the width of each joint, (n,)."""
     middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
-    return Subdivision.whole(*((base.low, base.high) if scale == 1 else (middle - scale * half, middle + scale * half)))
+    whole = share == 1
+    low, high = np.where(whole, base.low, middle - share * half), np.where(whole, base.high, middle + share * half)
+    return Subdivision.whole(low, high)
 
 
 def proved_scale(parts: Subdivision) -> float:
@@ -295,6 +316,7 @@ def _certificate(
         before[0] + search.judged,
         before[1] + seconds,
         getattr(chart.problem.domain, "least_singular_value", 0.0),
+        search.dead,
     )
 
 

@@ -13,12 +13,12 @@ from math import factorial, prod
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.certifying.monomials import Monomial, Variables, monomials
+from orthocas.certifying.monomials import DEGREE, Monomial, Variables, monomials
 from orthocas.certifying.rounding import SUM, TINY, UP
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.checks import Array
 
-HIGHEST = 4  #: order of the derivatives of J that are known at the middle
+ORDERS = (4, 6)  #: of the derivatives of J that are used, at most: more of them cost more and leave less out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,6 +28,11 @@ class Around:
     centre: Array  #: c, (n, boxes)
     middles: Array  #: C, (n, boxes)
     differences: Array  #: D, (n, boxes)
+    order: int = ORDERS[0]  #: of the derivatives of J that are used at most, even
+
+    def __getitem__(self, boxes: NDArray[np.intp]) -> "Around":
+        """Some of the boxes."""
+        return Around(self.centre[:, boxes], self.middles[:, boxes], self.differences[:, boxes], self.order)
 
     @property
     def reach(self) -> Array:
@@ -40,7 +45,9 @@ class Around:
 class Jets:
     """Some rows of J: their derivatives at the middle, and what these leave out of the average."""
 
-    derivatives: tuple[Array, ...]  #: of order 0 to 4, (rows, columns, multi-indices of that order, boxes)
+    derivatives: tuple[
+        Array, ...
+    ]  #: of order 0 to that of the boxes, (rows, columns, multi-indices of that order, boxes)
     doubts: tuple[Array, ...]  #: bounds of their errors, of shapes that broadcast to theirs
     rest: Array  #: (rows, columns, boxes)
 
@@ -55,34 +62,35 @@ class Jets:
     def average(self, around: Around, variables: Variables) -> tuple[TaylorModel, Array]:
         """The average of J as a model in the middle, and terms (rows, columns, terms, boxes) with signs of their own.
 
-        The terms of squares of one joint's difference are never negative: half of them goes to the centre.
+        The rest comes on top of both. The terms of squares of one joint's difference are never negative: half of them goes to the centre.
         """
-        weights = [power_weights(around, order) for order in range(HIGHEST + 1)]
-        model = [d * w[:, 0] for d, w in zip(self.derivatives[:HIGHEST], weights, strict=False)]
+        weights = [power_weights(around, order) for order in range(around.order + 1)]
+        model = [d * w[:, 0] for d, w in zip(self.derivatives[: DEGREE + 1], weights, strict=False)]
         squared = self.derivatives[2] * (weights[2][:, 2] / 3)
         alone = [place for place, m in enumerate(multi_indices(len(around.centre), 2)) if m[0] == m[1]]
         squared[:, :, alone] /= 2
         centre = model[0][:, :, 0] + squared[:, :, alone].sum(axis=2)
         mixed = self.derivatives[3] * (weights[3][:, 2] / 3)
-        last = self.derivatives[4] * even_average(weights[4])
-        terms = np.concatenate([squared, mixed, last], axis=2)
+        higher = [self.derivatives[k] * even_average(weights[k]) for k in range(DEGREE + 1, around.order + 1)]
+        terms = np.concatenate([squared, mixed, *higher], axis=2)
         coefficients = np.concatenate([centre[:, :, None], *model[1:]], axis=2)
         doubt = sum((e * even_average(w)).sum(axis=2) for e, w in zip(self.doubts, weights, strict=True))
         size = np.abs(coefficients).sum(axis=2) + np.abs(terms).sum(axis=2)
-        remainder = (self.rest + doubt + SUM * size) * UP + TINY
+        remainder = (doubt + SUM * size) * UP + TINY
         return TaylorModel(variables, np.ascontiguousarray(coefficients.transpose(2, 0, 1, 3)), remainder), terms
 
 
-def of_model(model: TaylorModel, columns: Variables, reach: Array) -> Jets:
+def of_model(model: TaylorModel, columns: Variables, reach: Array, highest: int) -> Jets:
     """The jets of a model (rows, columns, boxes) on boxes of half-widths `reach` (columns, boxes)."""
     whole = model.over(columns)
     derivatives, start, n = [], 0, len(columns)
-    for order in range(HIGHEST):
+    for order in range(DEGREE + 1):
         count = len(multi_indices(n, order))
         part = whole.coefficients[start : start + count].transpose(1, 2, 0, 3)
         derivatives.append(part / powers(reach, order))
         start += count
-    derivatives.append(np.zeros((*whole.remainder.shape[:2], len(multi_indices(n, HIGHEST)), reach.shape[1])))
+    for order in range(DEGREE + 1, highest + 1):
+        derivatives.append(np.zeros((*whole.remainder.shape[:2], len(multi_indices(n, order)), reach.shape[1])))
     doubts = tuple(SUM * np.abs(each) for each in derivatives)
     return Jets(tuple(derivatives), doubts, whole.remainder)
 

@@ -14,6 +14,7 @@ from orthocas.certifying.taylor import TaylorModel
 from orthocas.certifying.volume import conditioning_bound
 from orthocas.checks import Array
 
+UNKNOWN = -1
 _AT_ONCE = 64  # boxes whose models fit into the cache of a processor
 
 
@@ -25,11 +26,16 @@ class Verdicts:
     regular: Array  #: (boxes,) bool: det J has the sign below on the whole box
     sign: Array  #: (boxes,) of det J at the middle of the box: +1, -1, or 0 where it is unclear
     conditioning: Array  #: (boxes,) lower bounds; 0 where none is known
-    widest: Array  #: (boxes,) the joint to halve
+    widest: Array  #: (boxes,) the joint to halve; `UNKNOWN` where bounds are infinite, so none is known to help most
 
 
 class Judge(Protocol):
     """A test of boxes. Judges can be pickled, so that processes and machines can share the work."""
+
+    @property
+    def joints(self) -> Variables:
+        """The joints on which the verdict depends: halving others is of no use."""
+        ...
 
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
@@ -43,6 +49,11 @@ class RegularityJudge:
     rows: ChartRows
     bound: float
 
+    @property
+    def joints(self) -> Variables:
+        """The joints that J depends on."""
+        return self.rows.variables
+
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
         with one_blas_thread():  # small products, and the same rounding everywhere
@@ -55,7 +66,7 @@ class RegularityJudge:
             regular = all_positive(pivots(turned)) & (signs != 0)
         conditioning = np.zeros(len(signs))
         if self.bound > 0 and regular.any():
-            conditioning[regular] = conditioning_bound(_chosen(J, regular), self.rows.m)
+            conditioning[regular] = conditioning_bound(chosen(J, regular), self.rows.m)
         proved = regular & (conditioning >= self.bound)
         return proved, regular, signs, conditioning, influences(turned)
 
@@ -69,17 +80,24 @@ def influences(turned: TaylorModel) -> Array:
     """How much halving each variable narrows the matrix, relative to its singular values, (boxes, variables)."""
     middle = np.sqrt(np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))])) + 1e-300)
     influences: Array = (turned.gains() / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T
-    return np.nan_to_num(influences)
+    return influences
+
+
+def most_influential(influences: Array, joints: Variables) -> Array:
+    """The joint of the largest influence on each box, (boxes,); `UNKNOWN` where they are not finite."""
+    known = np.isfinite(influences).all(axis=1)
+    return np.where(known, np.array(joints)[np.argmax(np.nan_to_num(influences), axis=1)], UNKNOWN)
 
 
 def _parts(J: TaylorModel) -> list[TaylorModel]:
-    return [_chosen(J, slice(k, k + _AT_ONCE)) for k in range(0, J.remainder.shape[-1], _AT_ONCE)]
+    return [chosen(J, slice(k, k + _AT_ONCE)) for k in range(0, J.remainder.shape[-1], _AT_ONCE)]
 
 
-def _chosen(J: TaylorModel, boxes: slice | NDArray[np.bool_]) -> TaylorModel:
+def chosen(J: TaylorModel, boxes: slice | NDArray[np.bool_]) -> TaylorModel:
+    """The models of some of the boxes."""
     return TaylorModel(J.variables, J.coefficients[..., boxes], J.remainder[..., boxes])
 
 
 def _joined(parts: list[tuple[Array, ...]], variables: Variables) -> Verdicts:
     proved, regular, sign, conditioning, influences = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return Verdicts(proved, regular, sign, conditioning, np.array(variables)[np.argmax(influences, axis=1)])
+    return Verdicts(proved, regular, sign, conditioning, most_influential(influences, variables))

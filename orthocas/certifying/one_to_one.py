@@ -17,8 +17,8 @@ from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.certificates.subdivision import Subdivision
 from orthocas.certifying.chart_rows import ChartRows, CoordinateRows, joint_models
 from orthocas.certifying.elimination import between, is_orthogonal, pivots, singular_vectors
-from orthocas.certifying.jets import HIGHEST, Around, Jets, of_model
-from orthocas.certifying.judges import Verdicts, all_positive, influences
+from orthocas.certifying.jets import ORDERS, Around, Jets, of_model
+from orthocas.certifying.judges import Verdicts, all_positive, chosen, influences, most_influential
 from orthocas.certifying.product_rows import ProductRows
 from orthocas.certifying.rounding import SUM, TINY, UNIT, UP
 from orthocas.certifying.task_rows import TipRows, chain_of
@@ -29,7 +29,7 @@ from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.parametrisations.product_basis import ProductFamily
 
-AT_ONCE = 32  #: boxes, whose terms fit into the cache of a processor
+_AT_ONCE = 48  #: boxes, whose terms fit into the cache of a processor
 _ROUNDS = 2  # of bounds of the differences by the coordinates
 RowJets = Callable[[Array, Around], Jets]  #: joint positions (n, boxes), and boxes of the active joints
 
@@ -46,33 +46,60 @@ class OneToOneJudge:
     low: Array  #: of the whole, (n,)
     high: Array
 
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """The joints whose middles matter."""
+        return tuple(joint for k, joint in enumerate(self.active) if k not in self.still)
+
+    @property
+    def still_joints(self) -> tuple[int, ...]:
+        """The joints of the columns `still`."""
+        return tuple(self.active[k] for k in self.still)
+
+    def on(self, part: Subdivision) -> "OneToOneJudge":
+        """The judge for another whole."""
+        return replace(self, low=part.low, high=part.high)
+
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
         found = []
         with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            for k in range(0, len(low), AT_ONCE):
-                found.append(self._few(low[k : k + AT_ONCE], high[k : k + AT_ONCE]))
+            for k in range(0, len(low), _AT_ONCE):
+                found.append(self._few(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE]))
         proved, widest = (np.concatenate(each) for each in zip(*found, strict=True))
         nothing = np.zeros(len(low))
         return Verdicts(proved, proved, nothing, nothing, widest)
 
     def _few(self, low: Array, high: Array) -> tuple[Array, Array]:
-        q = (low + high).T / 2
-        around = self._around(low, high)
+        q, around = (low + high).T / 2, self._around(low, high)
         for _ in range(_ROUNDS if self.still and self.coordinates else 0):
             around = self._bounded(around, self.coordinates(q, around))
+        proved, widest, promising = self._judged(q, around)
+        for order in ORDERS[1:]:
+            again = np.flatnonzero(promising)
+            if again.size:
+                proved[again], widest[again], promising[again] = self._judged(
+                    q[:, again], replace(around[again], order=order)
+                )
+        return proved, widest
+
+    def _judged(self, q: Array, around: Around) -> tuple[Array, Array, Array]:
+        """Whether boxes are proved, the joint to halve, and whether they might be proved with higher derivatives."""
         jets = Jets.joined([rows(q, around) for rows in (self.task, self.coordinates) if rows])
         model, terms = jets.average(around, self.active)
         left, right = singular_vectors(model)
         turned = between(left, model, right)
-        spread = np.abs(left[:, None] @ terms.transpose(3, 2, 0, 1) @ right[:, None]).sum(axis=1)
-        spread = spread + SUM * (np.abs(left) @ np.abs(terms).sum(axis=2).transpose(2, 0, 1) @ np.abs(right))
-        turned = replace(turned, remainder=(turned.remainder + spread.transpose(1, 2, 0)) * UP)
-        proved = all_positive(pivots(turned)) & is_orthogonal(left) & is_orthogonal(right)
-        proved &= self._within_a_turn(model, terms, around)
-        gains = influences(turned)
+        known = replace(turned, remainder=(turned.remainder + _spread(left, terms, right)) * UP)
+        rest = (np.abs(left) @ jets.rest.transpose(2, 0, 1) @ np.abs(right)).transpose(1, 2, 0) * UP
+        all_ = replace(known, remainder=(known.remainder + rest) * UP)
+        sound = is_orthogonal(left) & is_orthogonal(right) & self._within_a_turn(jets, model, terms, around)
+        gains = influences(all_)
         gains[:, self.still] = 0
-        return proved, np.array(self.active)[np.argmax(gains, axis=1)]
+        proved = all_positive(pivots(all_)) & sound
+        promising = ~proved & sound
+        if around.order < ORDERS[-1] and promising.any():
+            promising[promising] = all_positive(pivots(chosen(known, promising)))
+        return proved, most_influential(gains, self.active), promising
 
     def _around(self, low: Array, high: Array) -> Around:
         """Middles of the boxes, and the largest differences that two points of the whole with such middles have."""
@@ -90,7 +117,7 @@ class OneToOneJudge:
         """Smaller differences: for xi(q) = xi(p), each row w of a combination of coordinates has w Jm d = 0."""
         model, terms = own.average(around, self.active)
         centre = model.centre.transpose(2, 0, 1)
-        doubt = (model.deviation() + np.abs(terms).sum(axis=2) * UP).transpose(2, 0, 1)
+        doubt = (model.deviation() + (np.abs(terms).sum(axis=2) + own.rest) * UP).transpose(2, 0, 1)
         r = centre.shape[1]
         projected = np.linalg.pinv(np.nan_to_num(centre))[:, list(self.still)]
         D = around.differences.copy()
@@ -103,10 +130,10 @@ class OneToOneJudge:
                     D[k] = np.where((least[:, row, k] > 0) & (bound < D[k]), bound * UP + TINY, D[k])
         return replace(around, differences=D)
 
-    def _within_a_turn(self, model: TaylorModel, terms: Array, around: Around) -> NDArray[np.bool_]:
+    def _within_a_turn(self, jets: Jets, model: TaylorModel, terms: Array, around: Around) -> NDArray[np.bool_]:
         """Whether coordinates with a period change by less than it between two points, (boxes,)."""
         circles = np.flatnonzero(self.turns)
-        size = model.magnitude()[circles] + np.abs(terms[circles]).sum(axis=2) * UP
+        size = model.magnitude()[circles] + (np.abs(terms[circles]).sum(axis=2) + jets.rest[circles]) * UP
         change = 2 * (size * around.differences).sum(axis=1)
         return np.asarray((change * UP < self.turns[circles, None]).all(axis=0))
 
@@ -125,10 +152,22 @@ def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToO
     own: RowJets | None = None
     if isinstance(rows.coordinates, ProductRows):
         assert isinstance(coordinates, Coordinates) and isinstance(coordinates.family, ProductFamily)
-        own = ProductJets(ProductRows.of(coordinates.family, coordinates.theta, HIGHEST + 2))
+        own = ProductJets(ProductRows.of(coordinates.family, coordinates.theta, ORDERS[-1] + 2))
     elif rows.coordinates is not None:
         own = ModelJets(rows.coordinates, active, active)
     return OneToOneJudge(task, own, active, still, rows.turns, base.low, base.high)
+
+
+def _spread(left: Array, terms: Array, right: Array) -> Array:
+    """Sums of |left @ term @ right| over the terms (rows, columns, terms, boxes), (rows, columns, boxes)."""
+    rows, columns, count, boxes = terms.shape
+    parts = np.ascontiguousarray(terms.transpose(3, 0, 1, 2))
+    products = (left @ parts.reshape(boxes, rows, columns * count)).reshape(boxes, rows, columns, count)
+    products = right.transpose(0, 2, 1)[:, None] @ products
+    sums = np.abs(products, out=products).sum(axis=3)
+    sizes = np.abs(left) @ np.abs(parts, out=parts).sum(axis=3) @ np.abs(right)
+    spread: Array = (sums * UP + SUM * sizes).transpose(1, 2, 0)
+    return spread
 
 
 def _combined(rows: Array, centre: Array, doubt: Array) -> tuple[Array, Array]:
@@ -164,4 +203,4 @@ class ModelJets:
         low, high = (middle - reach).T, (middle + reach).T
         joints, half = joint_models(low, high, self.columns)
         model = self.rows([joints[i] for i in self.joints], half[list(self.joints)], self.columns)
-        return of_model(model, self.columns, half[list(self.columns)])
+        return of_model(model, self.columns, half[list(self.columns)], around.order)

@@ -11,7 +11,7 @@ from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.certifying.chart_rows import ChartRows, GraphRows, joint_models
 from orthocas.certifying.elimination import between, is_orthogonal, singular_vectors
 from orthocas.certifying.graph import TaylorGraph
-from orthocas.certifying.judges import Judge, RegularityJudge, Verdicts
+from orthocas.certifying.judges import Judge, RegularityJudge, Verdicts, most_influential
 from orthocas.certifying.monomials import Variables
 from orthocas.certifying.rounding import UP
 from orthocas.certifying.task_rows import task_rows
@@ -42,6 +42,11 @@ class OutsideJudge:
     sign: float  #: of det J at the centre of the domain
     variables: Variables
 
+    @property
+    def joints(self) -> Variables:
+        """The joints that J or the bound depends on."""
+        return tuple(sorted({*self.inside.joints, *self.variables}))
+
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
         found = self.inside(low, high)
@@ -67,10 +72,10 @@ class OutsideJudge:
             sizes = least.magnitude()
             squared = (sizes**2).sum(axis=0) * UP
             squared += _GUARDS * (J.magnitude() ** 2).sum(axis=(0, 1))
-            influences = np.nan_to_num((least.gains() * sizes).sum(axis=1))
+            influences = (least.gains() * sizes).sum(axis=1)
         small = squared <= self.domain.least_singular_value**2 * (1 - _LENGTHS)
         outside: Array = small & is_orthogonal(left) & is_orthogonal(right)
-        return outside, np.array(least.variables)[np.argmax(influences, axis=0)]
+        return outside, most_influential(influences.T, least.variables)
 
 
 def _least_row(turned: TaylorModel) -> TaylorModel:
@@ -97,6 +102,11 @@ class CorridorJudge:
     domain: Corridor
     sign: float
 
+    @property
+    def joints(self) -> Variables:
+        """All joints: parts may lie outside in each of them."""
+        return tuple(range(self.domain.n))
+
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
         middle, half = (low + high) / 2, (high - low) / 2
@@ -121,7 +131,8 @@ def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
     if not isinstance(domain, ClearBox):
         return judge
     q = ca.SX.sym("q", chart.n)
-    task, same = chart.problem.task, bool((domain.scale == domain.scale[0]).all())
+    task = chart.problem.task  # rotated rows have the singular values of x for positions only
+    same = task.recipe["kind"] == "position:xyz" and bool((domain.scale == domain.scale[0]).all())
     turned, allowance = task_rows(task, domain) if same else (task.jacobian_function, 0.0)
     J = ca.densify(turned(q) / ca.repmat(ca.DM(domain.scale), 1, chart.n))
     graph = TaylorGraph.of(dense_function("scaled_rows", [q], [J]), "the task")

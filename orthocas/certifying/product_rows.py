@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.certifying.graph import TaylorGraph
 from orthocas.certifying.jets import (
-    HIGHEST,
     Around,
     Jets,
     largest_average,
@@ -48,7 +47,7 @@ class ProductRows:
     terms: Array  #: (1 + K, n): the one-joint function of each joint
     functions: TaylorGraph  #: q -> the one-joint functions that are not constant
     numbers: Array  #: (n, functions of one joint): where each is among them
-    orders: tuple[Derivatives, ...]  #: orders 1 to 5, or 6 for jets
+    orders: tuple[Derivatives, ...]  #: from order 1 on
 
     @classmethod
     def of(cls, family: ProductFamily, theta: Array, highest: int = DEGREE + 2) -> "ProductRows":
@@ -89,13 +88,13 @@ class ProductRows:
         return {i for index, there in zip(indices, sizes.tolist(), strict=True) if there for i in index}
 
     def jets(self, around: Around) -> Jets:
-        """The derivatives of J_xi at the middles of boxes. By Lagrange, order 5 bounds the rest of the average."""
+        """The derivatives of J_xi at the middles of boxes. By Lagrange, the next order bounds the rest of the average."""
         points = [TaylorModel.constant(np.ascontiguousarray(c)) for c in around.centre]
         values, errors = self._basis(self.functions(points))
-        known = [self._derivatives(order, values, errors) for order in range(1, HIGHEST + 2)]
+        known = [self._derivatives(order, values, errors) for order in range(1, around.order + 2)]
         linear = np.stack([around.centre, around.reach, *np.zeros((2, *around.centre.shape))], axis=1)
         boxes = [TaylorModel((k,), each, np.zeros(each.shape[1:])) for k, each in enumerate(linear)]
-        left_out = self._largest(HIGHEST + 2, boxes) * largest_average(power_weights(around, HIGHEST + 1))
+        left_out = self._largest(around.order + 2, boxes) * largest_average(power_weights(around, around.order + 1))
         derivatives, doubts = zip(*known, strict=True)
         return Jets(derivatives, doubts, left_out.sum(axis=2) * UP + TINY)
 
@@ -147,6 +146,10 @@ def _orders(family: ProductFamily, terms: Array, C: Array, highest: int) -> tupl
     orders = []
     for order in range(1, highest + 1):
         indices = multi_indices(n, order)
+        if orders and not len(orders[-1].used):  # a polynomial of a lower degree
+            nothing = np.zeros((len(indices) * len(C), 0))
+            orders.append(Derivatives(orders[-1].used, nothing, nothing, 0.0))
+            continue
         for index in indices:
             values, sizes = known[index[:-1]]
             step = steps[index[-1]]

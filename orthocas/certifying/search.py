@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from orthocas.certificates.subdivision import MOST_BOXES, OPEN, PROVED, Subdivision, halfway
-from orthocas.certifying.judges import Judge, Verdicts
+from orthocas.certifying.judges import UNKNOWN, Judge, Verdicts
 from orthocas.checks import Array
 
 BATCH = 512  #: most boxes of one task
@@ -30,6 +30,7 @@ class Limits:
     smallest: float = 2.0**-12  #: share of the width of the whole below which a joint's interval is not halved
     first_failure: bool = False  #: whether boxes that rank behind one that is too small to halve do not matter
     folds: bool = True  #: whether a fold ends the search
+    hopeless: int = MOST_BOXES  #: boxes after which the search ends if the rest would take more than `boxes`
 
 
 @dataclass(eq=False)
@@ -44,6 +45,7 @@ class Search:
     judged: int = 0
     proved_volume: float = 0.0  #: share of the whole
     failed: float = np.inf  #: least rank of the boxes too small to halve
+    dead: int = 0  #: number of boxes too small to halve
     conditioning: float = np.inf  #: least of the lower bounds on proved boxes
     signs: dict[int, Array] = field(default_factory=dict)  #: sign of det J -> a point that has it
     _codes: list[int] = field(default_factory=list)
@@ -72,7 +74,7 @@ class Search:
         pending: dict[Future[Verdicts], list[tuple[float, int, Array, Array]]] = {}
         try:
             while self._waiting or pending:
-                if self._decided or clock() > end or self.judged >= self.limits.boxes:
+                if self._decided or clock() > end or self.judged >= self.limits.boxes or self._hopeless:
                     break
                 self._step(pending)
                 look(self)
@@ -80,6 +82,12 @@ class Search:
             for future, batch in pending.items():
                 future.cancel()
                 self._return(batch)
+
+    @property
+    def _hopeless(self) -> bool:
+        """Whether all would take too many boxes, if it goes on as slowly as so far."""
+        late = self.judged > self.limits.hopeless
+        return late and self.judged > self.proved_volume * self.limits.boxes
 
     @property
     def _decided(self) -> bool:
@@ -147,12 +155,17 @@ class Search:
             self.conditioning = min(self.conditioning, float(verdicts.conditioning[proved].min()))
             self.proved_volume += float(_shares(self.base, low[proved], high[proved]).sum())
         for k, (rank, place, a, b) in enumerate(batch):
-            joint = int(verdicts.widest[k])
             if proved[k]:
                 self._codes[place] = PROVED
-            elif b[joint] - a[joint] > self.limits.smallest * (self.base.high[joint] - self.base.low[joint]):
+                continue
+            shares = (b - a) / (self.base.high - self.base.low)
+            joint = int(verdicts.widest[k])
+            if joint == UNKNOWN:  # the relatively widest one: any choice that stays the same may never help
+                joint = max(self.judge.joints, key=lambda i: float(shares[i]))
+            if shares[joint] > self.limits.smallest:
                 self._halve(place, a, b, joint)
             else:
+                self.dead += 1
                 self.failed = min(self.failed, rank)
 
     def _halve(self, place: int, low: Array, high: Array, joint: int) -> None:

@@ -7,11 +7,12 @@ by R(c)^T, and of the result its skew part is used. Where x(q) = x(p), these dif
 """
 
 from dataclasses import dataclass
+from math import comb, factorial
 
 import numpy as np
 
 from orthocas.certifying.elementary import sine_and_cosine
-from orthocas.certifying.jets import HIGHEST, Around, Jets, multi_indices, neighbours
+from orthocas.certifying.jets import Around, Jets, multi_indices, neighbours
 from orthocas.certifying.rounding import UP
 from orthocas.certifying.task_rows import TipRows, chain_of, longest_reach, rotation_deviation
 from orthocas.checks import Array
@@ -52,24 +53,24 @@ class TipJets:
         parts, rests = [], []
         if self.rows.position:
             first = np.where(turning[:, None, None], np.cross(axes, arms, axis=1), axes) * carried[:, None, None]
-            parts.append(_nested(outer, first))
+            parts.append(_nested(outer, first, around.order))
             rests.append(np.repeat(_rest(around, self.lengths)[None], 3, axis=0))
         if self.rows.rotation:
-            parts.append(_rotated(outer))
+            parts.append(_rotated(outer, around.order))
             rests.append(np.repeat(self._rest_of_turns(around, turning & carried)[None], 3, axis=0))
         if self.rows.axis is not None:
             u = R[:, :, self.rows.axis]
             across = R[:, :, [k for k in range(3) if k != self.rows.axis]]
-            nested = _nested(outer, np.cross(outer, np.broadcast_to(u.T[None], outer.shape), axis=1))
+            nested = _nested(outer, np.cross(outer, np.broadcast_to(u.T[None], outer.shape), axis=1), around.order)
             parts.append([np.einsum("bxk,mxb->mkb", across, each) for each in nested])
             rests.append(np.repeat(self._rest_of_turns(around, turning & carried)[None], 2, axis=0))
         n = len(self.columns)
         derivatives = tuple(
             np.concatenate([part[order][neighbours(n, order + 1)] for part in parts], axis=2).transpose(2, 0, 1, 3)
-            for order in range(HIGHEST + 1)
+            for order in range(around.order + 1)
         )
         doubt = np.full((1, 1, 1, 1), self.doubt)
-        return Jets(derivatives, (doubt,) * (HIGHEST + 1), np.concatenate(rests) * UP)
+        return Jets(derivatives, (doubt,) * (around.order + 1), np.concatenate(rests) * UP)
 
     def _rest_of_turns(self, around: Around, turning: Array) -> Array:
         """The rest for vectors of length 1 that prismatic joints leave alone."""
@@ -104,24 +105,24 @@ def _turns(angles: Array) -> Array:
     return np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
 
 
-def _nested(axes: Array, first: Array) -> list[Array]:
-    """a_i x (a_j x ... first_l) for multi-indices i <= j <= ... <= l of orders 1 to 5, (multi-indices, 3, boxes)."""
+def _nested(axes: Array, first: Array, highest: int) -> list[Array]:
+    """a_i x (a_j x ... first_l) for multi-indices i <= j <= ... <= l from order 1 on, (multi-indices, 3, boxes)."""
     found = [first]
-    for order in range(2, HIGHEST + 2):
+    for order in range(2, highest + 2):
         outer, inner = _split(len(axes), order)
         found.append(np.cross(axes[outer], found[-1][inner], axis=1))
     return found
 
 
-def _rotated(axes: Array) -> list[Array]:
-    """The skew part of [a_i]x [a_j]x ... [a_l]x as a vector, for multi-indices of orders 1 to 5."""
+def _rotated(axes: Array, highest: int) -> list[Array]:
+    """The skew part of [a_i]x [a_j]x ... [a_l]x as a vector, for multi-indices from order 1 on."""
     n, _, boxes = axes.shape
     crosses = np.zeros((n, 3, 3, boxes))
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         crosses[:, j, i], crosses[:, i, j] = axes[:, k], -axes[:, k]
     found, product = [], crosses
-    for order in range(1, HIGHEST + 2):
+    for order in range(1, highest + 2):
         if order > 1:
             outer, inner = _split(n, order)
             product = np.einsum("mijb,mjkb->mikb", crosses[outer], product[inner])
@@ -138,15 +139,17 @@ def _split(n: int, order: int) -> tuple[Array, Array]:
 
 
 def _rest(around: Around, lengths: Array) -> Array:
-    """What derivatives of J up to order 4 leave out of the average, (columns, boxes).
+    """What the derivatives of J that are used leave out of the average, (columns, boxes).
 
-    Of order 5 at the middle, the terms that are odd in d cancel; order 6 is bounded everywhere between the points. The
-    length of a derivative depends on the last of its joints: sums over joints up to each, weighted by their steps.
+    Of the next order at the middle, the terms that are odd in d cancel; the one after it is bounded everywhere between
+    the points. The length of a derivative depends on the last of its joints: sums over joints up to each, weighted by
+    their steps.
     """
+    next_ = around.order + 1
     c, s = np.cumsum(around.middles, axis=0), np.cumsum(around.differences, axis=0)
-    fifth = (c**5 + 10 / 3 * c**3 * s**2 + c * s**4) / 120
-    sixth = sum((c + s) ** k * c ** (6 - k) for k in range(7)) / (7 * 720)
-    upto = (fifth + sixth) * UP
+    odd = sum(comb(next_, k) * c ** (next_ - k) * s**k / (k + 1) for k in range(0, next_, 2))
+    even = sum(comb(next_ + 1, k) * c ** (next_ + 1 - k) * s**k / (k + 1) for k in range(next_ + 2))
+    upto = (odd / factorial(next_) + even / factorial(next_ + 1)) * UP
     steps = np.diff(upto, axis=0, prepend=0.0) * lengths[:, None]
     later = np.cumsum(steps[::-1], axis=0)[::-1]  # of the joint itself and those after it
     before = upto - np.diff(upto, axis=0, prepend=0.0)

@@ -1,0 +1,169 @@
+"""Boxes that are proved one-to-one hold no two points with the same phi; the bounds behind the proofs hold as well."""
+
+import importlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from certified_charts import certified, chart
+from public_objects import network, planar
+from random_arms import random_arm, second_solutions
+
+import orthocas as oc
+from orthocas.certificates.subdivision import Subdivision
+from orthocas.certifying.chart_rows import chart_rows
+from orthocas.certifying.jets import Jets
+from orthocas.certifying.one_to_one import OneToOneJudge, one_to_one_judge
+from orthocas.certifying.search import Limits, Search, largest_first
+
+certifying = importlib.import_module("orthocas.certifying.certify")  # a function has the name of the module
+
+
+def judge_on(known: oc.Chart, half: np.ndarray) -> tuple[OneToOneJudge, Subdivision]:
+    centre = known.problem.domain.centre
+    box = Subdivision.whole(centre - half, centre + half)
+    return one_to_one_judge(known, chart_rows(known), box), box
+
+
+def proved(known: oc.Chart, half: np.ndarray, boxes: int) -> bool:
+    judge, box = judge_on(known, half)
+    search = Search(judge, box, Limits(boxes=boxes), largest_first(box))
+    search.run(lambda _: None)
+    return search.finished
+
+
+def arm_chart(seed: int, task: str, width: float = 0.3, degree: int = 2) -> oc.Chart:
+    """A fit of a random arm with more joints than its task has components."""
+    rng = np.random.default_rng(seed)
+    small = task in ("axis", "axis:y", "position:xy")
+    robot = random_arm(rng, int(rng.integers(4, 6)) if small else 5 if task in ("position", "orientation") else 7)
+    box = oc.Box(rng.uniform(-1.5, 1.5, robot.n), width * rng.uniform(0.5, 1.0, robot.n))
+    problem = oc.Problem(robot, oc.Task.named(robot, task, box.centre), domain=box)
+    return oc.fit(problem, oc.Polynomial(degree), samples=200, seed=seed).chart
+
+
+def differences(known: oc.Chart, q: np.ndarray, p: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """What the rows stand for, at q less at p, from the robot's own functions: position, rotation or axis, and xi."""
+    robot, kind = known.problem.robot, known.problem.task.recipe["kind"]
+    R_q, R_p, R = robot.tip_rotation(q), robot.tip_rotation(p), robot.tip_rotation(middle)
+    parts = [robot.tip_position(q) - robot.tip_position(p)] if kind.startswith("po") else []
+    if "axis" in kind:
+        axis = "xyz".index(known.problem.task.recipe["kind"][-1]) if ":" in kind else 2
+        parts.append(R[:, [k for k in range(3) if k != axis]].T @ (R_q - R_p)[:, axis])
+    elif kind.startswith(("orientation", "pose")):
+        turned = (R_q - R_p) @ R.T
+        parts.append(
+            np.array([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]) / 2
+        )
+    scaled = known.xi(q) - known.xi(p)
+    fitted = len(known.coordinates.offset)
+    return np.concatenate([*parts, scaled[:fitted] / known.coordinates.scale])
+
+
+@pytest.mark.parametrize("order", [4, 6])
+@pytest.mark.parametrize("task", ["position", "orientation", "axis:y", "pose", "position+axis"])
+def test_finite_differences_of_phi_lie_within_their_bounds(task: str, order: int) -> None:
+    known = arm_chart(3, task)
+    half = known.problem.domain.half_width
+    judge, box = judge_on(known, half)
+    rng = np.random.default_rng(5)
+    parts = 6
+    width = half * rng.choice([0.01, 0.1, 0.4], (parts, 1))
+    middle = known.problem.domain.centre + (half - width) * rng.uniform(-1, 1, (parts, known.n))
+    low, high = middle - width, middle + width
+    active = list(judge.active)
+    around = replace(judge._around(low, high), order=order)
+    jets = Jets.joined([judge.task(middle.T, around), judge.coordinates(middle.T, around)])
+    model, terms = jets.average(around, judge.active)
+    for k in range(parts):
+        for _ in range(20):
+            c = rng.uniform(low[k], high[k])
+            d = (half - np.abs(c - known.problem.domain.centre)) * rng.choice([-1, 1], known.n)
+            d[[i for i in range(known.n) if i not in active]] = 0
+            c[active] = np.where(np.isin(np.arange(len(active)), judge.still), middle[k, active], c[active])
+            t = ((c - middle[k]) / width[k])[active]
+            values = polynomial(model.coefficients[..., k], t)
+            allowed = np.abs(terms[..., k]).sum(axis=2) + jets.rest[..., k] + model.remainder[..., k]
+            found = differences(known, c + d, c - d, middle[k]) / 2
+            error = np.abs(found - values @ d[active])
+            assert (error <= allowed @ np.abs(d[active]) + 1e-12).all()
+
+
+def polynomial(coefficients: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """A Taylor model's polynomial (monomials, rows, columns) at t in [-1, 1]^n."""
+    n = len(t)
+    total, place = coefficients[0].copy(), 1
+    for i in range(n):
+        total += coefficients[place] * t[i]
+        place += 1
+    for i in range(n):
+        for j in range(i, n):
+            total += coefficients[place] * t[i] * t[j]
+            place += 1
+    for i in range(n):
+        for j in range(i, n):
+            for k in range(j, n):
+                total += coefficients[place] * t[i] * t[j] * t[k]
+                place += 1
+    return total
+
+
+@pytest.mark.parametrize("task", ["position", "orientation", "axis", "pose:z", "position:xy", "position+axis"])
+def test_no_second_solution_is_found_in_a_proved_box_of_a_random_arm(task: str) -> None:
+    held = 0
+    for seed in range(3):
+        known = arm_chart(seed, task)
+        base = certifying.whole_domain(known.problem.domain)
+        for scale in (1.0, 0.6, 0.3):
+            if proved(known, known.problem.domain.half_width * scale, 100):
+                middle, half = known.problem.domain.centre, known.problem.domain.half_width * scale
+                assert not len(second_solutions(known, middle - half, middle + half, 1000, seed))
+                held += 1
+                break
+        assert base.open_count == 1
+    assert held  # some are proved
+
+
+def test_box_of_an_arm_with_two_solutions_is_refused() -> None:
+    """The condition of method taylor-3/1 certified this box, with body-fixed rows that are the derivative of nothing."""
+    ready = oc.charts.load("ur5-position")
+    half = np.array([6.28, 0.31, 0.31, 0.59, 0.59, 1.41])
+    problem = oc.Problem(ready.problem.robot, ready.problem.task, domain=oc.Box(ready.problem.domain.centre, half))
+    known = oc.fit(problem, oc.Polynomial(3), samples=1000).chart
+    pairs = second_solutions(known, problem.domain.centre - half, problem.domain.centre + half, 2000, 0)
+    assert len(pairs) > 100  # they exist
+    assert np.abs(known.phi(pairs[:, 0]) - known.phi(pairs[:, 1])).max() < 1e-9
+    assert not proved(known, half, 2000)
+
+
+def test_wide_range_of_a_turning_base_is_kept_where_the_coordinates_bound_it() -> None:
+    known = oc.charts.load("panda-position")
+    half = known.problem.domain.half_width * np.array([1, 0.3, 0.3, 0.3, 0.3, 0.3, 1])
+    assert proved(known, half, 100)
+    centre = known.problem.domain.centre
+    assert not len(second_solutions(known, centre - half, centre + half, 2000, 1))
+
+
+def test_one_to_one_boxes_of_networks_and_planar_arms_are_checked() -> None:
+    for known in (network(), oc.fit(planar("euclidean"), oc.Fourier(2), samples=300).chart):
+        certificate = oc.certify(known)
+        assert certificate.injective is not None
+        assert oc.check_certificate(known, certificate)
+        pairs = second_solutions(known, certificate.injective.low, certificate.injective.high, 2000, 2)
+        assert not len(pairs)
+
+
+def test_one_to_one_part_of_an_older_method_is_void() -> None:
+    old = replace(certified(), method="taylor-3/1")
+    assert old.injective is None
+    assert "certify the chart again" in old.facts()["one-to-one"]
+    with pytest.raises(oc.errors.CertifyError, match="taylor-3/1, expected taylor-3/2: certify it again"):
+        oc.check_certificate(chart(), old)
+
+
+def test_one_to_one_box_of_another_chart_does_not_pass_the_check() -> None:
+    part = certified().injective
+    assert part is not None
+    wide = Subdivision.whole(*(chart(0.2).problem.domain.centre + np.array([[-1.5], [1.5]])))
+    forged = replace(certified(), injective=Subdivision(wide.low, wide.high, np.array([254], dtype=np.uint8)))
+    assert not oc.check_certificate(chart(), forged)
