@@ -65,7 +65,7 @@ def differences(known: oc.Chart, q: np.ndarray, p: np.ndarray, middle: np.ndarra
 def test_finite_differences_of_phi_lie_within_their_bounds(task: str, order: int) -> None:
     known = arm_chart(3, task)
     half = known.problem.domain.half_width
-    judge, box = judge_on(known, half)
+    judge = judge_on(known, half)[0]
     rng = np.random.default_rng(5)
     parts = 6
     width = half * rng.choice([0.01, 0.1, 0.4], (parts, 1))
@@ -125,7 +125,7 @@ def test_no_second_solution_is_found_in_a_proved_box_of_a_random_arm(task: str) 
 
 
 def test_box_of_an_arm_with_two_solutions_is_refused() -> None:
-    """The condition of method taylor-3/1 certified this box, with body-fixed rows that are the derivative of nothing."""
+    """Method taylor-3/1 certified this box, by rows in a body's frame that are the derivative of nothing."""
     ready = oc.charts.load("ur5-position")
     half = np.array([6.28, 0.31, 0.31, 0.59, 0.59, 1.41])
     problem = oc.Problem(ready.problem.robot, ready.problem.task, domain=oc.Box(ready.problem.domain.centre, half))

@@ -83,7 +83,7 @@ class Certificate(Shown):
             facts["not proved"] = f"{len(low)} boxes, the largest at q = ({at})"
         if self.dead and not self.fold:
             facts["given up"] = (
-                f"{self.dead} boxes are too small to halve: J is nearly singular there, or folds; more time does not help"
+                f"{self.dead} boxes are too small to halve: J is nearly singular or folds there; more time is no help"
             )
         facts["boxes"] = f"{self.regular.proved_count} proved, {self.boxes} judged, {self.seconds:.3g} s"
         facts["method"] = f"{self.method}, chart {self.fingerprint[:12]}"

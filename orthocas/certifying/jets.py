@@ -62,7 +62,8 @@ class Jets:
     def average(self, around: Around, variables: Variables) -> tuple[TaylorModel, Array]:
         """The average of J as a model in the middle, and terms (rows, columns, terms, boxes) with signs of their own.
 
-        The rest comes on top of both. The terms of squares of one joint's difference are never negative: half of them goes to the centre.
+        The rest comes on top of both. Terms with the square of one joint's difference have one sign only: half of each
+        goes to the centre.
         """
         weights = [power_weights(around, order) for order in range(around.order + 1)]
         model = [d * w[:, 0] for d, w in zip(self.derivatives[: DEGREE + 1], weights, strict=False)]

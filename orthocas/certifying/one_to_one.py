@@ -1,9 +1,12 @@
 """Proofs that phi is one-to-one on a box (ours).
 
-Two points q = c + d and p = c - d of the box have phi(q) - phi(p) = 2 Jm(c, d) d, see `orthocas.certifying.jets`. So phi
-is one-to-one if Jm(c, d) d != 0 for all of them. Near its faces, the middles c of two points of a box leave little room
-for d; in its centre, J is usually best. The middles are divided into parts, and on each part Jm is proved nonsingular.
-Rows of x may be replaced by others that vanish with them, such as those of the rotation that x stands for.
+Two points q = c + d and p = c - d of the box have phi(q) - phi(p) = 2 Jm(c, d) d, see `orthocas.certifying.jets`. So
+phi is one-to-one if Jm(c, d) is nonsingular for all of them. Near the faces of the box, middles c leave little room for
+d; in its centre, J is usually best. The middles are divided into parts, and Jm is proved nonsingular on each part. Rows
+of x may be replaced by others whose differences vanish with theirs, such as those of the rotation that x stands for.
+
+If phi is the same up to a motion of the task for all positions of a leading joint, such as the turning base of an arm,
+the middle of that joint does not matter, and the coordinates bound how far two of its positions are apart.
 """
 
 from collections.abc import Callable
@@ -151,7 +154,8 @@ def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToO
         task = ModelJets(rows.task, tuple(range(chart.n)), active)
     own: RowJets | None = None
     if isinstance(rows.coordinates, ProductRows):
-        assert isinstance(coordinates, Coordinates) and isinstance(coordinates.family, ProductFamily)
+        assert isinstance(coordinates, Coordinates)
+        assert isinstance(coordinates.family, ProductFamily)
         own = ProductJets(ProductRows.of(coordinates.family, coordinates.theta, ORDERS[-1] + 2))
     elif rows.coordinates is not None:
         own = ModelJets(rows.coordinates, active, active)

@@ -88,7 +88,7 @@ class ProductRows:
         return {i for index, there in zip(indices, sizes.tolist(), strict=True) if there for i in index}
 
     def jets(self, around: Around) -> Jets:
-        """The derivatives of J_xi at the middles of boxes. By Lagrange, the next order bounds the rest of the average."""
+        """The derivatives of J_xi at the middles of boxes. The next order, on the whole box, bounds the rest."""
         points = [TaylorModel.constant(np.ascontiguousarray(c)) for c in around.centre]
         values, errors = self._basis(self.functions(points))
         known = [self._derivatives(order, values, errors) for order in range(1, around.order + 2)]

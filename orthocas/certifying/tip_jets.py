@@ -1,9 +1,10 @@
 """Derivatives of the tip's motion at points, in closed form, with bounds that hold everywhere (ours).
 
-For joints i <= j <= ... <= l along the chain, d^k p / dq_i dq_j ... dq_l = a_i x (a_j x ... (a_l x (p - o_l))), with the
-axes a and origins o of the joints: each factor is a product with a unit vector, so its length is at most |p - o_l|.
-For the rotation R of the tip, [a_i]x [a_j]x ... [a_l]x R, of norm 1; R(q) - R(p) is taken to the frame of the middle
-by R(c)^T, and of the result its skew part is used. Where x(q) = x(p), these differences vanish too.
+For joints i <= j <= ... <= l along the chain, the derivative of the tip position p is a_i x (a_j x ... (a_l x
+(p - o_l))), with the axes a and origins o of the joints.
+Each product is one with a unit vector, so the length is at most |p - o_l|.
+For the rotation R of the tip it is [a_i]x [a_j]x ... [a_l]x R, of norm 1. The rows of a rotation are those of the skew
+part of R(q) R(c)^T for the middle c of a box, a constant. Where x(q) = x(p), these rows agree at q and p, too.
 """
 
 from dataclasses import dataclass
