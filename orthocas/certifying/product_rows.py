@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.certifying.graph import TaylorGraph
 from orthocas.certifying.monomials import DEGREE, Monomial, Variables, monomials
-from orthocas.certifying.rounding import SUM, TINY, UNIT, UP
+from orthocas.certifying.rounding import TINY, UNIT, UP, above, sum_error
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.checks import Array
 from orthocas.parametrisations.product_basis import ProductFamily
@@ -67,13 +67,16 @@ class ProductRows:
             used = derivatives.used
             found = derivatives.table @ values[used]
             doubt = derivatives.sizes @ (errors[used] + derivatives.rounding * np.abs(values[used]))
+            doubt *= above(len(used))
             weights = _weights(half_widths, order - 1)
             coefficients = self._spread(found, order) * weights
-            left_out += (self._spread(doubt, order) * weights + SUM * np.abs(coefficients)).sum(axis=2)
+            left_out += (self._spread(doubt, order) * weights + sum_error(DEGREE + 2) * np.abs(coefficients)).sum(
+                axis=2
+            )
             parts.append(coefficients)
         left_out += self._rest(boxes, half_widths)
         coefficients = np.concatenate(parts, axis=2).transpose(2, 0, 1, 3)
-        return TaylorModel(variables, coefficients, left_out * UP + TINY)
+        return TaylorModel(variables, coefficients, left_out * above(len(coefficients)) + TINY)
 
     def dependences(self) -> set[int]:
         """The joints that J_xi depends on."""
@@ -90,7 +93,7 @@ class ProductRows:
         else:  # constants only
             highest = np.ones((len(last.used), half_widths.shape[1]))
         bounds = self._spread(last.sizes @ highest * (1 + last.rounding), DEGREE + 2)
-        rest: Array = (bounds * _weights(half_widths, DEGREE + 1)).sum(axis=2)
+        rest: Array = (bounds * _weights(half_widths, DEGREE + 1)).sum(axis=2) * above(bounds.shape[2])
         return rest
 
     def _spread(self, found: Array, order: int) -> Array:
@@ -105,7 +108,7 @@ class ProductRows:
         values = self._products([model.centre for model in functions], every)
         size = self._products([np.abs(model.centre) for model in functions], every)
         high = self._products([np.abs(model.centre) + model.remainder for model in functions], every)
-        return values, np.maximum(high - size, 0) + SUM * high + TINY
+        return values, np.maximum(high - size, 0) + sum_error(3 * self.terms.shape[1]) * high + TINY
 
     def _products(self, functions: list[Array], which: NDArray[np.intp]) -> Array:
         """Products of one-joint functions, (terms, boxes)."""
