@@ -4,8 +4,8 @@ Rotating all rows of the Jacobian of a position does not change a determinant. I
 the chain, each entry depends on fewer joints than in the axes of the world, so boxes can be larger (ours). The stored
 rotations of a robot are rotations up to rounding only. Each of the at most n factors then changes an entry by at most
 their deviation times the length of the chain, and an allowance covers all changes. It also covers the constants that
-CasADi multiplies and adds while it builds these rows: fewer than 10 n roundings of numbers up to the length of the chain,
-and the allowance is 512 n of them. All other rows come from `derivative_graph`, which rounds nothing unseen.
+CasADi multiplies and adds while it builds these rows: fewer than 10 n roundings of numbers up to the length, and the
+allowance is 512 n of them. All other rows come from `derivative_graph`, which rounds nothing unseen.
 """
 
 import casadi as ca
