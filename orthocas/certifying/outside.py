@@ -12,6 +12,7 @@ from orthocas.certifying.judges import Judge, RegularityJudge, Verdicts
 from orthocas.certifying.monomials import Variables
 from orthocas.certifying.rounding import UP
 from orthocas.certifying.taylor import TaylorModel
+from orthocas.certifying.unbounded import require_all_positions
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.postures.clear_box import ClearBox
@@ -109,7 +110,12 @@ class CorridorJudge:
 
 
 def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
-    """The judge of a chart: of its whole box or, of a part of it, of what is not proved to lie outside."""
+    """The judge of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
+
+    Raises:
+        CertifyError: if a joint is unbounded, and a proof for its half-width is none for all its positions.
+    """
+    require_all_positions(chart, rows.variables)
     judge, domain = RegularityJudge(rows, bound), chart.problem.domain
     if isinstance(domain, Corridor):
         start = domain.postures[domain.contains(domain.postures)][:1]
@@ -119,5 +125,6 @@ def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
     task, joints = chart.problem.task, range(chart.n)
     alike = bool((domain.scale == domain.scale[0]).all())
     own, variables = task_gradients(task, domain, joints) if alike else true_gradients(task, joints)
+    require_all_positions(chart, variables)
     sign = float(judge(domain.centre[None], domain.centre[None]).sign[0])  # rows have other scales than the chart's
     return OutsideJudge(judge, own, domain, sign, tuple(sorted(variables)))

@@ -70,9 +70,8 @@ class ProductRows:
             doubt *= above(len(used))
             weights = _weights(half_widths, order - 1)
             coefficients = self._spread(found, order) * weights
-            left_out += (self._spread(doubt, order) * weights + sum_error(DEGREE + 2) * np.abs(coefficients)).sum(
-                axis=2
-            )
+            rounding = sum_error(DEGREE + 2) * np.abs(coefficients)
+            left_out += (self._spread(doubt, order) * weights + rounding).sum(axis=2)
             parts.append(coefficients)
         left_out += self._rest(boxes, half_widths)
         coefficients = np.concatenate(parts, axis=2).transpose(2, 0, 1, 3)

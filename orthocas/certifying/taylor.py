@@ -146,7 +146,8 @@ class TaylorModel:
         flat, shape = size.reshape(len(size), -1), (len(taken), *size.shape[1:])
         last = (taken[:, cubic:] @ flat[cubic:]).reshape(shape)
         known = (taken[:, :cubic] @ flat[:cubic]).reshape(shape) + last
-        gains: Array = known + last / (last.sum(axis=0) + TINY) * self.remainder
+        with np.errstate(invalid="ignore"):  # infinite remainders
+            gains: Array = known + last / (last.sum(axis=0) + TINY) * self.remainder
         return gains
 
 

@@ -31,6 +31,7 @@ def certificate_to_data(certificate: Certificate) -> tuple[dict[str, Any], dict[
         "boxes": certificate.boxes,
         "seconds": certificate.seconds,
         **({"least_singular_value": certificate.least_singular_value} if certificate.least_singular_value else {}),
+        **({"digest": certificate.digest} if certificate.digest else {}),
     }
     return header, arrays
 
@@ -57,6 +58,7 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         require_count("boxes of a certificate", int(_number(data, "boxes")), least=0),
         _number(data, "seconds"),
         _number(data, "least_singular_value") if "least_singular_value" in data else 0.0,
+        part(data, "digest", str) if "digest" in data else "",  # missing in older files
     )
 
 
