@@ -22,6 +22,7 @@ from orthocas.files.problem_parts import FOREIGN, problem_from_data, problem_to_
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.parametrisations import (
     MLP,
+    CyclicParametrisation,
     Fourier,
     JointSpace,
     Linear,
@@ -29,6 +30,7 @@ from orthocas.parametrisations import (
     parametrisation_from_data,
     parametrisation_to_data,
 )
+from orthocas.parametrisations.cyclic_proof import require_cyclic
 from orthocas.problem import Problem
 
 CHART = Kind("chart", 1, ChartFileError)
@@ -161,12 +163,16 @@ def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str,
     if "leaf" in data:
         own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
         return GrownCoordinates(problem, leaf_from_arrays(problem, part(data, "leaf", str), own))
-    return Coordinates(
-        parametrisation_from_data(data),
+    parametrisation = parametrisation_from_data(data)
+    found = Coordinates(
+        parametrisation,
         JointSpace.of(problem),
         _idle(part(data, "idle", list), problem.n),
         *(part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
     )
+    if isinstance(parametrisation, CyclicParametrisation):
+        require_cyclic(problem, parametrisation.cyclic)
+    return found
 
 
 def _idle(joints: list[int], n: int) -> tuple[int, ...]:

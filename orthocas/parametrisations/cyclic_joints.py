@@ -4,6 +4,7 @@ import numpy as np
 
 from orthocas.checks import Array, require_kind
 from orthocas.domains import Box, Conditioned, sample_uniform
+from orthocas.parametrisations.cyclic_proof import leaves_stay
 from orthocas.problem import NEAR_SINGULAR, Problem, relative_singular_values
 
 _SAMPLES, _POSITIONS = 24, 6  # joint positions, and other positions of one joint at each of them
@@ -16,9 +17,12 @@ def cyclic_joints(problem: Problem) -> tuple[str, ...]:
     """Names of the joints that only turn or shift the whole task, for example the base rotation of a position task.
 
     Joint k is cyclic if h(q + t e_k) = g_t(h(q)) with isometries g_t, and A does not depend on q_k. Then neither does
-    span{grad_A h_i}, so coordinates xi = a q_k + f(other joints) are as good at every q_k as at one. The function tests
-    this at samples: A, the A-orthogonal projector on the span and the eigenvalues of J_x A^-1 J_x^T must not change
-    when joint k moves through its limits, or a full turn. Joints that do not move the task do not count.
+    span{grad_A h_i}, so coordinates xi = a q_k + f(other joints) are as good at every q_k as at one. That A and the
+    span do not depend on q_k is proved, from the kinematics or from the steps of a custom task (see
+    `parametrisations.cyclic_proof`). That g_t are isometries is tested at samples: A, the A-orthogonal projector on the
+    span and the eigenvalues of J_x A^-1 J_x^T must not change when joint k moves through its limits, or a full turn.
+    Joints that do not move the task do not count, nor do those without a proof, such as the base rotation for a custom
+    task that calls `robot.tip_position`.
 
     Args:
         problem: robot, task, metric and domain.
@@ -49,7 +53,8 @@ def _cyclic(problem: Problem, invariants: int) -> tuple[str, ...]:
     points = sample_uniform(problem.domain, _SAMPLES, _SEED)
     points = points[relative_singular_values(problem, points) >= NEAR_SINGULAR]
     names = problem.robot.joint_names
-    return tuple(name for k, name in enumerate(names) if len(points) and _is_cyclic(problem, points, k, invariants))
+    sampled = (k for k in range(problem.n) if len(points) and _is_cyclic(problem, points, k, invariants))
+    return tuple(names[k] for k in sampled if leaves_stay(problem, k))
 
 
 def over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
