@@ -13,7 +13,7 @@ from orthocas.checks import require_count, require_text
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.domains import sample_uniform
-from orthocas.errors import ChartFileError, InvalidValueError, OrthocasError
+from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
 from orthocas.files.archive import Kind, read_archive, write_archive
 from orthocas.files.certificate_parts import certificate_from_data, certificate_to_data
 from orthocas.files.json import part
@@ -55,10 +55,11 @@ def write_chart(
         ChartFileError: if the file cannot be written, or would replace something other than a chart without `force`.
     """
     header, arrays = _content(problem, coordinates)
+    header["notes"] = _checked_notes(notes)
     if certificate is not None:
-        header["certificate"], proof = certificate_to_data(certificate)
-        arrays |= proof
-    write_archive(path, CHART, {**header, "notes": _checked_notes(notes)}, arrays, force)
+        data, proof = certificate_to_data(certificate)
+        header["certificate"], arrays = {**data, "notes": _digest_of(header["notes"])}, {**arrays, **proof}
+    write_archive(path, CHART, header, arrays, force)
 
 
 def fingerprint(problem: Problem, coordinates: CoordinateMap) -> str:
@@ -106,9 +107,17 @@ def _certificate(
     """The certificate of the file, if it has one, and only if it belongs to the chart."""
     if "certificate" not in header:
         return None
-    certificate = certificate_from_data(part(header, "certificate", dict), arrays, problem.n)
+    data = part(header, "certificate", dict)
+    certificate = certificate_from_data(data, arrays, problem.n)
     certificate.require_for(fingerprint(problem, coordinates))
+    if "notes" in data and data["notes"] != _digest_of(header["notes"]):  # missing in older files
+        raise CertifyError("the notes have been changed since the file was written")
     return certificate
+
+
+def _digest_of(notes: Mapping[str, Any]) -> str:
+    """SHA-256 of notes: they are no part of a proof, and a certified chart shows them beside it."""
+    return hashlib.sha256(json.dumps(notes, sort_keys=True).encode()).hexdigest()
 
 
 def _checked_notes(notes: Notes) -> dict[str, str | float]:
