@@ -19,7 +19,7 @@ from orthocas.coordinates.fitted import Coordinates
 from orthocas.errors import CertifyError, ChartFileError
 from orthocas.files.chart_file import fingerprint
 from orthocas.parametrisations import JointSpace, Parametrisation
-from orthocas.parametrisations.cyclic_proof import leaves_stay
+from orthocas.parametrisations.cyclic_joints import leaves_stay
 
 
 def two_joints() -> oc.Robot:
@@ -124,6 +124,18 @@ def test_half_a_turn_of_an_unbounded_joint_is_not_enough() -> None:
     problem = oc.Problem(robot, task, domain=domain)
     with pytest.raises(CertifyError, match="expected bounds, or a full turn"):
         oc.certify(oc.fit(problem, oc.Given.from_function("xi", 2, lambda q: q[0])).chart)
+
+
+def test_a_corridor_beyond_the_first_turn_is_not_proved_by_the_box() -> None:
+    """Its path is at q1 = 7; in the box, q1 ends at pi, and all of it is far from the path."""
+    known = problems.get("planar_3r_xy")
+    box = oc.Box([0.0, 0.8, 0.8], [np.pi, 0.3, 0.3], [0])
+    corridor = oc.Corridor(box, [[7.0, 0.8, 0.8], [7.2, 0.8, 0.8]], [0.2, 0.2, 0.2])
+    assert corridor.contains([7.1, 0.8, 0.8])
+    free = oc.fit(oc.Problem(known.robot, known.task, domain=box), oc.Linear()).chart
+    chart = oc.Chart(oc.Problem(known.robot, known.task, domain=corridor), free.coordinates)
+    with pytest.raises(CertifyError, match="joint 'q1' is unbounded and counts in the corridor"):
+        oc.certify(chart, time_limit=1)
 
 
 @pytest.mark.parametrize(

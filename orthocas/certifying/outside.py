@@ -1,5 +1,6 @@
 """Boxes that need no proof, because they are proved to lie outside a ClearBox or a Corridor (ours)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ from orthocas.certifying.taylor import TaylorModel
 from orthocas.certifying.unbounded import require_all_positions
 from orthocas.chart import Chart
 from orthocas.checks import Array
+from orthocas.errors import CertifyError
 from orthocas.postures.clear_box import ClearBox
 from orthocas.postures.corridor import Corridor
 
@@ -113,11 +115,13 @@ def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
     """The judge of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
 
     Raises:
-        CertifyError: if a joint is unbounded, and a proof for its half-width is none for all its positions.
+        CertifyError: if a joint is unbounded, and a proof for its half-width is none for all its positions. In a
+            corridor, an unbounded joint whose distance to the path counts is one of these.
     """
     require_all_positions(chart, rows.variables)
     judge, domain = RegularityJudge(rows, bound), chart.problem.domain
     if isinstance(domain, Corridor):
+        _require_uncounted(domain, chart.problem.robot.joint_names)
         start = domain.postures[domain.contains(domain.postures)][:1]
         return CorridorJudge(judge, domain, float(judge(start, start).sign[0]))
     if not isinstance(domain, ClearBox):
@@ -128,3 +132,10 @@ def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
     require_all_positions(chart, variables)
     sign = float(judge(domain.centre[None], domain.centre[None]).sign[0])  # rows have other scales than the chart's
     return OutsideJudge(judge, own, domain, sign, tuple(sorted(variables)))
+
+
+def _require_uncounted(domain: Corridor, joint_names: Sequence[str]) -> None:
+    """Raise CertifyError if an unbounded joint counts: after a turn, what is far from the path may be near it."""
+    for joint in {*domain.unbounded} & {*domain.counted.tolist()}:
+        name = joint_names[joint]
+        raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")

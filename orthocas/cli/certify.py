@@ -13,6 +13,7 @@ import typer
 
 from orthocas import certifying
 from orthocas.certificates import Certificate
+from orthocas.certificates.certificate import METHOD
 from orthocas.certifying.scheduler import scheduler_executor
 from orthocas.chart import Chart
 from orthocas.checks import require_count
@@ -100,9 +101,11 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor | None]:
 
 
 def _unfinished(chart: Chart, bound: float | None) -> Certificate | None:
-    """The certificate in the file if there is more to prove and it is about the same bound."""
+    """The certificate in the file if there is more to prove, it is about the same bound, and it can be resumed."""
     known = chart.certificate
-    if known is None or known.proved or known.fold or (bound is not None and bound != known.bound):
+    if known is None or known.method != METHOD or not known.digest:
+        return None
+    if known.proved or known.fold or (bound is not None and bound != known.bound):
         return None
     return known
 

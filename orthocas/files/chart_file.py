@@ -30,7 +30,7 @@ from orthocas.parametrisations import (
     parametrisation_from_data,
     parametrisation_to_data,
 )
-from orthocas.parametrisations.cyclic_proof import require_cyclic
+from orthocas.parametrisations.cyclic_joints import require_cyclic
 from orthocas.problem import Problem
 
 CHART = Kind("chart", 1, ChartFileError)
