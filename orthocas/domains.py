@@ -255,8 +255,13 @@ def borders(domain: Domain) -> tuple[Array, Array]:
 def reach(domain: Domain) -> Array:
     """Largest distance from the centre that counts as inside, (n,), with slack for rounding at the borders."""
     lower, upper = borders(domain)
-    slack = 1e-12 * domain.half_width + 4 * np.finfo(float).eps * np.abs(domain.centre)
-    values: Array = (upper - lower) / 2 + slack
+    values: Array = (upper - lower) / 2 + slack(domain)
+    return values
+
+
+def slack(domain: Domain) -> Array:
+    """What the borders of a domain give for rounding, (n,)."""
+    values: Array = 1e-12 * domain.half_width + 4 * np.finfo(float).eps * np.abs(domain.centre)
     return values
 
 

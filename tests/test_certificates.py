@@ -49,15 +49,69 @@ def test_a_forged_certificate_does_not_hold() -> None:
     whole = Subdivision(known.regular.low, known.regular.high, np.array([PROVED], dtype=np.uint8))
     wide = chart(0.4)
     honest = certified(0.4)
-    forged = replace(honest, regular=Subdivision(honest.regular.low, honest.regular.high, whole.codes))
+    forged = replace(honest, regular=Subdivision(honest.regular.low, honest.regular.high, whole.codes)).sealed()
     assert not oc.check_certificate(wide, forged)
-    other = replace(honest, regular=known.regular)
+    other = replace(honest, regular=known.regular).sealed()
     with pytest.raises(CertifyError, match="another domain"):
         oc.check_certificate(wide, other)
     with pytest.raises(CertifyError, match="method"):
-        oc.check_certificate(wide, replace(honest, method="guess/1"))
-    too_good = replace(honest, conditioning=0.99)
-    assert not oc.check_certificate(wide, too_good)
+        oc.check_certificate(wide, replace(honest, method="guess/1").sealed())
+    assert not oc.check_certificate(wide, replace(honest, conditioning=0.99).sealed())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"boxes": 7},
+        {"seconds": 1.0},
+        {"bound": 0.1},
+        {"conditioning": 0.1},
+        {"least_singular_value": 0.2},
+        {"fold": ((0.0,) * 7, (0.1,) * 7)},
+        {"injective": None},
+        {"digest": ""},
+        {"digest": "0" * 64},
+    ],
+    ids=str,
+)
+def test_a_change_of_any_number_is_seen(change: dict[str, Any]) -> None:
+    changed = replace(certified(), **change)
+    with pytest.raises(CertifyError, match="changed since|no digest"):
+        oc.check_certificate(chart(), changed)
+    if "digest" not in change:
+        with pytest.raises(CertifyError, match="changed since"):
+            replace(chart(), certificate=changed)
+
+
+def test_what_is_printed_is_computed_again() -> None:
+    """With a digest that fits: it protects against accidents, and the check against the rest."""
+    known, honest = chart(), certified()
+    centre = tuple(known.problem.domain.centre)
+    assert not oc.check_certificate(known, replace(honest, fold=(centre, centre)).sealed())
+    with pytest.raises(CertifyError, match="leaves out singular values up to 0.3, the domain 0"):
+        oc.check_certificate(known, replace(honest, least_singular_value=0.3).sealed())
+    box = honest.injective
+    assert box is not None
+    shifted = replace(box, low=box.low + 0.01, high=box.high + 0.01)
+    assert not oc.check_certificate(known, replace(honest, injective=shifted).sealed())
+
+
+def test_a_bound_under_another_metric_is_refused() -> None:
+    linear = oc.fit(planar(), oc.Linear()).chart
+    found = oc.certify(linear)
+    with pytest.raises(CertifyError, match="bound is 0.1 with metric inertia"):
+        oc.check_certificate(linear, replace(found, bound=0.1).sealed())
+
+
+def test_a_fold_is_checked_at_its_two_points() -> None:
+    folding = oc.fit(planar(), oc.Linear()).chart
+    found = oc.certify(folding)
+    assert len(found.fold) == 2
+    assert oc.check_certificate(folding, found)
+    assert not oc.check_certificate(folding, replace(found, fold=found.fold[:1] * 2).sealed())
+    domain = folding.problem.domain
+    outside = tuple(domain.centre + 3 * (np.array(found.fold[1]) - domain.centre))
+    assert not oc.check_certificate(folding, replace(found, fold=(found.fold[0], outside)).sealed())
 
 
 @pytest.mark.parametrize("codes", [[0], [0, PROVED], [PROVED, PROVED], [7, PROVED, PROVED], []])

@@ -2,6 +2,7 @@
 
 import pytest
 from fuzz.atlases import atlases
+from fuzz.certificates import certificates
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.motions import motions
@@ -13,6 +14,11 @@ from fuzz.steps import steps
 @pytest.mark.slow
 def test_mutated_atlases_are_usable_or_refused_in_one_line() -> None:
     assert atlases(100) == []
+
+
+@pytest.mark.slow
+def test_no_number_of_a_certified_chart_can_be_changed() -> None:
+    assert certificates(100) == []
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from orthocas.certifying.elementary import exponential, hyperbolic_tangent, sine
 from orthocas.certifying.elimination import in_singular_basis, lower_bound, pivots
 from orthocas.certifying.graph import TaylorGraph
 from orthocas.certifying.monomials import monomials
+from orthocas.certifying.rounding import above, sum_error
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.certifying.volume import conditioning_bound
 from orthocas.checks import Array
@@ -190,3 +191,22 @@ def test_graphs_with_whole_powers_are_bounded() -> None:
     for k, model in enumerate(TaylorGraph.of(f, "it")(joints)):
         true = float(f([1.1, 2.2])[k])
         assert abs(values_at(model, np.ones((1, 2)))[0] - true) <= model.remainder[0] + 1e-14
+
+
+@pytest.mark.parametrize("count", [3, 10, 20])
+def test_lower_bounds_of_long_sums_lie_below_the_exact_ones(count: int) -> None:
+    """1 + many numbers below half of its spacing: each of them is lost, and all roundings go the same way."""
+    variables = tuple(range(count))
+    coefficients = np.full((len(monomials(variables)), 2), 2**-53 * 0.9999)  # two boxes: NumPy adds row by row
+    coefficients[[monomials(variables).index((v, v)) for v in variables]] *= -1  # least at the ends of the interval
+    coefficients[1 + count + 1] = 1.0
+    exact = [Fraction(float(value)) for value in coefficients[:, 0]]
+    bound = lower_bound(TaylorModel(variables, coefficients, np.zeros(2)))[0]
+    assert Fraction(float(bound)) <= exact[0] - sum(map(abs, exact[1:]))
+
+
+def test_the_error_of_a_sum_grows_with_its_terms() -> None:
+    for terms in (1, 250, 286, 1771, 10**6):
+        exact = Fraction(terms, 2**53) / (1 - Fraction(terms, 2**53))
+        assert exact < Fraction(sum_error(terms)) < exact + Fraction(1, 2**53) * (9 + terms // 50)
+        assert Fraction(above(terms)) > 1 + exact

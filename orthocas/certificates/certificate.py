@@ -1,7 +1,9 @@
 """Certificates: what was proved of a chart, with all that is needed to check it again."""
 
-from dataclasses import dataclass, field
-from typing import Any
+import hashlib
+import json
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -34,6 +36,7 @@ class Certificate(Shown):
     seconds: float = field(default=0.0)
     least_singular_value: float = 0.0  #: of a ClearBox; parts proved to lie outside it count as proved. 0: no ClearBox
     dead: int = 0  #: number of unproved parts that are too small to halve: a longer search does not help there
+    digest: str = ""  #: of all of the above, see `sealed`
 
     def __post_init__(self) -> None:
         for name in ("fingerprint", "method"):
@@ -44,8 +47,25 @@ class Certificate(Shown):
         if self.method != METHOD:
             object.__setattr__(self, "injective", None)
 
+    def sealed(self) -> Self:
+        """The same certificate with the digest of its content, which shows accidental changes. It is no signature."""
+        return replace(self, digest=self._content_digest())
+
+    def _content_digest(self) -> str:
+        """SHA-256 of all numbers and texts but the digest."""
+        numbers = (self.bound, self.conditioning, self.boxes, self.seconds, self.least_singular_value, self.dead)
+        points = [[float(value) for value in point] for point in self.fold]
+        content = [self.fingerprint, self.method, [float(number) for number in numbers], points]
+        digest = hashlib.sha256(json.dumps(content).encode())
+        for tree in (self.regular, self.injective):
+            parts = () if tree is None else (tree.low, tree.high, tree.codes)
+            digest.update(b"".join(hashlib.sha256(part.tobytes()).digest() for part in parts) or b"none")
+        return digest.hexdigest()
+
     def require_for(self, fingerprint: str) -> None:
-        """Raise CertifyError if the certificate is not one of the chart with this fingerprint."""
+        """Raise CertifyError if the certificate is not that of the chart with this fingerprint, or has been changed."""
+        if self.digest and self.digest != self._content_digest():
+            raise CertifyError("the certificate is void: it has been changed since `certify` made it")
         if self.fingerprint != fingerprint:
             raise CertifyError("the certificate is void: it was made for another chart, or the chart has changed")
 

@@ -1,7 +1,6 @@
 """Certify charts: prove with rigorous arithmetic that they do not fold, and where they are one-to-one (ours)."""
 
 import time
-from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -16,11 +15,10 @@ from orthocas.certifying.outside import judge_of
 from orthocas.certifying.search import Limits, Look, Search, distances, largest_first, nearest_first
 from orthocas.chart import Chart
 from orthocas.checks import Array, as_number, require_at_least, require_executor, require_kind
-from orthocas.domains import Box, Domain, SelfDrawing, contains, reach, sample_heavily
+from orthocas.domains import Box, Domain, SelfDrawing, contains, reach, sample_heavily, slack
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.files.chart_file import fingerprint
 from orthocas.minimising.watch import Monitor, Progress, silent
-from orthocas.parametrisations import CyclicParametrisation
 
 _SAMPLES = 20_000  # points where folds are looked for before the proof
 _SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
@@ -109,7 +107,6 @@ def folds_nowhere(chart: Chart, time_limit: float) -> bool:
 def _regularity_search(
     chart: Chart, rows: ChartRows, bound: float, base: Subdivision, limits: Limits, executor: Executor | None
 ) -> Search:
-    _require_independent(chart, rows.variables)
     return Search(judge_of(chart, rows, bound), base, limits, largest_first(base), executor)
 
 
@@ -178,9 +175,12 @@ def checked_bound(chart: Chart, bound: float) -> float:
 
 
 def whole_domain(domain: Domain) -> Subdivision:
-    """The domain, with the slack of its borders, as a box in one part; unbounded joints have their half-width."""
-    half = domain.half_width if domain.name == "torus" else reach(domain)
-    half = np.where(np.isfinite(half), half, domain.half_width)
+    """The domain, with the slack of its borders, as a box in one part; unbounded joints have their half-width.
+
+    That of a full turn is pi, rounded down. With the slack, the box holds every angle.
+    """
+    half = reach(domain)
+    half = np.where(np.isfinite(half), half, domain.half_width + slack(domain))
     low, high = domain.centre - half, domain.centre + half
     return Subdivision.whole(np.nextafter(low, -np.inf), np.nextafter(high, np.inf))
 
@@ -191,25 +191,19 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
     if certificate.method != METHOD:
         raise CertifyError(f"the certificate is of method {certificate.method}, expected {METHOD}: certify it again")
     certificate.require_for(fingerprint(chart.problem, chart.coordinates))
+    if not certificate.digest:
+        raise CertifyError("the certificate has no digest, expected one made by `certify`")
+    left_out = getattr(chart.problem.domain, "least_singular_value", 0.0)
+    if certificate.least_singular_value != left_out:
+        raise CertifyError(
+            f"the certificate is void: it leaves out singular values up to {certificate.least_singular_value:g}, "
+            f"the domain {left_out:g}"
+        )
     domain = whole_domain(chart.problem.domain)
     if not (
         np.array_equal(domain.low, certificate.regular.low) and np.array_equal(domain.high, certificate.regular.high)
     ):
         raise CertifyError("the certificate is void: it covers another domain")
-
-
-def _require_independent(chart: Chart, variables: Sequence[int]) -> None:
-    """Raise CertifyError if a proof for the half-width of an unbounded joint is none for all its positions.
-
-    It is one if J does not depend on the joint, or if the coordinates are linear in it and it makes a full turn.
-    """
-    problem, parametrisation = chart.problem, getattr(chart.coordinates, "parametrisation", None)
-    linear = parametrisation.cyclic if isinstance(parametrisation, CyclicParametrisation) else ()
-    for joint in getattr(problem.domain, "unbounded", ()):
-        name = problem.robot.joint_names[joint]
-        turning = not problem.robot.tree.prismatic[joint] and problem.domain.half_width[joint] >= np.pi
-        if joint in variables and not (name in linear and turning):
-            raise CertifyError(f"joint '{name}' is unbounded and J depends on it, expected bounds, or a cyclic joint")
 
 
 def _resumed(chart: Chart, bound: float, certificate: Certificate) -> Subdivision:
@@ -317,7 +311,7 @@ def _certificate(
         before[1] + seconds,
         getattr(chart.problem.domain, "least_singular_value", 0.0),
         search.dead,
-    )
+    ).sealed()
 
 
 def _shown(monitor: Monitor, stage: str) -> Look:

@@ -1,12 +1,15 @@
 """The Jacobian of a chart on boxes, as Taylor models."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from orthocas.casadi_tools.batch import dense_function
+from orthocas.casadi_tools.structure import gradient_dependences
+from orthocas.casadi_tools.tape import to_tape
+from orthocas.certifying.derivative_graph import DerivativeGraph
 from orthocas.certifying.graph import TaylorGraph
 from orthocas.certifying.monomials import Variables
 from orthocas.certifying.network_rows import NetworkRows
@@ -17,9 +20,11 @@ from orthocas.certifying.taylor import TaylorModel, stacked
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
+from orthocas.domains import Domain
 from orthocas.errors import CertifyError
 from orthocas.parametrisations.mlp import MLPFamily
 from orthocas.parametrisations.product_basis import ProductFamily
+from orthocas.tasks import Task
 
 MOST_VARIABLES = 20
 _MOST_STEPS = 100_000
@@ -61,7 +66,7 @@ class ChartRows:
 class GraphRows:
     """A matrix of so many rows that a graph gives column by column."""
 
-    graph: TaylorGraph
+    graph: TaylorGraph | DerivativeGraph
     rows: int
     allowance: float = 0.0  #: added to the remainders
 
@@ -89,17 +94,37 @@ def chart_rows(chart: Chart) -> ChartRows:
     if not np.all(coordinates.scale != 0):
         raise CertifyError("a coordinate is scaled by 0, so it is constant, expected coordinates that vary")
     active = tuple(coordinates.active)
-    q = ca.SX.sym("q", chart.n)
-    rows, allowance = task_rows(chart.problem.task, chart.problem.domain)
-    J_x = ca.densify(rows(q)[:, list(active)])
-    own, depends = _coordinate_rows(coordinates, q)
-    variables = tuple(sorted({*_dependences(J_x, q), *depends}))
+    task, moved_by = task_gradients(chart.problem.task, chart.problem.domain, active)
+    own, depends = _coordinate_rows(coordinates)
+    variables = tuple(sorted({*moved_by, *depends}))
     if len(variables) > MOST_VARIABLES:
         raise CertifyError(f"the chart depends on {len(variables)} joints, expected at most {MOST_VARIABLES}")
-    graph = TaylorGraph.of(dense_function("task_rows", [q], [J_x]), "the task")
     periods = coordinates.turns[: len(coordinates.offset)] / np.abs(coordinates.scale)
     turns = np.concatenate([np.zeros(chart.m), periods])
-    return ChartRows(chart.n, chart.m, active, variables, GraphRows(graph, chart.m, allowance), own, turns)
+    return ChartRows(chart.n, chart.m, active, variables, task, own, turns)
+
+
+def task_gradients(task: Task, domain: Domain, joints: Sequence[int]) -> tuple[GraphRows, set[int]]:
+    """Columns of J_x, or of C(q) J_x from `task_rows`, and the joints that they depend on."""
+    rows, allowance = task_rows(task, domain)
+    if rows is task.jacobian_function:
+        return true_gradients(task, joints)
+    q = ca.SX.sym("q", task.robot.n)
+    J = ca.densify(rows(q)[:, list(joints)])
+    graph = TaylorGraph.of(dense_function("task_rows", [q], [J]), "the task")
+    return GraphRows(graph, task.m, allowance), {k for k in range(task.robot.n) if ca.depends_on(J, q[k])}
+
+
+def true_gradients(task: Task, joints: Sequence[int]) -> tuple[GraphRows, set[int]]:
+    """Columns of J_x itself, the derivative of h, and the joints that they depend on."""
+    return _derivatives(task.function, joints, "the task")
+
+
+def _derivatives(function: ca.Function, joints: Sequence[int], what: str) -> tuple[GraphRows, set[int]]:
+    """Columns of the Jacobian of a function of q, and the inputs that they depend on."""
+    graph = DerivativeGraph.of(function, joints, what)
+    known = gradient_dependences(to_tape(function))
+    return GraphRows(graph, graph.outputs), {k for row in known for j in joints for k in row.get(j, ())}
 
 
 def joint_models(low: Array, high: Array, variables: Variables) -> tuple[list[TaylorModel], Array]:
@@ -119,7 +144,7 @@ def joint_models(low: Array, high: Array, variables: Variables) -> tuple[list[Ta
     return models, np.ascontiguousarray(half.T)
 
 
-def _coordinate_rows(coordinates: Coordinates, q: ca.SX) -> tuple[CoordinateRows | None, set[int]]:
+def _coordinate_rows(coordinates: Coordinates) -> tuple[CoordinateRows | None, set[int]]:
     """The fitted coordinates, and the joints they depend on."""
     if not len(coordinates.offset):
         return None, set()
@@ -130,14 +155,9 @@ def _coordinate_rows(coordinates: Coordinates, q: ca.SX) -> tuple[CoordinateRows
     if isinstance(family, MLPFamily):
         return NetworkRows.of(family, coordinates.theta), set(active)
     own = ca.SX.sym("q", len(active))
-    theta = ca.SX(ca.DM(coordinates.theta))
-    J = ca.densify(ca.horzcat(*family.jacobian(own, theta)).T)
-    if J.numel() and ca.Function("size", [own], [J]).n_instructions() > _MOST_STEPS:
+    xi = family.expression(own, ca.SX(ca.DM(coordinates.theta)))
+    function = dense_function("xi", [own], [xi])
+    if function.n_instructions() * len(active) > _MOST_STEPS:
         raise CertifyError(f"{coordinates.label} coordinates take too many operations, expected at most {_MOST_STEPS}")
-    graph = TaylorGraph.of(dense_function("J_xi", [own], [J]), "the coordinates")
-    return GraphRows(graph, family.outputs), {active[i] for i in _dependences(J, own)}
-
-
-def _dependences(J: ca.SX, q: ca.SX) -> set[int]:
-    """The joints that a matrix depends on."""
-    return {k for k in range(q.shape[0]) if ca.depends_on(J, q[k])}
+    found, depends = _derivatives(function, range(len(active)), "the coordinates")
+    return found, {active[i] for i in depends}

@@ -7,17 +7,19 @@ import numpy as np
 
 from orthocas.certificates.certificate import Certificate
 from orthocas.certificates.subdivision import PROVED, Subdivision
-from orthocas.certifying.certify import checked_options, require_same
+from orthocas.certifying.certify import checked_bound, checked_options, require_same
 from orthocas.certifying.chart_rows import chart_rows
 from orthocas.certifying.judges import Judge, Verdicts
 from orthocas.certifying.one_to_one import one_to_one_judge
 from orthocas.certifying.outside import judge_of
 from orthocas.chart import Chart
 from orthocas.checks import Array
+from orthocas.domains import contains
 from orthocas.errors import CertifyError
 from orthocas.minimising.watch import Monitor, Progress, silent
 
 _AT_ONCE = 512
+_OFF_CENTRE = 1e-6  # of the width of a box
 Mapped = Callable[..., Iterable[Verdicts]]
 
 
@@ -28,7 +30,10 @@ def check_certificate(
     executor: Executor | None = None,
     monitor: Monitor = silent,
 ) -> bool:
-    """Whether a certificate holds: the bounds of each of its parts are computed once more.
+    """Whether a certificate holds: all that it says of the chart is computed once more.
+
+    That is each part of the domain, the bound of the conditioning, the two signs of a fold, and the one-to-one box. The
+    number of boxes that were judged and the seconds are history, which only the digest of the certificate covers.
 
     Args:
         chart: the chart.
@@ -37,7 +42,8 @@ def check_certificate(
         monitor: called with progress.
 
     Raises:
-        CertifyError: if there is no certificate, or it belongs to another chart or method.
+        CertifyError: if there is no certificate, if it belongs to another chart or method or has been changed, or if
+            `certify` would refuse the chart.
 
     Example:
         >>> import orthocas as oc
@@ -51,17 +57,40 @@ def check_certificate(
     if certificate is None:
         raise CertifyError("the chart has no certificate, expected one made by `certify`")
     require_same(chart, certificate)
-    rows = chart_rows(chart)
+    bound, rows = checked_bound(chart, certificate.bound), chart_rows(chart)
+    judge = judge_of(chart, rows, bound)
     mapped: Mapped = map if executor is None else executor.map
-    regular = _judged(judge_of(chart, rows, certificate.bound), certificate.regular, mapped, monitor)
-    signs = {int(sign) for verdicts in regular for sign in np.unique(verdicts.sign) if sign}
-    least = min((float(verdicts.conditioning.min()) for verdicts in regular), default=0.0)
-    holds = all(verdicts.proved.all() for verdicts in regular) and len(signs) < 2 and least >= certificate.conditioning
-    if certificate.injective is None or not holds:
-        return holds
-    judge = one_to_one_judge(chart, rows, certificate.injective)
-    found = _judged(judge, certificate.injective, mapped, monitor)
-    return certificate.injective.complete and all(verdicts.proved.all() for verdicts in found)
+    if certificate.fold and not _folds(chart, judge, np.array(certificate.fold)):
+        return False
+    if not _regular(certificate, _judged(judge, certificate.regular, mapped, monitor)):
+        return False
+    box = certificate.injective
+    if box is None:
+        return True
+    found = _judged(one_to_one_judge(chart, rows, box), box, mapped, monitor)
+    return box.complete and _around_the_centre(certificate, box) and all(verdicts.proved.all() for verdicts in found)
+
+
+def _regular(certificate: Certificate, found: list[Verdicts]) -> bool:
+    """Whether the parts are proved, with one sign unless the chart folds, and the conditioning is what it says."""
+    signs = {int(sign) for verdicts in found for sign in np.unique(verdicts.sign) if sign}
+    least = min((float(verdicts.conditioning.min()) for verdicts in found), default=0.0)
+    proved = all(verdicts.proved.all() for verdicts in found)
+    return proved and (len(signs) < 2 or bool(certificate.fold)) and least >= certificate.conditioning
+
+
+def _folds(chart: Chart, judge: Judge, points: Array) -> bool:
+    """Whether det J is proved to have opposite signs at two points (2, n) of the domain."""
+    found = judge(points, points)
+    return bool(contains(chart.problem.domain, points).all() and found.regular.all() and found.sign.prod() < 0)
+
+
+def _around_the_centre(certificate: Certificate, box: Subdivision) -> bool:
+    """Whether a box lies in the domain, around its centre."""
+    domain = certificate.regular
+    off = (box.low + box.high - domain.low - domain.high) / (box.high - box.low)
+    inside = (box.low >= domain.low).all() and (box.high <= domain.high).all()
+    return bool(inside and np.abs(off).max() < _OFF_CENTRE)
 
 
 def _judged(judge: Judge, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[Verdicts]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthocas.certifying.functions import reciprocal
 from orthocas.certifying.monomials import Variables, monomials
-from orthocas.certifying.rounding import SUM, TINY, UP
+from orthocas.certifying.rounding import TINY, UP, sum_error
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.checks import Array
 
@@ -45,7 +45,7 @@ def between(left: Array, J: TaylorModel, right: Array) -> TaylorModel:
     N, m, n, boxes = J.coefficients.shape
     inner = np.ascontiguousarray(J.coefficients.transpose(3, 1, 0, 2)).reshape(boxes, m * N, n) @ right
     outer = (left @ inner.reshape(boxes, m, N * n)).reshape(boxes, m, N, n)
-    unknown = J.remainder + SUM * np.abs(J.coefficients).sum(axis=0)
+    unknown = J.remainder + sum_error(m + n) * np.abs(J.coefficients).sum(axis=0)
     spread = np.abs(left) @ np.moveaxis(unknown, -1, 0) @ np.abs(right)
     coefficients = np.ascontiguousarray(outer.transpose(2, 1, 3, 0))
     return TaylorModel(J.variables, coefficients, np.moveaxis(spread, 0, -1) * UP + TINY)
@@ -65,7 +65,7 @@ def lower_bound(model: TaylorModel) -> Array:
     """A number below all values, (boxes,); NaN or -inf where nothing is known.
 
     Each variable is bounded exactly in its linear and square term, g t + h t^2 for t in [-1, 1]; mixed terms and cubic
-    ones by their absolute values.
+    ones by their absolute values. The few sums of the coefficients have at most 4 roundings for each of them.
     """
     squares = _square_places(model.variables)
     linear = np.abs(model.coefficients[1 : 1 + len(squares)])
@@ -74,8 +74,8 @@ def lower_bound(model: TaylorModel) -> Array:
     least = np.where(inside, -(linear**2) / (4 * np.where(inside, square, 1)), square - linear)
     least = np.minimum(least, 0)
     rest = np.abs(model.coefficients[1 + len(squares) :]).sum(axis=0) - np.abs(square).sum(axis=0)
-    size = np.abs(model.coefficients).sum(axis=0)
-    bound: Array = model.centre + least.sum(axis=0) - rest - model.remainder * UP - SUM * size
+    rounding = sum_error(4 * len(model.coefficients)) * np.abs(model.coefficients).sum(axis=0)
+    bound: Array = model.centre + least.sum(axis=0) - rest - model.remainder * UP - rounding
     return bound
 
 

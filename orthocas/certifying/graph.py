@@ -39,7 +39,7 @@ class TaylorGraph:
         """Refuse operations without bounds."""
         constants: dict[int, float] = {}
         for name, into, *of in self.steps:
-            if name in POWERS and not _is_whole(constants.get(of[1])):
+            if name in POWERS and not is_whole(constants.get(of[1])):
                 raise CertifyError(f"{self.what} has a power that is no whole number, so it cannot be certified")
             if name not in (*UNARY, *BINARY, *POWERS, "const", "input", "output"):
                 raise CertifyError(f"{self.what} uses the operation {name}, which cannot be certified")
@@ -67,5 +67,6 @@ class TaylorGraph:
         return [results[k] for k in range(self.outputs)]
 
 
-def _is_whole(value: float | None) -> bool:
+def is_whole(value: float | None) -> bool:
+    """Whether a constant, if there is one, is a whole number that powers may have as exponent."""
     return value is not None and value == round(value) and abs(value) <= _LARGEST_POWER

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.certifying.monomials import DEGREE, Monomial, Variables, monomials
-from orthocas.certifying.rounding import SUM, TINY, UP
+from orthocas.certifying.rounding import TINY, UP, above, sum_error
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.checks import Array
 
@@ -77,7 +77,7 @@ class Jets:
         coefficients = np.concatenate([centre[:, :, None], *model[1:]], axis=2)
         doubt = sum((e * even_average(w)).sum(axis=2) for e, w in zip(self.doubts, weights, strict=True))
         size = np.abs(coefficients).sum(axis=2) + np.abs(terms).sum(axis=2)
-        remainder = (doubt + SUM * size) * UP + TINY
+        remainder = (doubt + sum_error(8 * around.order) * size) * above(terms.shape[2]) + TINY
         return TaylorModel(variables, np.ascontiguousarray(coefficients.transpose(2, 0, 1, 3)), remainder), terms
 
 
@@ -92,7 +92,7 @@ def of_model(model: TaylorModel, columns: Variables, reach: Array, highest: int)
         start += count
     for order in range(DEGREE + 1, highest + 1):
         derivatives.append(np.zeros((*whole.remainder.shape[:2], len(multi_indices(n, order)), reach.shape[1])))
-    doubts = tuple(SUM * np.abs(each) for each in derivatives)
+    doubts = tuple(sum_error(4 * DEGREE) * np.abs(each) for each in derivatives)
     return Jets(tuple(derivatives), doubts, whole.remainder)
 
 

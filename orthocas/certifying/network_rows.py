@@ -7,7 +7,7 @@ import numpy as np
 
 from orthocas.certifying.functions import cosine, sine, square, tanh
 from orthocas.certifying.monomials import Variables
-from orthocas.certifying.rounding import TINY, UNIT, UP
+from orthocas.certifying.rounding import TINY, UNIT, above
 from orthocas.certifying.taylor import TaylorModel, stacked
 from orthocas.checks import Array
 from orthocas.parametrisations.mlp import MLPFamily
@@ -67,5 +67,5 @@ def _weighted(W: Array, models: TaylorModel) -> TaylorModel:
     """W times a column of models, (out, boxes)."""
     size = np.abs(W)
     rounding = 4 * UNIT * (W.shape[1] + 8) * np.abs(models.coefficients).sum(axis=0)
-    remainder = (size @ (models.remainder + rounding)) * UP + TINY
+    remainder = (size @ (models.remainder + rounding)) * above(W.shape[1]) + TINY
     return TaylorModel(models.variables, W @ models.coefficients, remainder)

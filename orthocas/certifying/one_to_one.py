@@ -23,7 +23,7 @@ from orthocas.certifying.elimination import between, is_orthogonal, pivots, sing
 from orthocas.certifying.jets import ORDERS, Around, Jets, of_model
 from orthocas.certifying.judges import Verdicts, all_positive, chosen, influences, most_influential
 from orthocas.certifying.product_rows import ProductRows
-from orthocas.certifying.rounding import SUM, TINY, UNIT, UP
+from orthocas.certifying.rounding import TINY, UNIT, UP, above, sum_error
 from orthocas.certifying.task_rows import TipRows, chain_of
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.certifying.tip_jets import TipJets
@@ -73,10 +73,11 @@ class OneToOneJudge:
         nothing = np.zeros(len(low))
         return Verdicts(proved, proved, nothing, nothing, widest)
 
-    def _few(self, low: Array, high: Array) -> tuple[Array, Array]:
+    def _few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
         q, around = (low + high).T / 2, self._around(low, high)
-        for _ in range(_ROUNDS if self.still and self.coordinates else 0):
-            around = self._bounded(around, self.coordinates(q, around))
+        if self.still and self.coordinates is not None:
+            for _ in range(_ROUNDS):
+                around = self._bounded(around, self.coordinates(q, around))
         proved, widest, promising = self._judged(q, around)
         for order in ORDERS[1:]:
             again = np.flatnonzero(promising)
@@ -86,7 +87,7 @@ class OneToOneJudge:
                 )
         return proved, widest
 
-    def _judged(self, q: Array, around: Around) -> tuple[Array, Array, Array]:
+    def _judged(self, q: Array, around: Around) -> tuple[NDArray[np.bool_], Array, NDArray[np.bool_]]:
         """Whether boxes are proved, the joint to halve, and whether they might be proved with higher derivatives."""
         jets = Jets.joined([rows(q, around) for rows in (self.task, self.coordinates) if rows])
         model, terms = jets.average(around, self.active)
@@ -145,7 +146,8 @@ def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToO
     """The judge for a box in the domain of a chart, with rows whose vanishing differences are those of phi."""
     problem, active, coordinates = chart.problem, rows.active, chart.coordinates
     task: RowJets
-    tip, still = TipRows.of(problem.task), ()
+    tip = TipRows.of(problem.task)
+    still: tuple[int, ...] = ()
     if tip is not None:
         task = TipJets.of(tip, problem.robot.tree, active, problem.domain)
         leading = takewhile(lambda i: i not in rows.variables, chain_of(problem.robot.tree))
@@ -170,14 +172,14 @@ def _spread(left: Array, terms: Array, right: Array) -> Array:
     products = right.transpose(0, 2, 1)[:, None] @ products
     sums = np.abs(products, out=products).sum(axis=3)
     sizes = np.abs(left) @ np.abs(parts, out=parts).sum(axis=3) @ np.abs(right)
-    spread: Array = (sums * UP + SUM * sizes).transpose(1, 2, 0)
+    spread: Array = ((sums + sum_error(2 * (rows + columns)) * sizes) * above(count)).transpose(1, 2, 0)
     return spread
 
 
 def _combined(rows: Array, centre: Array, doubt: Array) -> tuple[Array, Array]:
     """Upper and lower bounds of the sizes of rows @ J for |J - centre| <= doubt, (boxes, rows, columns)."""
     middle = np.abs(rows @ centre)
-    error = (np.abs(rows) @ (doubt + SUM * np.abs(centre))) * UP
+    error = (np.abs(rows) @ (doubt + sum_error(rows.shape[2]) * np.abs(centre))) * UP
     return (middle + error) * UP, (middle - error) / UP
 
 

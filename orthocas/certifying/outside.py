@@ -1,28 +1,27 @@
 """Boxes that need no proof, because they are proved to lie outside a ClearBox or a Corridor (ours)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.batch import dense_function
 from orthocas.casadi_tools.threads import one_blas_thread
-from orthocas.certifying.chart_rows import ChartRows, GraphRows, joint_models
+from orthocas.certifying.chart_rows import ChartRows, GraphRows, joint_models, task_gradients, true_gradients
 from orthocas.certifying.elimination import between, is_orthogonal, singular_vectors
-from orthocas.certifying.graph import TaylorGraph
 from orthocas.certifying.judges import Judge, RegularityJudge, Verdicts, most_influential
 from orthocas.certifying.monomials import Variables
 from orthocas.certifying.rounding import UP
-from orthocas.certifying.task_rows import task_rows
 from orthocas.certifying.taylor import TaylorModel
+from orthocas.certifying.unbounded import require_all_positions
 from orthocas.chart import Chart
 from orthocas.checks import Array
+from orthocas.errors import CertifyError
 from orthocas.postures.clear_box import ClearBox
 from orthocas.postures.corridor import Corridor
 
 _ROUNDING = 1e-6  # of distances, far above that of floating-point numbers
-_LENGTHS = 1e-7  # of squares: far above what singular vectors miss that are orthogonal up to 1e-9
+_LENGTHS = 1e-7  # of squares: far above what singular vectors miss that are orthogonal up to 1e-9, and roundings of D
 _GUARDS = 1e-12  # of |J_x|^2: elimination in floating-point numbers is exact to less, so guards agree
 
 
@@ -37,7 +36,7 @@ class OutsideJudge:
     """
 
     inside: RegularityJudge
-    rows: GraphRows  #: D^-1 J_x, or C(q) D^-1 J_x with orthogonal C
+    rows: GraphRows  #: J_x, or C(q) J_x with orthogonal C if all entries of D are the same
     domain: ClearBox
     sign: float  #: of det J at the centre of the domain
     variables: Variables
@@ -65,7 +64,7 @@ class OutsideJudge:
 
     def _lie_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Whether boxes lie outside, and the joint to halve to find out."""
-        J = self.rows(joint_models(low, high, self.variables)[0])
+        J = self.rows(joint_models(low, high, self.variables)[0]).times(1 / self.domain.scale[:, None, None])
         left, right = singular_vectors(J)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             least = _least_row(between(left, J, right))
@@ -105,7 +104,7 @@ class CorridorJudge:
     @property
     def joints(self) -> Variables:
         """All joints: parts may lie outside in each of them."""
-        return tuple(range(self.domain.n))
+        return tuple(range(len(self.domain.centre)))
 
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
@@ -123,20 +122,30 @@ class CorridorJudge:
 
 
 def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
-    """The judge of a chart: of its whole box or, of a part of it, of what is not proved to lie outside."""
+    """The judge of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
+
+    Raises:
+        CertifyError: if a joint is unbounded, and a proof for its half-width is none for all its positions. In a
+            corridor, an unbounded joint whose distance to the path counts is one of these.
+    """
+    require_all_positions(chart, rows.variables)
     judge, domain = RegularityJudge(rows, bound), chart.problem.domain
     if isinstance(domain, Corridor):
+        _require_uncounted(domain, chart.problem.robot.joint_names)
         start = domain.postures[domain.contains(domain.postures)][:1]
         return CorridorJudge(judge, domain, float(judge(start, start).sign[0]))
     if not isinstance(domain, ClearBox):
         return judge
-    q = ca.SX.sym("q", chart.n)
-    task = chart.problem.task  # rotated rows have the singular values of x for positions only
-    same = task.recipe["kind"] == "position:xyz" and bool((domain.scale == domain.scale[0]).all())
-    turned, allowance = task_rows(task, domain) if same else (task.jacobian_function, 0.0)
-    J = ca.densify(turned(q) / ca.repmat(ca.DM(domain.scale), 1, chart.n))
-    graph = TaylorGraph.of(dense_function("scaled_rows", [q], [J]), "the task")
+    task, joints = chart.problem.task, range(chart.n)  # rotated rows have the singular values of x for positions only
+    alike = task.recipe["kind"] == "position:xyz" and bool((domain.scale == domain.scale[0]).all())
+    own, variables = task_gradients(task, domain, joints) if alike else true_gradients(task, joints)
+    require_all_positions(chart, variables)
     sign = float(judge(domain.centre[None], domain.centre[None]).sign[0])  # rows have other scales than the chart's
-    variables = tuple(k for k in range(chart.n) if ca.depends_on(J, q[k]))
-    own = GraphRows(graph, chart.m, allowance / float(domain.scale.min()) * UP)
-    return OutsideJudge(judge, own, domain, sign, variables)
+    return OutsideJudge(judge, own, domain, sign, tuple(sorted(variables)))
+
+
+def _require_uncounted(domain: Corridor, joint_names: Sequence[str]) -> None:
+    """Raise CertifyError if an unbounded joint counts: after a turn, what is far from the path may be near it."""
+    for joint in {*domain.unbounded} & {*domain.counted.tolist()}:
+        name = joint_names[joint]
+        raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")

@@ -23,7 +23,7 @@ from orthocas.certifying.jets import (
     powers,
 )
 from orthocas.certifying.monomials import DEGREE, Monomial, Variables
-from orthocas.certifying.rounding import SUM, TINY, UNIT, UP
+from orthocas.certifying.rounding import TINY, UNIT, UP, above, sum_error
 from orthocas.certifying.taylor import TaylorModel
 from orthocas.checks import Array
 from orthocas.parametrisations.product_basis import ProductFamily
@@ -74,11 +74,11 @@ class ProductRows:
             found, doubt = self._derivatives(order, values, errors)
             weights = powers(half_widths, order - 1)
             coefficients = found * weights
-            left_out += (doubt * weights + SUM * np.abs(coefficients)).sum(axis=2)
+            left_out += (doubt * weights + sum_error(DEGREE + 2) * np.abs(coefficients)).sum(axis=2)
             parts.append(coefficients)
         left_out += (self._largest(DEGREE + 2, boxes) * powers(half_widths, DEGREE + 1)).sum(axis=2)
         coefficients = np.concatenate(parts, axis=2).transpose(2, 0, 1, 3)
-        return TaylorModel(variables, coefficients, left_out * UP + TINY)
+        return TaylorModel(variables, coefficients, left_out * above(len(coefficients)) + TINY)
 
     def dependences(self) -> set[int]:
         """The joints that J_xi depends on."""
@@ -96,14 +96,14 @@ class ProductRows:
         boxes = [TaylorModel((k,), each, np.zeros(each.shape[1:])) for k, each in enumerate(linear)]
         left_out = self._largest(around.order + 2, boxes) * largest_average(power_weights(around, around.order + 1))
         derivatives, doubts = zip(*known, strict=True)
-        return Jets(derivatives, doubts, left_out.sum(axis=2) * UP + TINY)
+        return Jets(derivatives, doubts, left_out.sum(axis=2) * above(left_out.shape[2]) + TINY)
 
     def _derivatives(self, order: int, values: Array, errors: Array) -> tuple[Array, Array]:
         """Those of J_xi at points, of one order less, and bounds of their errors."""
         one = self.orders[order - 1]
         found = one.table @ values[one.used]
         doubt = one.sizes @ (errors[one.used] + one.rounding * np.abs(values[one.used]))
-        return self._spread(found, order), self._spread(doubt, order)
+        return self._spread(found, order), self._spread(doubt * above(len(one.used)), order)
 
     def _largest(self, order: int, boxes: list[TaylorModel]) -> Array:
         """Bounds of the derivatives of J_xi of one order less on boxes, (r, n, multi-indices, boxes)."""
@@ -112,7 +112,7 @@ class ProductRows:
             highest = self._products([box.magnitude() for box in self.functions(boxes)], last.used)
         else:  # constants only
             highest = np.ones((len(last.used), boxes[0].remainder.shape[-1]))
-        return self._spread(last.sizes @ highest * (1 + last.rounding), order)
+        return self._spread(last.sizes @ highest * (1 + last.rounding) * above(len(last.used)), order)
 
     def _spread(self, found: Array, order: int) -> Array:
         """Derivatives by multi-index as those of J_xi: (r, n, multi-indices of one order less, boxes)."""
@@ -126,7 +126,7 @@ class ProductRows:
         values = self._products([model.centre for model in functions], every)
         size = self._products([np.abs(model.centre) for model in functions], every)
         high = self._products([np.abs(model.centre) + model.remainder for model in functions], every)
-        return values, np.maximum(high - size, 0) + SUM * high + TINY
+        return values, np.maximum(high - size, 0) + sum_error(3 * self.terms.shape[1]) * high + TINY
 
     def _products(self, functions: list[Array], which: NDArray[np.intp]) -> Array:
         """Products of one-joint functions, (terms, boxes)."""

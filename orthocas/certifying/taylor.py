@@ -12,8 +12,10 @@ from typing import Self
 import numpy as np
 
 from orthocas.certifying.monomials import Variables, monomials, order_starts, places, product
-from orthocas.certifying.rounding import SUM, TINY, UNIT, UP
+from orthocas.certifying.rounding import TINY, UNIT, UP, sum_error
 from orthocas.checks import Array
+
+_PRODUCTS = 8  # that add up to a coefficient of a product: a_S b_rest over the subsets S of three variables
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +116,7 @@ class TaylorModel:
         all_a, all_b = a.sum(axis=0), b.sum(axis=0)
         high = a[3] * (b[1] + b[2] + b[3]) + a[2] * (b[2] + b[3]) + a[1] * b[3]
         carried = self.remainder * (all_b + other.remainder) + other.remainder * all_a
-        bound: Array = (high + carried + SUM * (all_a * all_b)) * UP + TINY
+        bound: Array = (high + carried + sum_error(_PRODUCTS) * (all_a * all_b)) * UP + TINY
         return bound
 
     def composed(self, series: "Series") -> "TaylorModel":
@@ -144,7 +146,8 @@ class TaylorModel:
         flat, shape = size.reshape(len(size), -1), (len(taken), *size.shape[1:])
         last = (taken[:, cubic:] @ flat[cubic:]).reshape(shape)
         known = (taken[:, :cubic] @ flat[:cubic]).reshape(shape) + last
-        gains: Array = known + last / (last.sum(axis=0) + TINY) * self.remainder
+        with np.errstate(invalid="ignore"):  # infinite remainders
+            gains: Array = known + last / (last.sum(axis=0) + TINY) * self.remainder
         return gains
 
 

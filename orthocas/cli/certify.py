@@ -101,15 +101,11 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor | None]:
 
 
 def _unfinished(chart: Chart, bound: float | None) -> Certificate | None:
-    """The certificate in the file if there is more to prove and it is about the same bound."""
+    """The certificate in the file if there is more to prove, it is about the same bound, and it can be resumed."""
     known = chart.certificate
-    if (
-        known is None
-        or known.method != METHOD
-        or known.proved
-        or known.fold
-        or (bound is not None and bound != known.bound)
-    ):
+    if known is None or known.method != METHOD or not known.digest:
+        return None
+    if known.proved or known.fold or (bound is not None and bound != known.bound):
         return None
     return known
 

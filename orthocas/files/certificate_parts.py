@@ -32,6 +32,7 @@ def certificate_to_data(certificate: Certificate) -> tuple[dict[str, Any], dict[
         "seconds": certificate.seconds,
         **({"least_singular_value": certificate.least_singular_value} if certificate.least_singular_value else {}),
         **({"dead": certificate.dead} if certificate.dead else {}),
+        **({"digest": certificate.digest} if certificate.digest else {}),
     }
     return header, arrays
 
@@ -59,6 +60,7 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         _number(data, "seconds"),
         _number(data, "least_singular_value") if "least_singular_value" in data else 0.0,
         require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0) if "dead" in data else 0,
+        part(data, "digest", str) if "digest" in data else "",  # missing in older files
     )
 
 

@@ -13,7 +13,7 @@ from orthocas.checks import require_count, require_text
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import CoordinateMap
 from orthocas.domains import sample_uniform
-from orthocas.errors import ChartFileError, InvalidValueError, OrthocasError
+from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
 from orthocas.files.archive import Kind, read_archive, write_archive
 from orthocas.files.certificate_parts import certificate_from_data, certificate_to_data
 from orthocas.files.json import part
@@ -22,6 +22,7 @@ from orthocas.files.problem_parts import FOREIGN, problem_from_data, problem_to_
 from orthocas.growing import GrownCoordinates, leaf_from_arrays
 from orthocas.parametrisations import (
     MLP,
+    CyclicParametrisation,
     Fourier,
     JointSpace,
     Linear,
@@ -29,6 +30,7 @@ from orthocas.parametrisations import (
     parametrisation_from_data,
     parametrisation_to_data,
 )
+from orthocas.parametrisations.cyclic_joints import require_cyclic
 from orthocas.problem import Problem
 
 CHART = Kind("chart", 1, ChartFileError)
@@ -53,10 +55,11 @@ def write_chart(
         ChartFileError: if the file cannot be written, or would replace something other than a chart without `force`.
     """
     header, arrays = _content(problem, coordinates)
+    header["notes"] = _checked_notes(notes)
     if certificate is not None:
-        header["certificate"], proof = certificate_to_data(certificate)
-        arrays |= proof
-    write_archive(path, CHART, {**header, "notes": _checked_notes(notes)}, arrays, force)
+        data, proof = certificate_to_data(certificate)
+        header["certificate"], arrays = {**data, "notes": _digest_of(header["notes"])}, {**arrays, **proof}
+    write_archive(path, CHART, header, arrays, force)
 
 
 def fingerprint(problem: Problem, coordinates: CoordinateMap) -> str:
@@ -104,9 +107,17 @@ def _certificate(
     """The certificate of the file, if it has one, and only if it belongs to the chart."""
     if "certificate" not in header:
         return None
-    certificate = certificate_from_data(part(header, "certificate", dict), arrays, problem.n)
+    data = part(header, "certificate", dict)
+    certificate = certificate_from_data(data, arrays, problem.n)
     certificate.require_for(fingerprint(problem, coordinates))
+    if "notes" in data and data["notes"] != _digest_of(header["notes"]):  # missing in older files
+        raise CertifyError("the notes have been changed since the file was written")
     return certificate
+
+
+def _digest_of(notes: Mapping[str, Any]) -> str:
+    """SHA-256 of notes: they are no part of a proof, and a certified chart shows them beside it."""
+    return hashlib.sha256(json.dumps(notes, sort_keys=True).encode()).hexdigest()
 
 
 def _checked_notes(notes: Notes) -> dict[str, str | float]:
@@ -161,12 +172,16 @@ def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str,
     if "leaf" in data:
         own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
         return GrownCoordinates(problem, leaf_from_arrays(problem, part(data, "leaf", str), own))
-    return Coordinates(
-        parametrisation_from_data(data),
+    parametrisation = parametrisation_from_data(data)
+    found = Coordinates(
+        parametrisation,
         JointSpace.of(problem),
         _idle(part(data, "idle", list), problem.n),
         *(part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
     )
+    if isinstance(parametrisation, CyclicParametrisation):
+        require_cyclic(problem, parametrisation.cyclic)
+    return found
 
 
 def _idle(joints: list[int], n: int) -> tuple[int, ...]:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from fuzz import signals
 from fuzz.atlases import atlases
 from fuzz.calls import calls
+from fuzz.certificates import certificates
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
@@ -18,6 +19,7 @@ from fuzz.steps import steps
 CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "atlases": atlases,
     "calls": calls,
+    "certificates": certificates,
     "charts": charts,
     "checkpoints": checkpoints,
     "commands": commands,
