@@ -69,4 +69,4 @@ class TaylorGraph:
 
 def is_whole(value: float | None) -> bool:
     """Whether a constant, if there is one, is a whole number that powers may have as exponent."""
-    return value is not None and value == round(value) and abs(value) <= _LARGEST_POWER
+    return value is not None and abs(value) <= _LARGEST_POWER and value == round(value)
