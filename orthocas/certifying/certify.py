@@ -257,7 +257,8 @@ def _one_to_one(
             best = search.subdivision()
         return search.finished
 
-    for held in [judge.still_joints, ()] if judge.still_joints else [()]:
+    idle = sorted({*range(chart.n)} - {*rows.active})  # coordinates themselves: their range does not matter
+    for held in [[*idle, *judge.still_joints], idle] if judge.still_joints else [idle]:
         shares = [np.where(np.isin(np.arange(chart.n), held), 1.0, scale) for scale in _SCALES]
         low, high = 0, len(shares)  # the scales before `low` are proved, those from `high` on are not with few boxes
         while low < high:

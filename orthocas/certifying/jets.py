@@ -112,13 +112,14 @@ def power_weights(around: Around, order: int) -> Array:
 
 def even_average(weights: Array) -> Array:
     """The average over s in [-1, 1] of polynomials (terms, powers, boxes)."""
-    average: Array = sum(weights[:, k] / (k + 1) for k in range(0, weights.shape[1], 2))
+    powers_ = np.arange(weights.shape[1])
+    average: Array = np.einsum("tkb,k->tb", weights, np.where(powers_ % 2, 0.0, 1 / (powers_ + 1)))
     return average
 
 
 def largest_average(weights: Array) -> Array:
     """The average over s in [-1, 1] of polynomials (terms, powers, boxes) in |s|."""
-    average: Array = sum(weights[:, k] / (k + 1) for k in range(weights.shape[1]))
+    average: Array = np.einsum("tkb,k->tb", weights, 1 / (np.arange(weights.shape[1]) + 1))
     return average
 
 

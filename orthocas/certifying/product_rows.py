@@ -143,7 +143,7 @@ def _orders(family: ProductFamily, terms: Array, C: Array, highest: int) -> tupl
     n = family.space.n
     steps = [family.derivative_matrix(i) for i in range(n)]
     known: dict[Monomial, tuple[Any, Any]] = {(): (C, np.abs(C))}
-    orders = []
+    orders: list[Derivatives] = []
     for order in range(1, highest + 1):
         indices = multi_indices(n, order)
         if orders and not len(orders[-1].used):  # a polynomial of a lower degree

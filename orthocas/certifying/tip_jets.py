@@ -75,7 +75,7 @@ class TipJets:
 
     def _rest_of_turns(self, around: Around, turning: Array) -> Array:
         """The rest for vectors of length 1 that prismatic joints leave alone."""
-        still = ~np.asarray(turning)[:, None]
+        still = np.logical_not(turning)[:, None]
         part = Around(around.centre, np.where(still, 0, around.middles), np.where(still, 0, around.differences))
         return _rest(part, np.asarray(turning, dtype=float))
 
