@@ -260,7 +260,9 @@ def _one_to_one(
     idle = sorted({*range(chart.n)} - {*rows.active})  # coordinates themselves: their range does not matter
     for held in [[*idle, *judge.still_joints], idle] if judge.still_joints else [idle]:
         shares = [np.where(np.isin(np.arange(chart.n), held), 1.0, scale) for scale in _SCALES]
-        low, high = 0, len(shares)  # the scales before `low` are proved, those from `high` on are not with few boxes
+        if proved(shares[-1], _FEW_BOXES):
+            break
+        low, high = 0, len(shares) - 1  # the scales before `low` are proved, those from `high` on not with few boxes
         while low < high:
             middle = (low + high) // 2
             low, high = (middle + 1, high) if proved(shares[middle], _FEW_BOXES) else (low, middle)
