@@ -243,11 +243,13 @@ def _one_to_one(
     end = time.monotonic() + seconds
     judge = one_to_one_judge(chart, rows, base)
     best: Subdivision | None = None
+    if judge is None:
+        return None
 
     def proved(share: Array, most: int) -> bool:
         nonlocal best
         part = _scaled(base, share)
-        middle, own = (part.low + part.high)[None] / 2, judge.on(part)
+        middle, own = (part.low + part.high)[None] / 2, replace(judge, low=part.low, high=part.high)
         if not own(middle, middle).proved.all():  # the middle of points that may be farthest apart
             return False
         limits = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=_HOPELESS)

@@ -67,8 +67,10 @@ def check_certificate(
     box = certificate.injective
     if box is None:
         return True
-    found = _judged(one_to_one_judge(chart, rows, box), box, mapped, monitor)
-    return box.complete and _around_the_centre(certificate, box) and all(verdicts.proved.all() for verdicts in found)
+    one_to_one = one_to_one_judge(chart, rows, box)
+    if one_to_one is None or not box.complete or not _around_the_centre(certificate, box):
+        return False
+    return all(verdicts.proved.all() for verdicts in _judged(one_to_one, box, mapped, monitor))
 
 
 def _regular(certificate: Certificate, found: list[Verdicts]) -> bool:

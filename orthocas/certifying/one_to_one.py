@@ -59,10 +59,6 @@ class OneToOneJudge:
         """The joints of the columns `still`."""
         return tuple(self.active[k] for k in self.still)
 
-    def on(self, part: Subdivision) -> "OneToOneJudge":
-        """The judge for another whole."""
-        return replace(self, low=part.low, high=part.high)
-
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
         found = []
@@ -142,8 +138,13 @@ class OneToOneJudge:
         return np.asarray((change * UP < self.turns[circles, None]).all(axis=0))
 
 
-def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneJudge:
-    """The judge for a box in the domain of a chart, with rows whose vanishing differences are those of phi."""
+def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneJudge | None:
+    """The judge for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
+
+    None if the other rows depend on an idle joint, which then is none.
+    """
+    if {*rows.variables} - {*rows.active}:
+        return None
     problem, active, coordinates = chart.problem, rows.active, chart.coordinates
     task: RowJets
     tip = TipRows.of(problem.task)
