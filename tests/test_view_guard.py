@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from browser import PROGRAM, browser
+from fuzz.views import views
 
 import orthocas as oc
 from orthocas.errors import ViewError
@@ -223,3 +224,7 @@ def test_pages_of_others_in_a_real_browser_get_no_websocket(view: oc.viewing.Vie
         page.open(page.value("location.href"))  # viser adds to the address; it stays one that can be opened
         page.wait("!!document.querySelector('canvas')")
         evil.shutdown()
+
+
+def test_spoiled_requests_are_refused_and_good_ones_served() -> None:
+    assert views(300) == []

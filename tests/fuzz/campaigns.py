@@ -14,6 +14,7 @@ from fuzz.paths import logs, paths
 from fuzz.robots import robots
 from fuzz.runs import runs
 from fuzz.steps import steps
+from fuzz.views import views
 
 CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "atlases": atlases,
@@ -28,4 +29,5 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "runs": runs,
     "signals": signals.campaign,
     "steps": steps,
+    "views": views,
 }
