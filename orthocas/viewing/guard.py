@@ -83,7 +83,7 @@ def guarded(host: str) -> Iterator[Guard]:
 
     A later viser may start it in another way: then `Guard.seen` stays empty.
     """
-    guard, module = Guard(host), import_module("websockets.asyncio.server")
+    guard, module = Guard(host), _serving()
     with _starting:
         serve = module.serve
         module.serve = _with_guard(serve, guard)
@@ -91,6 +91,11 @@ def guarded(host: str) -> Iterator[Guard]:
             yield guard
         finally:
             module.serve = serve
+
+
+def _serving() -> Any:
+    """The module whose function `serve` is looked up."""
+    return import_module("websockets.asyncio.server")
 
 
 def _with_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
