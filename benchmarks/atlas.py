@@ -80,7 +80,8 @@ def large(count: int) -> str:
         tiles = region.tiles(plan.lattice)[:count].tolist()
         for first in range(0, count, 500):
             cells = [Cell.whole(tile, len(plan.joints)) for tile in tiles[first : first + 500]]
-            add_results(path, plan, [(-1, False, Result(c, Outcome.CHART, numbers=numbers)) for c in cells], first)
+            results = [Result(cell, Outcome.CHART, numbers=numbers, leak_deg=0.0, conditioning=1.0) for cell in cells]
+            add_results(path, plan, [(-1, False, result) for result in results], first)
         start = time.perf_counter()
         atlas = oc.Atlas.load(path)
         opened = time.perf_counter() - start

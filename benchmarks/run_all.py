@@ -43,6 +43,7 @@ SCRIPTS = (
     "inverse",
     "default_gains",
     "safety",
+    "frozen_sensors",
     "following",
     "operational_space",
     "redundancy_peers",

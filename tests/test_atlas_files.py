@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import time
+import zlib
+from base64 import b64decode, b64encode
 from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +17,8 @@ import pytest
 from planar_atlas import ASKED, built, cells_of, planar
 
 import orthocas as oc
-from orthocas.atlases.atlas_file import ATLAS, Stock, add_results, header_of, plan_terms, read_stock
+from orthocas.atlases.atlas_file import ATLAS, Stock, add_results, chart_type, header_of, plan_terms, read_stock
+from orthocas.atlases.build import opened
 from orthocas.atlases.cells import Cell
 from orthocas.atlases.jobs import Job, packed, run_job
 from orthocas.atlases.outcomes import Outcome, Result
@@ -24,7 +27,8 @@ from orthocas.atlases.processes import Processes
 from orthocas.atlases.regions import joint_range_of
 from orthocas.checks import Array
 from orthocas.errors import AtlasFileError
-from orthocas.files.blocks import create, owned
+from orthocas.files.blocks import create, owned, sealed
+from orthocas.files.npy import from_npy, to_npy
 
 
 def test_file_holds_the_same_atlas(planar_atlas: oc.Atlas, covered: Array) -> None:
@@ -49,6 +53,127 @@ def test_build_goes_on_after_a_process_died_while_it_wrote(planar_atlas: oc.Atla
         with pytest.raises(AtlasFileError, match="truncated"):
             oc.Atlas.load(path)
         assert cells_of(built(path).stock) == cells_of(planar_atlas.stock)
+
+
+@pytest.fixture(scope="module")
+def grown(tmp_path_factory: pytest.TempPathFactory) -> Stock:
+    """A file of several blocks of cells, and one of turns after each build."""
+    path = tmp_path_factory.mktemp("grown") / "arm.orthocas-atlas"
+    for share in (0.1, 0.2, 0.3):
+        built(path, share=share)
+    return read_stock(path)
+
+
+def of_version_1(content: bytes, stock: Stock) -> bytes:
+    """The file as the first version wrote it: without checksums of the headers of blocks."""
+    ends = [block.body - len(block.head) for block in stock.contents.blocks]
+    parts = [content[: len(ATLAS.magic)], b"\1", content[len(ATLAS.magic) + 1 : ends[0] - 4]]
+    for end, after in zip(ends, [end - 4 for end in ends[1:]] + [len(content)], strict=True):
+        parts.append(content[end:after])
+    return b"".join(parts)
+
+
+def turned(content: bytes, byte: int, bit: int) -> bytes:
+    return content[:byte] + bytes([content[byte] ^ 1 << bit]) + content[byte + 1 :]
+
+
+def test_every_bit_of_every_header_is_guarded(grown: Stock, tmp_path: Path) -> None:
+    content, blocks = grown.path.read_bytes(), grown.contents.blocks
+    headers = [range(block.body - len(block.head) - 28, block.body - len(block.head)) for block in blocks]
+    assert len(headers) == 6
+    places = [(byte, bit) for part in (range(56), *headers) for byte in part for bit in range(8)]
+    places += [(byte, byte % 8) for byte in range(56, headers[0][0], 31)]  # under a SHA-256
+    path = tmp_path / "arm.orthocas-atlas"
+    for byte, bit in places:
+        path.write_bytes(turned(content, byte, bit))
+        with pytest.raises(AtlasFileError), opened(path, grown.plan, grown.region, False):
+            pass
+        assert [file.name for file in tmp_path.iterdir()] == [path.name]
+        assert path.read_bytes() == turned(content, byte, bit)
+
+
+def test_nothing_is_lost_of_a_file_of_version_1_with_a_turned_bit(grown: Stock, tmp_path: Path) -> None:
+    content = of_version_1(grown.path.read_bytes(), grown)
+    path, rest = tmp_path / "arm.orthocas-atlas", tmp_path / "arm.orthocas-atlas.rest"
+    path.write_bytes(content)
+    blocks = read_stock(path).contents.blocks
+    for block in (blocks[0], blocks[-1]):
+        for byte in range(block.body - len(block.head) - 24, block.body - len(block.head)):
+            for bit in range(8):
+                bent = turned(content, byte, bit)
+                path.write_bytes(bent)
+                with suppress(AtlasFileError), opened(path, grown.plan, grown.region, False) as stock:
+                    assert stock.contents.blocks == blocks[:-1]  # damaged lengths of the last block look cut off
+                assert path.read_bytes() + (rest.read_bytes() if rest.exists() else b"") == bent
+                assert block is blocks[-1] or not rest.exists()
+                rest.unlink(missing_ok=True)
+
+
+def test_file_of_version_1_goes_on_as_such(planar_atlas: oc.Atlas, grown: Stock, tmp_path: Path) -> None:
+    path = tmp_path / "arm.orthocas-atlas"
+    path.write_bytes(of_version_1(grown.path.read_bytes(), grown))
+    assert cells_of(built(path).stock) == cells_of(planar_atlas.stock)
+    assert path.read_bytes()[len(ATLAS.magic)] == 1
+
+
+def test_what_a_dying_process_left_is_set_aside(grown: Stock, tmp_path: Path) -> None:
+    content, last = grown.path.read_bytes(), grown.contents.blocks[-1]
+    begin = last.body - len(last.head) - 28
+    path = tmp_path / "arm.orthocas-atlas"
+    for number in ("", "2", "3"):  # what an earlier one left stays
+        path.write_bytes(content[:-3])
+        with opened(path, grown.plan, grown.region, False) as stock:
+            assert stock.contents.blocks == grown.contents.blocks[:-1]
+        assert path.read_bytes() == content[:begin]
+        assert (tmp_path / f"{path.name}.rest{number}").read_bytes() == content[begin:-3]
+
+
+def test_whole_blocks_after_one_that_was_cut_are_not_removed(grown: Stock, tmp_path: Path) -> None:
+    """As two computers may leave that write one file on a network disk without locks."""
+    content, block = grown.path.read_bytes(), grown.contents.blocks[2]
+    begin, end = block.body - len(block.head) - 28, block.body + block.length
+    path = tmp_path / "arm.orthocas-atlas"
+    bent = content[: begin + 40] + content[end:]
+    assert block.length + len(block.head) > len(content) - end  # so the file seems to end within this block
+    path.write_bytes(bent)
+    with pytest.raises(AtlasFileError, match=f"block at byte {begin}"), opened(path, grown.plan, grown.region, False):
+        pass
+    assert path.read_bytes() == bent
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[("scale", value) for value in (0.0, -1.0, 1e-320, 1e308, np.inf, np.nan)],
+        *[("lattice_low", value) for value in (1e300, -40.0, np.nan)],
+        *[("lattice_width", value) for value in (1e-320, 0.0, -1.0, 1e300)],
+        ("lattice_counts", 10**6),
+        ("map_signs", 0.5),
+        ("map_shifts", 1.0),
+    ],
+)
+def test_values_of_the_header_are_checked(grown: Stock, tmp_path: Path, name: str, value: float) -> None:
+    path, header = tmp_path / "forged.orthocas-atlas", grown.contents.header
+    array = from_npy(b64decode(header["arrays"][name]))
+    array.flat[0] = value
+    arrays = {**header["arrays"], name: b64encode(to_npy(array)).decode()}
+    path.write_bytes(sealed({**header, "arrays": arrays}, ATLAS))
+    with pytest.raises(AtlasFileError, match=rf"forged.*{name if name[:4] != 'map_' else 'maps'}"):
+        oc.Atlas.load(path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e308])
+def test_numbers_of_charts_are_checked(grown: Stock, tmp_path: Path, value: float) -> None:
+    content, kind = bytearray(grown.path.read_bytes()), chart_type(grown.plan)
+    place = int(grown.places[0])
+    record = np.frombuffer(content, kind, 1, place).copy()
+    record["numbers"][0, 0, 1] = value
+    record["crc"] = zlib.crc32(record.tobytes()[4:])
+    content[place : place + kind.itemsize] = record.tobytes()
+    path = tmp_path / "forged.orthocas-atlas"
+    path.write_bytes(content)
+    with pytest.raises(AtlasFileError, match=r"forged.*numbers of chart 0"):
+        read_stock(path).numbers(np.array([0]))
 
 
 def test_file_of_other_settings_is_not_gone_on_with(planar_atlas: oc.Atlas) -> None:
@@ -103,7 +228,8 @@ def test_opening_a_large_atlas_reads_no_charts(tmp_path: Path, monkeypatch: pyte
     create(path, header_of(plan, region), ATLAS)
     numbers = np.zeros((plan.fitted, 1 + plan_terms(plan)))
     cells = [Cell.whole(tile, len(plan.joints)) for tile in region.tiles(plan.lattice)[:20_000].tolist()]
-    add_results(path, plan, [(-1, False, Result(cell, Outcome.CHART, numbers=numbers)) for cell in cells], 0)
+    results = [Result(cell, Outcome.CHART, numbers=numbers, leak_deg=0.0, conditioning=1.0) for cell in cells]
+    add_results(path, plan, [(-1, False, result) for result in results], 0)
     monkeypatch.setattr(Stock, "numbers", None)
     found = oc.Atlas(read_stock(path))
     assert len(found) == 20_000

@@ -61,7 +61,7 @@ def test_loop_of_the_page_on_c_compiles(library: GeneratedC, tmp_path: Path) -> 
 
 
 def test_controller_for_ros2_control_holds_moves_and_resumes(library: GeneratedC, tmp_path: Path) -> None:
-    """On stand-ins for ROS, around the library's own model; a missing measurement is 50 ticks long."""
+    """On stand-ins for ROS, around the library's own model; a missing measurement is 50 ticks long, a target is NaN."""
     folders = [f"-I{folder}" for folder in (STUBS / "ros2", ROS / "include", library.folder)]
     output_of("gcc", "-std=c99", "-O1", "-c", library.folder / "arm.c", "-o", tmp_path / "arm.o")
     sources = (ROS / "src" / "arm_controller.cpp", STUBS / "ros2" / "drive.cpp", tmp_path / "arm.o")
@@ -69,12 +69,16 @@ def test_controller_for_ros2_control_holds_moves_and_resumes(library: GeneratedC
     printed = dict(line.rsplit(" ", 1) for line in output_of(tmp_path / "drive").splitlines())
     ok, caught = 0, 6
     assert float(printed.pop("moved by")) == pytest.approx(0.1, abs=1e-4)
+    assert float(printed.pop("still moved by")) == pytest.approx(0.1, abs=1e-4)
+    assert float(printed.pop("now moved by")) == pytest.approx(0.05, abs=1e-4)
     assert printed == {
         "without joints": "1",
         "first command": "A1/effort",
         "last state": "A7/velocity",
         "held": f"{ok}",
         "moved": f"{ok}",
+        "spoiled target": f"{ok}",
+        "moved again": f"{ok}",
         "blind": "8",
         "seeing again": f"{caught}",
         "resumed": f"{ok}",

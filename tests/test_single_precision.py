@@ -16,7 +16,16 @@ from orthocas.checks import Array
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, check_c, compile_shared, gain_numbers
 from orthocas.codegen.library import compilers
 from orthocas.codegen.precision import SINGLE
-from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, KinematicProjector, PDPlus, Projector
+from orthocas.control import (
+    Controller,
+    ControlStatus,
+    Impedance,
+    Kinematic,
+    KinematicProjector,
+    PDPlus,
+    Projector,
+    Safety,
+)
 from orthocas.domains import borders
 from orthocas.errors import ProofError
 from orthocas.fitting.fit import Fit
@@ -234,7 +243,7 @@ def test_the_closed_loop_moves_like_the_double_one(
 
 def test_the_low_pass_comes_to_rest_and_is_never_stale(library: CompiledLibrary, law: Controller) -> None:
     q = law.problem.domain.centre
-    supervisor = Supervisor(library, law)
+    supervisor = Supervisor(library, law, Safety.of(law, stale_ticks=10_000))  # measurements stand still here
     supervisor.start(q)
     reference = np.concatenate([law.chart.phi(q), np.zeros(6)])
     target = reference[:3] + np.array([1e-2, 0.0, -0.1])

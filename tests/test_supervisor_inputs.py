@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from programs import built, needs_c
-from supervised import TICK, Arm, at_rest, run
+from supervised import TICK, Arm, at_rest, moving, run
 
 import orthocas as oc
-from orthocas.codegen import CompiledLibrary, Supervisor
+from orthocas.checks import Array
+from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.codegen.generated import GeneratedC
-from orthocas.control import Controller, ControlStatus
+from orthocas.control import Controller, ControlStatus, PDPlus, Safety
+from orthocas.simulation import MuJoCoPlant
 
 pytestmark = needs_c
 
@@ -48,6 +50,182 @@ def test_speeds_that_cannot_be_true_are_bad_measurements(supervisor: Supervisor,
     command, status = supervisor.step(q, np.array([0.0, 0.0, 1e6]), at_rest(planar_for_control, q), TICK)
     assert status is ControlStatus.BAD_INPUT
     np.testing.assert_array_equal(command, before)
+
+
+def settled(supervisor: Supervisor, chart: oc.Chart, q: Array) -> Array:
+    """The command at rest, after as many ticks with one measurement as one likes: nothing is wrong with that."""
+    supervisor.start(q)
+    for _ in range(2000):
+        command, status = supervisor.step(q, np.zeros(3), at_rest(chart, q), TICK)
+        assert status in (ControlStatus.OK, ControlStatus.SATURATED)
+    return command
+
+
+def test_the_same_measurement_of_a_moving_arm_is_missing_after_five_ticks(
+    supervisor: Supervisor, planar_for_control: oc.Chart
+) -> None:
+    chart, q = planar_for_control, planar_for_control.problem.domain.centre
+    for dq in (np.array([0.0, 1e-3, 0.0]), np.array([-0.5, 0.0, 0.0])):
+        settled(supervisor, chart, q)
+        for k in range(17):
+            command, status = supervisor.step(q, dq, at_rest(chart, q), TICK)
+            assert (status is ControlStatus.BAD_INPUT) == (k >= 5)
+            if k == 4:
+                before = command
+            if 5 <= k < 15:
+                np.testing.assert_array_equal(command, before)
+        assert supervisor.mode == 1  # the catcher, after hold_ticks
+        assert supervisor.step(q, dq + 1e-9, at_rest(chart, q), TICK)[1] is ControlStatus.CAUGHT
+        assert supervisor.cause == ControlStatus.BAD_INPUT
+
+
+def test_a_measurement_now_and_then_is_enough(supervisor: Supervisor, planar_for_control: oc.Chart) -> None:
+    """Sensors that are five times slower than the law, and equal measurements between others."""
+    chart, q = planar_for_control, planar_for_control.problem.domain.centre
+    settled(supervisor, chart, q)
+    for k in range(1000):
+        dq = np.array([0.1, 0.0, 1e-3 * (k // 5)])
+        assert supervisor.step(q, dq, at_rest(chart, q), TICK)[1] is not ControlStatus.BAD_INPUT
+
+
+def test_spoiled_ticks_between_do_not_hide_that_sensors_stand_still(
+    supervisor: Supervisor, planar_for_control: oc.Chart
+) -> None:
+    chart, q = planar_for_control, planar_for_control.problem.domain.centre
+    settled(supervisor, chart, q)
+    dq, nowhere = np.array([0.3, 0.0, 0.0]), np.full(3, np.nan)
+    for k in range(40):
+        _, status = supervisor.step(nowhere if k % 4 == 3 else q, dq, at_rest(chart, q), TICK)
+    assert status is ControlStatus.BAD_INPUT
+    assert supervisor.mode == 1
+
+
+def test_a_simulated_arm_that_rests_starts_and_rests_again_is_not_taken_for_a_fault(
+    supervisor: Supervisor, supervised_library: CompiledLibrary, planar_for_control: oc.Chart
+) -> None:
+    """Without noise, an arm comes to rest at one double; dq may stay at 1e-18, where q + dt dq is q."""
+    chart, domain = planar_for_control, planar_for_control.problem.domain
+    arm, wanted = Arm(chart.problem.robot, domain.centre), domain.centre + 0.1 * domain.half_width
+    supervisor.start(arm.q)
+    reference, rested = at_rest(chart, domain.centre), []
+    for k in range(2200):
+        goal = wanted if 600 <= k < 1600 else domain.centre
+        supervised_library.low_pass(reference, chart.phi(goal), 5.0, 1.0, TICK)
+        command, status = supervisor.step(arm.q, arm.dq, reference, TICK)
+        arm.move(command)
+        assert status in (ControlStatus.OK, ControlStatus.SATURATED)
+        rested.append(supervisor.same_ticks)
+    assert rested[599] > 100  # it did come to rest, with a dq that is not 0
+    assert np.abs(arm.dq).max() > 0
+
+
+def test_sensors_that_stand_still_at_rest_are_found_once_the_reference_moves(
+    supervisor: Supervisor, planar_for_control: oc.Chart
+) -> None:
+    """dq is 0, and the reference asks for 0.5 rad/s of all joints; the arm itself would start, unseen."""
+    chart, q = planar_for_control, planar_for_control.problem.domain.centre
+    settled(supervisor, chart, q)
+    dq = np.array([0.5, -0.5, 0.5])
+    statuses, drawn = [], []
+    for k in range(300):
+        statuses.append(supervisor.step(q, np.zeros(3), moving(chart, q + k * TICK * dq, dq), TICK)[1])
+        drawn.append(supervisor.drawn)
+    first = statuses.index(ControlStatus.BAD_INPUT)
+    assert drawn[first - 2] <= 0.1 < drawn[first - 1]
+    assert 5 <= first <= 100
+    assert supervisor.mode == 1
+    assert statuses[-1] is ControlStatus.CAUGHT  # the catcher asks for no motion
+    assert supervisor.cause == ControlStatus.BAD_INPUT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["iiwa7-position", "panda-position"])
+def test_an_arm_in_mujoco_does_not_run_away_from_sensors_that_stand_still(name: str, tmp_path: Path) -> None:
+    """It moves at 0.5 rad/s when its measurements freeze; 200 ms later it must not be faster than 3 rad/s."""
+    pytest.importorskip("mujoco", minversion="4")
+    chart = oc.charts.load(name)
+    law, robot, domain = PDPlus.on_chart(chart), chart.problem.robot, chart.problem.domain
+    library = CompiledLibrary(
+        compile_shared(oc.generate_c(chart, tmp_path, law, "arm"), tmp_path, ("-O1",)), "arm", robot.n
+    )
+    size = 0.3 * np.minimum(domain.half_width, 1.0)
+    speeds = {}
+    for stale_ticks in (5, 10**6):  # as it is, and without the rule
+        supervisor, plant = (
+            Supervisor(library, law, Safety.of(law, stale_ticks=stale_ticks)),
+            MuJoCoPlant(robot, stops=False),
+        )
+        plant.reset(domain.centre, np.full(robot.n, 0.5))
+        supervisor.take_over(domain.centre, robot.gravity(domain.centre))
+        for k in range(600):
+            angle = 0.5 / size * k * TICK
+            wanted = moving(chart, domain.centre + size * np.sin(angle), 0.5 * np.cos(angle))
+            if k <= 400:
+                seen = plant.q, plant.dq
+            plant.step(supervisor.step(*seen, wanted, TICK)[0], TICK)
+            if k == 400:
+                assert supervisor.mode == 0
+                assert np.abs(plant.dq).max() > 0.1
+        speeds[stale_ticks] = np.abs(plant.dq).max()
+    assert speeds[5] < 3.0
+    assert speeds[10**6] > 10.0
+
+
+BAD = (np.nan, np.inf, -np.inf, 1e300)
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_the_low_pass_goes_on_to_its_last_good_target(supervised_library: CompiledLibrary, bad: float) -> None:
+    """A bad target changes nothing: the reference is that of a low pass that never heard of it, to rounding."""
+    start, target = np.zeros(9), np.array([0.3, -0.2, 0.1])
+    for zeta in (0.7, 1.0, 2.0):
+        here, want = start.copy(), start.copy()
+        for k in range(3000):
+            spoiled = target.copy()
+            spoiled[k % 3] = bad
+            status = supervised_library.low_pass(here, spoiled if 50 <= k < 2000 else target, 5.0, zeta, TICK)
+            assert status == (3 if 50 <= k < 2000 else 0)  # NOT_FINITE, OK
+            supervised_library.low_pass(want, target, 5.0, zeta, TICK)
+            np.testing.assert_allclose(here, want, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(here[:3], target, atol=0.01)
+
+
+@pytest.mark.parametrize("setting", [(np.nan, 1.0, TICK), (0.0, 1.0, TICK), (3.0, np.nan, TICK), (3.0, 1.0, np.nan)])
+def test_the_low_pass_refuses_settings_that_are_no_numbers(
+    supervised_library: CompiledLibrary, setting: tuple[float, float, float]
+) -> None:
+    here = np.arange(9.0)
+    assert supervised_library.low_pass(here, np.zeros(3), *setting) == 3
+    np.testing.assert_array_equal(here, np.arange(9.0))
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_the_spline_stops_at_its_last_good_value(supervised_library: CompiledLibrary, bad: float) -> None:
+    start, target = np.arange(9.0) / 10, np.array([0.3, -0.2, 0.1])
+    good = supervised_library.spline(start, target, 1.0, 0.4)
+    spoiled = target.copy()
+    spoiled[1] = bad
+    calls = [(spoiled, 1.0, 0.5), (target, bad, 0.5), (target, 1.0, bad)]
+    for where, duration, time in calls:
+        held = supervised_library.spline(start, where, duration, time, good)
+        np.testing.assert_array_equal(held, np.concatenate([good[:3], np.zeros(6)]))
+        np.testing.assert_array_equal(supervised_library.spline(start, target, 1.0, 0.4, held), good)
+
+
+def test_the_arm_follows_good_targets_again_after_a_bad_one(
+    supervisor: Supervisor, supervised_library: CompiledLibrary, planar_for_control: oc.Chart
+) -> None:
+    chart, domain = planar_for_control, planar_for_control.problem.domain
+    arm, wanted = Arm(chart.problem.robot, domain.centre), domain.centre + 0.1 * domain.half_width
+    supervisor.start(arm.q)
+    reference, bad = at_rest(chart, domain.centre), np.full(3, np.nan)
+    for k in range(1800):
+        target = bad if 200 <= k < 600 else chart.phi(wanted if k >= 600 else domain.centre)
+        supervised_library.low_pass(reference, target, 5.0, 1.0, TICK)
+        command, status = supervisor.step(arm.q, arm.dq, reference, TICK)
+        assert status in (ControlStatus.OK, ControlStatus.SATURATED)
+        arm.move(command)
+    np.testing.assert_allclose(arm.q, wanted, atol=2e-3)
 
 
 def test_a_bad_reference_is_held(supervisor: Supervisor, planar_for_control: oc.Chart) -> None:

@@ -113,8 +113,8 @@ def test_springs_and_dampers_keep_away_from_joint_limits(
 ) -> None:
     q, speed = planar_for_control.problem.domain.centre, np.array([0.0, 0.1, 0.0])
     upper = q + np.array([1.0, 0.02, 1.0])
-    settings, commands = Safety.of(supervised_law), []
-    for safety in (settings, Safety.of(supervised_law, upper=upper, stop_zone=0.05)):
+    settings, commands = Safety.of(supervised_law, stale_ticks=1000), []
+    for safety in (settings, Safety.of(supervised_law, stale_ticks=1000, upper=upper, stop_zone=0.05)):
         supervisor = Supervisor(supervised_library, supervised_law, safety)
         supervisor.take_over(q, planar_for_control.problem.robot.gravity(q))
         for _ in range(400):  # until the limit of change is no matter any more

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -66,7 +67,7 @@ def test_handle_sweep_undo_and_home(build: Callable[[], oc.Chart]) -> None:
 def test_a_taken_port_is_named_and_a_closed_one_is_free() -> None:
     robot = fitted().chart.problem.robot
     with oc.view(robot, port=0) as view:
-        port = int(view.url.rpartition(":")[2])
+        port = urlsplit(view.url).port
         with pytest.raises(ViewError, match=f"port {port} of 127.0.0.1 is taken"):
             oc.view(robot, port=port)
         assert view.url in view._repr_html_()

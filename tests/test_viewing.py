@@ -22,6 +22,7 @@ from orthocas.errors import (
     ViewError,
 )
 from orthocas.viewing import Motion, export_page, window
+from orthocas.viewing.guard import is_local
 from orthocas.viewing.loop import Loop
 from orthocas.viewing.panel import ChartPanel, PlayerPanel, RobotPanel
 from orthocas.viewing.session import Session
@@ -106,7 +107,7 @@ def test_addresses_that_cannot_be_opened_are_refused() -> None:
         window.require_free("no such host", 0)
     with pytest.raises(InvalidValueError, match="port"):
         window.require_free("127.0.0.1", 70000)
-    assert [window.is_local(host) for host in ("127.0.0.1", "::1", "localhost", "0.0.0.0")] == [True, True, True, False]
+    assert [is_local(host) for host in ("127.0.0.1", "::1", "localhost", "0.0.0.0")] == [True, True, True, False]
     assert window.url_of("0.0.0.0", 80) == "http://127.0.0.1:80"
     assert window.url_of("::1", 80) == "http://[::1]:80"
 

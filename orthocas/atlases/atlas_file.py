@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from orthocas.atlases.lattice import Lattice
 from orthocas.atlases.outcomes import Outcome, Result
-from orthocas.atlases.plan import AtlasSettings, Plan
+from orthocas.atlases.plan import AtlasSettings, Plan, lattice_of
 from orthocas.atlases.regions import Region, Surroundings, joint_range_of
 from orthocas.atlases.symmetry import Symmetries
 from orthocas.checks import Array, Indices, frozen_array, frozen_indices, require_count
@@ -26,8 +26,11 @@ from orthocas.files.json import part
 from orthocas.files.npy import Stored, from_npy, to_npy
 from orthocas.files.problem_parts import FOREIGN, problem_from_data, problem_to_data
 
-ATLAS = BlockKind("atlas", b"\x93ORTHOCASATLAS\n", 1, AtlasFileError)
 _CELL, _TURN = b"CELL", b"TURN"
+ATLAS = BlockKind("atlas", b"\x93ORTHOCASATLAS\n", 2, (_CELL, _TURN), AtlasFileError)
+_MODERATE = 1e50  # products of a few such numbers do not overflow
+_SAME = 1e-9  # of a tile
+_NARROWEST = 1e-9  # of tiles [rad] or [m]
 Records = NDArray[np.void]
 
 
@@ -206,24 +209,41 @@ def _plan(header: Mapping[str, Any]) -> tuple[Plan, Region]:
         for name in ("idle", "cyclic")
     )
     active = tuple(i for i in range(problem.n) if i not in idle)
-    k = len(active) - len(cyclic)
-    signs = frozen_array("map_signs", arrays["map_signs"], (None, len(active)))
-    shifts = frozen_array("map_shifts", arrays["map_shifts"], signs.shape)
+    joints = tuple(i for i in active if i not in cyclic)
+    if len({*idle, *cyclic}) != len(idle) + len(cyclic) or not joints or problem.r <= len(idle):
+        raise InvalidValueError("idle and cyclic joints", (idle, cyclic), "different ones, and others to divide")
+    k = len(joints)
+    maps = _maps(active, arrays)
     counts = frozen_indices("lattice_counts", arrays["lattice_counts"], (k,), 2**31)
     low, width = (frozen_array(name, arrays[name], (k,)) for name in ("lattice_low", "lattice_width"))
-    if not (len(signs) and k > 0 and counts.min() > 0 and width.min() > 0 and problem.r > len(idle)):
-        raise InvalidValueError("lattice", "empty", "tiles, and coordinates to fit")
     endless = np.array(frozen_array("lattice_endless", arrays["lattice_endless"], (k,)) > 0)
-    plan = Plan(
-        problem,
-        settings,
-        idle,
-        cyclic,
-        Lattice(low, width, counts, endless),
-        Symmetries(active, signs, shifts),
-        frozen_array("scale", arrays["scale"], (problem.m,)),
-    )
+    lattice = Lattice(low, width, counts, endless)
+    _require_lattice(lattice, lattice_of(problem, joints, maps, settings))
+    scale = frozen_array("scale", arrays["scale"], (problem.m,))
+    if not ((scale > 1 / _MODERATE) & (scale < _MODERATE)).all():
+        raise InvalidValueError("scale", scale.tolist(), f"positive numbers below {_MODERATE:g}")
+    plan = Plan(problem, settings, idle, cyclic, lattice, maps, scale)
     return plan, _region(header, arrays, plan)
+
+
+def _maps(joints: tuple[int, ...], arrays: Mapping[str, Stored]) -> Symmetries:
+    """Symmetries in the joints that coordinates depend on, the identity first."""
+    signs = frozen_array("map_signs", arrays["map_signs"], (None, len(joints)))
+    shifts = frozen_array("map_shifts", arrays["map_shifts"], signs.shape)
+    known = (np.abs(signs) == 1).all() and ((shifts == 0) | (shifts == np.pi)).all()
+    if not (known and len(signs) and (signs[0] == 1).all() and (shifts[0] == 0).all()):
+        raise InvalidValueError("maps", signs.tolist(), "the identity, then signs of 1 and -1 with shifts of 0 and pi")
+    return Symmetries(joints, signs, shifts)
+
+
+def _require_lattice(found: Lattice, wanted: Lattice) -> None:
+    """Raise InvalidValueError unless the tiles are those of joint range, settings and symmetries."""
+    if not wanted.width.min() > _NARROWEST:
+        raise InvalidValueError("joint range", wanted.width.tolist(), f"tiles wider than {_NARROWEST:g}")
+    for name in ("low", "width", "counts", "endless"):
+        has, wants = (np.asarray(getattr(lattice, name), dtype=float) for lattice in (found, wanted))
+        if not (np.abs(has - wants) <= _SAME * wanted.width).all():
+            raise InvalidValueError(f"lattice_{name}", has.tolist(), f"{wants.tolist()}, which covers the joint range")
 
 
 def _region(header: Mapping[str, Any], arrays: Mapping[str, Stored], plan: Plan) -> Region:
@@ -234,6 +254,8 @@ def _region(header: Mapping[str, Any], arrays: Mapping[str, Stored], plan: Plan)
     if isinstance(radius, bool) or not isinstance(radius, float) or not 0 < radius < np.pi:
         raise InvalidValueError("field 'radius'", repr(radius)[:80], "a positive number below pi")
     postures = frozen_array("postures", arrays["postures"], (None, len(plan.joints)))
+    if not len(postures):
+        raise InvalidValueError("postures", "empty", "at least one")
     return Surroundings(whole.low, whole.high, postures, radius)
 
 
@@ -271,8 +293,17 @@ def _require_tree(path: Path, plan: Plan, records: Records) -> None:
     outer = parent < 0
     sound[outer] &= ~records["levels"][outer].any(axis=1) & ~records["places"][outer].any(axis=1)
     sound &= records["levels"].sum(axis=1, dtype=np.int64) <= plan.settings.splits
+    sound &= _numbers_make_sense(records)
     if not sound.all():
         raise AtlasFileError(f"{path} is damaged: record {int(np.argmin(sound))} of its cells makes no sense")
+
+
+def _numbers_make_sense(records: Records) -> NDArray[np.bool_]:
+    """Whether seconds are none or more, and leak, conditioning and share of charts are in their ranges, (cells,)."""
+    ranges = {"leak_deg": 90.0, "conditioning": 1.0, "clear": 1.0}
+    inside = [(records[name] >= 0) & (records[name] <= most * (1 + 1e-6)) for name, most in ranges.items()]
+    timed = (records["seconds"] >= 0) & np.isfinite(records["seconds"])
+    return np.asarray(timed & (np.all(inside, axis=0) | (records["outcome"] != Outcome.CHART)))
 
 
 def _turns(plan: Plan, contents: Contents) -> Turns | None:
@@ -286,6 +317,8 @@ def _turns(plan: Plan, contents: Contents) -> Turns | None:
     coded = np.frombuffer(head, np.int8, charts * r, 16).reshape(charts, r)
     constants = frozen_array("constants", np.frombuffer(head, "<f8", charts * r, 16 + charts * r), (None,))
     order = frozen_indices("order", np.abs(coded.astype(int)) - 1, (charts, r), r)
+    if (np.sort(order, axis=1) != np.arange(r)).any() or (np.abs(constants) >= _MODERATE).any():
+        raise InvalidValueError("turns of charts", "a coordinate twice, or a huge constant", "an order and constants")
     return Turns(order, np.sign(coded).astype(float), constants.reshape(charts, r))
 
 
@@ -301,5 +334,8 @@ def _checked(path: Path, content: bytes, kind: np.dtype[np.void], row: int) -> A
     if len(content) == kind.itemsize:
         record = np.frombuffer(content, kind)[0]
         if record["crc"] == zlib.crc32(content[4:]) and record["row"] == row:
-            return np.asarray(record["numbers"])
+            numbers = np.asarray(record["numbers"])
+            if not (np.abs(numbers) < _MODERATE).all():
+                raise AtlasFileError(f"{path} is damaged: numbers of chart {row} are not finite, or huge")
+            return numbers
     raise AtlasFileError(f"{path} is damaged: chart {row} does not match its checksum")

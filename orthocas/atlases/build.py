@@ -21,7 +21,7 @@ from orthocas.atlases.processes import Processes
 from orthocas.atlases.regions import Region
 from orthocas.casadi_tools.batch import THREADS
 from orthocas.errors import AtlasFileError
-from orthocas.files.blocks import begins, create, cut_rest, owned, text_of
+from orthocas.files.blocks import begins, create, owned, set_rest_aside, text_of
 from orthocas.minimising.watch import Monitor, Progress
 
 _BATCH = 4  # cells in a job
@@ -176,7 +176,7 @@ def opened(path: Path, plan: Plan, region: Region, force: bool) -> Iterator[Stoc
         )
     with owned(path, ATLAS):
         stock = read_stock(path)  # another process may have gone on meanwhile
-        cut_rest(path, stock.contents, ATLAS)
+        set_rest_aside(path, stock.contents, ATLAS)
         yield stock
 
 

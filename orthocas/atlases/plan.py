@@ -156,7 +156,7 @@ def make_plan(problem: Problem, settings: AtlasSettings, margin_deg: float) -> P
     maps = find_symmetries(local, active, cyclic) if settings.symmetric else identity_only(active)
     points = sample_uniform(problem.domain, _SCALE_SAMPLES, _SEED)
     scale = row_scale(task_jacobians(local, points), problem.task.units)
-    return Plan(problem, settings, idle, cyclic, _lattice(problem, region, joints, maps, settings), maps, scale)
+    return Plan(problem, settings, idle, cyclic, lattice_of(problem, joints, maps, settings), maps, scale)
 
 
 def joint_range(robot: Robot, margin_deg: float) -> Box:
@@ -187,11 +187,20 @@ def joint_range(robot: Robot, margin_deg: float) -> Box:
     return Box((low + high) / 2, (high - low) / 2, np.flatnonzero(free).tolist())
 
 
-def _lattice(
-    problem: Problem, region: Box, joints: tuple[int, ...], maps: Symmetries, settings: AtlasSettings
-) -> Lattice:
-    chosen = list(joints)
-    low, high = (region.centre - region.half_width)[chosen], (region.centre + region.half_width)[chosen]
+def lattice_of(problem: Problem, joints: tuple[int, ...], maps: Symmetries, settings: AtlasSettings) -> Lattice:
+    """The tiles over a problem's domain, in the joints that boxes divide.
+
+    Args:
+        problem: its domain is the whole joint range.
+        joints: those that boxes divide.
+        maps: symmetries, of these joints and others.
+        settings: what is asked of the charts.
+
+    Raises:
+        InvalidValueError: if there are too many.
+    """
+    chosen, domain = list(joints), problem.domain
+    low, high = (domain.centre - domain.half_width)[chosen], (domain.centre + domain.half_width)[chosen]
     prismatic = np.array(problem.robot.tree.prismatic)[chosen]
     widest = np.where(prismatic, settings.half_width / 4, settings.half_width) * 2
     endless = ~prismatic & (high - low >= 2 * np.pi - 1e-9)

@@ -27,9 +27,10 @@ from orthocas.following.path_file import read_path
 from orthocas.robots import Robot
 from orthocas.viewing import View, cyclic_motions, export_page
 from orthocas.viewing import view as open_view
+from orthocas.viewing.guard import is_local
 from orthocas.viewing.motion import read_joint_motion, read_run
 from orthocas.viewing.view import PORT, require_page
-from orthocas.viewing.window import LOCAL, is_local, require_free
+from orthocas.viewing.window import LOCAL, require_free
 
 _RUN = "trajectory.npz"  # in the folders of `orthocas simulate`
 
@@ -162,9 +163,7 @@ def _tell(page: View, host: str, json: bool) -> None:
     if json:
         print_json({"url": page.url, "host": host, "local": local, "missing_meshes": list(page.missing)})
     else:
-        who = (
-            "this machine only (--host opens it to others)" if local else "all who reach this machine, without password"
-        )
+        who = "this machine only (--host opens it to others)" if local else "all who reach it and know this address"
         print_rows({"page": page.url, "open to": who, "end": "Ctrl-C"})
 
 

@@ -162,7 +162,7 @@ _LAW = {  # lines of templates that are empty for a single chart
     "home": "state->chart, ",
     "no_chart_yet": ", 0",
     "changed": ", changed",
-    "other_chart": " ||\n      reference->chart != state->chart",
+    "other_chart": " || reference->chart != state->chart",
     "reference_chart": "  int chart; /* whose xi these are; ${name}_step changes all with the chart */\n",
     "state_chart": "  int chart;                 /* in use; NO_CHART until there was one */\n"
     "  int hand_overs;            /* from one chart to another */\n",
@@ -173,7 +173,6 @@ _LAW = {  # lines of templates that are empty for a single chart
     "        state->carry[i] += state->law[i] - (law[i] - fallback[i]);\n",
     "fade_carry": "  for (i = 0; i < N; ++i) state->carry[i] *= LEFT_BEHIND / (LEFT_BEHIND + period);\n",
     "reference_of_chart": "  reference->chart = chart;\n",
-    "same_chart": "  reference->chart = from->chart;\n",
 }
 _LAW_PARTS = {
     "beyond": "beyond.c",

@@ -124,7 +124,7 @@ def position_within(domain: Domain) -> Array:
 _NUMBERS_OF_CHARTS = ("which", "that", "check_that", "require_chart", "of_chart", "tables_c", "atlas_functions_h")
 _OF_CHARTS = (
     *("beyond", "reference_chart", "no_chart_yet", "state_chart", "state_carry", "hand_over_h", "home", "first_chart"),
-    *("choose_chart", "carry", "fade_carry", "reference_of_chart", "same_chart", "other_chart", "changed"),
+    *("choose_chart", "carry", "fade_carry", "reference_of_chart", "other_chart", "changed"),
 )
 _PARTS = {
     "about_chart": "about_box.h",

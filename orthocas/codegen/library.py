@@ -116,17 +116,22 @@ class CompiledLibrary:
         command = self._zeros(self.n)
         return command, self._call("control", [q, dq, reference, gains], [command], which)
 
-    def low_pass(self, reference: Array, target: Array, omega: float, zeta: float, period: float) -> None:
-        """Move a reference (3 k,) by one step of the low pass towards a target (k,)."""
+    def low_pass(self, reference: Array, target: Array, omega: float, zeta: float, period: float) -> int:
+        """Move a reference (3 k,) by one step of the low pass towards a target (k,); the status."""
         run, here, there = self.function("reference_low_pass"), self.numbers(reference), self.numbers(target)
-        run.argtypes, run.restype = [ctypes.c_void_p] * 2 + [self.precision.c_type] * 3, None
-        run(here.ctypes.data, there.ctypes.data, omega, zeta, period)
+        run.argtypes, run.restype = [ctypes.c_void_p] * 2 + [self.precision.c_type] * 3, ctypes.c_int
+        status = run(here.ctypes.data, there.ctypes.data, omega, zeta, period)
         reference[:] = here
+        return int(status)
 
-    def spline(self, start: Array, target: Array, duration: float, time: float) -> Array:
-        """The reference (3 k,) at a time on the spline from a reference to rest at a target (k,)."""
-        run, reference, number = self.function("reference_spline"), self._zeros(3 * len(target)), self.precision.c_type
-        run.argtypes, run.restype = [*[ctypes.c_void_p] * 2, number, number, ctypes.c_void_p], None
+    def spline(self, start: Array, target: Array, duration: float, time: float, last: Array | None = None) -> Array:
+        """The reference (3 k,) at a time on the spline from a reference to rest at a target (k,).
+
+        Where that is not finite, C returns the value of the last reference (default 0), at rest.
+        """
+        run, number = self.function("reference_spline"), self.precision.c_type
+        run.argtypes, run.restype = [*[ctypes.c_void_p] * 2, number, number, ctypes.c_void_p], ctypes.c_int
+        reference = self._zeros(3 * len(target)) if last is None else self.numbers(last).copy()
         ends = [self.numbers(end) for end in (start, target)]
         run(*(end.ctypes.data for end in ends), duration, time, reference.ctypes.data)
         return reference

@@ -67,7 +67,7 @@ _VELOCITY = """It stops the arm and holds it."""
 
 def _field(name: str, value: object) -> str:
     size = f"[{value.size}]" if isinstance(value, np.ndarray) else ""
-    kind = "int" if name == "hold_ticks" else "double"
+    kind = "int" if isinstance(value, int) else "double"
     return f"  {kind} {name}{size}; /* {Safety.meaning(name)} */"
 
 

@@ -103,13 +103,16 @@ class Supervisor:
 
 def _state_type(n: int, k: int, precision: Precision, of_atlas: bool) -> type[ctypes.Structure]:
     joints, quantities = precision.c_type * n, precision.c_type * k
-    names = ("q", "dq", "command", "law", "anchor", "safe")
+    names = ("q", "dq", "seen_q", "seen_dq", "command", "law", "anchor", "safe")
     layout = [
-        *((name, ctypes.c_int) for name in ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks")),
+        *(
+            (name, ctypes.c_int)
+            for name in ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")
+        ),
         *((name, ctypes.c_int) for name in ("chart", "hand_overs") if of_atlas),
-        *((name, precision.c_type) for name in ("weight", "brake")),
+        *((name, precision.c_type) for name in ("weight", "brake", "drawn")),
         *((name, joints) for name in names),
-        *((name, quantities) for name in ("offset", "integral")),
+        *((name, quantities) for name in ("offset", "integral", "drawn_from")),
         *((name, joints) for name in ("carry",) if of_atlas),
         *((name, quantities) for name in ("value", "velocity", "acceleration")),
         *((name, ctypes.c_int) for name in ("reference_chart",) if of_atlas),

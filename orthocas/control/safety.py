@@ -47,6 +47,9 @@ class Safety:
     integral_rate: Annotated[Array, "integral action: growth of the reference's shift per error (k,) [1/s]; 0: none"]
     integral_limit: Annotated[Array, "largest shift (k,)"]
     hold_ticks: Annotated[int, "ticks without a good measurement for which the last command is held"]
+    stale_ticks: Annotated[
+        int, "ticks for which a moving arm may measure the same, bit by bit; more are a bad measurement"
+    ]
     longest_period: Annotated[float, "between two ticks; later ones call the catcher [s]"]
     lower: Annotated[Array, "joint limits [rad] or [m]"]
     upper: Annotated[Array, "joint limits [rad] or [m]"]
@@ -60,8 +63,8 @@ class Safety:
     def __post_init__(self) -> None:
         for setting in fields(self):
             value = getattr(self, setting.name)
-            if setting.name == "hold_ticks":
-                require_count("hold_ticks", value, least=0)
+            if get_args(setting.type)[0] is int:
+                require_count(setting.name, value, least=0)
             elif get_args(setting.type)[0] is float:
                 _require_number(setting.name, value)
             else:
@@ -114,6 +117,7 @@ class Safety:
             "integral_rate": 0 * span,
             "integral_limit": 0.05 * span,
             "hold_ticks": 10,
+            "stale_ticks": 5,
             "longest_period": 0.02,
             "lower": robot.lower,
             "upper": robot.upper,

@@ -26,7 +26,7 @@ Scene = Callable[
 
 def recorded(build: Scene) -> str:
     """The HTML of a scene and its motion. It is built on a server that nobody is told of."""
-    server = open_window(LOCAL, 0, "orthocas")
+    server, _ = open_window(LOCAL, 0, "orthocas")
     try:
         duration, show = build(server)
         show(0.0)

@@ -24,7 +24,7 @@ from orthocas.viewing.robot_page import RobotPage
 from orthocas.viewing.session import Session
 from orthocas.viewing.stick_arm import Look, stick_arm
 from orthocas.viewing.urdf_look import urdf_look
-from orthocas.viewing.window import LOCAL, close_window, open_window, url_of
+from orthocas.viewing.window import LOCAL, close_window, open_window
 
 PORT = 8080
 _OURS = b"<!-- written by orthocas -->"
@@ -90,7 +90,8 @@ def view(
         robot: for motions: whose they are, or a chart of that robot.
         robot_file: URDF file of the robot with its meshes. Default: drums and rods, made from the kinematic tree.
         locked: joints that were locked when the robot was built from that file, with their positions [rad] or [m].
-        host: address to listen at. By default only this machine can open the page. There is no password.
+        host: address to listen at. By default only this machine can open the page. The page's address holds a random
+            token, which stands for a password.
         port: of the page; 0 takes any free one.
 
     Returns:
@@ -104,7 +105,7 @@ def view(
     """
     arm, motions = subject(shown, robot)
     shape = shape_of(arm, robot_file, locked)
-    server = open_window(host, port, "orthocas")
+    server, url = open_window(host, port, "orthocas")
     try:
         page: ChartPage | RobotPage | PlayerPage
         if motions:
@@ -118,7 +119,7 @@ def view(
     except BaseException:
         close_window(server)
         raise
-    return View(url_of(host, server.get_port()), shape.missing, server, page)
+    return View(url, shape.missing, server, page)
 
 
 def export_page(

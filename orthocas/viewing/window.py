@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import io
-import ipaddress
 import socket
 from types import ModuleType
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from orthocas.checks import Array, of_extra, require_count
 from orthocas.errors import InvalidValueError, ViewError
 from orthocas.robots import Robot
+from orthocas.viewing.guard import guarded
 from orthocas.viewing.stick_arm import chain_length
 
 LOCAL = "127.0.0.1"
@@ -31,17 +31,20 @@ def viser() -> ModuleType:
     return of_extra("viser", "a view in the browser", "view")
 
 
-def open_window(host: str, port: int, title: str) -> Any:
-    """A `viser.ViserServer` at an address; port 0 takes any free port.
+def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
+    """A `viser.ViserServer`, and its address for a browser; port 0 takes any free port.
 
     Raises:
         MissingExtraError: if viser is not installed.
-        ViewError: if the port is taken, or the host is no address of this machine.
+        ViewError: if the port is taken, the host is no address of this machine, or viser cannot be guarded.
     """
     package = viser()
     require_free(host, port)
-    with contextlib.redirect_stdout(io.StringIO()):  # it announces itself
+    with guarded(host) as guard, contextlib.redirect_stdout(io.StringIO()):  # it announces itself
         server = package.ViserServer(host=host, port=port, label=title, verbose=False)
+    if not guard.seen:
+        close_window(server)
+        raise ViewError("this version of viser starts its server in another way, expected one that can be guarded")
     if port not in (0, server.get_port()):  # somebody else was faster
         close_window(server)
         raise _taken(host, port)
@@ -49,7 +52,7 @@ def open_window(host: str, port: int, title: str) -> Any:
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=BRAND)
     server.scene.configure_environment_map(None)
     server.scene.configure_default_lights(False)  # `place_lights` has lights without shadows
-    return server
+    return server, f"{url_of(host, server.get_port())}/{guard.token}"
 
 
 def close_window(server: Any) -> None:
@@ -81,16 +84,8 @@ def require_free(host: str, port: int) -> None:
             raise _refused(host, port, error) from None
 
 
-def is_local(host: str) -> bool:
-    """Whether only this machine can reach an address."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 def url_of(host: str, port: int) -> str:
-    """The address for a browser."""
+    """The address for a browser, without its token."""
     shown = LOCAL if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     return f"http://{shown}:{port}"
 

@@ -1,9 +1,11 @@
 /* Hostile ticks of a supervised law: positions that wander through the domain and out of it, now and then NaN,
- * infinities, huge numbers, wrong turns, references that stand still and claim to move, and late ticks.
+ * infinities, huge numbers, wrong turns, sensors that stand still, references that stand still and claim to move, targets
+ * that are no numbers, and late ticks.
  *
  * Compile with -DTICKS=, -DLIMIT= and, for a library in single precision, -DNUMBER=float. Prints how often each status
  * came. Exits with 1 at a wrong status, 2 at a command that is not finite or beyond the limit, 3 at a change beyond the
- * rate, 4 at a state that makes no sense. */
+ * rate, 4 at a state that makes no sense, 5 at a reference that is not finite, 6 at a good status for sensors that stand still
+ * for long while they claim a speed. */
 #include <math.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -65,12 +67,32 @@ static int status_is_right(int status, const arm_state *state, int measured, int
   return status == ARM_OK || status == ARM_SATURATED || status == ARM_NEAR_BORDER || status == ARM_BAD_INPUT;
 }
 
+/* Targets around a reference, some of which cannot be used: it stays finite, and good ones are followed again. */
+static int references_stay_finite(arm_reference *reference) {
+  NUMBER target[K];
+  arm_reference spline = *reference;
+  int i, status, spoiled;
+  for (i = 0; i < K; ++i) target[i] = reference->value[i] + (NUMBER)(1e-4 * uniform());
+  spoiled = spoil(target, K);
+  status = (int)arm_reference_spline(reference, target, 2.0, uniform(), &spline);
+  if (!spoiled && status != ARM_OK) return 0;
+  status = (int)arm_reference_low_pass(reference, target, 5.0, 1.0, 1e-3);
+  if (status != (spoiled ? ARM_NOT_FINITE : ARM_OK)) return 0;
+  for (i = 0; i < K; ++i)
+    if (!isfinite(reference->value[i]) || !isfinite(reference->velocity[i]) || !isfinite(reference->acceleration[i]) ||
+        !isfinite(spline.value[i]) || !isfinite(spline.velocity[i]) || !isfinite(spline.acceleration[i]))
+      return 0;
+  return 1;
+}
+
 int main(void) {
   long k, counts[11] = {0};
+  int still = 0;
+  NUMBER still_q[N] = {0}, still_dq[N] = {0};
   const double rounding = sizeof(NUMBER) < sizeof(double) ? 1e-5 : 1e-9;
   NUMBER q[N], dq[N], command[N], before[N];
   arm_state state;
-  arm_reference reference;
+  arm_reference reference, led;
   int i;
   for (i = 0; i < N; ++i) q[i] = (NUMBER)MIDDLE_OF(i);
   memset(dq, 0, sizeof dq);
@@ -87,20 +109,39 @@ int main(void) {
       measured_dq[i] = dq[i];
     }
     if (k % 1000 == 0) REFERENCE_AT(q, &reference);
+    if (k % 1000 == 0) led = reference;
+    if (!references_stay_finite(&led)) return 5;
     for (i = 0; i < K; ++i) reference.velocity[i] = k % 7000 < 100 ? 0.1 : 0.0; /* stands still and claims to move */
     if (k % 1500 == 0) arm_resume(&state);
-    if (k % 50000 == 49999) arm_take_over(&state, q, before);
+    if (k % 50000 == 49999) {
+      arm_take_over(&state, q, before);
+      still = 0;
+    }
     if (uniform() > 0.999) measured_q[0] += 6.283185307179586;
+    if (k % 9000 >= 8970) { /* sensors stand still while the arm goes on */
+      if (still == 0) {
+        memcpy(still_q, measured_q, sizeof still_q);
+        memcpy(still_dq, measured_dq, sizeof still_dq);
+        still_dq[0] = (NUMBER)0.1;
+      }
+      memcpy(measured_q, still_q, sizeof still_q);
+      memcpy(measured_dq, still_dq, sizeof still_dq);
+      ++still;
+    } else {
+      still = 0;
+    }
     measured = !spoil(measured_q, N) & !spoil(measured_dq, N);
     {
       arm_reference seen = reference;
       referred = !spoil((NUMBER *)&seen, 3 * K);
       if (uniform() > 0.999) period = uniform() > 0.0 ? NAN : -period;
       if (!(period > 0.0)) measured = 0;
+      if (still > 12) measured = 0; /* five equal ticks, even with some spoiled ones among them */
       status = (int)arm_step(&state, &arm_default_safety, measured_q, measured_dq, &seen, &arm_default_gains, period,
                              command);
     }
     if (status < 0 || status > 10 || !status_is_right(status, &state, measured, referred)) return 1;
+    if (still > 12 && status != ARM_BAD_INPUT) return 6;
     counts[status]++;
     for (i = 0; i < N; ++i) {
       const double time = period > 0.0 ? fmin(period, arm_default_safety.longest_period) : 0.0;

@@ -15,6 +15,7 @@ from fuzz.paths import logs, paths
 from fuzz.robots import robots
 from fuzz.runs import runs
 from fuzz.steps import steps
+from fuzz.views import views
 
 CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "atlases": atlases,
@@ -30,4 +31,5 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "runs": runs,
     "signals": signals.campaign,
     "steps": steps,
+    "views": views,
 }

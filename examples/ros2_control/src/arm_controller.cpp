@@ -64,6 +64,10 @@ CallbackReturn ArmController::on_configure(const rclcpp_lifecycle::State & /*pre
                       message->data.size());
           return;
         }
+        if (!std::all_of(message->data.begin(), message->data.end(), [](double value) { return std::isfinite(value); })) {
+          RCLCPP_WARN(get_node()->get_logger(), "refused a target with NaN or infinity; the last one stays");
+          return;
+        }
         Target target;
         target.number = ++received_;
         std::copy(message->data.begin(), message->data.end(), target.value.begin());

@@ -94,6 +94,16 @@ int main() {
   std::printf("moved %d\n", run(controller, 4000));
   std::printf("moved by %.6f\n", first_extra() - start);
 
+  auto spoiled = std::make_shared<std_msgs::msg::Float64MultiArray>(*target);
+  spoiled->data[ARM_TASK] = std::numeric_limits<double>::quiet_NaN();
+  made<rclcpp::Subscription<std_msgs::msg::Float64MultiArray>>->callback(spoiled);
+  std::printf("spoiled target %d\n", run(controller, 500));
+  std::printf("still moved by %.6f\n", first_extra() - start);
+  target->data[ARM_TASK] -= 0.05;
+  made<rclcpp::Subscription<std_msgs::msg::Float64MultiArray>>->callback(target);
+  std::printf("moved again %d\n", run(controller, 4000));
+  std::printf("now moved by %.6f\n", first_extra() - start);
+
   std::printf("blind %d\n", run(controller, 50, true));
   std::printf("seeing again %d\n", run(controller, 500));
   auto response = std::make_shared<std_srvs::srv::Trigger::Response>();
