@@ -22,7 +22,7 @@ from orthocas.minimising.watch import Monitor, Progress, silent
 
 _SAMPLES = 20_000  # points where folds are looked for before the proof
 _SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
-_FEW_BOXES, _MANY_BOXES, _HOPELESS = 300, 50_000, 2_000  # for one scale; then a search that goes too slowly ends
+_FEW_BOXES, _MANY_BOXES, _HOPELESS = 300, 40_000, 2_000  # for one scale; then a search that goes too slowly ends
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
 
@@ -268,9 +268,11 @@ def _one_to_one(
         while low < high:
             middle = (low + high) // 2
             low, high = (middle + 1, high) if proved(shares[middle], _FEW_BOXES) else (low, middle)
-        while best is not None and low < len(shares) and proved(shares[low], _MANY_BOXES):
-            low = min(low + 2, len(shares) - 1) if low + 1 < len(shares) else len(shares)
         if best is not None:
+            while low + 1 < len(shares) and proved(shares[low + 1], _MANY_BOXES):
+                low += 2
+            if low < len(shares):
+                proved(shares[low], _MANY_BOXES)
             break
     return best
 
