@@ -24,6 +24,7 @@ SCRIPTS = (
     "threads",
     "clear_boxes",
     "certificates",
+    "one_to_one",
     "atlas",
     "atlas_c",
     "suggested_domains",

@@ -18,7 +18,7 @@ def chart(width: float = 0.2) -> oc.Chart:
 
 @cache
 def certified(width: float = 0.2) -> oc.Certificate:
-    return oc.certify(chart(width), time_limit=100)
+    return oc.certify(chart(width), time_limit=20)
 
 
 def fourier() -> oc.Chart:

@@ -10,7 +10,7 @@ from public_objects import network, planar
 from random_arms import random_arm, second_solutions
 
 import orthocas as oc
-from orthocas.certificates.subdivision import Subdivision
+from orthocas.certificates.subdivision import PROVED, Subdivision
 from orthocas.certifying.chart_rows import chart_rows
 from orthocas.certifying.jets import Jets
 from orthocas.certifying.one_to_one import OneToOneJudge, one_to_one_judge
@@ -161,9 +161,7 @@ def test_one_to_one_part_of_an_older_method_is_void() -> None:
         oc.check_certificate(chart(), old)
 
 
-def test_one_to_one_box_of_another_chart_does_not_pass_the_check() -> None:
-    part = certified().injective
-    assert part is not None
-    wide = Subdivision.whole(*(chart(0.2).problem.domain.centre + np.array([[-1.5], [1.5]])))
-    forged = replace(certified(), injective=Subdivision(wide.low, wide.high, np.array([254], dtype=np.uint8)))
-    assert not oc.check_certificate(chart(), forged)
+def test_forged_one_to_one_box_in_one_part_does_not_pass_the_check() -> None:
+    regular = certified(0.4).regular
+    box = Subdivision(regular.low, regular.high, np.array([PROVED], dtype=np.uint8))
+    assert not oc.check_certificate(chart(0.4), replace(certified(0.4), injective=box).sealed())
