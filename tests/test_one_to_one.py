@@ -3,6 +3,7 @@
 import importlib
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from certified_charts import certified, chart
@@ -165,3 +166,22 @@ def test_forged_one_to_one_box_in_one_part_does_not_pass_the_check() -> None:
     regular = certified(0.4).regular
     box = Subdivision(regular.low, regular.high, np.array([PROVED], dtype=np.uint8))
     assert not oc.check_certificate(chart(0.4), replace(certified(0.4), injective=box).sealed())
+
+
+def test_angle_of_a_whole_turn_is_no_difference() -> None:
+    """The angle of a polar task is the same after a turn of the base, though its derivative never vanishes."""
+    arm = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[1.0, 1.0, 1.0])
+    half, centre = np.array([3.5, 0.1, 0.1]), np.array([0.0, 1.0, 0.8])
+    polar = oc.Problem(arm, oc.Task.polar(arm), domain=oc.Box(centre, half))
+    known = oc.fit(polar, oc.Polynomial(2, cyclic=["joint1"]), samples=200).chart
+    turned = centre + np.array([[-np.pi, 0, 0], [np.pi, 0, 0]])
+    if np.abs(np.diff(known.xi(turned), axis=0)).max() < 1e-9:
+        assert not proved(known, half, 500)
+    assert proved(known, half * [0.2, 1, 1], 100)
+
+    def angle(q: ca.SX) -> ca.SX:
+        return ca.vertcat(q[1], ca.atan2(ca.sin(q[0]), ca.cos(q[0])))
+
+    jumping = oc.Problem(arm, oc.Task.custom(arm, "angle", angle), domain=oc.Box(centre, half))
+    chart_ = oc.fit(jumping, oc.Linear(), samples=200).chart
+    assert one_to_one_judge(chart_, chart_rows(chart_), judge_on(known, half)[1]) is None

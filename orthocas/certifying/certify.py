@@ -1,6 +1,7 @@
 """Certify charts: prove with rigorous arithmetic that they do not fold, and where they are one-to-one (ours)."""
 
 import time
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -261,20 +262,26 @@ def _one_to_one(
 
     idle = sorted({*range(chart.n)} - {*rows.active})  # coordinates themselves: their range does not matter
     for held in [[*idle, *judge.still_joints], idle] if judge.still_joints else [idle]:
-        shares = [np.where(np.isin(np.arange(chart.n), held), 1.0, scale) for scale in _SCALES]
-        if proved(shares[-1], _FEW_BOXES):
-            break
-        low, high = 0, len(shares) - 1  # the scales before `low` are proved, those from `high` on not with few boxes
-        while low < high:
-            middle = (low + high) // 2
-            low, high = (middle + 1, high) if proved(shares[middle], _FEW_BOXES) else (low, middle)
+        _try_scales([np.where(np.isin(np.arange(chart.n), held), 1.0, scale) for scale in _SCALES], proved)
         if best is not None:
-            while low + 1 < len(shares) and proved(shares[low + 1], _MANY_BOXES):
-                low += 2
-            if low < len(shares):
-                proved(shares[low], _MANY_BOXES)
             break
     return best
+
+
+def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool]) -> None:
+    """Ask for proofs of boxes of increasing size: the largest one, then by bisection with few boxes, then with many."""
+    if proved(shares[-1], _FEW_BOXES):
+        return
+    low, high = 0, len(shares) - 1  # those before `low` are proved, those from `high` on are not with few boxes
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (middle + 1, high) if proved(shares[middle], _FEW_BOXES) else (low, middle)
+    if low == 0:
+        return
+    while low + 1 < len(shares) and proved(shares[low + 1], _MANY_BOXES):
+        low += 2
+    if low < len(shares):
+        proved(shares[low], _MANY_BOXES)
 
 
 def _scaled(base: Subdivision, share: Array) -> Subdivision:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.certificates.subdivision import Subdivision
-from orthocas.certifying.chart_rows import ChartRows, CoordinateRows, joint_models
+from orthocas.certifying.chart_rows import ChartRows, CoordinateRows, GraphRows, joint_models
 from orthocas.certifying.elimination import between, is_orthogonal, pivots, singular_vectors
 from orthocas.certifying.jets import ORDERS, Around, Jets, of_model
 from orthocas.certifying.judges import Verdicts, all_positive, chosen, influences, most_influential
@@ -141,7 +141,7 @@ class OneToOneJudge:
 def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneJudge | None:
     """The judge for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
 
-    None if the other rows depend on an idle joint, which then is none.
+    None if the other rows depend on an idle joint, which then is none, or jump where an arc tangent begins a new turn.
     """
     if {*rows.variables} - {*rows.active}:
         return None
@@ -153,6 +153,8 @@ def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToO
         task = TipJets.of(tip, problem.robot.tree, active, problem.domain)
         leading = takewhile(lambda i: i not in rows.variables, chain_of(problem.robot.tree))
         still = tuple(active.index(i) for i in leading if i in active)
+    elif _jumps(rows.task):
+        return None
     else:
         task = ModelJets(rows.task, tuple(range(chart.n)), active)
     own: RowJets | None = None
@@ -160,9 +162,16 @@ def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToO
         assert isinstance(coordinates, Coordinates)
         assert isinstance(coordinates.family, ProductFamily)
         own = ProductJets(ProductRows.of(coordinates.family, coordinates.theta, ORDERS[-1] + 2))
+    elif rows.coordinates is not None and _jumps(rows.coordinates) and not rows.turns[chart.m :].all():
+        return None
     elif rows.coordinates is not None:
         own = ModelJets(rows.coordinates, active, active)
     return OneToOneJudge(task, own, active, still, rows.turns, base.low, base.high)
+
+
+def _jumps(rows: CoordinateRows) -> bool:
+    """Whether the function of which these are the gradients has steps with jumps."""
+    return isinstance(rows, GraphRows) and any(step[0] == "atan2" for step in rows.graph.steps)
 
 
 def _spread(left: Array, terms: Array, right: Array) -> Array:

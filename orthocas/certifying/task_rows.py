@@ -34,8 +34,8 @@ _AXES = "xyz"
 class TipRows:
     """What a task compares of the tip, so that x(q) = x(p) if and only if these agree at q and p."""
 
-    position: bool  #: the whole position
-    rotation: bool  #: the whole orientation
+    position: tuple[int, ...] = ()  #: axes of the world along which the position counts
+    rotation: bool = False  #: the whole orientation
     axis: int | None = None  #: the direction of one axis of the tip, unless the whole orientation counts
 
     @classmethod
@@ -44,18 +44,20 @@ class TipRows:
         kind = task.recipe["kind"]
         if task.robot.tree.tip_parent < 0:
             return None
-        if kind == "position:xyz":
-            return cls(True, False)
+        if kind == "polar":
+            return cls((0, 1))
+        if kind.startswith("position:"):
+            return cls(tuple(map(_AXES.index, kind.removeprefix("position:"))))
         if (turned := TipTurn.of_kind(kind)) is None:
             return None
         whole = turned.whole or turned.axis is None
-        return cls(turned.with_position, whole, None if whole else _AXES.index(str(turned.axis)))
+        return cls((0, 1, 2) if turned.with_position else (), whole, None if whole else _AXES.index(str(turned.axis)))
 
 
 def task_rows(task: Task, domain: Domain) -> tuple[ca.Function, float]:
     """q (n, 1) -> J_x (m, n), or C(q) J_x with det C > 0 up to an error of the entries, and that error."""
     tip, tree = TipRows.of(task), task.robot.tree
-    if tip is None:
+    if tip is None or tip.position not in ((), (0, 1, 2)):  # some axes of the world only cannot be rotated
         return task.jacobian_function, 0.0
     q = ca.SX.sym("q", task.robot.n)
     parts = []

@@ -39,11 +39,12 @@ class TipJets:
         slides = np.where(tree.prismatic, np.abs(domain.centre) + domain.half_width, 0.0)
         steps = np.linalg.norm(tree.translations, axis=1) + slides
         beyond = float(np.linalg.norm(tree.tip_translation))
+        longer = 1 + 16 * tree.n * rotation_deviation(tree)
         lengths = dict.fromkeys(columns, 0.0)
         for i in reversed(chain):
             lengths[i] = 1.0 if tree.prismatic[i] else beyond
             beyond += float(steps[i])
-        return cls(rows, tree, columns, np.array([lengths[i] for i in columns]) * (1 + 1e-9), doubt)
+        return cls(rows, tree, columns, np.array([lengths[i] for i in columns]) * longer, doubt)
 
     def __call__(self, q: Array, around: Around) -> Jets:
         """Jets at joint positions q (all joints, boxes), the columns of which are the middles of the boxes."""
@@ -54,8 +55,9 @@ class TipJets:
         parts, rests = [], []
         if self.rows.position:
             first = np.where(turning[:, None, None], np.cross(axes, arms, axis=1), axes) * carried[:, None, None]
-            parts.append(_nested(outer, first, around.order))
-            rests.append(np.repeat(_rest(around, self.lengths)[None], 3, axis=0))
+            along = list(self.rows.position)
+            parts.append([each[:, along] for each in _nested(outer, first, around.order)])
+            rests.append(np.repeat(_rest(around, self.lengths)[None], len(along), axis=0))
         if self.rows.rotation:
             parts.append(_rotated(outer, around.order))
             rests.append(np.repeat(self._rest_of_turns(around, turning & carried)[None], 3, axis=0))
