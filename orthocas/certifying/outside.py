@@ -23,21 +23,22 @@ from orthocas.postures.corridor import Corridor
 
 _ROUNDING = 1e-6  # of distances, far above that of floating-point numbers
 _LENGTHS = 1e-7  # of squares: far above what singular vectors miss that are orthogonal up to 1e-9
-_GUARDS = 1e-12  # of |J_x|^2: elimination in floating-point numbers is exact to less, so guards agree
+_GUARDS = 1e-12  # of |J|^2: elimination in floating-point numbers is exact to less, so guards agree
 
 
 @dataclass(frozen=True, eq=False)
 class OutsideJudge:
     """Counts boxes as proved, without a sign, that lie outside a ClearBox: s(q) <= bound all over the box.
 
-    s(q) <= |v^T D^-1 J_x(q)| for all |v| >= 1. Here v(q) is the singular vector of the smallest singular value at the
-    middle of the box, plus as much of the others, linear in q, as cancels the change of v^T D^-1 J_x along them to
-    first order. Another judge judges the other boxes, and their det J must have the sign of the middle of the
-    domain: a box with the other sign is halved until its parts lie outside, or a fold shows.
+    s(q) <= |v^T D^-1 J(q)| for all |v| >= 1, with the rows J that count in that ClearBox. Here v(q) is the singular
+    vector of the smallest singular value at the middle of the box, plus as much of the others, linear in q, as cancels
+    the change of v^T D^-1 J along them to first order. Another judge judges the other boxes, and their det J must have
+    the sign of the middle of the domain: a box with the other sign is halved until its parts lie outside, or a fold
+    shows.
     """
 
     inside: RegularityJudge
-    rows: GraphRows  #: D^-1 J_x, or C(q) D^-1 J_x with orthogonal C
+    rows: GraphRows  #: D^-1 J, or C(q) D^-1 J with orthogonal C
     domain: ClearBox
     sign: float  #: of det J at the centre of the domain
     variables: Variables
@@ -122,7 +123,8 @@ def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
         return judge
     q = ca.SX.sym("q", chart.n)
     task, same = chart.problem.task, bool((domain.scale == domain.scale[0]).all())
-    turned, allowance = task_rows(task, domain) if same else (task.jacobian_function, 0.0)
+    of_x = domain.jacobian_function is task.jacobian_function
+    turned, allowance = task_rows(task, domain) if same and of_x else (domain.jacobian_function, 0.0)
     J = ca.densify(turned(q) / ca.repmat(ca.DM(domain.scale), 1, chart.n))
     graph = TaylorGraph.of(dense_function("scaled_rows", [q], [J]), "the task")
     sign = float(judge(domain.centre[None], domain.centre[None]).sign[0])  # rows have other scales than the chart's

@@ -172,6 +172,8 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
         rows["singular"] = f"{check.singular_share:.2%} of the domain is near-singular, worst at q = ({at})"
         if offer is None:
             rows["singular"] += "; --domain auto, or another --centre or --home, stays clear"
+    if check.half_turn_samples:
+        rows["half a turn"] = f"at {check.half_turn_share:.2%} of the domain the task's own orientation ends"
     if offer is not None:
         bound, share = offer.least_singular_value, offer.share
         rows["clear part"] = f"--least-singular-value {bound:g} leaves out singular positions and keeps {share:.1%}"
@@ -199,6 +201,7 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
         "least_conditioning": None if result.worst is None else result.worst.least,
         "cyclic_joints": list(result.cyclic_joints),
         "near_singular_share": check.singular_share,
+        "half_turn_share": check.half_turn_share,
         "most_singular_point": list(check.most_singular_point),
         "clear_part": None if result.clear_part is None else asdict(result.clear_part),
         "stages": [

@@ -104,8 +104,8 @@ class FitSettings:
 
 
 def default_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
-    """Polynomials of degree 5, and of degree 4 where the terms grow too many: for many joints, or with a bound."""
-    return Polynomial(degree=4 if bounded or problem.n > 7 else 5)
+    """Polynomials of degree 5; of degree 4 with a bound or 8 joints, and of degree 3 with more: terms grow too many."""
+    return Polynomial(degree=3 if problem.n > 8 else 4 if bounded or problem.n > 7 else 5)
 
 
 def default_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
@@ -140,7 +140,8 @@ def _digest(problem: Problem) -> str:
     samples = sample_problem(problem, *_TELLTALE)
     parts = [samples.points, samples.task_jacobian]
     parts += [] if samples.metric_inverse is None else [samples.metric_inverse]
-    domain = problem.domain
+    domain, own = problem.domain, problem.task.jacobian_function
     parts += [np.append(domain.scale, domain.least_singular_value)] if isinstance(domain, ClearBox) else []
+    parts += [np.array([1.0])] if isinstance(domain, ClearBox) and domain.jacobian_function is not own else []
     parts += [domain.postures, domain.radius] if isinstance(domain, Corridor) else []
     return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]

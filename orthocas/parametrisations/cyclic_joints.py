@@ -4,7 +4,7 @@ import numpy as np
 
 from orthocas.checks import Array, require_kind
 from orthocas.domains import Box, Conditioned, sample_uniform
-from orthocas.problem import NEAR_SINGULAR, Problem, relative_singular_values
+from orthocas.problem import Problem, is_regular
 
 _SAMPLES, _POSITIONS = 24, 6  # joint positions, and other positions of one joint at each of them
 _SEED = 0
@@ -47,7 +47,7 @@ def leaf_cyclic_joints(problem: Problem) -> tuple[str, ...]:
 def _cyclic(problem: Problem, invariants: int) -> tuple[str, ...]:
     """Joints at whose position A and the first of `_invariants` do not depend."""
     points = sample_uniform(problem.domain, _SAMPLES, _SEED)
-    points = points[relative_singular_values(problem, points) >= NEAR_SINGULAR]
+    points = points[is_regular(problem, points)]
     names = problem.robot.joint_names
     return tuple(name for k, name in enumerate(names) if len(points) and _is_cyclic(problem, points, k, invariants))
 
