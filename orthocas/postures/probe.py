@@ -31,7 +31,7 @@ from orthocas.solvers import GaussNewton
 
 _DEGREE = 2  # its conditioning is that of degree 4, its leak about a fifth larger
 _TRAINING, _HEAVY, _JUDGES = 700, 300, 3000  # numbers of samples: even, near faces and corners, and of a verdict
-_AGAIN = 4  # steps of a fit that starts from that of another box
+_MANY, _AGAIN = 6, 4  # coordinates from which a fit starts from that of another box, and its steps then
 _SEED = 0
 _TINY = 1e-4
 
@@ -85,13 +85,16 @@ class Verdict:
 
 @dataclass(eq=False)
 class Prober:
-    """Fits quadratic coordinates of the active joints on trial boxes, each from those of the one before."""
+    """Fits quadratic coordinates of the active joints on trial boxes.
+
+    Many coordinates take a second, so they start from those of an earlier box, which are nearly the best already.
+    """
 
     problem: Problem  #: robot, task and metric; trial boxes replace its domain
     active: list[int]  #: joints that are not coordinates themselves
     cyclic: tuple[str, ...] = ()  #: joints that enter linearly
     _objective: BasisObjective | None = None  #: of the last box; others only move it
-    _start: Array | None = None  #: parameters of the last box without folds, on its cube
+    _start: Array | None = None  #: parameters of the last box without folds, on its cube; None: a spectral start
 
     @property
     def outputs(self) -> int:
@@ -120,7 +123,8 @@ class Prober:
                 return J
 
             found = judged(problem, sample_heavily(box, _JUDGES, _SEED), jacobian, self.active)
-        self._start = theta if found.conditioning > 0 else self._start
+        if self.outputs >= _MANY and found.conditioning > 0:
+            self._start = theta
         return found
 
     def _fitted(self, problem: Problem, family: LinearFamily) -> Array:
