@@ -18,6 +18,7 @@ from orthocas.samples import sample_problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt, QuasiNewton
 
 PRECISIONS = ("double", "single")  #: of the large products of a fit
+_MANY_JOINTS = 8  # with more, coordinates are many as well, and the matrix grows with their square
 _MANY_TERMS = 300  # where a Gauss-Newton matrix takes longer than ten gradients: degree 4 for seven joints
 _TELLTALE = (20, (0, 1000))  # number and seed of the samples that identify a problem
 _LEAST_BOUND = 1e-6  # deg; rounding hides smaller angles
@@ -105,14 +106,15 @@ class FitSettings:
 
 def default_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
     """Polynomials of degree 5; of degree 4 with a bound or 8 joints, and of degree 3 with more: terms grow too many."""
-    return Polynomial(degree=3 if problem.n > 8 else 4 if bounded or problem.n > 7 else 5)
+    return Polynomial(degree=3 if problem.n > _MANY_JOINTS else 4 if bounded or problem.n > 7 else 5)
 
 
 def default_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
     """Gauss-Newton for families linear in their parameters, with fewer matrices if these are large; else L-BFGS."""
     if not parametrisation.linear:
         return LBFGS()
-    many = isinstance(parametrisation, GradedParametrisation) and parametrisation.term_count(problem.n) > _MANY_TERMS
+    terms = parametrisation.term_count(problem.n) if isinstance(parametrisation, GradedParametrisation) else 0
+    many = terms > _MANY_TERMS or (terms and problem.n > _MANY_JOINTS)
     return QuasiNewton() if many else GaussNewton()
 
 
