@@ -23,6 +23,7 @@ SCRIPTS = (
     "quality_and_time",
     "threads",
     "clear_boxes",
+    "clear_positions",
     "certificates",
     "one_to_one",
     "atlas",

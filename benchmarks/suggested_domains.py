@@ -8,6 +8,7 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.errors import DomainError
 from orthocas.postures.probe import judged_chart
 
 CASES = (  # robot, task, metric
@@ -19,11 +20,19 @@ CASES = (  # robot, task, metric
     ("ur10", "position", "euclidean"),
     ("tiago with its torso", "position", "euclidean"),
     ("iiwa", "position", "inertia"),
+    ("panda", "position", "inertia"),
+    ("panda", "pose", "inertia"),
+    ("xarm7", "position", "inertia"),
+    ("kinova j2s6", "position", "inertia"),
+    ("ur5", "position", "inertia"),
+    ("ur10", "position", "inertia"),
+    ("tiago with its torso", "position", "inertia"),
 )
 ROBOTS = {  # of the package example-robot-data: file and tip
     "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
     "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef"),
     "kinova j2s6": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
     "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
     "tiago with its torso": ("tiago_description/robots/tiago.urdf", "arm_tool_link"),
 }
@@ -31,7 +40,7 @@ HEADER = (
     "| robot, task, metric | home | half-widths (what ends them) | suggestion, of which fit [s] | leak [deg] "
     "| folds, least conditioning |\n| --- | --- | --- | --- | --- | --- |"
 )
-MARKS = {"leak": "L", "conditioning": "C", "singularity": "S", "joint limit": "J"}
+MARKS = {"leak": "L", "conditioning": "C", "singularity": "S", "joint limit": "J", "half a turn": "H"}
 
 
 def robot_of(name: str) -> oc.Robot:
@@ -47,7 +56,10 @@ def row(name: str, task: str, metric: str, degree: int, samples: int) -> str:
     """One row of the table, with the quality at `samples` points, two thirds of them near faces and corners."""
     robot = robot_of(name)
     parametrisation = oc.Polynomial(degree, cyclic="auto")
-    found = oc.suggest_domain(robot, oc.Task.named(robot, task), metric=metric, parametrisation=parametrisation)
+    try:
+        found = oc.suggest_domain(robot, oc.Task.named(robot, task), metric=metric, parametrisation=parametrisation)
+    except DomainError as error:
+        return f"| {name}, {task}, {metric} | refused: {error} | | | | |"
     widths = ", ".join(f"{joint.half_width:.2f} {MARKS.get(joint.reason, joint.reason)}" for joint in found.joints)
     verdicts = [judged_chart(found.fit.chart, 50_000, seed=100 + k) for k in range(samples // 50_000)]
     least = min(verdict.conditioning for verdict in verdicts)

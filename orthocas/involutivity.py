@@ -10,7 +10,7 @@ from orthocas.casadi_tools.batch import Batched, dense_function
 from orthocas.checks import Array, require_count, require_kind, require_memory, require_shape
 from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.problem import NEAR_SINGULAR, Problem, check, relative_singular_values
+from orthocas.problem import Problem, check, is_regular
 from orthocas.showing import Shown, number_list
 
 _ROUNDING = 1e-7  # a defect below this share of the terms that cancel in it counts as zero
@@ -130,7 +130,7 @@ def _regular_points(problem: Problem, samples: int, seed: int) -> Array:
     """Uniform samples of the domain, without the near-singular ones."""
     check(problem, samples, seed)
     points = sample_uniform(problem.domain, samples, seed)
-    regular = relative_singular_values(problem, points) >= NEAR_SINGULAR
+    regular = is_regular(problem, points)
     if not regular.any():
         raise SingularTaskError(f"task '{problem.task.name}' is near-singular at all {samples} samples of the domain")
     return points[regular]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.checks import Array, require_kind, require_shape, require_text
 from orthocas.domains import Domain, require_within_limits, sample_uniform
@@ -16,7 +17,8 @@ from orthocas.robots import Robot
 from orthocas.showing import Shown, listed, number_list
 from orthocas.tasks import Task
 
-NEAR_SINGULAR = 0.01  #: smallest relative singular value of J_x below which a sample counts as singular
+NEAR_SINGULAR = 0.01  #: smallest relative singular value of the task below which a sample counts as singular
+NEAR_HALF_A_TURN = 0.01  #: cos(angle / 2) of turns that count as half a turn: those above 178.9 deg
 _RANK_LOST = 1e-9
 
 
@@ -129,9 +131,15 @@ class ProblemCheck:
     """The result of `check`."""
 
     samples: int
-    singular_samples: int  #: samples with a relative singular value of J_x below NEAR_SINGULAR
-    smallest_singular_value: float  #: relative one of J_x, see `orthocas.ClearBox`
+    singular_samples: int  #: samples with a relative singular value of the task below NEAR_SINGULAR
+    smallest_singular_value: float  #: relative one of the task, see `orthocas.ClearBox`
     most_singular_point: tuple[float, ...]  #: joint position of the smallest singular value [rad] or [m]
+    half_turn_samples: int  #: samples where the tool is about half a turn from the reference: x ends there
+
+    @property
+    def half_turn_share(self) -> float:
+        """Share of samples about half a turn from the reference."""
+        return self.half_turn_samples / self.samples
 
     @property
     def singular_share(self) -> float:
@@ -140,9 +148,10 @@ class ProblemCheck:
 
 
 def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
-    """Check the metric (SPD) and the rank of J_x on uniform samples of the domain.
+    """Check the metric (SPD) and the rank of the task on uniform samples of the domain.
 
-    Rows of J_x with the same unit are first divided by their root mean square length over the domain.
+    The rank is that of the rows of `orthocas.ClearBox`: of the frame Jacobian for a task that compares orientations.
+    Rows with the same unit are first divided by their root mean square length over the domain.
 
     Raises:
         MetricError: if A is not symmetric positive definite at a sample.
@@ -169,24 +178,43 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
         singular_samples=int((smallest < NEAR_SINGULAR).sum()),
         smallest_singular_value=float(smallest[worst]),
         most_singular_point=tuple(points[worst].tolist()),
+        half_turn_samples=int((distance_from_half_a_turn(problem, points) < NEAR_HALF_A_TURN).sum()),
     )
 
 
 def relative_singular_values(problem: Problem, points: Array) -> Array:
-    """Relative singular values of J_x at points (N, n), (N,); see `orthocas.ClearBox`.
+    """Relative singular values of the task at points (N, n), (N,); see `orthocas.ClearBox`.
 
-    Rows with the same unit are divided by their root mean square length at these points, or by the scale of a ClearBox.
+    Rows with the same unit are divided by their root mean square length at these points. A ClearBox uses its own rows
+    and scale.
 
     Raises:
         SingularTaskError: if a task component does not depend on any joint, or J_x is not finite at a point.
     """
+    task, domain = problem.task, problem.domain
     J = task_jacobians(problem, points)
     idle = np.flatnonzero((J == 0).all(axis=(0, 2)))
     if idle.size:
-        raise SingularTaskError(f"task component '{problem.task.labels[idle[0]]}' does not depend on any joint")
-    domain = problem.domain
-    scale = domain.scale if isinstance(domain, ClearBox) else row_scale(J, problem.task.units)
-    return np.asarray(np.linalg.svd(J / scale[:, None], compute_uv=False)[:, -1])
+        raise SingularTaskError(f"task component '{task.labels[idle[0]]}' does not depend on any joint")
+    if isinstance(domain, ClearBox):
+        return np.asarray(domain.singular_values(points))
+    if task.turn is not None:
+        J = task.batched_frame_jacobian(points)[0].reshape(J.shape)
+    return np.asarray(np.linalg.svd(J / row_scale(J, task.units)[:, None], compute_uv=False)[:, -1])
+
+
+def is_regular(problem: Problem, points: Array) -> NDArray[np.bool_]:
+    """Whether J_x is far from losing rank at points (N, n), (N,): the robot is, and the tool far from half a turn."""
+    clear = relative_singular_values(problem, points) >= NEAR_SINGULAR
+    return clear & (distance_from_half_a_turn(problem, points) >= NEAR_HALF_A_TURN)
+
+
+def distance_from_half_a_turn(problem: Problem, points: Array) -> Array:
+    """cos(angle / 2) of the tool's turn from the reference at points (N, n), (N,); 1 for tasks without a reference."""
+    task = problem.task
+    if task.turn is None:
+        return np.ones(len(points))
+    return task.turn.distance_from_half_a_turn(task.batched(points)[0].reshape(-1, task.m))
 
 
 def task_sizes(problem: Problem) -> Array:

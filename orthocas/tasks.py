@@ -209,7 +209,12 @@ class Task(Shown):
     @property
     def lacks_reference(self) -> bool:
         """Whether the task compares the tip's orientation with a reference that was not given."""
-        return TipTurn.of_kind(self.recipe["kind"]) is not None and "reference" not in self.recipe
+        return self.turn is not None and "reference" not in self.recipe
+
+    @property
+    def turn(self) -> TipTurn | None:
+        """How the task compares the tip's orientation with a reference; None if it does not."""
+        return TipTurn.of_kind(self.recipe["kind"])
 
     def with_reference_at(self, q: ArrayLike) -> Self:
         """The task with the tip's orientation at q (n,) as its reference, or the task itself if it has one already."""
@@ -231,6 +236,22 @@ class Task(Shown):
         return dense_function("task_jacobian", [q], [ca.jacobian(self.function(q), q)])
 
     @cached_property
+    def frame_jacobian_function(self) -> ca.Function:
+        """q (n, 1) -> rows (m, n) that tell how near to a singular position the robot is, in whatever coordinates x.
+
+        For orientation, pose and axis tasks they are the velocity [m/s] and the angular velocity [rad/s] of the tip in
+        its own axes, per unit joint velocity: rows of the geometric Jacobian, of which an axis task takes the two
+        across its axis. J_x loses rank half a turn from the reference, where x ends; these rows do not. For other tasks
+        they are J_x itself.
+        """
+        turn = self.turn
+        if turn is None:
+            return self.jacobian_function
+        q = ca.SX.sym("q", self.robot.n)
+        J, R = self.robot.function("tip_jacobian")(q), self.robot.function("tip_rotation")(q)
+        return dense_function("frame_jacobian", [q], [ca.cse(turn.rates(R.T @ J[3:, :], R.T @ J[:3, :]))])
+
+    @cached_property
     def second_derivative_function(self) -> ca.Function:
         """q, v, w (n, 1) -> d^2 h(q)[v, w] = (d/ds) J_x(q + s v) w, (m, 1)."""
         q, v, w = (ca.SX.sym(name, self.robot.n) for name in ("q", "v", "w"))
@@ -241,7 +262,7 @@ class Task(Shown):
     def centred_jacobian_function(self) -> ca.Function:
         """q, centre (n, 1) -> J_x at q (m, n). A missing reference is taken at the centre."""
         q, centre = (ca.SX.sym(name, self.robot.n) for name in ("q", "centre"))
-        x, turn = self.function(q), TipTurn.of_kind(self.recipe["kind"])
+        x, turn = self.function(q), self.turn
         if turn is not None and self.lacks_reference:
             rotation, position = self.robot.function("tip_rotation"), self.robot.function("tip_position")
             x = turn.components(rotation(centre).T @ rotation(q), position(q))
@@ -256,6 +277,11 @@ class Task(Shown):
     def batched_jacobian(self) -> BlockedFunction:
         """Evaluates J_x at many points."""
         return BlockedFunction(self.jacobian_function)
+
+    @cached_property
+    def batched_frame_jacobian(self) -> BlockedFunction:
+        """Evaluates the rows of `frame_jacobian_function` at many points."""
+        return self.batched_jacobian if self.turn is None else BlockedFunction(self.frame_jacobian_function)
 
     @classmethod
     def _turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None) -> Self:

@@ -41,13 +41,25 @@ def chart(problem: oc.Problem) -> oc.Chart:
     return oc.fit(problem, oc.Polynomial(3)).chart
 
 
-def by_hand(task: oc.Task, domain: oc.Box, q: Numbers) -> Numbers:
-    """Relative singular values from NumPy's SVD and central differences of the task, up to its scale, (N,)."""
+def by_hand(task: oc.Task, domain: oc.Box, q: Numbers, rows: str = "frame") -> Numbers:
+    """Relative singular values from NumPy's SVD and central differences, up to the scale, (N,).
+
+    Differences of the task, or of positions and orientations of the tip: without a reference.
+    """
+
+    def change(after: Numbers, before: Numbers) -> Numbers:
+        if task.turn is None or rows == "x":
+            return np.asarray(task.batched(after)[0] - task.batched(before)[0])
+        moved = task.robot.tip_position(after) - task.robot.tip_position(before)
+        R, S = task.robot.tip_rotation(before), task.robot.tip_rotation(after)
+        turned = R.transpose(0, 2, 1) @ S
+        if task.turn.axis is not None:
+            return np.hstack([moved, turned[:, :2, 2]])
+        return np.hstack([moved, turned[:, [2, 0, 1], [1, 2, 0]]])
 
     def jacobians(points: Numbers) -> Numbers:
         steps = 1e-6 * np.eye(points.shape[1])
-        columns = [(task.batched(points + e)[0] - task.batched(points - e)[0]) / 2e-6 for e in steps]
-        return np.stack(columns, axis=2)
+        return np.stack([change(points + e, points - e) / 2e-6 for e in steps], axis=2)
 
     u = np.random.default_rng(5).uniform(-1, 1, (20_000, len(domain.centre)))
     lengths = np.sqrt((jacobians(domain.centre + domain.half_width * u) ** 2).sum(axis=2).mean(axis=0))
@@ -142,6 +154,60 @@ def test_a_missing_reference_is_taken_at_the_centre() -> None:
     pose = oc.Problem(arm.robot, oc.Task.pose(arm.robot), domain=arm.domain, least_singular_value=0.01)
     assert isinstance(pose.domain, oc.ClearBox)
     assert pose.domain.task is pose.task
+
+
+def test_a_pose_is_judged_by_the_robot_and_not_by_its_reference(iiwa: oc.Problem) -> None:
+    """The last joint only turns the tool: s does not depend on it, while the rows of x lose rank at half a turn."""
+    box = oc.Box(iiwa.domain.centre, [*[0.5] * 6, 3.0])
+    task = oc.Task.pose(iiwa.robot, iiwa.robot.tip_rotation(box.centre))
+    frame, of_x = oc.ClearBox(box, task, 0.05), oc.ClearBox(box, task, 0.05, rows="x")
+    points = sample_uniform(box, 500, 3)
+    turned = points * [1, 1, 1, 1, 1, 1, 0] + np.eye(7)[6] * np.pi
+    np.testing.assert_allclose(frame.singular_values(turned), frame.singular_values(points), rtol=1e-9)
+    np.testing.assert_allclose(by_hand(task, box, points, "x"), of_x.singular_values(points), rtol=0.03)
+    half = box.centre + (np.pi - 1e-3) * np.eye(7)[6]
+    assert of_x.singular_values(half) < 1e-3
+    assert frame.singular_values(half) == pytest.approx(frame.singular_values(box.centre), rel=1e-9)
+    metres, turns = frame.scale[[0, 5]]
+    assert turns == pytest.approx(np.sqrt(7 / 3))  # seven unit axes
+    assert f"(rows of the frame Jacobian over {metres:.3g} m, {turns:.3g} rad)" in frame.heading
+    assert "rows of J_x over" in of_x.heading
+    with pytest.raises(oc.errors.UnknownNameError, match="rows 'world'"):
+        oc.ClearBox(box, task, 0.05, rows="world")
+
+
+def test_files_that_do_not_name_the_rows_mean_those_of_x(iiwa: oc.Problem, tmp_path: Path) -> None:
+    """And they keep their fingerprints, so their certificates stay."""
+    box = oc.Box(iiwa.domain.centre, [*[0.5] * 6, 2.9])
+    task = oc.Task.pose(iiwa.robot, iiwa.robot.tip_rotation(box.centre))
+    points = sample_uniform(box, 300, 4)
+    for rows in ("x", "frame"):
+        clear = oc.ClearBox(box, task, 0.1, rows=rows)
+        chart = oc.fit(oc.Problem(iiwa.robot, task, domain=clear), oc.Linear()).chart
+        chart.save(tmp_path / rows)
+        assert ("judged_rows" in header_of(tmp_path / rows)["problem"]) == (rows == "frame")  # type: ignore[operator]
+        again = oc.load(tmp_path / rows).problem.domain
+        assert isinstance(again, oc.ClearBox)
+        assert again.rows == rows
+        np.testing.assert_array_equal(again.contains(points), clear.contains(points))
+    header = header_of(tmp_path / "frame")
+    header["problem"] = {**header["problem"], "judged_rows": "wrist"}  # type: ignore[dict-item]
+    with pytest.raises(ChartFileError, match="rows 'wrist'"):
+        oc.load(resealed(tmp_path / "frame", header))
+
+
+def test_laws_report_singular_where_only_x_ends(iiwa: oc.Problem) -> None:
+    box = oc.Box(iiwa.domain.centre, [*[0.3] * 6, 3.2])
+    free = oc.Robot(dataclasses.replace(iiwa.robot.tree, lower=np.full(7, -9.0), upper=np.full(7, 9.0)))
+    task = oc.Task.pose(free, free.tip_rotation(box.centre))
+    chart = oc.fit(oc.Problem(free, task, domain=box, least_singular_value=0.02), oc.Linear()).chart
+    law, zero = control.PDPlus(chart, 50.0), np.zeros(7)
+    for turn, wanted in ((0.0, ControlStatus.OK), (2.8, ControlStatus.OK), (np.pi - 1e-3, ControlStatus.SINGULAR)):
+        q = box.centre + turn * np.eye(7)[6]
+        assert chart.problem.domain.contains(q)
+        _, status = law.function(q, zero, chart.phi(q), zero, zero, *law.gains.values())
+        assert int(status) == wanted
+    assert oc.check(chart.problem, 2000).half_turn_samples > 0
 
 
 def test_cyclic_joints_keep_the_condition(problem: oc.Problem) -> None:

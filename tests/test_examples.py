@@ -7,6 +7,7 @@ import batches
 import c_timing
 import casadi as ca
 import certificates
+import clear_positions
 import compare_parametrisations
 import distillation
 import domain_size
@@ -143,6 +144,12 @@ def test_angles_grow_with_the_box_as_the_defect_expects_at_any_degree(tmp_path: 
     assert found["exponent"] > 1.1  # faster than the size: the defect itself grows
     assert found["gain_of_degree"] < 1.3
     assert (tmp_path / "domain_size.png").stat().st_size > 10_000
+
+
+def test_a_clear_box_takes_for_clear_what_pinocchio_does() -> None:
+    of_x, frame = clear_positions.main(quick=True)
+    assert float(of_x.split("|")[3].strip(" %")) > 20
+    assert frame.endswith("| 0.0 % | 0.0 % |")
 
 
 @pytest.mark.slow

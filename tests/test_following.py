@@ -235,7 +235,7 @@ def cost(choice: XiChoice, values: Array) -> float:
 
 def by_ipopt(choice: XiChoice, limits: Limits, first: Array) -> Array:
     """Values of the spline (K, 1)."""
-    chart, P, scale = choice.chart, len(choice.s), limits.scale()
+    chart, P, scale = choice.chart, len(choice.s), limits.scale
     opti = ca.Opti()
     q, values = opti.variable(3, P), opti.variable(choice._basis.shape[1])
     xi, total = ca.DM(choice._basis) @ values, ca.MX(0)

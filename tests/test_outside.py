@@ -15,6 +15,29 @@ BOUND = 0.1
 
 
 @pytest.fixture(scope="module")
+def pose_chart(iiwa: oc.Problem) -> oc.Chart:
+    """Of the tool's pose, around half a turn from its reference, where rows of x would leave everything out."""
+    box = oc.Box([0.0, 0.6, 0.2, -0.4, 0.2, 0.5, 0.0], [0.3, 0.3, 0.3, 0.4, 0.3, 0.3, 0.3])
+    task = oc.Task.pose(iiwa.robot, iiwa.robot.tip_rotation(box.centre + 3.0 * np.eye(7)[6]))
+    problem = oc.Problem(iiwa.robot, task, iiwa.metric, box, least_singular_value=BOUND / 2)
+    return oc.fit(problem, oc.Linear()).chart
+
+
+def test_boxes_that_lie_outside_for_a_pose_hold_no_position_that_is_clear_for_the_frame(pose_chart: oc.Chart) -> None:
+    domain, bound, rng = pose_chart.problem.domain, BOUND / 2, np.random.default_rng(0)
+    middle = domain.centre + domain.half_width * rng.uniform(-1, 1, (2000, 7))
+    half = rng.uniform(0.001, 0.05, (2000, 1)) * np.ones(7)
+    found = judge_of(pose_chart, chart_rows(pose_chart), 0.0)(middle - half, middle + half)
+    outside = found.proved & ~found.regular
+    assert outside.sum() > 50
+    points = middle[outside, None] + half[outside, None] * rng.uniform(-1, 1, (int(outside.sum()), 100, 7))
+    assert domain.singular_values(points.reshape(-1, 7)).max() <= bound
+    clear = domain.singular_values(middle) > bound
+    assert not (outside & clear).any()
+    assert clear.mean() > 0.3
+
+
+@pytest.fixture(scope="module")
 def chart(iiwa: oc.Problem) -> oc.Chart:
     """Of a part of the 7-DoF arm's range at whose border the elbow is stretched."""
     box = oc.Box([0.0, 0.6, 0.2, -0.4, 0.2, 0.5, 0.0], [0.3, 0.3, 0.3, 0.4, 0.3, 0.3, 0.3])

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import robot_data
+from conftest import arm, robot_data
 
 import orthocas as oc
 from orthocas.casadi_tools.tape import from_tape, to_tape
@@ -212,3 +212,53 @@ def test_bad_tasks_are_refused() -> None:
             oc.Task.custom(robot, name, function)
     with pytest.raises(ShapeError, match="labels"):
         oc.Task.custom(robot, "one", lambda q: q[0], labels=("a", "b"))
+
+
+SPINS = {  # rows of Pinocchio's frame Jacobian in the tip's axes, with signs: the axis z moves by (w_y, -w_x)
+    "orientation": ([3, 4, 5], [1, 1, 1]),
+    "pose": ([0, 1, 2, 3, 4, 5], [1, 1, 1, 1, 1, 1]),
+    "orientation:x": ([5, 4, 3], [1, -1, 1]),
+    "pose:z": ([0, 1, 2, 4, 3, 5], [1, 1, 1, 1, -1, 1]),
+    "axis:y": ([5, 3], [-1, 1]),
+    "position+axis:x": ([0, 1, 2, 5, 4], [1, 1, 1, 1, -1]),
+}
+
+
+@pytest.mark.parametrize("kind", SPINS)
+def test_rows_that_judge_are_those_of_pinocchios_frame_jacobian(kind: str) -> None:
+    """Also half a turn from the reference, where J_x loses rank; at the reference both turn alike."""
+    model, tip = arm("panda")
+    robot, data = oc.Robot.from_model(model, tip), model.createData()
+    task = oc.Task.named(robot, kind, READY)
+    rows, signs = SPINS[kind]
+    for q in (READY, READY + np.pi * np.eye(7)[6], READY + 0.4, READY - [0.9, -0.3, 0.5, 0.2, -0.7, 0.1, 0.8]):
+        J = pin.computeFrameJacobian(model, data, q, model.getFrameId(tip), pin.LOCAL)
+        found = np.array(task.frame_jacobian_function(q))
+        np.testing.assert_allclose(found, np.array(signs)[:, None] * J[rows], atol=1e-9)
+    turning = slice(3 if kind.startswith("po") else 0, None)
+    at_reference = np.array(task.jacobian_function(READY))[turning]
+    np.testing.assert_allclose(np.array(task.frame_jacobian_function(READY))[turning], at_reference, atol=1e-9)
+
+
+def test_other_tasks_are_judged_by_their_own_rows() -> None:
+    for kind in ("position", "position:xz", "polar"):
+        task = oc.Task.named(iiwa_robot(), kind)
+        assert task.frame_jacobian_function is task.jacobian_function
+
+
+@pytest.mark.parametrize("kind", ["orientation", "pose", "pose:z", "axis:x", "position+axis:y"])
+def test_the_distance_from_half_a_turn_is_that_of_rotation_matrices(kind: str) -> None:
+    robot = iiwa_robot()
+    task, points = oc.Task.named(robot, kind, Q), np.random.default_rng(4).uniform(-2, 2, (50, 7))
+    R = robot.tip_rotation(Q).T @ robot.tip_rotation(points)
+    if task.turn is None or task.turn.axis is None:
+        cosines = (np.trace(R, axis1=1, axis2=2) - 1) / 2
+    else:
+        k = "xyz".index(task.turn.axis)
+        cosines = R[:, k, k]
+    wanted = np.cos(np.arccos(np.clip(cosines, -1, 1)) / 2)
+    if kind == "pose:z":  # its turn ends at half a turn as well
+        wanted = np.minimum(wanted, np.cos(task.batched(points)[0][:, 5] / 2))
+    assert task.turn is not None
+    found = task.turn.distance_from_half_a_turn(task.batched(points)[0].reshape(50, -1))
+    np.testing.assert_allclose(found, wanted, atol=1e-7)

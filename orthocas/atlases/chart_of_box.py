@@ -11,7 +11,7 @@ from orthocas.atlases.plan import Plan
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.coordinates.fitted import Coordinates
-from orthocas.domains import Box
+from orthocas.domains import Box, Domain
 from orthocas.errors import DomainError
 from orthocas.files.json import plain
 from orthocas.files.problem_parts import problem_from_data, problem_to_data
@@ -88,7 +88,9 @@ def chart_of(plan: Plan, box: Box, numbers: Array, clear: float, problem: Proble
     """
     base = problem
     bound = plan.settings.least_singular_value
-    domain = ClearBox(box, base.task, bound, plan.scale) if clear < 1 or is_turning(base.task) else box
+    domain: Domain = box
+    if clear < 1 or is_turning(base.task):
+        domain = ClearBox(box, base.task, bound, plan.scale, rows="x")  # ends before x does, half a turn away
     problem = Problem(base.robot, base.task, base.metric, domain, base.name)
     parametrisation = Polynomial(plan.settings.degree, plan.cyclic_names)
     r = plan.fitted

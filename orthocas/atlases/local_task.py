@@ -9,13 +9,12 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.batch import dense_function
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.problem import Problem
-from orthocas.robots.tip_turn import TipTurn
 from orthocas.tasks import Task
 
 
 def is_turning(task: Task) -> bool:
     """Whether a task compares the tip's orientation with a reference."""
-    return TipTurn.of_kind(task.recipe["kind"]) is not None
+    return task.turn is not None
 
 
 def local_problem(problem: Problem) -> Problem:

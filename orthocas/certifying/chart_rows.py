@@ -109,10 +109,15 @@ def task_gradients(task: Task, domain: Domain, joints: Sequence[int]) -> tuple[G
     rows, allowance = task_rows(task, domain)
     if rows is task.jacobian_function:
         return true_gradients(task, joints)
-    q = ca.SX.sym("q", task.robot.n)
+    return closed_form_rows(rows, joints, allowance)
+
+
+def closed_form_rows(rows: ca.Function, joints: Sequence[int], allowance: float = 0.0) -> tuple[GraphRows, set[int]]:
+    """Columns of a matrix that a function of q gives as it is, and the joints that they depend on."""
+    q = ca.SX.sym("q", rows.size1_in(0))
     J = ca.densify(rows(q)[:, list(joints)])
     graph = TaylorGraph.of(dense_function("task_rows", [q], [J]), "the task")
-    return GraphRows(graph, task.m, allowance), {k for k in range(task.robot.n) if ca.depends_on(J, q[k])}
+    return GraphRows(graph, J.shape[0], allowance), {k for k in range(q.shape[0]) if ca.depends_on(J, q[k])}
 
 
 def true_gradients(task: Task, joints: Sequence[int]) -> tuple[GraphRows, set[int]]:

@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 
 from orthocas.casadi_tools.threads import one_blas_thread
-from orthocas.certifying.chart_rows import ChartRows, GraphRows, joint_models, task_gradients, true_gradients
+from orthocas.certifying.chart_rows import (
+    ChartRows,
+    GraphRows,
+    closed_form_rows,
+    joint_models,
+    task_gradients,
+    true_gradients,
+)
 from orthocas.certifying.elimination import between, is_orthogonal, singular_vectors
 from orthocas.certifying.judges import Judge, RegularityJudge, Verdicts, most_influential
 from orthocas.certifying.monomials import Variables
@@ -22,21 +29,22 @@ from orthocas.postures.corridor import Corridor
 
 _ROUNDING = 1e-6  # of distances, far above that of floating-point numbers
 _LENGTHS = 1e-7  # of squares: far above what singular vectors miss that are orthogonal up to 1e-9, and roundings of D
-_GUARDS = 1e-12  # of |J_x|^2: elimination in floating-point numbers is exact to less, so guards agree
+_GUARDS = 1e-12  # of |J|^2: elimination in floating-point numbers is exact to less, so guards agree
 
 
 @dataclass(frozen=True, eq=False)
 class OutsideJudge:
     """Counts boxes as proved, without a sign, that lie outside a ClearBox: s(q) <= bound all over the box.
 
-    s(q) <= |v^T D^-1 J_x(q)| for all |v| >= 1. Here v(q) is the singular vector of the smallest singular value at the
-    middle of the box, plus as much of the others, linear in q, as cancels the change of v^T D^-1 J_x along them to
-    first order. Another judge judges the other boxes, and their det J must have the sign of the middle of the
-    domain: a box with the other sign is halved until its parts lie outside, or a fold shows.
+    s(q) <= |v^T D^-1 J(q)| for all |v| >= 1, with the rows J that count in that ClearBox. Here v(q) is the singular
+    vector of the smallest singular value at the middle of the box, plus as much of the others, linear in q, as cancels
+    the change of v^T D^-1 J along them to first order. Another judge judges the other boxes, and their det J must have
+    the sign of the middle of the domain: a box with the other sign is halved until its parts lie outside, or a fold
+    shows.
     """
 
     inside: RegularityJudge
-    rows: GraphRows  #: J_x, or C(q) J_x with orthogonal C if all entries of D are the same
+    rows: GraphRows  #: J, the rows that judge, or C(q) J with orthogonal C if all entries of D are the same
     domain: ClearBox
     sign: float  #: of det J at the centre of the domain
     variables: Variables
@@ -136,12 +144,19 @@ def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
         return CorridorJudge(judge, domain, float(judge(start, start).sign[0]))
     if not isinstance(domain, ClearBox):
         return judge
-    task, joints = chart.problem.task, range(chart.n)  # rotated rows have the singular values of x for positions only
-    alike = task.recipe["kind"] == "position:xyz" and bool((domain.scale == domain.scale[0]).all())
-    own, variables = task_gradients(task, domain, joints) if alike else true_gradients(task, joints)
+    own, variables = _judging_rows(chart, domain)
     require_all_positions(chart, variables)
     sign = float(judge(domain.centre[None], domain.centre[None]).sign[0])  # rows have other scales than the chart's
     return OutsideJudge(judge, own, domain, sign, tuple(sorted(variables)))
+
+
+def _judging_rows(chart: Chart, domain: ClearBox) -> tuple[GraphRows, set[int]]:
+    """The rows that judge positions, just as `domain.is_clear` takes them, and the joints that they depend on."""
+    task, joints = chart.problem.task, range(chart.n)
+    if domain.jacobian_function is not task.jacobian_function:
+        return closed_form_rows(domain.jacobian_function, joints)
+    rotated = task.recipe["kind"] == "position:xyz" and bool((domain.scale == domain.scale[0]).all())
+    return task_gradients(task, domain, joints) if rotated else true_gradients(task, joints)
 
 
 def _require_uncounted(domain: Corridor, joint_names: Sequence[str]) -> None:

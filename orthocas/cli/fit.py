@@ -1,6 +1,6 @@
 """`orthocas fit`: from a robot to a chart file."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,12 +31,14 @@ from orthocas.files.archive import require_free
 from orthocas.files.chart_file import CHART
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
-from orthocas.fitting.settings import PRECISIONS
+from orthocas.fitting.loss import Weights
+from orthocas.fitting.settings import PRECISIONS, default_parametrisation
 from orthocas.minimising.solver import Status
-from orthocas.parametrisations import parse_parametrisation
+from orthocas.parametrisations import Parametrisation, parse_parametrisation
 from orthocas.postures.probe import Bounds
 from orthocas.postures.suggest import CONDITIONING, LEAK_DEG
 from orthocas.postures.suggestion import DomainSuggestion
+from orthocas.problem import Problem
 from orthocas.quality import Report, evaluate
 from orthocas.showing import number_list
 from orthocas.solvers import get as get_solver
@@ -116,7 +118,10 @@ def fit(
             if bounds is not None:
                 built, suggestion = suggested(problem, words, parametrisation, bounds, seed, monitor)
             assert built is not None
-            result = fit_chart(
+            others = (minimiser, samples, max_mutual_deg, checkpoint)
+            usual = others == (None,) * 4 and loss == Weights() and precision == PRECISIONS[0]
+            result = _confirming(suggestion, built, parametrisation) if usual else None
+            result = result or fit_chart(
                 built,
                 parametrisation,
                 minimiser,
@@ -139,6 +144,16 @@ def fit(
     if result.status is Status.INTERRUPTED:
         note("interrupted: the chart holds the best coordinates found so far")
         raise typer.Exit(130)
+
+
+def _confirming(
+    suggestion: DomainSuggestion | None, built: Problem, parametrisation: Parametrisation | None
+) -> Fit | None:
+    """The fit that confirmed the domain, if it has the family that is asked for."""
+    default = default_parametrisation(built, True) == default_parametrisation(built, False)
+    if suggestion is None or (parametrisation is None and not default):
+        return None
+    return replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
 
 
 def _bounds(
@@ -172,6 +187,8 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
         rows["singular"] = f"{check.singular_share:.2%} of the domain is near-singular, worst at q = ({at})"
         if offer is None:
             rows["singular"] += "; --domain auto, or another --centre or --home, stays clear"
+    if check.half_turn_samples:
+        rows["half a turn"] = f"at {check.half_turn_share:.2%} of the domain the task's own orientation ends"
     if offer is not None:
         bound, share = offer.least_singular_value, offer.share
         rows["clear part"] = f"--least-singular-value {bound:g} leaves out singular positions and keeps {share:.1%}"
@@ -199,6 +216,7 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
         "least_conditioning": None if result.worst is None else result.worst.least,
         "cyclic_joints": list(result.cyclic_joints),
         "near_singular_share": check.singular_share,
+        "half_turn_share": check.half_turn_share,
         "most_singular_point": list(check.most_singular_point),
         "clear_part": None if result.clear_part is None else asdict(result.clear_part),
         "stages": [

@@ -91,6 +91,7 @@ def _problem(problem: Problem) -> dict[str, Any]:
         **_clear(problem.domain),
         "cyclic_joints": list(cyclic_joints(problem)),
         "near_singular_share": found.singular_share,
+        "half_turn_share": found.half_turn_share,
         "most_singular_point": list(found.most_singular_point),
         **_involutivity(problem),
         **_robot(problem.robot),
@@ -117,6 +118,7 @@ def _clear(domain: Domain) -> dict[str, Any]:
         return {}
     return {
         "least_singular_value": domain.least_singular_value,
+        "judged_rows": domain.rows,
         "row_scale": domain.scale.tolist(),
         "clear_share": domain.share,
     }

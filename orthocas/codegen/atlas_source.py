@@ -55,7 +55,7 @@ class AtlasSource:
             return None
         domain = self.first.problem.domain
         box = Box(domain.centre, domain.half_width)
-        return ClearBox(box, plan.problem.task, plan.settings.least_singular_value, plan.scale)
+        return ClearBox(box, plan.problem.task, plan.settings.least_singular_value, plan.scale, rows="x")
 
     @property
     def somewhere(self) -> Array:

@@ -42,7 +42,7 @@ def problem_to_data(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]
             "metric": _with_tape(problem.metric.recipe, problem.metric.function),
             "domain": domain.name,
             **({"unbounded": list(domain.unbounded)} if isinstance(domain, Box) else {}),
-            **({"least_singular_value": domain.least_singular_value} if isinstance(domain, ClearBox) else {}),
+            **(_condition(domain) if isinstance(domain, ClearBox) else {}),
         },
     }
     return header, arrays
@@ -56,6 +56,12 @@ def problem_from_data(header: Mapping[str, Any], arrays: Mapping[str, Stored]) -
     """
     robot = Robot(_tree(part(header, "robot", dict), arrays))
     return _problem(robot, part(header, "problem", dict), arrays)
+
+
+def _condition(domain: ClearBox) -> dict[str, Any]:
+    """The bound, and the rows that count if they are not J_x: older files, which do not name them, mean J_x."""
+    of_x = domain.jacobian_function is domain.task.jacobian_function
+    return {"least_singular_value": domain.least_singular_value, **({} if of_x else {"judged_rows": domain.rows})}
 
 
 def _with_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:
@@ -86,7 +92,8 @@ def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]
     if data["domain"] == CLEAR_BOX and isinstance(domain, Box):
         require_within_limits(robot, domain)  # before the task is evaluated there
         scale = part(arrays, "domain_row_scale", np.ndarray)
-        domain = ClearBox(domain, task, part(data, "least_singular_value", float), scale)
+        rows = part(data, "judged_rows", str) if "judged_rows" in data else "frame" if task.turn is None else "x"
+        domain = ClearBox(domain, task, part(data, "least_singular_value", float), scale, rows)
     if data["domain"] == CORRIDOR and isinstance(domain, Box):
         domain = Corridor(domain, *(part(arrays, f"domain_{name}", np.ndarray) for name in ("postures", "radius")))
     return Problem(robot, task, metric, domain, part(data, "name", str))

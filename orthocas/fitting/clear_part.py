@@ -50,6 +50,6 @@ def clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints | None)
         if not wanted <= _LARGEST:
             return None
         bound = round(_STEP * (1 + wanted // _STEP), 2)
-        return ClearPart(bound, ClearBox(domain, problem.task, bound, measured.scale).share)
+        return ClearPart(bound, ClearBox(domain, problem.task, bound, measured.scale, measured.rows).share)
     except DomainError:  # the centre is not clear
         return None

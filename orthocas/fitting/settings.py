@@ -18,6 +18,7 @@ from orthocas.samples import sample_problem
 from orthocas.solvers import LBFGS, GaussNewton, Ipopt, QuasiNewton
 
 PRECISIONS = ("double", "single")  #: of the large products of a fit
+_MANY_JOINTS = 8  # with more, coordinates are many as well, and the matrix grows with their square
 _MANY_TERMS = 300  # where a Gauss-Newton matrix takes longer than ten gradients: degree 4 for seven joints
 _TELLTALE = (20, (0, 1000))  # number and seed of the samples that identify a problem
 _LEAST_BOUND = 1e-6  # deg; rounding hides smaller angles
@@ -104,15 +105,16 @@ class FitSettings:
 
 
 def default_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
-    """Polynomials of degree 5, and of degree 4 where the terms grow too many: for many joints, or with a bound."""
-    return Polynomial(degree=4 if bounded or problem.n > 7 else 5)
+    """Polynomials of degree 5; of degree 4 with a bound or 8 joints, and of degree 3 with more: terms grow too many."""
+    return Polynomial(degree=3 if problem.n > _MANY_JOINTS else 4 if bounded or problem.n > 7 else 5)
 
 
 def default_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
     """Gauss-Newton for families linear in their parameters, with fewer matrices if these are large; else L-BFGS."""
     if not parametrisation.linear:
         return LBFGS()
-    many = isinstance(parametrisation, GradedParametrisation) and parametrisation.term_count(problem.n) > _MANY_TERMS
+    terms = parametrisation.term_count(problem.n) if isinstance(parametrisation, GradedParametrisation) else 0
+    many = terms > _MANY_TERMS or (terms and problem.n > _MANY_JOINTS)
     return QuasiNewton() if many else GaussNewton()
 
 
@@ -140,7 +142,8 @@ def _digest(problem: Problem) -> str:
     samples = sample_problem(problem, *_TELLTALE)
     parts = [samples.points, samples.task_jacobian]
     parts += [] if samples.metric_inverse is None else [samples.metric_inverse]
-    domain = problem.domain
+    domain, own = problem.domain, problem.task.jacobian_function
     parts += [np.append(domain.scale, domain.least_singular_value)] if isinstance(domain, ClearBox) else []
+    parts += [np.array([1.0])] if isinstance(domain, ClearBox) and domain.jacobian_function is not own else []
     parts += [domain.postures, domain.radius] if isinstance(domain, Corridor) else []
     return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]

@@ -3,8 +3,11 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import casadi as ca
 import numpy as np
 
+from orthocas.casadi_tools.blocks import BlockedFunction
+from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array
 from orthocas.domains import borders, contains, sample_uniform
 from orthocas.errors import InvalidValueError, PathError
@@ -20,7 +23,7 @@ from orthocas.reaching.stops import Walls
 if TYPE_CHECKING:
     from orthocas.chart import Chart
 
-_SAMPLES = 256  # of the domain, for the scale of the rows of J_x
+_SAMPLES = 256  # of the domain, for the scale of the rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +36,33 @@ class Limits:
     distances: LinkDistances
     clearance: float  #: smallest distance from obstacles to allow [m]
 
-    def scale(self) -> Array:
-        """The scale of the rows of J_x, (m,); see `orthocas.ClearBox`."""
+    @property
+    def rows(self) -> ca.Function:
+        """q (n, 1) -> the rows J (m, n) that tell how near to a singular position the robot is."""
         domain, task = self.chart.problem.domain, self.chart.problem.task
+        return domain.jacobian_function if isinstance(domain, ClearBox) else task.frame_jacobian_function
+
+    @cached_property
+    def scale(self) -> Array:
+        """The scale of these rows, (m,); see `orthocas.ClearBox`."""
+        domain = self.chart.problem.domain
         if isinstance(domain, ClearBox):
             return domain.scale
-        J = task.batched_jacobian(sample_uniform(domain, _SAMPLES, 0))[0].reshape(-1, self.chart.m, self.chart.n)
-        return row_scale(J[np.isfinite(J).all(axis=(1, 2))], task.units)
+        J = self._rows_at(sample_uniform(domain, _SAMPLES, 0))
+        return row_scale(J[np.isfinite(J).all(axis=(1, 2))], self.chart.problem.task.units)
+
+    def scaled_rows(self, q: Array) -> Array:
+        """D^-1 J at joint positions (P, n), (P, m, n)."""
+        J: Array = self._rows_at(q) / self.scale[:, None]
+        return J
+
+    def _rows_at(self, q: Array) -> Array:
+        J: Array = self._batched_rows(q)[0].reshape(-1, self.chart.m, self.chart.n)
+        return J
+
+    @cached_property
+    def _batched_rows(self) -> BlockedFunction:
+        return BlockedFunction(self.rows)
 
     def require_kept(self, plan: Plan, s: Array, q: Array) -> None:
         """Raise PathError at the first place (P,) whose joint position (P, n) is lost, outside, or at an obstacle."""
@@ -90,8 +113,7 @@ class Limits:
         room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width
         worst = int(np.argmin(room.min(axis=0)))
         bounded = bool(np.isfinite(room).any())
-        J = self.chart.problem.task.batched_jacobian(q)[0].reshape(-1, self.chart.m, self.chart.n)
-        values = np.linalg.svd(J / self.scale()[:, None], compute_uv=False)
+        values = np.linalg.svd(self.scaled_rows(q), compute_uv=False)
         distances = self.distances(q)
         pair = int(np.argmin(distances.min(axis=0))) if distances.size else -1
         return Margins(

@@ -56,25 +56,19 @@ class Costs:
         return residuals, gradients
 
     def _of_task(self, q: Array) -> tuple[Array, Array]:
-        chart = self.limits.chart
-        J = chart.problem.task.batched_jacobian(q)[0].reshape(-1, chart.m, chart.n) / self._scale[:, None]
-        left, values, right = np.linalg.svd(J, full_matrices=False)
-        domain = chart.problem.domain
+        left, values, right = np.linalg.svd(self.limits.scaled_rows(q), full_matrices=False)
+        domain = self.limits.chart.problem.domain
         bound = domain.least_singular_value if isinstance(domain, ClearBox) else 0.0
         residuals, slopes = _inverse(values[:, -1:] - bound, _REGULAR, _NEARLY_SINGULAR)
-        gradients = self._turning(q, left[:, :, -1] / self._scale, right[:, -1])[0]
+        gradients = self._turning(q, left[:, :, -1] / self.limits.scale, right[:, -1])[0]
         return residuals, slopes[..., None] * gradients[:, None]
 
     @cached_property
-    def _scale(self) -> Array:
-        return self.limits.scale()
-
-    @cached_property
     def _turning(self) -> Batched:
-        """q, u, v -> the gradient (n, 1) of u^T J_x(q) v: with singular vectors, that of the singular value."""
+        """q, u, v -> the gradient (n, 1) of u^T J(q) v: with singular vectors, that of the singular value."""
         chart = self.limits.chart
         q, v, u = ca.SX.sym("q", chart.n), ca.SX.sym("v", chart.n), ca.SX.sym("u", chart.m)
-        product = ca.dot(u, chart.problem.task.jacobian_function(q) @ v)
+        product = ca.dot(u, self.limits.rows(q) @ v)
         return Batched(dense_function("turning", [q, u, v], [ca.cse(ca.gradient(product, q))]))
 
 

@@ -11,7 +11,7 @@ from orthocas.checks import Array, require_kind
 from orthocas.domains import Box, Conditioned, sample_uniform
 from orthocas.errors import InvalidValueError
 from orthocas.metrics import Metric
-from orthocas.problem import NEAR_SINGULAR, Problem, relative_singular_values
+from orthocas.problem import Problem, is_regular
 from orthocas.robots.tip_turn import TipTurn
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks import Task
@@ -61,7 +61,7 @@ def leaf_cyclic_joints(problem: Problem) -> tuple[str, ...]:
 def _cyclic(problem: Problem, invariants: int) -> tuple[str, ...]:
     """Joints at whose position A and the first of `_invariants` do not depend."""
     points = sample_uniform(problem.domain, _SAMPLES, _SEED)
-    points = points[relative_singular_values(problem, points) >= NEAR_SINGULAR]
+    points = points[is_regular(problem, points)]
     names = problem.robot.joint_names
     sampled = (k for k in range(problem.n) if len(points) and _is_cyclic(problem, points, k, invariants))
     return tuple(names[k] for k in sampled if leaves_stay(problem, k))

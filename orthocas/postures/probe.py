@@ -1,12 +1,11 @@
 """Quick fits on trial boxes: the leak and the conditioning that a chart would have there (ours)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from orthocas.casadi_tools.cached import cached_property
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.chart import Chart
@@ -20,17 +19,24 @@ from orthocas.fitting.spectral_start import spectral_start
 from orthocas.judging.gradients import in_the_metric
 from orthocas.minimising.solver import Status
 from orthocas.parametrisations import JointSpace, LinearFamily, Polynomial
-from orthocas.problem import NEAR_SINGULAR, Problem
+from orthocas.problem import (
+    NEAR_HALF_A_TURN,
+    NEAR_SINGULAR,
+    Problem,
+    distance_from_half_a_turn,
+    relative_singular_values,
+)
 from orthocas.samples import Samples, samples_at
 from orthocas.solvers import GaussNewton
 
 _DEGREE = 2  # its conditioning is that of degree 4, its leak about a fifth larger
 _TRAINING, _HEAVY, _JUDGES = 700, 300, 3000  # numbers of samples: even, near faces and corners, and of a verdict
+_MANY, _AGAIN = 6, 4  # coordinates from which a fit starts from that of another box, and its steps then
 _SEED = 0
 _TINY = 1e-4
 
 
-Miss = Literal["leak", "conditioning", "singularity"]  #: bounds that a box may miss
+Miss = Literal["leak", "conditioning", "singularity", "half a turn"]  #: bounds that a box may miss
 
 
 @dataclass(frozen=True)
@@ -48,30 +54,49 @@ class Verdict:
     leak_deg: float  #: root mean square over uniform samples and coordinates [deg]
     conditioning: float  #: the smallest at any sample; negative if det J changes its sign, because the chart folds over
     worst_point: Array  #: where, (n,)
-    task_value: float  #: smallest singular value of J_x with rows of unit root mean square length
+    task_value: float  #: smallest relative singular value of the task, see `orthocas.ClearBox`
+    turn_value: float  #: cos(angle / 2) of the tool's largest turn from the reference; 1 for tasks without one
 
     def excess(self, bounds: Bounds) -> dict[Miss, float]:
         """How much each value misses its bound, as a ratio of at most 1 where it keeps it, the largest first.
 
-        "singularity" is the bound `NEAR_SINGULAR` on the task itself, which the conditioning does not see.
+        "singularity" and "half a turn" are the bounds `NEAR_SINGULAR` and `NEAR_HALF_A_TURN` on the task itself, which
+        the conditioning does not see.
         """
         ratios: dict[Miss, float] = {
             "leak": self.leak_deg / bounds.leak_deg,
             "conditioning": bounds.conditioning / max(self.conditioning, _TINY),
             "singularity": NEAR_SINGULAR / max(self.task_value, _TINY),
+            "half a turn": NEAR_HALF_A_TURN / max(self.turn_value, _TINY),
         }
         return dict(sorted(ratios.items(), key=lambda pair: -pair[1]))
 
+    def told(self, miss: Miss, bounds: Bounds) -> str:
+        """The value that misses a bound, and the bound, in words."""
+        trial, most, least = "a trial chart has a", bounds.leak_deg, bounds.conditioning
+        words: dict[Miss, str] = {
+            "leak": f"{trial} leak of {self.leak_deg:.3g} deg, expected at most {most:.3g}",
+            "conditioning": f"{trial} conditioning of {self.conditioning:.3g}, expected at least {least:.3g}",
+            "singularity": f"the task's relative singular value is {self.task_value:.3g}, expected {NEAR_SINGULAR:g}",
+            "half a turn": "the tool turns by half a turn from the reference, expected less",
+        }
+        return words[miss]
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(eq=False)
 class Prober:
-    """Fits quadratic coordinates of the active joints on trial boxes."""
+    """Fits quadratic coordinates of the active joints on trial boxes.
+
+    Many coordinates take a second, so they start from those of an earlier box, which are nearly the best already.
+    """
 
     problem: Problem  #: robot, task and metric; trial boxes replace its domain
     active: list[int]  #: joints that are not coordinates themselves
     cyclic: tuple[str, ...] = ()  #: joints that enter linearly
+    _objective: BasisObjective | None = None  #: of the last box; others only move it
+    _start: Array | None = None  #: parameters of the last box without folds, on its cube; None: a spectral start
 
-    @cached_property
+    @property
     def outputs(self) -> int:
         """Number of coordinates to fit."""
         return len(self.active) - self.problem.m
@@ -83,12 +108,13 @@ class Prober:
             KeyboardInterrupt: after Ctrl-C.
         """
         if self.outputs == 0:
-            return Verdict(0.0, 1.0, box.centre, 1.0)
+            return Verdict(0.0, 1.0, box.centre, 1.0, 1.0)
         problem = Problem(self.problem.robot, self.problem.task, self.problem.metric, box)
         space = JointSpace.of(problem).restricted_to(self.active)
         family = Polynomial(_DEGREE, self.cyclic).family(space, self.outputs)
         with one_blas_thread():
-            C = self._fitted(problem, family).reshape(self.outputs, family.width)
+            theta = self._fitted(problem, family)
+            C = theta.reshape(self.outputs, family.width)
 
             def jacobian(points: Array) -> Array:
                 basis = gradients_of(family, len(self.active))
@@ -96,21 +122,38 @@ class Prober:
                 J: Array = (G @ C.T).transpose(0, 2, 1)
                 return J
 
-            return judged(samples_at(problem, sample_heavily(box, _JUDGES, _SEED)), jacobian, self.active)
+            found = judged(problem, sample_heavily(box, _JUDGES, _SEED), jacobian, self.active)
+        if self.outputs >= _MANY and found.conditioning > 0:
+            self._start = theta
+        return found
 
     def _fitted(self, problem: Problem, family: LinearFamily) -> Array:
         """Parameters, (size,)."""
         even = sample_evenly(problem.domain, _TRAINING, _SEED)
         heavy = sample_heavily(problem.domain, _HEAVY, _SEED + 1)
         samples = samples_at(problem, np.vstack([even, heavy])).restricted_to(self.active)
+        solver = GaussNewton().coarser()
         with deferred():
-            start = spectral_start(family, samples[: len(even)])
-            objective = BasisObjective(family, samples, DEFAULT_WEIGHTS, start, lambda count, seed: samples)
-        result = GaussNewton().coarser().minimise(objective, start)
+            if self._start is None:
+                start = spectral_start(family, samples[: len(even)])
+            else:
+                start, solver = self._start, replace(solver, max_iterations=_AGAIN)
+            objective = self._loss(problem, family, samples, start)
+        result = solver.minimise(objective, start)
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         theta: Array = result.theta
         return theta
+
+    def _loss(self, problem: Problem, family: LinearFamily, samples: Samples, start: Array) -> BasisObjective:
+        """The loss of the fit that confirms the box: with the weights for its metric."""
+        known = self._objective
+        if known is None:
+            weights = DEFAULT_WEIGHTS.for_metric(problem.metric)
+            self._objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
+        else:
+            self._objective = known.moved(gradients_of(family, len(self.active)), samples, start)
+        return self._objective
 
 
 def judged_chart(chart: Chart, samples: int, seed: int) -> Verdict:
@@ -123,25 +166,27 @@ def judged_chart(chart: Chart, samples: int, seed: int) -> Verdict:
         J: Array = coordinates.jacobian(points)[:, :fitted, active]
         return J
 
-    return judged(samples_at(chart.problem, sample_heavily(chart.problem.domain, samples, seed)), jacobian, active)
+    return judged(chart.problem, sample_heavily(chart.problem.domain, samples, seed), jacobian, active)
 
 
-def judged(samples: Samples, jacobian: Callable[[Array], Array], active: list[int]) -> Verdict:
+def judged(problem: Problem, points: Array, jacobian: Callable[[Array], Array], active: list[int]) -> Verdict:
     """Quality at the result of `sample_heavily`.
 
     Args:
-        samples: all samples.
+        problem: robot, task and metric.
+        points: all samples (N, n).
         jacobian: gradients of the fitted coordinates in the active joints, (N, r, n), at points of all joints.
         active: the active joints.
     """
+    samples = samples_at(problem, points)
     J, own = jacobian(samples.points), samples.restricted_to(active)
     uniform = len(samples) - 2 * (len(samples) // 3)
     leaks, conditioning = leak_and_conditioning(own, J)
     worst = int(np.argmin(conditioning))
     leak = float(np.degrees(np.sqrt(np.mean(leaks[:uniform] ** 2))))
-    scale = np.sqrt((samples.task_jacobian**2).sum(axis=2).mean(axis=0))
-    task_values = np.linalg.svd(samples.task_jacobian / scale[:, None], compute_uv=False)[:, -1]
-    return Verdict(leak, float(conditioning[worst]), samples.points[worst], float(task_values.min()))
+    task_value = float(relative_singular_values(problem, points).min())
+    turn_value = float(distance_from_half_a_turn(problem, points).min())
+    return Verdict(leak, float(conditioning[worst]), samples.points[worst], task_value, turn_value)
 
 
 def leak_and_conditioning(samples: Samples, J: Array) -> tuple[Array, Array]:

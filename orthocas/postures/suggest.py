@@ -12,14 +12,14 @@ from orthocas.domains import Box
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.idle_joints import idle_joints
-from orthocas.fitting.settings import require_parametrisation
+from orthocas.fitting.settings import default_parametrisation, require_parametrisation
 from orthocas.metrics import Metric, MetricSpec
 from orthocas.minimising.watch import Monitor, silent
-from orthocas.parametrisations import Parametrisation, Polynomial, cyclic_joints
+from orthocas.parametrisations import Parametrisation, cyclic_joints
 from orthocas.postures.home import home_posture
 from orthocas.postures.probe import Bounds, Miss, Prober, Verdict, judged_chart
 from orthocas.postures.suggestion import JUDGES, DomainSuggestion, JointWidth, Reason
-from orthocas.postures.widest import WidestBox
+from orthocas.postures.widest import REMEDIES, WidestBox
 from orthocas.problem import Problem, check
 from orthocas.robots import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
@@ -61,12 +61,13 @@ def suggest_domain(
         leak_deg: largest leak: the root mean square angle, in the metric, between the gradients of the fitted
             coordinates and the space orthogonal to the task [deg]. 8 degrees couple accelerations by sin 8 = 14 %.
         conditioning: smallest conditioning, at samples of which two thirds lie near faces and corners; 0 to 1.
-        parametrisation: the family of the fit. Default: Polynomial(degree=4).
+        parametrisation: the family of the fit. Default: Polynomial(degree=4), of degree 3 for more than 8 joints.
         seed: seed of the fit.
         monitor: called with progress.
 
     Raises:
-        DomainError: if the home lies at a joint limit, or no box around it keeps the bounds.
+        DomainError: if the home lies at a joint limit, or no box around it keeps the bounds. The message says which
+            bound breaks, and what may help.
         SingularTaskError: if the task is singular everywhere.
         UnknownNameError: if there is no posture of that name.
         InvalidValueError, NotRedundantError: if an argument is invalid.
@@ -86,8 +87,8 @@ def suggest_domain(
     """
     start = time.perf_counter()
     bounds = _checked(robot, task, leak_deg, conditioning, seed)
-    wanted = Polynomial(degree=4) if parametrisation is None else parametrisation
-    require_parametrisation(wanted)
+    if parametrisation is not None:
+        require_parametrisation(parametrisation)
     posture = home_posture(robot, task, home)
     room = np.minimum(_room(robot, posture.q), _farthest(robot))
     problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_unit(robot), room)))
@@ -96,6 +97,7 @@ def suggest_domain(
     prober = Prober(problem, joints.active, joints.cyclic)
     stricter = replace(bounds, conditioning=min(1.0, _MARGIN * bounds.conditioning))
     widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).found(_unit(robot))
+    wanted = default_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
     found, verdict = _confirmed(problem, wanted, joints, widths, bounds, seed, monitor)
     return DomainSuggestion(
         fit=found,
@@ -203,5 +205,5 @@ def _confirmed(
             return found, verdict
     raise DomainError(
         f"fits of {parametrisation.label} miss the bounds on {_TRIES} ever smaller boxes around the home: the last one "
-        f"has a leak of {verdict.leak_deg:.3g} deg and a conditioning of {verdict.conditioning:.3g}"
+        f"has a leak of {verdict.leak_deg:.3g} deg and a conditioning of {verdict.conditioning:.3g}; {REMEDIES}"
     )

@@ -12,7 +12,7 @@ from orthocas.showing import Shown, listed, number_list
 
 JUDGES = 30_000  #: samples that judge the fit
 
-Reason = Literal["joint limit", "unlimited", "idle", "cyclic", "leak", "conditioning", "singularity"]
+Reason = Literal["joint limit", "unlimited", "idle", "cyclic", "leak", "conditioning", "singularity", "half a turn"]
 _WORDS: dict[Reason, str] = {
     "joint limit": "to the joint limit",
     "unlimited": "as far as tried",
@@ -21,6 +21,7 @@ _WORDS: dict[Reason, str] = {
     "leak": "ended by the leak",
     "conditioning": "ended by conditioning",
     "singularity": "ended by singularity",
+    "half a turn": "ended by half a turn",
 }
 
 
@@ -28,8 +29,9 @@ _WORDS: dict[Reason, str] = {
 class JointWidth:
     """How wide a suggested box is in one joint, and what ends it.
 
-    The reasons "leak", "conditioning" and "singularity" name the bound that breaks first if this joint alone moves a
-    fifth further. A joint is "unlimited" if it reaches a full turn, or 1 m, without breaking a bound.
+    The reasons "leak", "conditioning", "singularity" and "half a turn" (of the tool, from the reference) name the bound
+    that breaks first if this joint alone moves a fifth further. A joint is "unlimited" if it reaches a full turn, or
+    1 m, without breaking a bound.
     """
 
     joint: str

@@ -17,7 +17,12 @@ _ROUNDS = 2  # exchanges of width between joints
 _WIDER = 1.2  # factor by which one joint alone is widened
 _LARGEST_EXCHANGE = np.log(1.5)
 _STAGE = "suggest a domain"
-_PROBES = 35.0  # about as many as a search needs
+_PROBES, _PROBES_OF_A_JOINT = 15, 3  # about as many as a search needs
+#: what helps if no box keeps the bounds
+REMEDIES = (
+    "another home (home=..., --centre or --home), another metric (metric=..., --metric), a larger leak_deg "
+    "(--leak-deg) or a smaller conditioning (--conditioning) may help"
+)
 
 
 @dataclass(eq=False)
@@ -69,7 +74,8 @@ class WidestBox:
         """Fit and judge the box of the given half-widths."""
         self.probes += 1
         detail = f"trial {self.probes}: mean half-width {widths[self.free].mean():.3g}"
-        self.monitor(Progress(_STAGE, min(0.99, self.probes / _PROBES), detail))
+        expected = _PROBES + _PROBES_OF_A_JOINT * len(self.free)
+        self.monitor(Progress(_STAGE, min(0.99, self.probes / expected), detail))
         return self.prober.verdict(Box(self.home, widths))
 
     def _clipped(self, widths: Array) -> Array:
@@ -79,6 +85,15 @@ class WidestBox:
 
     def _excess(self, widths: Array) -> float:
         return max(self.verdict(widths).excess(self.bounds).values())
+
+    def _refusal(self, widths: Array) -> DomainError:
+        """Which bound breaks even on a box of these half-widths (n,), and what may help."""
+        found = self.verdict(widths)
+        miss = next(iter(found.excess(self.bounds)))
+        return DomainError(
+            f"no box around the home {np.round(self.home, 4).tolist()} keeps the bounds: with half-widths of "
+            f"{widths[self.free].max():.1g} {found.told(miss, self.bounds)}; {REMEDIES}"
+        )
 
     def _to_border(self, unit: Array, scale: float) -> Array:
         """The widest multiple of half-widths that keeps the bounds."""
@@ -92,10 +107,7 @@ class WidestBox:
             else:
                 high = scale
             if high < _SMALLEST:
-                raise DomainError(
-                    "no box around the home keeps the bounds, expected a posture where the task is regular "
-                    f"(home {np.round(self.home, 4).tolist()})"
-                )
+                raise self._refusal(widths)
             scale = low * _STEP if np.isinf(high) else high / _STEP**2 if low == 0 else float(np.sqrt(low * high))
         return self._clipped(low * unit)
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.checks import Array, frozen_array, require_known
 from orthocas.errors import InvalidValueError
-from orthocas.robots.spatial import half_angle_vector, rotation_z_to, tilt, turn_about
+from orthocas.robots.spatial import half_angle_vector, rotation_z_to, skew, tilt, turn_about
 
 _AXES = ("x", "y", "z")
 _KINDS = {  # whether the position comes first, and whether the whole orientation counts
@@ -67,6 +67,33 @@ class TipTurn:
 
     def _about_axis(self, turned: ca.SX, axis: int) -> ca.SX:
         return ca.vertcat(tilt(turned, axis), *([turn_about(turned, axis)] if self.whole else []))
+
+    def rates(self, turning: ca.SX, moving: ca.SX) -> ca.SX:
+        """How fast the components change if the reference is the tip's present orientation, for each joint, (m, n).
+
+        Args:
+            turning: angular velocity of the tip in its own axes, (3, n).
+            moving: velocity of the tip in whatever axes, (3, n).
+        """
+        rows = turning
+        if self.axis is not None:
+            axis = _AXES.index(self.axis)
+            tilting = -skew(ca.SX(np.eye(3)[axis])) @ turning  # how fast the axis itself moves
+            rows = ca.vertcat(tilting[_others(axis), :], *([turning[axis, :]] if self.whole else []))
+        return ca.vertcat(moving, rows) if self.with_position else rows
+
+    def distance_from_half_a_turn(self, x: Array) -> Array:
+        """cos(angle / 2) of the larger of tilt and turn, at task values (N, m), (N,): 0 where the components end."""
+        turns = x[:, 3:] if self.with_position else x
+        angles = 2 * np.arcsin(np.minimum(np.linalg.norm(turns[:, : 3 if self.axis is None else 2], axis=1) / 2, 1.0))
+        if self.axis is not None and self.whole:
+            angles = np.maximum(angles, np.abs(turns[:, 2]))
+        margin: Array = np.cos(angles / 2)
+        return margin
+
+
+def _others(axis: int) -> list[int]:
+    return [k for k in range(3) if k != axis]
 
 
 def frame_along(direction: ArrayLike, axis: str) -> Array:
