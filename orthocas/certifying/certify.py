@@ -24,6 +24,7 @@ from orthocas.minimising.watch import Monitor, Progress, silent
 _SAMPLES = 20_000  # points where folds are looked for before the proof
 _SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
 _FEW_BOXES, _MANY_BOXES, _HOPELESS = 300, 40_000, 2_000  # for one scale; then a search that goes too slowly ends
+_HELD_RANGE = 1.0  # half-width of a leading joint on which J does not depend, if its whole range is too wide
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
 
@@ -238,8 +239,8 @@ def _one_to_one(
 ) -> Subdivision | None:
     """The largest of some boxes around the centre with a proof, and its parts; None if there is no proof for any.
 
-    Joints that the first bounds of the differences hold keep their whole range. A few boxes are enough for most
-    scales; from there, larger ones are tried with more, until one of them would take too many.
+    Leading joints on which J does not depend keep their whole range, or 1 rad. A few boxes are enough for most scales;
+    from there, larger ones are tried with more, until one of them would take too many.
     """
     end = time.monotonic() + seconds
     judge = one_to_one_judge(chart, rows, base)
@@ -260,9 +261,12 @@ def _one_to_one(
             best = search.subdivision()
         return search.finished
 
-    idle = sorted({*range(chart.n)} - {*rows.active})  # coordinates themselves: their range does not matter
-    for held in [[*idle, *judge.still_joints], idle] if judge.still_joints else [idle]:
-        _try_scales([np.where(np.isin(np.arange(chart.n), held), 1.0, scale) for scale in _SCALES], proved)
+    joints = np.arange(chart.n)
+    idle = ~np.isin(joints, rows.active)  # coordinates themselves: their range does not matter
+    held, half = np.isin(joints, judge.still_joints), (base.high - base.low) / 2
+    for range_ in (np.inf, _HELD_RANGE) if held.any() else (np.inf,):
+        share = np.where(idle, 1.0, np.minimum(1.0, range_ / half))
+        _try_scales([np.where(idle | held, share, scale) for scale in _SCALES], proved)
         if best is not None:
             break
     return best
