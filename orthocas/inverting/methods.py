@@ -20,7 +20,11 @@ from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import InvertibleMap
 from orthocas.coordinates.phi import PhiFunctions
 from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError, SingularTaskError
+from orthocas.inverting.boxed import BoxedPhi
+from orthocas.inverting.cells import Cells
 from orthocas.inverting.implicit import inverse_function
+from orthocas.inverting.in_domain import InDomain
+from orthocas.inverting.inside import Inside
 from orthocas.inverting.inverse import Inverse
 from orthocas.inverting.nearest import Nearest
 from orthocas.inverting.newton import LocalSolver, Newton
@@ -28,6 +32,7 @@ from orthocas.inverting.own_inverse import OwnInverse
 from orthocas.inverting.phi_map import PhiMap
 from orthocas.inverting.point import FewRows, PointFunctions
 from orthocas.inverting.solutions import Solutions
+from orthocas.inverting.starts import Starts
 from orthocas.inverting.tracker import Tracker
 from orthocas.problem import task_sizes
 
@@ -136,7 +141,9 @@ class InverseMethods(PhiFunctions):
         """
         require_at_least("tolerance", tolerance, 0)
         self._require_expression("a search for all solutions")
-        return self._inverse.all_inside(as_point("phi", phi, self.n), float(tolerance))
+        in_domain = self._inverse.in_domain
+        assert in_domain is not None
+        return in_domain.all_solutions(as_point("phi", phi, self.n), float(tolerance))
 
     def tracker(self, q0: ArrayLike, largest_step: ArrayLike | None = None) -> Tracker:
         """A tracker that follows a stream of phi from q0; see `Tracker`.
@@ -187,13 +194,15 @@ class InverseMethods(PhiFunctions):
 
     @cached_property
     def _inverse(self) -> Inverse:
-        phi_map = self.phi_map
+        phi_map, domain = self.phi_map, self.problem.domain
+        starts = Starts(phi_map, domain)
         if isinstance(self.coordinates, InvertibleMap):
-            return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map))
+            return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map), starts)
+        boxed = BoxedPhi(self.problem.task, domain, phi_map)
         local = FewRows(phi_map, self._point_functions, Newton(phi_map))
-        return Inverse(
-            self.problem, phi_map, local, Nearest(self.problem.domain, self.m, self.function("phi"), phi_map)
-        )
+        by_ipopt = Nearest(domain, self.m, self.function("phi"), phi_map)
+        in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts, by_ipopt)
+        return Inverse(self.problem, phi_map, local, starts, in_domain, inside)
 
     @cached_property
     def _inverse_function(self) -> ca.Function:
