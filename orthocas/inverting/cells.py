@@ -1,6 +1,6 @@
 """Cells of a domain, and which of them may hold a solution of phi(q) = phi (ours).
 
-The box of the domain is cut into 256 equal cells, across the joints along which phi bends most. In a cell with the
+The box of the domain is cut into 1,024 equal cells, across the joints along which phi bends most. In a cell with the
 middle c, the map y(u) = J(c)^-1 (phi(u) - phi(c)) is nearly u - c, so it maps the cell to about itself. The range of y
 over the cell is sampled once. A target whose y lies far outside of that range has no solution in the cell, and c + y is
 a good start in the others. Samples are no proof: `MARGIN` is chosen such that hardly any cell with a solution is left
@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.casadi_tools.cached import cached_property
-from orthocas.checks import Array
+from orthocas.checks import Array, Indices
 from orthocas.inverting.boxed import BoxedPhi
 from orthocas.inverting.newton import inverses
 
 MARGIN = 0.75  #: how far outside its range y may lie, relative to half of the range
-_HALVINGS = 8  # so many cells as 2 to the power of it
-_PROBES, _SAMPLES, _SEED = 64, 96, 1  # points that measure how phi bends, and points in each cell
+CORE = 0.25  #: the same, for cells that most probably hold a solution if there is one
+_HALVINGS = 10  # so many cells as 2 to the power of it
+_PROBES, _SAMPLES, _SEED = 64, 32, 1  # points that measure how phi bends, and points in each cell
 _NEAR = 1.25  # starts may leave their cell by so much, relative to its half-widths
 
 
@@ -37,6 +38,7 @@ class _Linear:
 
     phi: Array  #: in the middle, (G, n)
     inverse: Array  #: J^-1 in the middle, (G, n, n); 0 where it is not finite
+    y: Array  #: of samples of the cell, (G, samples, n)
     low: Array  #: least y of the cell, (G, n)
     high: Array  #: greatest y of the cell, (G, n)
     known: NDArray[np.bool_]  #: cells where all this is finite, (G,)
@@ -51,17 +53,24 @@ class Cells:
     def places(self, targets: Array) -> Places:
         """Where targets (N, n) of phi would be in each cell."""
         linear, middles = self._linear, self._middles
-        difference = self._boxed.phi_map.difference(targets[:, None], linear.phi)
-        y = np.einsum("gij,ngj->ngi", linear.inverse, difference)
+        y = np.einsum("gij,ngj->ngi", linear.inverse, self._difference(targets[:, None], linear.phi))
         half = (linear.high - linear.low) / 2
         outside = np.maximum(linear.low - y, y - linear.high) / np.where(half > 0, half, 1.0)
         overshoot = np.where(linear.known, outside.max(axis=2), 0.0)
         width = _NEAR * self._half_width
         return Places(overshoot, np.clip(middles + np.clip(y, -width, width), -1.0, 1.0))
 
-    def samples(self, cell: int, count: int) -> Array:
-        """Points of a cell, (count, n)."""
-        return self._middles[cell] + self._half_width * self._unit[:count]
+    def samples(self, targets: Array, cells: Indices, count: int) -> Array:
+        """The samples of given cells (N,) that are nearest to targets (N, n), (N, count, n)."""
+        linear = self._linear
+        y = np.einsum("kij,kj->ki", linear.inverse[cells], self._difference(targets, linear.phi[cells]))
+        away = np.abs((linear.y[cells] - y[:, None]) / self._half_width).max(axis=2)
+        nearest = self._unit[np.argsort(away, axis=1)[:, :count]]
+        points: Array = self._middles[cells][:, None] + self._half_width * nearest
+        return points
+
+    def _difference(self, targets: Array, phi: Array) -> Array:
+        return self._boxed.phi_map.difference(targets, phi)
 
     @cached_property
     def _halved(self) -> tuple[int, ...]:
@@ -90,7 +99,7 @@ class Cells:
     @cached_property
     def _middles(self) -> Array:
         """Middles of the cells, (G, n)."""
-        along = [-1 + (2 * np.arange(2**times) + 1) / 2**times for times in self._halved]
+        along = [(2.0 * np.arange(2**times) + 1) / 2**times - 1 for times in self._halved]
         return np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, len(along))
 
     @cached_property
@@ -115,7 +124,7 @@ class Cells:
         with np.errstate(invalid="ignore"):
             y = np.einsum("gij,gkj->gki", inverse, boxed.phi_map.difference(values, phi[:, None]))
         known = np.isfinite(y).all(axis=(1, 2))
-        return _Linear(*(_finite(part) for part in (phi, inverse, y.min(axis=1), y.max(axis=1))), known)
+        return _Linear(*(_finite(part) for part in (phi, inverse, y, y.min(axis=1), y.max(axis=1))), known)
 
     def _jacobian(self, u: Array) -> Array:
         """dphi/du, (N, n, n)."""
