@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocas.checks import Array, Indices
-from orthocas.domains import borders
+from orthocas.domains import Conditioned, borders
 from orthocas.inverting.arm_length import beyond_reach
 from orthocas.inverting.in_domain import InDomain
 from orthocas.inverting.inside import Inside
@@ -17,7 +17,8 @@ from orthocas.inverting.starts import Starts
 from orthocas.problem import Problem
 
 _ROWS = 16_384  # solved at once
-_RESTARTS = 8  # from points of the table, where neither the rough inverse nor the centre leads to any solution
+_FIRST = 2  # restarts from points of the table, and the centre, before all of the domain is searched
+_RESTARTS = 8  # from points of the table, where nothing leads to any solution
 _UNSOLVED = (InverseStatus.NOT_FOUND, InverseStatus.OUT_OF_REACH)
 _MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, *_UNSOLVED)
 _SNAP = 1e-9  # of the half-widths: solutions so close to the border are moved onto it
@@ -83,8 +84,10 @@ class Inverse:
         if inside and self.inside is not None:
             self._search_inside(self.inside, targets, best, tolerance)
         elif starts is None:
+            self._restart(targets, best, self._open(best), _FIRST, InverseStatus.FOUND, tolerance)
             self._search_domain(targets, best, self._open(best), tolerance)
-            self._restart(targets, best, tolerance)
+            rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
+            self._restart(targets, best, rows, _RESTARTS, InverseStatus.SINGULAR, tolerance)
         return best
 
     def _tell_beyond(self, targets: Array, best: Found) -> None:
@@ -103,12 +106,15 @@ class Inverse:
             q, _ = self.in_domain.search(targets[rows], tolerance)
             attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
             best.improve(rows, self._judged(attempt, tolerance))
+        if isinstance(self.problem.domain, Conditioned):  # it may be a small part of its box
+            self._restart(targets, best, rows, _RESTARTS, InverseStatus.FOUND, tolerance)
 
-    def _restart(self, targets: Array, best: Found, tolerance: float) -> None:
-        """Look for any solution, also outside the domain, from other starts in the rows that have none."""
-        rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
-        for start in self._other_starts(targets[rows]):
-            left = best.status[rows] == InverseStatus.NOT_FOUND
+    def _restart(
+        self, targets: Array, best: Found, rows: Indices, count: int, worst: InverseStatus, tolerance: float
+    ) -> None:
+        """Search some rows again from points of the table and the centre, until their status is `worst` or better."""
+        for start in self._other_starts(targets[rows], count):
+            left = best.status[rows] > worst
             if not left.any():
                 break
             best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
@@ -135,11 +141,11 @@ class Inverse:
         missed = np.where(beyond, InverseStatus.OUT_OF_REACH, InverseStatus.NOT_FOUND)
         best.status[rows] = np.where(whole, InverseStatus.FOUND, np.where(kept, InverseStatus.NEAREST, missed))
 
-    def _other_starts(self, targets: Array) -> Iterator[Array]:
-        """The centre of the domain, and points of the table near the targets, (N, n) each."""
+    def _other_starts(self, targets: Array, count: int) -> Iterator[Array]:
+        """Points of the table near the targets, nearest first, and the centre of the domain, (N, n) each."""
         if len(targets):
+            yield from self.starts.nearest(targets, count, self.problem.n)
             yield np.broadcast_to(self.problem.domain.centre, targets.shape)
-            yield from self.starts.nearest(targets, _RESTARTS, self.problem.n)
 
     def _attempt(self, targets: Array, starts: Array, tolerance: float) -> Found:
         """One search from starts (N, n), judged."""
