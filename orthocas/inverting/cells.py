@@ -100,7 +100,7 @@ class Cells:
     def _middles(self) -> Array:
         """Middles of the cells, (G, n)."""
         along = [(2.0 * np.arange(2**times) + 1) / 2**times - 1 for times in self._halved]
-        return np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, len(along))
+        return np.asarray(np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, len(along)))
 
     @cached_property
     def _half_width(self) -> Array:
@@ -124,7 +124,8 @@ class Cells:
         with np.errstate(invalid="ignore"):
             y = np.einsum("gij,gkj->gki", inverse, boxed.phi_map.difference(values, phi[:, None]))
         known = np.isfinite(y).all(axis=(1, 2))
-        return _Linear(*(_finite(part) for part in (phi, inverse, y, y.min(axis=1), y.max(axis=1))), known)
+        phi, inverse, y = _finite(phi), _finite(inverse), _finite(y)
+        return _Linear(phi, inverse, y, y.min(axis=1), y.max(axis=1), known)
 
     def _jacobian(self, u: Array) -> Array:
         """dphi/du, (N, n, n)."""

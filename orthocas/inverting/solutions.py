@@ -94,7 +94,7 @@ class Solutions(Shown):
         missing = np.flatnonzero(np.isin(self.status, _UNSOLVED))
         if missing.size:
             raise InverseError(
-                f"no q with phi(q) = phi found for {self._rows(missing)}: relative error is "
+                f"no q with phi(q) = phi found for {self.named(missing)}: relative error is "
                 f"{self.error[missing].max():.3g}, expected <= {self.tolerance:.1g}. "
                 "The target may be out of reach, or the path to it singular"
             )
@@ -103,8 +103,9 @@ class Solutions(Shown):
             raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}: q is not unique there")
         beyond = np.flatnonzero(~np.isin(self.status, accepted))
         if beyond.size:
-            raise InverseError(f"the only q with phi(q) = phi lies outside the domain for {self._rows(beyond)}")
+            raise InverseError(f"the only q with phi(q) = phi lies outside the domain for {self.named(beyond)}")
         return self
 
-    def _rows(self, rows: Indices) -> str:
+    def named(self, rows: Indices) -> str:
+        """Some rows in words, for messages."""
         return f"rows {rows[:_FEW].tolist()}" if len(self) > 1 else "phi"
