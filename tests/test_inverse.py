@@ -136,12 +136,12 @@ def test_all_solutions_of_a_folded_chart_are_found() -> None:
 
 
 def test_corner_heavy_round_trips_of_a_ready_chart_are_found() -> None:
-    """Of 4,000 points of this chart near faces and in corners, some 100 were missed by restarts near stored samples."""
+    """Of 2,000 points of this chart near faces and in corners, more than 50 were missed by restarts near stored samples."""
     chart = oc.charts.load("ur10-position")
     domain = chart.problem.domain
     rng = np.random.default_rng(77)
-    unit = rng.uniform(-1, 1, (4000, chart.n))
-    unit = np.sign(unit) * np.abs(unit) ** rng.choice([0.25, 0.1, 0.0], (4000, 1))
+    unit = rng.uniform(-1, 1, (2000, chart.n))
+    unit = np.sign(unit) * np.abs(unit) ** rng.choice([0.25, 0.1, 0.0], (2000, 1))
     phi = chart.phi(np.clip(domain.centre + domain.half_width * unit, *oc.domains.borders(domain)))
     solutions = chart.solve(phi)
     assert solutions.found.all()
