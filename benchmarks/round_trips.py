@@ -104,7 +104,7 @@ def main(quick: bool = False) -> list[str]:
     """Both tables; `quick` takes two charts and few points."""
     rows = table(MISSES, (misses(name, 2_000 if quick else 50_000) for name in (QUICK if quick else oc.charts.names())))
     print()
-    return rows + table(RECALL, (recall(name, 2 if quick else 20) for name in (QUICK[1:] if quick else SEVERAL)))
+    return rows + table(RECALL, (recall(name, 2 if quick else 12) for name in (QUICK[1:] if quick else SEVERAL)))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 - `newton` solves phi(q) = phi for many rows at once, near given starts; `own_inverse` does it for grown coordinates.
 - `point` solves few rows one by one, and has the functions of trackers.
 - `starts` finds starts: a rough inverse, and a table of points of the domain.
-- `phi_map` has phi and J with the scale of errors, `boxed` the same in a box, and `solve_in_box` solves equations there.
+- `phi_map` has phi and J with the scale of errors, `boxed` the same in a box; `solve_in_box` solves equations there.
 - `in_domain` searches all of the domain, in `cells` that may hold a solution. `arm_length` tells what is out of reach.
 - `inside` finds points inside the domain where there is no solution inside: any with the same task values, and by
   `nearest_xi` that with the nearest coordinates, with the quadratic programs of `box_programs`; `nearest` is Ipopt's
