@@ -2,10 +2,11 @@
 
 import difflib
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:  # NumPy takes long to load
+    import numpy as np
+    from numpy.typing import NDArray
 
 _FEW_NAMES = 10  # names that are read at a glance, in their own order
 _LONGEST = 1500  # characters of a message
@@ -171,7 +172,7 @@ class InverseError(OrthocasError, RuntimeError):
             the nearest xi that was found. None unless solutions lie outside.
     """
 
-    def __init__(self, message: str, nearest: NDArray[np.float64] | None = None) -> None:
+    def __init__(self, message: str, nearest: "NDArray[np.float64] | None" = None) -> None:
         super().__init__(message)
         self.nearest = nearest
 

@@ -112,7 +112,7 @@ class Cells:
         """Points of [-1, 1]^n, uniform, near faces, and corners, (samples, n)."""
         rng = np.random.default_rng(_SEED)
         unit = rng.uniform(-1, 1, (_SAMPLES, len(self._half_width)))
-        return np.sign(unit) * np.abs(unit) ** rng.choice([1.0, 0.25, 0.0], (_SAMPLES, 1))
+        return np.asarray(np.sign(unit) * np.abs(unit) ** rng.choice([1.0, 0.25, 0.0], (_SAMPLES, 1)))
 
     @cached_property
     def _linear(self) -> _Linear:
