@@ -8,7 +8,7 @@ from public_objects import circle
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.domains import sample_uniform
+from orthocas.domains import borders, sample_uniform
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
 from orthocas.inverting.arm_length import beyond_reach
@@ -135,15 +135,16 @@ def test_all_solutions_of_a_folded_chart_are_found() -> None:
         np.testing.assert_allclose(chart.phi(found), np.tile(chart.phi(q), (len(found), 1)), atol=1e-9)
 
 
-def test_corner_heavy_round_trips_of_a_ready_chart_are_found() -> None:
-    """Restarts near stored samples missed 157 of these 2,000 points near faces and in corners."""
-    chart = oc.charts.load("ur10-position")
+@pytest.mark.parametrize(("name", "inside"), [("ur10-position", False), ("iiwa7-position", True)])
+def test_corner_heavy_round_trips_of_a_ready_chart_are_found(name: str, inside: bool) -> None:
+    """Restarts near stored samples missed 157 of 2,000 points near faces and in corners of the first chart."""
+    chart = oc.charts.load(name)
     domain = chart.problem.domain
     rng = np.random.default_rng(77)
     unit = rng.uniform(-1, 1, (2000, chart.n))
     unit = np.sign(unit) * np.abs(unit) ** rng.choice([0.25, 0.1, 0.0], (2000, 1))
-    phi = chart.phi(np.clip(domain.centre + domain.half_width * unit, *oc.domains.borders(domain)))
-    solutions = chart.solve(phi)
+    phi = chart.phi(np.clip(domain.centre + domain.half_width * unit, *borders(domain)))
+    solutions = chart.solve(phi, inside=inside)
     assert solutions.found.all()
     np.testing.assert_allclose(chart.phi(solutions.q), phi, atol=1e-8)
     assert oc.contains(domain, solutions.q).all()

@@ -121,11 +121,11 @@ class Inverse:
 
     def _search_inside(self, inside: Inside, targets: Array, best: Found, tolerance: float) -> None:
         """Replace what is not found by other solutions, or the nearest coordinates, inside the domain."""
+        self._search_domain(targets, best, self._open(best), tolerance)
         rows = np.flatnonzero(best.status != InverseStatus.FOUND)
         q, in_reach = inside.with_task(targets[rows], best.q[rows])
         self._replace(targets, best, rows[~in_reach], q[~in_reach], tolerance)
         rows, q = rows[in_reach], q[in_reach]
-        self._search_domain(targets, best, rows, tolerance)
         moved = np.isin(best.status[rows], _MOVED)
         self._replace(targets, best, rows[moved], inside.nearest(targets[rows[moved]], q[moved]), tolerance)
 
