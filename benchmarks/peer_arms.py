@@ -88,7 +88,7 @@ def self_motion(arm: Arm) -> list[Target]:
     for share in smooth(np.arange(TICK, MOVE_TIME, TICK) / MOVE_TIME):
         wanted = chart.phi(arm.home)
         wanted[chart.m] += share * size
-        q = chart.inverse(wanted, q)
+        q = chart.inverse(wanted, q, outside=True)  # a target for all methods
         targets.append(arm.target(arm.home, posture=q))
     return [*targets, arm.target(arm.home)]
 

@@ -136,7 +136,9 @@ def way(corners: Array, seconds: float, time: float) -> tuple[Array, Array, Arra
 def asked(part: oc.AtlasPart, near: Array, values: Array, number: int) -> tuple[Array, Array]:
     """Posture and joint velocity that a reference asks for in a chart, found in Python."""
     chart = part.atlas.chart(int(part.charts[number]), near=near)
-    q = chart.inverse(values[: chart.n], q_start=near, tolerance=1e-11)
+    q = chart.inverse(
+        values[: chart.n], q_start=near, outside=True, tolerance=1e-11
+    )  # a reference may lead a little outside
     return q, np.linalg.solve(chart.jacobian(q), values[chart.n : 2 * chart.n])
 
 

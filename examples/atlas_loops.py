@@ -98,7 +98,7 @@ def held(chart: oc.Chart, q: Array, x: Array) -> Array:
     """The last posture along task values with the coordinates of one chart held."""
     xi = chart.xi(q)
     for wanted in x:
-        q = chart.inverse(np.concatenate([wanted, xi]), q_start=q)
+        q = chart.inverse(np.concatenate([wanted, xi]), q_start=q, outside=True)  # charts of an atlas overlap
     return q
 
 

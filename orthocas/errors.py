@@ -2,7 +2,11 @@
 
 import difflib
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # NumPy takes long to load
+    import numpy as np
+    from numpy.typing import NDArray
 
 _FEW_NAMES = 10  # names that are read at a glance, in their own order
 _LONGEST = 1500  # characters of a message
@@ -160,7 +164,17 @@ class InfeasibleError(SolveError):
 
 
 class InverseError(OrthocasError, RuntimeError):
-    """The inverse map q(x, xi) has no solution near its initial guess, or meets a singular Jacobian."""
+    """The inverse map q(x, xi) has no solution, only one outside the domain, or meets a singular Jacobian.
+
+    Args:
+        message: what failed, and for which rows.
+        nearest: joint positions inside the domain instead, of the shape that was asked for: those with the same x and
+            the nearest xi that was found. None unless solutions lie outside.
+    """
+
+    def __init__(self, message: str, nearest: "NDArray[np.float64] | None" = None) -> None:
+        super().__init__(message)
+        self.nearest = nearest
 
 
 class ArchiveError(OrthocasError, ValueError):

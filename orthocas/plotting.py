@@ -103,7 +103,7 @@ def _sweep(chart: Chart, j: int, postures: int, reach: float | None) -> Array:
         for k in order:
             target = base.copy()
             target[chart.m + j] = values[k]
-            q = chart.inverse(target, q)
+            q = chart.inverse(target, q, outside=True)  # as far as was asked
             found[k] = q
     return found
 

@@ -1,5 +1,6 @@
 """The inverse map for many rows: a status for each, starts, and all solutions."""
 
+import casadi as ca
 import numpy as np
 import pytest
 from charts import beyond_domain
@@ -7,9 +8,10 @@ from public_objects import circle
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.domains import sample_uniform
+from orthocas.domains import borders, sample_uniform
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
+from orthocas.inverting.arm_length import beyond_reach
 from orthocas.inverting.newton import inverses
 
 FOUND = oc.InverseStatus.FOUND
@@ -131,6 +133,89 @@ def test_all_solutions_of_a_folded_chart_are_found() -> None:
         found = chart.solutions(chart.phi(q))
         assert len(found) == crossings
         np.testing.assert_allclose(chart.phi(found), np.tile(chart.phi(q), (len(found), 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize(("name", "inside"), [("ur10-position", False), ("iiwa7-position", True)])
+def test_corner_heavy_round_trips_of_a_ready_chart_are_found(name: str, inside: bool) -> None:
+    """Restarts near stored samples missed 157 of 2,000 points near faces and in corners of the first chart."""
+    chart = oc.charts.load(name)
+    domain = chart.problem.domain
+    rng = np.random.default_rng(77)
+    unit = rng.uniform(-1, 1, (2000, chart.n))
+    unit = np.sign(unit) * np.abs(unit) ** rng.choice([0.25, 0.1, 0.0], (2000, 1))
+    phi = chart.phi(np.clip(domain.centre + domain.half_width * unit, *borders(domain)))
+    solutions = chart.solve(phi, inside=inside)
+    assert solutions.found.all()
+    np.testing.assert_allclose(chart.phi(solutions.q), phi, atol=1e-8)
+    assert oc.contains(domain, solutions.q).all()
+
+
+def test_a_certified_chart_has_all_the_solutions_that_newton_finds() -> None:
+    """No fold is not one solution: Newton's method from 3,000 points finds several, and no more than `solutions`."""
+    chart = oc.charts.load("ur5-position")
+    domain = chart.problem.domain
+    starts, several = sample_uniform(domain, 3000, 2), 0
+    for q in sample_uniform(domain, 4, 3):
+        phi = chart.phi(q)
+        found = chart.solutions(phi)
+        np.testing.assert_allclose(chart.phi(found), np.tile(phi, (len(found), 1)), atol=1e-8)
+        assert oc.contains(domain, found).all()
+        tried = chart.solve(np.tile(phi, (len(starts), 1)), starts)
+        away = np.abs(tried.q[tried.found][:, None] - found).max(axis=2)
+        assert away.min(axis=1).max() < 1e-5
+        signs = np.sign(np.linalg.det(chart.jacobian(found)))
+        assert len(np.unique(signs)) == 1
+        several += len(found) > 1
+    assert several >= 2
+
+
+def test_out_of_reach_is_said_only_where_the_arm_is_too_short(planar_arm: oc.Chart) -> None:
+    """The three links of 1 m reach 3 m; a task of the user's own has no such bound."""
+    phi = planar_arm.phi(planar_arm.problem.domain.centre)
+    turn = np.array([np.cos(0.3), np.sin(0.3)])
+    targets = [[*(length * turn), phi[2]] for length in (2.9999, 3.0001)]
+    statuses = planar_arm.solve(targets).statuses
+    assert statuses[0] != oc.InverseStatus.OUT_OF_REACH
+    assert statuses[1] == oc.InverseStatus.OUT_OF_REACH
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    task = oc.Task.custom(robot, "cosine", lambda q: ca.cos(q[0]))
+    chart = oc.fit(oc.Problem(robot, task, domain=oc.Box([1.0, 0.0], 0.5)), oc.Polynomial(1)).chart
+    assert chart.solve([2.0, 0.0]).statuses == (oc.InverseStatus.NOT_FOUND,)
+
+
+def test_no_tip_is_farther_away_than_beyond_reach_says() -> None:
+    """Random postures of arms with tools, offsets and prismatic joints, and the same along a straight arm."""
+    for name in ("iiwa7-position", "ur10-position", "tiago-pro-left-pose", "pr2-left-position"):
+        chart = oc.charts.load(name)
+        robot = chart.problem.robot
+        low, high = np.maximum(robot.lower, -4.0), np.minimum(robot.upper, 4.0)
+        x = chart.task(np.random.default_rng(0).uniform(low, high, (2000, chart.n)))
+        assert not beyond_reach(chart.problem.task, x).any()
+        assert beyond_reach(chart.problem.task, x + np.eye(chart.m)[0] * 9.0).all()
+
+
+def test_inverse_refuses_what_lies_outside_and_has_the_nearest_inside() -> None:
+    """The ready chart of the Panda: with xi1 moved by 9, q1 and q6 end beyond their limits."""
+    chart = oc.charts.load("panda-position")
+    domain = chart.problem.domain
+    centre = domain.centre
+    phi = chart.phi(centre) + 9.0 * np.eye(chart.n)[chart.m]
+    with pytest.raises(InverseError, match=r"outside the domain for phi: joint '.*expected within") as caught:
+        chart.inverse(phi, centre)
+    nearest = caught.value.nearest
+    assert nearest is not None
+    assert nearest.shape == (chart.n,)
+    assert oc.contains(domain, nearest)
+    np.testing.assert_array_equal(nearest, chart.solve(phi, centre, inside=True).q[0])
+    beyond = chart.inverse(phi, centre, outside=True)
+    assert not oc.contains(domain, beyond)
+    np.testing.assert_allclose(chart.phi(beyond), phi, atol=1e-7)
+    with pytest.raises(InverseError, match=r"rows \[1\]") as caught:
+        chart.inverse([chart.phi(centre), phi], centre)
+    assert caught.value.nearest is not None
+    np.testing.assert_allclose(caught.value.nearest, [centre, nearest], atol=1e-7)
+    with pytest.raises(InvalidValueError, match="outside"):
+        chart.inverse(phi, centre, outside=1)  # type: ignore[arg-type]
 
 
 def test_grown_charts_solve_with_their_own_inverse() -> None:

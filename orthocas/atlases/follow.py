@@ -73,7 +73,8 @@ def _required(atlas: Atlas, q: Array, current: int, k: int) -> int:
 def _stepped(chart: Chart, q: Array, x_now: Array, target: Array, xi: Array, halvings: int, k: int) -> Array:
     """q with task value `target` and coordinates xi in a chart, by Newton's method, in halves if it fails."""
     try:
-        return chart.inverse(np.concatenate([target, xi]), q_start=q, tolerance=_TOLERANCE)
+        phi = np.concatenate([target, xi])
+        return chart.inverse(phi, q_start=q, outside=True, tolerance=_TOLERANCE)  # another chart may take over there
     except InverseError:
         if not halvings:
             raise PathError(f"row {k} of x cannot be reached with the posture held") from None

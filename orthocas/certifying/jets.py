@@ -81,21 +81,6 @@ class Jets:
         return TaylorModel(variables, np.ascontiguousarray(coefficients.transpose(2, 0, 1, 3)), remainder), terms
 
 
-def of_model(model: TaylorModel, columns: Variables, reach: Array, highest: int) -> Jets:
-    """The jets of a model (rows, columns, boxes) on boxes of half-widths `reach` (columns, boxes)."""
-    whole = model.over(columns)
-    derivatives, start, n = [], 0, len(columns)
-    for order in range(DEGREE + 1):
-        count = len(multi_indices(n, order))
-        part = whole.coefficients[start : start + count].transpose(1, 2, 0, 3)
-        derivatives.append(part / powers(reach, order))
-        start += count
-    for order in range(DEGREE + 1, highest + 1):
-        derivatives.append(np.zeros((*whole.remainder.shape[:2], len(multi_indices(n, order)), reach.shape[1])))
-    doubts = tuple(sum_error(4 * DEGREE) * np.abs(each) for each in derivatives)
-    return Jets(tuple(derivatives), doubts, whole.remainder)
-
-
 def power_weights(around: Around, order: int) -> Array:
     """(C + s D)^a / a! as polynomials in s, (multi-indices a, order + 1, boxes)."""
     n, boxes = around.centre.shape

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from orthocas.casadi_tools.threads import one_blas_thread
 from orthocas.certificates.subdivision import Subdivision
-from orthocas.certifying.chart_rows import ChartRows, CoordinateRows, GraphRows, joint_models
+from orthocas.certifying.chart_rows import ChartRows, CoordinateRows, GraphRows, true_gradients
 from orthocas.certifying.elimination import between, is_orthogonal, pivots, singular_vectors
-from orthocas.certifying.jets import ORDERS, Around, Jets, of_model
+from orthocas.certifying.jets import ORDERS, Around, Jets
 from orthocas.certifying.judges import Verdicts, all_positive, chosen, influences, most_influential
 from orthocas.certifying.product_rows import ProductRows
 from orthocas.certifying.rounding import TINY, UNIT, UP, above, sum_error
@@ -45,7 +45,6 @@ class OneToOneJudge:
     coordinates: RowJets | None
     active: tuple[int, ...]
     still: tuple[int, ...]  #: columns of joints that Jm does not depend on in the middle; they may have wide ranges
-    turns: Array  #: periods of the rows; 0 for those that have none
     low: Array  #: of the whole, (n,)
     high: Array
 
@@ -65,9 +64,7 @@ class OneToOneJudge:
         with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             for k in range(0, len(low), _AT_ONCE):
                 found.append(self._few(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE]))
-        proved, widest = (np.concatenate(each) for each in zip(*found, strict=True))
-        nothing = np.zeros(len(low))
-        return Verdicts(proved, proved, nothing, nothing, widest)
+        return _verdicts(found)
 
     def _few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
         q, around = (low + high).T / 2, self._around(low, high)
@@ -92,7 +89,7 @@ class OneToOneJudge:
         known = replace(turned, remainder=(turned.remainder + _spread(left, terms, right)) * UP)
         rest = (np.abs(left) @ jets.rest.transpose(2, 0, 1) @ np.abs(right)).transpose(1, 2, 0) * UP
         all_ = replace(known, remainder=(known.remainder + rest) * UP)
-        sound = is_orthogonal(left) & is_orthogonal(right) & self._within_a_turn(jets, model, terms, around)
+        sound = is_orthogonal(left) & is_orthogonal(right)
         gains = influences(all_)
         gains[:, self.still] = 0
         proved = all_positive(pivots(all_)) & sound
@@ -130,48 +127,93 @@ class OneToOneJudge:
                     D[k] = np.where((least[:, row, k] > 0) & (bound < D[k]), bound * UP + TINY, D[k])
         return replace(around, differences=D)
 
-    def _within_a_turn(self, jets: Jets, model: TaylorModel, terms: Array, around: Around) -> NDArray[np.bool_]:
-        """Whether coordinates with a period change by less than it between two points, (boxes,)."""
-        circles = np.flatnonzero(self.turns)
-        size = model.magnitude()[circles] + (np.abs(terms[circles]).sum(axis=2) + jets.rest[circles]) * UP
-        change = 2 * (size * around.differences).sum(axis=1)
-        return np.asarray((change * UP < self.turns[circles, None]).all(axis=0))
+
+@dataclass(frozen=True, eq=False)
+class ConvexJudge:
+    """Proves that the symmetric part of P J is positive definite, for one P on all boxes and the true rows of J.
+
+    (q - p)^T P (phi(q) - phi(p)) is the integral of (q - p)^T P J (q - p) over the segment between two points of a convex
+    set, so it is positive. This is for rows that have bounds, but no derivatives in closed form.
+    """
+
+    rows: ChartRows
+    inverse: Array  #: P, (active, active)
+    low: Array  #: of the convex set, (n,)
+    high: Array
+    still_joints: tuple[int, ...] = ()
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """The joints that J depends on."""
+        return self.rows.variables
+
+    def __call__(self, low: Array, high: Array) -> Verdicts:
+        """Judge boxes between corners (boxes, n)."""
+        found = []
+        with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            for k in range(0, len(low), _AT_ONCE):
+                found.append(self._few(self.rows(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE])))
+        return _verdicts(found)
+
+    def _few(self, J: TaylorModel) -> tuple[NDArray[np.bool_], Array]:
+        boxes = J.remainder.shape[-1]
+        unit = np.broadcast_to(np.eye(len(self.inverse)), (boxes, *self.inverse.shape))
+        product = between(np.broadcast_to(self.inverse, unit.shape), J, unit)
+        transposed = replace(
+            product, coefficients=product.coefficients.swapaxes(1, 2), remainder=product.remainder.swapaxes(0, 1)
+        )
+        symmetric = product + transposed
+        vectors = np.linalg.eigh(np.nan_to_num(np.moveaxis(symmetric.centre, -1, 0)))[1][:, :, ::-1]
+        turned = between(vectors.transpose(0, 2, 1), symmetric, vectors)
+        proved = all_positive(pivots(turned)) & is_orthogonal(vectors) & self._within_a_turn(J)
+        return proved, most_influential(influences(turned), J.variables)
+
+    def _within_a_turn(self, J: TaylorModel) -> NDArray[np.bool_]:
+        """Whether rows with a period change by less than it, over the widths at their largest slopes, (boxes,)."""
+        circles = np.flatnonzero(self.rows.turns)
+        widths = (self.high - self.low)[list(self.rows.active), None] * UP
+        change = (J.magnitude()[circles] * widths).sum(axis=1)
+        return np.asarray((change * UP < self.rows.turns[circles, None]).all(axis=0))
 
 
-def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneJudge | None:
+def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneJudge | ConvexJudge | None:
     """The judge for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
 
     None if the other rows depend on an idle joint, which then is none, or jump where an arc tangent begins a new turn.
     """
-    if {*rows.variables} - {*rows.active}:
+    tip, tree, active = TipRows.of(chart.problem.task), chart.problem.robot.tree, rows.active
+    coordinates, known = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
+    if {*rows.variables} - {*active} or _jumps(chart, rows):
         return None
-    problem, active, coordinates = chart.problem, rows.active, chart.coordinates
-    task: RowJets
-    tip = TipRows.of(problem.task)
-    still: tuple[int, ...] = ()
-    if tip is not None:
-        task = TipJets.of(tip, problem.robot.tree, active, problem.domain)
-        leading = takewhile(lambda i: i not in rows.variables, chain_of(problem.robot.tree))
-        still = tuple(active.index(i) for i in leading if i in active)
-    elif _jumps(rows.task):
-        return None
-    else:
-        task = ModelJets(rows.task, tuple(range(chart.n)), active)
+    if tip is None or not known:
+        true = replace(rows, task=true_gradients(chart.problem.task, active)[0])
+        centre = chart.problem.domain.centre[None]
+        return ConvexJudge(true, np.linalg.pinv(true(centre, centre).centre[:, :, 0]), base.low, base.high)
     own: RowJets | None = None
-    if isinstance(rows.coordinates, ProductRows):
+    if rows.coordinates is not None:
         assert isinstance(coordinates, Coordinates)
         assert isinstance(coordinates.family, ProductFamily)
         own = ProductJets(ProductRows.of(coordinates.family, coordinates.theta, ORDERS[-1] + 2))
-    elif rows.coordinates is not None and _jumps(rows.coordinates) and not rows.turns[chart.m :].all():
-        return None
-    elif rows.coordinates is not None:
-        own = ModelJets(rows.coordinates, active, active)
-    return OneToOneJudge(task, own, active, still, rows.turns, base.low, base.high)
+    leading = takewhile(lambda i: i not in rows.variables, chain_of(tree))
+    still = tuple(active.index(i) for i in leading if i in active)
+    task = TipJets.of(tip, tree, active, chart.problem.domain)
+    return OneToOneJudge(task, own, active, still, base.low, base.high)
 
 
-def _jumps(rows: CoordinateRows) -> bool:
-    """Whether the function of which these are the gradients has steps with jumps."""
+def _jumps(chart: Chart, rows: ChartRows) -> bool:
+    """Whether task or coordinates have steps with jumps, other than those of a coordinate's own period."""
+    task = TipRows.of(chart.problem.task) is None and _has_angle(rows.task)
+    return task or (_has_angle(rows.coordinates) and not rows.turns[rows.m :].all())
+
+
+def _has_angle(rows: CoordinateRows | None) -> bool:
     return isinstance(rows, GraphRows) and any(step[0] == "atan2" for step in rows.graph.steps)
+
+
+def _verdicts(found: list[tuple[NDArray[np.bool_], Array]]) -> Verdicts:
+    proved, widest = (np.concatenate(each) for each in zip(*found, strict=True))
+    nothing = np.zeros(len(proved))
+    return Verdicts(proved, proved, nothing, nothing, widest)
 
 
 def _spread(left: Array, terms: Array, right: Array) -> Array:
@@ -202,21 +244,3 @@ class ProductJets:
     def __call__(self, q: Array, around: Around) -> Jets:
         """Jets at the middles of boxes."""
         return self.rows.jets(around)
-
-
-@dataclass(frozen=True, eq=False)
-class ModelJets:
-    """The jets of rows that have Taylor models only."""
-
-    rows: CoordinateRows
-    joints: tuple[int, ...]  #: of the robot that the rows take
-    columns: tuple[int, ...]
-
-    def __call__(self, q: Array, around: Around) -> Jets:
-        """Jets at joint positions q (n, boxes)."""
-        reach, middle = np.zeros_like(q), q.copy()
-        reach[list(self.columns)] = around.reach * UP
-        low, high = (middle - reach).T, (middle + reach).T
-        joints, half = joint_models(low, high, self.columns)
-        model = self.rows([joints[i] for i in self.joints], half[list(self.joints)], self.columns)
-        return of_model(model, self.columns, half[list(self.columns)], around.order)

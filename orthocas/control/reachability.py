@@ -62,7 +62,7 @@ class _Follower:
             found = self._tracker.step(phi)
             if self._tracker.status == TrackerStatus.OK:
                 return found
-        found = self._chart.inverse(phi, q)
+        found = self._chart.inverse(phi, q, outside=True)  # the caller says where it leaves the domain
         self._tracker = self._tracker_at(found)
         return found
 

@@ -14,8 +14,8 @@ from orthocas.checks import Array
 from orthocas.inverting.boxed import BoxedPhi
 from orthocas.inverting.nearest import Nearest
 from orthocas.inverting.nearest_xi import nearest_xi
+from orthocas.inverting.solve_in_box import KEPT, solve_in_box
 from orthocas.inverting.starts import Starts
-from orthocas.inverting.task_in_box import KEPT, reach_task
 
 _STARTS = 3  # of the table, after a given one
 
@@ -37,7 +37,7 @@ class Inside:
         x, u, error = targets[:, : self.boxed.m], self.boxed.of_points(q), np.full(len(q), np.inf)
         left = np.arange(len(q))
         for start in self._starts(targets, q):
-            found, missed = reach_task(self.boxed, x[left], self.boxed.of_points(start[left]))
+            found, missed = solve_in_box(self.boxed.task_equations, x[left], self.boxed.of_points(start[left]))
             better = missed < error[left]
             u[left[better]], error[left[better]] = found[better], missed[better]
             left = left[error[left] > KEPT]

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, Indices
-from orthocas.domains import borders
-from orthocas.inverting.boxed import BoxedPhi
+from orthocas.domains import Conditioned, borders
+from orthocas.inverting.arm_length import beyond_reach
+from orthocas.inverting.in_domain import InDomain
 from orthocas.inverting.inside import Inside
-from orthocas.inverting.nearest import Nearest
 from orthocas.inverting.newton import Attempt, LocalSolver
 from orthocas.inverting.phi_map import PhiMap, largest
 from orthocas.inverting.solutions import InverseStatus, Solutions
@@ -18,10 +17,10 @@ from orthocas.inverting.starts import Starts
 from orthocas.problem import Problem
 
 _ROWS = 16_384  # solved at once
-_RESTARTS = 8  # from points of the table, where neither the rough inverse nor the centre leads to a solution inside
-_MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, InverseStatus.OUT_OF_REACH)
-_MANY = 1024  # starts of the search for all solutions
-_SAME = 1e-6  # of the half-widths: distance up to which two solutions count as one
+_FIRST = 2  # restarts from points of the table, and the centre, before all of the domain is searched
+_RESTARTS = 8  # from points of the table, where nothing leads to any solution
+_UNSOLVED = (InverseStatus.NOT_FOUND, InverseStatus.OUT_OF_REACH)
+_MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, *_UNSOLVED)
 _SNAP = 1e-9  # of the half-widths: solutions so close to the border are moved onto it
 _SLACK = 1e-9  # of the half-widths: joint limits are decimal numbers, see `require_within_limits`
 
@@ -39,7 +38,7 @@ class Found:
         """Take over what another search found in some rows, where it is better."""
         better = other.status < self.status[rows]
         same = other.status == self.status[rows]
-        better |= same & (other.status == InverseStatus.OUT_OF_REACH) & (other.error < self.error[rows])
+        better |= same & (other.status == InverseStatus.NOT_FOUND) & (other.error < self.error[rows])
         into = rows[better]
         for name in ("q", "residual", "iterations", "status"):
             getattr(self, name)[into] = getattr(other, name)[better]
@@ -49,11 +48,6 @@ class Found:
         """Largest entries of the residuals, (N,)."""
         return largest(self.residual)
 
-    @property
-    def missing(self) -> Indices:
-        """Rows without a solution inside the domain."""
-        return np.flatnonzero(self.status != InverseStatus.FOUND)
-
 
 @dataclass(frozen=True, eq=False)
 class Inverse:
@@ -62,7 +56,9 @@ class Inverse:
     problem: Problem
     phi_map: PhiMap
     local: LocalSolver
-    nearest: Nearest | None = None  #: for solutions inside the domain only
+    starts: Starts
+    in_domain: InDomain | None = None  #: searches all of the domain; for fitted coordinates
+    inside: Inside | None = None  #: finds points inside that keep the task; for fitted coordinates
 
     def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
         """Solutions for targets (N, n), from starts (N, n) or our own. Rows that are not finite fail."""
@@ -81,42 +77,55 @@ class Inverse:
                 error[rows[kept]] = largest(found.residual[kept, : self.problem.m])
         return Solutions(q, status, iterations, error, distance, tolerance)
 
-    def all_inside(self, target: Array, tolerance: float) -> Array:
-        """Different solutions for one target (n,) inside the domain, that nearest to the centre first, (k, n)."""
-        domain = self.problem.domain
-        starts = np.vstack([self.starts.guess(target[None]), domain.centre[None], self.starts.spread(_MANY, target)])
-        found = self._attempt(np.broadcast_to(target, starts.shape), starts, tolerance)
-        q = found.q[found.status == InverseStatus.FOUND]
-        different: list[Array] = []
-        for row in q[np.argsort(np.linalg.norm((q - domain.centre) / domain.half_width, axis=1))]:
-            if all(np.abs((row - other) / domain.half_width).max() > _SAME for other in different):
-                different.append(row)
-        return np.array(different).reshape(-1, len(target))
-
     def _searched(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
-        """What the search finds from given starts, or from the rough inverse and, where that fails, from others."""
+        """What the search finds from given starts, or from the rough inverse and, where that fails, in the domain."""
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance)
-        if inside and self._inside is not None:
-            self._search_inside(self._inside, targets, best, tolerance)
+        self._tell_beyond(targets, best)
+        if inside and self.inside is not None:
+            self._search_inside(self.inside, targets, best, tolerance)
         elif starts is None:
-            self._restart(targets, best, best.missing, tolerance)
+            self._restart(targets, best, self._open(best), _FIRST, InverseStatus.FOUND, tolerance)
+            self._search_domain(targets, best, self._open(best), tolerance)
+            rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
+            self._restart(targets, best, rows, _RESTARTS, InverseStatus.SINGULAR, tolerance)
         return best
 
-    def _restart(self, targets: Array, best: Found, rows: Indices, tolerance: float) -> None:
-        """Search again from other starts in some rows, until a solution lies inside the domain."""
-        for start in self._other_starts(targets[rows]):
-            left = best.status[rows] != InverseStatus.FOUND
+    def _tell_beyond(self, targets: Array, best: Found) -> None:
+        """Say of rows without a solution whether the arm is too short."""
+        rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
+        beyond = beyond_reach(self.problem.task, targets[rows, : self.problem.m])
+        best.status[rows[beyond]] = InverseStatus.OUT_OF_REACH
+
+    def _open(self, best: Found) -> Indices:
+        """Rows that may have another solution, inside the domain."""
+        return np.flatnonzero(~np.isin(best.status, (InverseStatus.FOUND, InverseStatus.OUT_OF_REACH)))
+
+    def _search_domain(self, targets: Array, best: Found, rows: Indices, tolerance: float) -> None:
+        """Search all of the domain in some rows."""
+        if rows.size and self.in_domain is not None:
+            q, _ = self.in_domain.search(targets[rows], tolerance)
+            attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
+            best.improve(rows, self._judged(attempt, tolerance))
+        if isinstance(self.problem.domain, Conditioned):  # it may be a small part of its box
+            self._restart(targets, best, rows, _RESTARTS, InverseStatus.FOUND, tolerance)
+
+    def _restart(
+        self, targets: Array, best: Found, rows: Indices, count: int, worst: InverseStatus, tolerance: float
+    ) -> None:
+        """Search some rows again from points of the table and the centre, until their status is `worst` or better."""
+        for start in self._other_starts(targets[rows], count):
+            left = best.status[rows] > worst
             if not left.any():
                 break
             best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
 
     def _search_inside(self, inside: Inside, targets: Array, best: Found, tolerance: float) -> None:
         """Replace what is not found by other solutions, or the nearest coordinates, inside the domain."""
-        rows = best.missing
+        self._search_domain(targets, best, self._open(best), tolerance)
+        rows = np.flatnonzero(best.status != InverseStatus.FOUND)
         q, in_reach = inside.with_task(targets[rows], best.q[rows])
         self._replace(targets, best, rows[~in_reach], q[~in_reach], tolerance)
         rows, q = rows[in_reach], q[in_reach]
-        self._restart(targets, best, rows, tolerance)
         moved = np.isin(best.status[rows], _MOVED)
         self._replace(targets, best, rows[moved], inside.nearest(targets[rows[moved]], q[moved]), tolerance)
 
@@ -127,21 +136,25 @@ class Inverse:
         residual = self.phi_map.residual(targets[rows], q)
         kept = (largest(residual[:, : self.problem.m]) <= tolerance) & self.problem.domain.contains(q)
         whole = kept & (largest(residual) <= tolerance)
-        status = np.where(kept, InverseStatus.NEAREST, InverseStatus.OUT_OF_REACH)
         best.q[rows], best.residual[rows] = q, residual
-        best.status[rows] = np.where(whole, InverseStatus.FOUND, status)
+        beyond = best.status[rows] == InverseStatus.OUT_OF_REACH
+        missed = np.where(beyond, InverseStatus.OUT_OF_REACH, InverseStatus.NOT_FOUND)
+        best.status[rows] = np.where(whole, InverseStatus.FOUND, np.where(kept, InverseStatus.NEAREST, missed))
 
-    def _other_starts(self, targets: Array) -> Iterator[Array]:
-        """The centre of the domain, and points of the table near the targets, (N, n) each."""
+    def _other_starts(self, targets: Array, count: int) -> Iterator[Array]:
+        """Points of the table near the targets, nearest first, and the centre of the domain, (N, n) each."""
         if len(targets):
+            yield from self.starts.nearest(targets, count, self.problem.n)
             yield np.broadcast_to(self.problem.domain.centre, targets.shape)
-            yield from self.starts.nearest(targets, _RESTARTS, self.problem.n)
 
     def _attempt(self, targets: Array, starts: Array, tolerance: float) -> Found:
         """One search from starts (N, n), judged."""
-        attempt = self._snapped(targets, self.local(targets, starts), tolerance)
+        return self._judged(self._snapped(targets, self.local(targets, starts), tolerance), tolerance)
+
+    def _judged(self, attempt: Attempt, tolerance: float) -> Found:
+        """Where a search ended, with a status."""
         solved = largest(attempt.residual) <= tolerance
-        status = np.full(len(targets), int(InverseStatus.OUT_OF_REACH))
+        status = np.full(len(attempt.q), int(InverseStatus.NOT_FOUND))
         status[solved] = self._status(attempt.q[solved])
         doubtful = np.flatnonzero(solved & attempt.suspicious)
         if doubtful.size:
@@ -174,15 +187,3 @@ class Inverse:
         difference = (residual * self.phi_map.scale(targets))[:, self.problem.m :]
         distance = np.sqrt((difference**2).sum(axis=1))
         return np.where(np.isfinite(distance), distance, np.inf)
-
-    @cached_property
-    def _inside(self) -> Inside | None:
-        """Searches inside the domain, for fitted coordinates."""
-        if self.nearest is None:
-            return None
-        return Inside(BoxedPhi(self.problem.task, self.problem.domain, self.phi_map), self.starts, self.nearest)
-
-    @cached_property
-    def starts(self) -> Starts:
-        """Starts for this chart."""
-        return Starts(self.phi_map, self.problem.domain)

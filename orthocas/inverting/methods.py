@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import (
     Array,
+    Indices,
     as_float_array,
     as_point,
     as_point_set,
@@ -19,8 +20,13 @@ from orthocas.checks import (
 from orthocas.coordinates.fitted import Coordinates
 from orthocas.coordinates.map import InvertibleMap
 from orthocas.coordinates.phi import PhiFunctions
-from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError, SingularTaskError
+from orthocas.domains import Conditioned, borders
+from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, SingularTaskError
+from orthocas.inverting.boxed import BoxedPhi
+from orthocas.inverting.cells import Cells
 from orthocas.inverting.implicit import inverse_function
+from orthocas.inverting.in_domain import InDomain
+from orthocas.inverting.inside import Inside
 from orthocas.inverting.inverse import Inverse
 from orthocas.inverting.nearest import Nearest
 from orthocas.inverting.newton import LocalSolver, Newton
@@ -28,6 +34,7 @@ from orthocas.inverting.own_inverse import OwnInverse
 from orthocas.inverting.phi_map import PhiMap
 from orthocas.inverting.point import FewRows, PointFunctions
 from orthocas.inverting.solutions import Solutions
+from orthocas.inverting.starts import Starts
 from orthocas.inverting.tracker import Tracker
 from orthocas.problem import task_sizes
 
@@ -37,26 +44,51 @@ FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobia
 class InverseMethods(PhiFunctions):
     """What a chart has on top of phi: its inverse in batches, for streams, and as a CasADi function."""
 
-    def inverse(self, phi: ArrayLike, q_start: ArrayLike | None = None, tolerance: float = 1e-9) -> Array:
+    def inverse(
+        self, phi: ArrayLike, q_start: ArrayLike | None = None, *, outside: bool = False, tolerance: float = 1e-9
+    ) -> Array:
         """Solve phi(q) = phi for q: fitted charts by Newton's method with line search, grown ones along the flow.
+
+        Several q may have the same phi, inside the domain too. With `q_start`, q is the one that is reached from there.
+        Without it, q is the first that the search of `solve` finds inside. `solutions` has all.
 
         Args:
             phi: target values, (n,) or (N, n).
-            q_start: initial guess (n,), or (N, n) with one guess per row of phi; default: starts that are found as in
-                `solve`. For grown coordinates it selects the number of full turns and the sheet of a linear leaf.
+            q_start: initial guess (n,), or (N, n) with one guess per row of phi. For grown coordinates it selects the
+                number of full turns and the sheet of a linear leaf.
+            outside: accept solutions outside the domain, where the chart is not known to be good, and beyond joint
+                limits.
             tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
 
         Returns:
-            q, (n,) or (N, n). It may lie outside the domain; check with `orthocas.contains`.
+            q, (n,) or (N, n), inside the domain unless `outside`.
 
         Raises:
-            InverseError: if no solution is found, or J is singular there. The message names the rows.
+            InverseError: if no solution is found, J is singular there, or it lies outside the domain. The message names
+                the rows. If solutions lie outside, `error.nearest` has q, (n,) or (N, n), inside the domain: solutions
+                where there are any, otherwise the same x with the nearest xi that is found (see `solve` with
+                `inside=True`); None for grown coordinates.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+            >>> start = [0.6, 0.8, 0.8]
+            >>> try:
+            ...     chart.inverse(chart.phi(start) + [0.0, 0.0, 2.0], start)
+            ... except oc.errors.InverseError as error:
+            ...     bool(oc.contains(chart.problem.domain, error.nearest))
+            True
         """
         targets, single = as_point_set("phi", phi, self.n)
         if q_start is not None:
             as_point_set("q_start", q_start, self.n)
-        q = self.solve(targets, q_start, tolerance=tolerance).require(inside=False).q
-        return q[0] if single else q
+        require_kind("outside", outside, bool)
+        found = self.solve(targets, q_start, tolerance=tolerance).require(inside=False)
+        beyond = np.flatnonzero(~found.found)
+        if beyond.size and not outside:
+            raise self._outside_error(targets, q_start, found, beyond, single)
+        return found.q[0] if single else found.q
 
     def solve(
         self,
@@ -69,10 +101,11 @@ class InverseMethods(PhiFunctions):
     ) -> Solutions:
         """Solve phi(q) = phi for q, with a status for each row: a row that fails does not disturb the others.
 
-        Newton's method works on all rows at once. With `q_start`, it searches from there only, and q is the solution
-        near the start. Otherwise it starts at a rough inverse of phi, a polynomial fitted to points of the domain.
-        Rows that do not lead to a solution inside the domain start again at its centre, and at the 8 points of a table
-        whose phi is nearest.
+        Several q may have the same phi, inside the domain too. With `q_start`, Newton's method searches from there
+        only, and q is the solution that it reaches, inside the domain or not. Otherwise it starts at a rough inverse of
+        phi, a polynomial fitted to points of the domain, then at stored points of the domain whose phi is nearest. Rows
+        that still have no solution inside are searched for in all cells of the domain that may hold one. q is the first
+        solution inside that is found; `solutions` has all.
 
         Args:
             phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
@@ -80,7 +113,7 @@ class InverseMethods(PhiFunctions):
             tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
             inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
                 other starts, get the q inside with the same x and the nearest xi that is found, a local minimum, with
-                the status NEAREST, or OUT_OF_REACH if none has that x. Not for grown coordinates.
+                the status NEAREST, or NOT_FOUND if none with that x is found. Not for grown coordinates.
             local: another solver of phi(q) = phi near given starts; `orthocas.compile_inverse` has one.
 
         Returns:
@@ -111,9 +144,11 @@ class InverseMethods(PhiFunctions):
         return inverse.solve(targets, starts, float(tolerance), inside)
 
     def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
-        """All q inside the domain with phi(q) = phi that a search from 1,026 starts finds.
+        """All q inside the domain with phi(q) = phi that a search of the whole domain finds.
 
-        A chart that does not fold has one at most. The search is no proof: it may miss solutions near folds.
+        A chart without a fold may have several: det J != 0 makes phi one-to-one near each point only. On the box of a
+        certificate's proof "one-to-one", there is at most one. The search starts in all cells of the domain that may
+        hold a solution. It is no proof that there are no others; docs/inverse.md has what it misses.
 
         Args:
             phi: target values, (n,).
@@ -136,7 +171,9 @@ class InverseMethods(PhiFunctions):
         """
         require_at_least("tolerance", tolerance, 0)
         self._require_expression("a search for all solutions")
-        return self._inverse.all_inside(as_point("phi", phi, self.n), float(tolerance))
+        in_domain = self._inverse.in_domain
+        assert in_domain is not None
+        return in_domain.all_solutions(as_point("phi", phi, self.n), float(tolerance))
 
     def tracker(self, q0: ArrayLike, largest_step: ArrayLike | None = None) -> Tracker:
         """A tracker that follows a stream of phi from q0; see `Tracker`.
@@ -187,13 +224,15 @@ class InverseMethods(PhiFunctions):
 
     @cached_property
     def _inverse(self) -> Inverse:
-        phi_map = self.phi_map
+        phi_map, domain = self.phi_map, self.problem.domain
+        starts = Starts(phi_map, domain)
         if isinstance(self.coordinates, InvertibleMap):
-            return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map))
+            return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map), starts)
+        boxed = BoxedPhi(self.problem.task, domain, phi_map)
         local = FewRows(phi_map, self._point_functions, Newton(phi_map))
-        return Inverse(
-            self.problem, phi_map, local, Nearest(self.problem.domain, self.m, self.function("phi"), phi_map)
-        )
+        by_ipopt = Nearest(domain, self.m, self.function("phi"), phi_map)
+        in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts, by_ipopt)
+        return Inverse(self.problem, phi_map, local, starts, in_domain, inside)
 
     @cached_property
     def _inverse_function(self) -> ca.Function:
@@ -202,6 +241,30 @@ class InverseMethods(PhiFunctions):
     @cached_property
     def _point_functions(self) -> PointFunctions:
         return PointFunctions.of(self.function("phi"), self.function("jacobian"), self.phi_sizes, self.turns)
+
+    def _outside_error(
+        self, targets: Array, q_start: ArrayLike | None, found: Solutions, beyond: Indices, single: bool
+    ) -> InverseError:
+        """What to raise for solutions (N, n) of which some rows lie outside the domain."""
+        nearest = None
+        if not isinstance(self.coordinates, InvertibleMap):
+            nearest = found.q.copy()
+            starts = None if q_start is None else np.broadcast_to(self._rows("q_start", q_start), targets.shape)[beyond]
+            inside = self.solve(targets[beyond], starts, tolerance=found.tolerance, inside=True)
+            nearest[beyond] = inside.q
+        q, domain = found.q[beyond[0]], self.problem.domain
+        low, high = borders(domain)
+        j = int(np.argmax(np.maximum(low - q, q - high) / domain.half_width))
+        reason = (
+            f"joint '{self.problem.robot.joint_names[j]}' at {q[j]:.4g}, expected within [{low[j]:.4g}, {high[j]:.4g}]"
+        )
+        if isinstance(domain, Conditioned) and low[j] <= q[j] <= high[j]:
+            reason = domain.told(q)
+        return InverseError(
+            f"q with phi(q) = phi lies outside the domain for {found.named(beyond)}: {reason}. "
+            "`error.nearest` has joint positions inside; outside=True accepts those outside",
+            None if nearest is None else nearest[0] if single else nearest,
+        )
 
     def _jacobian_or_nan(self, points: Array) -> Array:
         """J at points (N, n), with NaN where the task has no finite Jacobian."""

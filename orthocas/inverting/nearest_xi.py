@@ -3,8 +3,8 @@
     minimise |xi(q) - xi|^2 / 2   subject to   h(q) = x,  q in the box,
 
 from points with h(q) = x. A step is the minimum of a quadratic model, with a damped Gauss-Newton matrix, on the tangent
-of h(q) = x and within the box. `reach_task` then leads back to h(q) = x, while the joints at their borders stay there.
-Steps that do not reduce the distance are tried again with more damping.
+of h(q) = x and within the box. `solve_in_box` then leads back to h(q) = x, while the joints at their borders stay
+there. Steps that do not reduce the distance are tried again with more damping.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthocas.checks import Array, Indices
 from orthocas.inverting.box_programs import Minimum, Programs, minimum
 from orthocas.inverting.boxed import BoxedPhi
-from orthocas.inverting.task_in_box import KEPT, reach_task
+from orthocas.inverting.solve_in_box import KEPT, solve_in_box
 
 _MOST, _RETURN = 40, 8  # iterations, and those of a return to h(q) = x
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-8, 1e6  # relative to the mean eigenvalue
@@ -102,10 +102,10 @@ class _Run:
     def _returned(self, rows: Indices, found: Minimum) -> tuple[Array, NDArray[np.bool_]]:
         """Points with h(q) = x after steps, (rows, n), and whether they were found, (rows,)."""
         x, start = self._targets[rows, : self._boxed.m], self.u[rows] + found.d
-        u, error = reach_task(self._boxed, x, start, found.at_low | found.at_high, _RETURN)
+        u, error = solve_in_box(self._boxed.task_equations, x, start, found.at_low | found.at_high, _RETURN)
         missed = np.flatnonzero(error > KEPT)
         if missed.size:  # the joints at the border are needed
-            u[missed], error[missed] = reach_task(self._boxed, x[missed], start[missed], most=_RETURN)
+            u[missed], error[missed] = solve_in_box(self._boxed.task_equations, x[missed], start[missed], most=_RETURN)
         return u, np.asarray(error <= KEPT)
 
 

@@ -22,11 +22,13 @@ class InverseStatus(IntEnum):
     OUTSIDE_DOMAIN = 2  #: a solution within the joint limits, but outside the domain
     LIMIT = 3  #: a solution beyond the joint limits
     SINGULAR = 4  #: a solution at which J is singular, so that it is not unique
-    OUT_OF_REACH = 5  #: no solution found; q is the point with the smallest error
+    NOT_FOUND = 5  #: no solution was found, which does not prove that there is none; q has the smallest error found
     BAD_INPUT = 6  #: a number of phi or of the start is not finite; q is NaN
+    OUT_OF_REACH = 7  #: no solution: x is farther from the first joint than the arm is long; q as for NOT_FOUND
 
 
 _SOLVED = (InverseStatus.FOUND, InverseStatus.NEAREST)
+_UNSOLVED = (InverseStatus.NOT_FOUND, InverseStatus.BAD_INPUT, InverseStatus.OUT_OF_REACH)
 _BEYOND = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT)
 
 
@@ -89,10 +91,10 @@ class Solutions(Shown):
             InverseError: if a row is not solved; the message names the rows.
         """
         accepted = _SOLVED if inside else (*_SOLVED, *_BEYOND)
-        missing = np.flatnonzero(self.status >= InverseStatus.OUT_OF_REACH)
+        missing = np.flatnonzero(np.isin(self.status, _UNSOLVED))
         if missing.size:
             raise InverseError(
-                f"no q with phi(q) = phi found for {self._rows(missing)}: relative error is "
+                f"no q with phi(q) = phi found for {self.named(missing)}: relative error is "
                 f"{self.error[missing].max():.3g}, expected <= {self.tolerance:.1g}. "
                 "The target may be out of reach, or the path to it singular"
             )
@@ -101,8 +103,9 @@ class Solutions(Shown):
             raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}: q is not unique there")
         beyond = np.flatnonzero(~np.isin(self.status, accepted))
         if beyond.size:
-            raise InverseError(f"the only q with phi(q) = phi lies outside the domain for {self._rows(beyond)}")
+            raise InverseError(f"the only q with phi(q) = phi lies outside the domain for {self.named(beyond)}")
         return self
 
-    def _rows(self, rows: Indices) -> str:
+    def named(self, rows: Indices) -> str:
+        """Some rows in words, for messages."""
         return f"rows {rows[:_FEW].tolist()}" if len(self) > 1 else "phi"

@@ -48,20 +48,10 @@ class Starts:
         nearest: Array = points[order.T]
         return nearest
 
-    def spread(self, count: int, target: Array) -> Array:
-        """Points of the table: half of them near a target (n,), the others spread over the domain, (count, n)."""
-        near = self.nearest(target[None], count // 2, len(target))[:, 0]
-        return np.vstack([near, self._table[0][: count - len(near)]])
-
     @cached_property
     def _table(self) -> tuple[Array, Array]:
         """Points of the domain where phi is defined, and phi, (K, n) each."""
-        points = sample_uniform(self._domain, _POINTS, _SEED)
-        phi = self._map.phi(points)
-        known = np.isfinite(phi).all(axis=1)
-        if not known.any():
-            raise SingularTaskError(f"phi is not finite at any of {_POINTS} samples of the domain")
-        return points[known], phi[known]
+        return where_known(self._map, sample_uniform(self._domain, _POINTS, _SEED))
 
     @cached_property
     def _range(self) -> tuple[Array, Array]:
@@ -85,6 +75,19 @@ class Starts:
         """Values of phi (N, n) in the range [-1, 1], or a little beyond."""
         middle, half = self._range
         return np.clip((phi - middle) / half, -_OVERSHOOT, _OVERSHOOT)
+
+
+def where_known(phi_map: PhiMap, points: Array) -> tuple[Array, Array]:
+    """The points (N, n) at which phi is finite, and phi there, (K, n) each.
+
+    Raises:
+        SingularTaskError: if there are none.
+    """
+    phi = phi_map.phi(points)
+    known = np.isfinite(phi).all(axis=1)
+    if not known.any():
+        raise SingularTaskError(f"phi is not finite at any of {len(points)} samples of the domain")
+    return points[known], phi[known]
 
 
 def _terms(u: Array, degree: int) -> Array:

@@ -299,7 +299,7 @@ def _methods() -> dict[str, Call]:
         **{f"grown.{name}": (getattr(grown, name), {"q": q[:2]}) for name in evaluations},
         "chart.quality": (chart.quality, {"q": q}),
         "grown.quality": (grown.quality, {"q": [q[:2], q[:2]]}),
-        "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "tolerance": 1e-9}),
+        "chart.inverse": (chart.inverse, {"phi": phi, "q_start": q, "outside": False, "tolerance": 1e-9}),
         "chart.solve": (chart.solve, {"phi": phi, "q_start": q, "tolerance": 1e-9, "inside": True}),
         "chart.solutions": (chart.solutions, {"phi": phi, "tolerance": 1e-9}),
         "chart.tracker": (chart.tracker, {"q0": planar().domain.centre, "largest_step": 0.1}),
