@@ -7,6 +7,7 @@ of the paper; smaller ones, or in the other direction, where these leave the dom
 law, which holds still, without and with integral action; poses as rotation vectors, which leave, are left out.
 """
 
+import argparse
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -15,7 +16,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
@@ -204,4 +204,8 @@ def main(quick: bool = False, modes_alone: bool = False) -> list[str]:
 
 
 if __name__ == "__main__":
-    run(main, __doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="one arm and one start")
+    parser.add_argument("--modes", action="store_true", help="the first table alone (40 s)")
+    options = parser.parse_args()
+    main(options.quick, options.modes)
