@@ -28,6 +28,7 @@ SCRIPTS = (
     "atlas_c",
     "suggested_domains",
     "choices",
+    "elbow_angle",
     "scaling",
     "gradients",
     "compiled_loss",

@@ -101,7 +101,7 @@ class Report(Shown):
         found = {
             "task angle": paper(self.task_angle),
             "mutual angle": paper(self.mutual_angle),
-            "leak": f"rms {leak.rms:.2f}, mean {leak.mean:.2f}, largest sampled {leak.max:.1f} deg (angle in the metric)",
+            "leak": f"rms {leak.rms:.2f}, mean {leak.mean:.2f}, largest sampled {leak.max:.1f} deg (in the metric)",
         }
         if self.r == 1:
             found["mutual angle"] = "none, r = 1"
