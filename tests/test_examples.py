@@ -265,7 +265,7 @@ def test_gradients_agree_with_pytorch() -> None:
 def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -> None:
     """The benchmark takes leaks straight from Jacobians; `evaluate` has formulas of its own."""
     found = {name: numbers["leak rms [deg]"] for name, numbers in elbow_angle.main(quick=True).items()}
-    assert found["stereographic SEW"] > found["conventional SEW"] > 55 > 40 > found["linear"] > found["fitted"]
+    assert found["stereographic SEW"] > found["conventional SEW"] > 1.5 * found["linear"] > 1.5 * found["fitted"]
     arm = oc.problems.get("iiwa")
     task = oc.Task.named(arm.robot, "pose", arm.domain.centre)
     chart = oc.fit(oc.Problem(arm.robot, task, domain=arm.domain), oc.SEW()).chart

@@ -9,8 +9,9 @@ what they are (`values` of `main` by name, and the `tables` that it prints: head
 (`tolerance`, relative, by a part of the name, which for cells is that of column and row; "" is the rest), and
 what pages print of them (`printed`). A phrase of `printed` takes values as {name|format} or {name*factor|format}; other
 numbers in it are settings. Rows are known by their numbers, so pages may name them in other words. `source` is
-"measured" if the numbers come from a run by this tool, and "transcribed" if they were copied from a page. Numbers that
-nobody measured (settings, limits, versions) are the phrases of `constants.json`.
+"measured" if the numbers come from a run by this tool, and "transcribed" if some were copied from a page: --write gives
+such a record new tables, and "measured" once its phrases take values. Numbers that nobody measured (settings, limits,
+versions) are the phrases of `constants.json`.
 """
 
 import argparse
@@ -79,7 +80,7 @@ class Record:
     @property
     def cheap(self) -> bool:
         """Whether `make figures` reruns it."""
-        return bool(self.script) and self.cpu_seconds is not None and self.cpu_seconds <= CHEAP
+        return self.source == "measured" and self.cpu_seconds is not None and self.cpu_seconds <= CHEAP
 
     @property
     def phrases(self) -> list[str]:
@@ -191,7 +192,9 @@ def measured(record: Record) -> Record:
     spent = float(f"{_cpu_seconds() - before:.2g}")
     every = dict(flat(found)) if isinstance(found, Mapping) else {}
     values = {name: every[name] for name in sorted(record.used)}
-    return replace(record, source="measured", values=values, tables=tables(output.getvalue()), cpu_seconds=spent)
+    copied = record.source == "transcribed" and not all(TAKEN.search(phrase) for phrase in record.printed)
+    source = "transcribed" if copied else "measured"  # phrases with copied numbers need values first
+    return replace(record, source=source, values=values, tables=tables(output.getvalue()), cpu_seconds=spent)
 
 
 def imported(script: str) -> Any:
@@ -282,7 +285,8 @@ def renew(old: Record, new: Record) -> None:
         for before, after in changes:
             for start, end in reversed(places(text, before)):
                 text = text[:start] + renumbered(text[start:end], after) + text[end:]
-        rows = {key(a): b for (_, a), (_, b) in zip(old.rows, new.rows, strict=False)}
+        pairs = zip(old.rows, new.rows, strict=False)
+        rows = {key(a): b for (_, a), (_, b) in pairs if len(numbers(a)) == len(numbers(b)) > 1}
         text = LINE.sub(lambda line, rows=rows: renumbered(line[0], rows.get(key(line[0]), line[0])), text)
         if text != page:
             (ROOT / name).write_text(text)
