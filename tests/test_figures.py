@@ -25,6 +25,12 @@ def test_what_a_record_prints_is_on_a_page(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RECORDS)
+def test_phrases_say_what_their_numbers_are(name: str) -> None:
+    """A bare number would explain every other one like it."""
+    assert [phrase for phrase in RECORDS[name].printed if figures.says_nothing(phrase)] == []
+
+
+@pytest.mark.parametrize("name", RECORDS)
 def test_records_say_how_they_were_measured(name: str) -> None:
     record = RECORDS[name]
     if name in {"constants", "by_hand"}:

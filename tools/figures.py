@@ -49,7 +49,7 @@ UNPRINTED = re.compile(  # what is no text: front matter, blocks of code, header
             r"^( *)```.*?^\1```$",
             r"^ *\|[^\n]*\|\n(?= *\|[ :|-]+\|$)",
             r"`[^`]*`",
-            r"\$\$.*?\$\$|\$[^$\n]+\$",
+            r"\$\$.*?\$\$|\$(?:[^$\n]|\n(?!\n))+\$",
             r"\]\([^)]*\)|!\[[^\]]*\]",
             r"^#+ [^\n]*$|<!--.*?-->",
         ]
@@ -123,7 +123,8 @@ def figures(page: str) -> list[tuple[int, int]]:
     """Where the page prints numbers that need a record, as spans of the text.
 
     These are numbers with a decimal point, an exponent or a unit, and all numbers in cells of tables that hold nothing
-    else. Code, formulas, targets of links, headings and headers of tables do not count.
+    else and are not the label of their row. Code, formulas, targets of links, headings and headers of tables do not
+    count.
     """
     text = UNPRINTED.sub(lambda found: re.sub(r"[^\n]", " ", found[0]), page)
     numeric = [span for line in LINE.finditer(text) for span in _numeric_cells(line)]
@@ -131,7 +132,7 @@ def figures(page: str) -> list[tuple[int, int]]:
 
 
 def _numeric_cells(line: re.Match[str]) -> Iterator[tuple[int, int]]:
-    for cell in re.finditer(r"(?<=\|)[^|]*(?=\|)", line[0]):
+    for cell in list(re.finditer(r"(?<=\|)[^|]*(?=\|)", line[0]))[1:]:
         if NUMERIC_CELL.fullmatch(cell[0]) and cell[0].strip("- "):
             yield line.start() + cell.start(), line.start() + cell.end()
 
@@ -160,6 +161,12 @@ def on_one_line(page: str) -> str:
 def numbers(text: str) -> list[str]:
     """The numbers of a text, in order."""
     return NUMBER.findall(text)
+
+
+def says_nothing(phrase: str) -> bool:
+    """Whether a phrase is numbers and units alone, which would explain any such number."""
+    words = re.sub(rf"\b(?:{UNITS})\b", " ", phrase)
+    return re.search(r"[^\W\d_]{3}", words) is None
 
 
 def key(row: str) -> tuple[str, ...]:
