@@ -306,7 +306,7 @@ class _OperationalSpace(Shown):
 
         def slowness(q: Array) -> Array:
             W = scale[:, None] * mobility(self.chart, q, robot) * scale
-            known = np.isfinite(W).all(axis=(1, 2))
+            known = np.asarray(np.isfinite(W).all(axis=(1, 2)))
             return np.where(known, -np.linalg.eigvalsh(np.where(known[:, None, None], W, 0))[:, -1], np.nan)
 
         return np.vstack([sample_uniform(domain, _MODE_SAMPLES, 0), least_in_domain(slowness, domain)])
