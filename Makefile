@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
-.PHONY: demo test check docs fuzz lint types wheel-check bench charts clean
+.PHONY: demo test check docs fuzz lint types wheel-check bench figures charts clean
 
 demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and picture in out/
 	$(BIN)/python examples/iiwa_demo.py --out out
@@ -37,6 +37,9 @@ wheel-check: $(INSTALLED)  ## the built wheel in a fresh environment, outside th
 bench: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet -e '.[bench]'
 	$(BIN)/python benchmarks/run_all.py
+
+figures: $(INSTALLED)  ## measure the cheap figures of the documentation again, and show what moved beyond its tolerance
+	OMP_NUM_THREADS=1 $(BIN)/python tools/figures.py $(ONLY)
 
 charts: $(INSTALLED)  ## the ready charts, those that are missing or changed; ONLY=panda-position makes one again
 	$(BIN)/python examples/ready_charts.py $(ONLY)

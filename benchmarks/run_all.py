@@ -30,6 +30,7 @@ SCRIPTS = (
     "atlas_c",
     "suggested_domains",
     "choices",
+    "elbow_angle",
     "scaling",
     "gradients",
     "compiled_loss",

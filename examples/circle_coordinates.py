@@ -172,7 +172,7 @@ def fitted(metric: str, degrees: tuple[int, ...], iterations: int) -> list[oc.Ch
     for before, pairs in pairwise([stages[0], *stages]):
         theta = pairs.embedded(theta, before)
         points = half_of_torus(problem, 4 * pairs.degree + 30, NEAR)
-        theta = GaussNewton(iterations, 5e-4).minimise(Leak(pairs, points), theta).theta
+        theta = GaussNewton(iterations, 1e-5).minimise(Leak(pairs, points), theta).theta
         charts.append(pairs.chart(theta))
     return charts
 

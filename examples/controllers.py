@@ -37,7 +37,7 @@ def main(quick: bool = False) -> dict[str, float]:
     """Print a table for each arm.
 
     Returns:
-        Worst coupling of the task by the extra coordinates, by arm and controller.
+        Worst coupling of the task by the extra coordinates, by arm and controller, and the angle of each fit.
     """
     found = {}
     for name in ("planar_3r_x",) if quick else ("planar_3r_x", "planar_3r_xy"):
@@ -45,8 +45,9 @@ def main(quick: bool = False) -> dict[str, float]:
         linear = oc.fit(problem, oc.Linear()).chart
         fitted = oc.fit(problem, oc.Polynomial(6 if quick else 8), weights=WEIGHTS, align_to=linear)
         chart = fitted.chart  # in the order and with the signs of the linear coordinates: a step means the same motion
-        labels = chart.problem.task.labels
-        print(f"\n{name}: task {', '.join(labels)}; fitted {oc.evaluate(chart, 20_000).task_angle.std:.2f} deg off\n")
+        labels, angle = chart.problem.task.labels, oc.evaluate(chart, 20_000).task_angle.std
+        found[f"{name} fitted, task angle std [deg]"] = angle
+        print(f"\n{name}: task {', '.join(labels)}; fitted {angle:.2f} deg off\n")
         print("| controller | task <- xi | xi <- task | x <-> y | xi <-> xi |\n| --- | --- | --- | --- | --- |")
         for title, judged, law, reference in laws(chart, linear):
             run = oc.simulate(law, reference, problem.domain.centre, must_be_reachable=False)

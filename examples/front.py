@@ -29,7 +29,8 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
         quick: degree 2 and three points per curve.
 
     Returns:
-        Numbers of the picture: task std [deg] at the ends of the front, conditioning at both ends of lambda3.
+        Numbers of the picture: angles of the last degree [deg], task std of the first one at the ends of the front,
+        conditioning at both ends of lambda3.
     """
     out.mkdir(parents=True, exist_ok=True)
     problem, samples = problems.get("iiwa"), 5_000 if quick else 100_000
@@ -49,7 +50,12 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     _draw_regularity(upper, figure.add_subplot(grid[1, 1], sharex=upper), degrees[-1], lambda3, regular)
     figure.savefig(out / "front.png", dpi=150)
     first = fronts[degrees[0]]
+    last = zip(lambda2, fronts[degrees[-1]], strict=True)
+    angles = {f"lambda2 = {value:g}": report for value, report in last}
+    angles |= {f"lambda3 = {value:g}": report for value, report in zip(lambda3, regular, strict=True)}
     return {
+        **{f"{name}, task std [deg]": report.task_angle.std for name, report in angles.items()},
+        **{f"{name}, mutual std [deg]": report.mutual_angle.std for name, report in angles.items()},
         "task_std_small_lambda2": first[0].task_angle.std,
         "task_std_large_lambda2": first[-1].task_angle.std,
         "p01_small_lambda2": first[0].conditioning.p01,

@@ -95,13 +95,13 @@ class Report(Shown):
         leak, others = self.leak, self.without_idle
 
         def paper(angles: AngleStatistics) -> str:
-            spread = f"mean {angles.mean:.2f}, std {angles.std:.2f}, largest deviation {angles.max:.1f} deg"
+            spread = f"mean {angles.mean:.2f}, std {angles.std:.2f}, largest sampled deviation {angles.max:.1f} deg"
             return f"{spread} (the paper's cosines)"
 
         found = {
             "task angle": paper(self.task_angle),
             "mutual angle": paper(self.mutual_angle),
-            "leak": f"rms {leak.rms:.2f}, mean {leak.mean:.2f}, largest {leak.max:.1f} deg (angle in the metric)",
+            "leak": f"rms {leak.rms:.2f}, mean {leak.mean:.2f}, largest sampled {leak.max:.1f} deg (in the metric)",
         }
         if self.r == 1:
             found["mutual angle"] = "none, r = 1"
@@ -195,7 +195,8 @@ def evaluate(
         count, drawn = _count(chart, SAMPLES if samples is None else samples), SEED if seed is None else seed
         drawn = require_count("seed", drawn, least=0)
         searched = isinstance(chart.coordinates, Coordinates) and not isinstance(chart.problem.domain, Torus)
-        worst = worst_points(chart.problem, chart.coordinates, drawn) if searched else None
+        problem, found = chart.problem, chart.coordinates
+        worst = worst_points(problem, found, drawn, thorough=True) if searched else None
         return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst)
     if samples is not None or seed is not None:
         raise InvalidValueError("points", "given with samples or a seed", "points alone")

@@ -1,20 +1,23 @@
 """The worst points of a chart: a search of the domain for the least conditioning and for folds (ours)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from orthocas.checks import Array
 from orthocas.coordinates.map import CoordinateMap
-from orthocas.domains import contains, sample_heavily
+from orthocas.domains import Domain, contains, sample_heavily
 from orthocas.judging.gradients import Judged
 from orthocas.problem import Problem
 
 CANDIDATES = 6000
-_DESCENTS = 300  # of the worst candidates
-_STEPS = 15
-_FIRST_STEP = 0.3  # of the half-widths
+_DESCENTS, _STEPS = 300, 15  # of the worst candidates
+_KEPT, _MORE_STEPS = 60, 150  # the worst of them go on, if the result is to be printed
+_FIRST_STEP, _LAST_STEP = 0.3, 1e-4  # of the half-widths
 _MOVED = 0.4  # share of the joints that move in a step
+
+Value = Callable[[Array], Array]  #: u (N, n) -> (N,), NaN where there is no value
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,35 +43,86 @@ class WorstPoints:
         return self.points[self.conditioning < bound]
 
 
-def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) -> WorstPoints:
-    """Search the domain: uniform candidates, others near faces and corners, then local descent from the worst.
+def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0, *, thorough: bool = False) -> WorstPoints:
+    """Search the domain: uniform candidates, others near faces and corners, then descent from the worst (`descended`).
 
-    Folds of charts lie in corners and in thin wedges, which uniform samples miss. Descent is a random search that keeps
-    what is worse and in the domain. Points where a gradient vanishes, or a grown coordinate has no value, are left out.
+    Folds of charts lie in corners and in thin wedges, which uniform samples miss. Points where a gradient vanishes, or
+    a grown coordinate has no value, are left out.
 
     Args:
         problem: problem of the coordinates.
         coordinates: the coordinates.
         seed: seed of candidates and steps.
+        thorough: follow the worst descents to their ends, for a least value that is printed; fits need bad points only.
     """
-    rng = np.random.default_rng((seed, CANDIDATES))
     points = sample_heavily(problem.domain, CANDIDATES, (seed, CANDIDATES, 1))
     u = (points - problem.domain.centre) / problem.domain.half_width
     found = _signed_conditioning(problem, coordinates, u)
-    u, found = u[np.isfinite(found)], found[np.isfinite(found)]
-    orientation = 1.0 if np.sum(found >= 0) >= len(found) / 2 else -1.0
-    order = np.argsort(orientation * found)[:_DESCENTS]
-    u, found = u[order], orientation * found[order]
-    step = np.full(len(u), _FIRST_STEP)
+    orientation = 1.0 if np.sum(found >= 0) >= np.isfinite(found).sum() / 2 else -1.0
+    u, found = descended(
+        lambda u: orientation * _signed_conditioning(problem, coordinates, u), u, orientation * found, seed, thorough
+    )
+    return WorstPoints(_joint_positions(problem, u), found)
+
+
+def least_in_domain(value: Value, domain: Domain, seed: int = 0) -> Array:
+    """Where a function of the joint position is least, as far as a search of the domain finds it, q (n,).
+
+    Candidates as in `worst_points`, then thorough descents.
+
+    Args:
+        value: q (N, n) -> (N,); NaN where it has none.
+        domain: the domain.
+        seed: seed of candidates and steps.
+
+    Source:
+        ours.
+    """
+    points = sample_heavily(domain, CANDIDATES, (seed, CANDIDATES, 1))
+
+    def inside(u: Array) -> Array:
+        q = domain.centre + domain.half_width * u
+        return np.where(contains(domain, q), value(q), np.nan)
+
+    u, _ = descended(inside, (points - domain.centre) / domain.half_width, value(points), seed, thorough=True)
+    best: Array = domain.centre + domain.half_width * u[0]
+    return best
+
+
+def descended(value: Value, u: Array, found: Array, seed: int, thorough: bool) -> tuple[Array, Array]:
+    """Descents from the least of many points of the cube [-1, 1]^n; points and values, the least first.
+
+    Each is a random search that keeps what is less: a step moves some joints at a time, so that faces and corners are
+    reached, and its size follows success. In 8 joints, gradients by differences cost more.
+
+    Args:
+        value: the function; NaN where it has none.
+        u: points (N, n).
+        found: its values there, (N,).
+        seed: of the steps.
+        thorough: whether the least descents go on until they gain nothing.
+    """
+    rng = np.random.default_rng((seed, CANDIDATES))
+    order = np.argsort(found)[: min(_DESCENTS, int(np.isfinite(found).sum()))]
+    u, found, step = u[order], found[order], np.full(len(order), _FIRST_STEP)
     for _ in range(_STEPS):
-        moves = rng.normal(size=u.shape) * (rng.uniform(size=u.shape) < _MOVED)
-        tried = np.clip(u + step[:, None] * moves, -1, 1)
-        values = orientation * _signed_conditioning(problem, coordinates, tried)
-        worse = values < found
-        u[worse], found[worse] = tried[worse], values[worse]
-        step *= np.where(worse, 1.5, 0.8)
+        _step(value, u, found, step, rng)
     order = np.argsort(found)
-    return WorstPoints(_joint_positions(problem, u[order]), found[order])
+    u, found, step = u[order], found[order], step[order]
+    for _ in range(_MORE_STEPS * thorough):
+        _step(value, u[:_KEPT], found[:_KEPT], step[:_KEPT], rng)
+    order = np.argsort(found)
+    return u[order], found[order]
+
+
+def _step(value: Value, u: Array, found: Array, step: Array, rng: np.random.Generator) -> None:
+    """One step of all descents, in place."""
+    moves = rng.normal(size=u.shape) * (rng.uniform(size=u.shape) < _MOVED)
+    tried = np.clip(u + step[:, None] * moves, -1, 1)
+    values = value(tried)
+    less = values < found
+    u[less], found[less] = tried[less], values[less]
+    step[:] = np.maximum(_LAST_STEP, step * np.where(less, 1.5, 0.8))
 
 
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:

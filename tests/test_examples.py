@@ -11,6 +11,7 @@ import clear_positions
 import compare_parametrisations
 import distillation
 import domain_size
+import elbow_angle
 import fits
 import folds
 import follow_path
@@ -35,6 +36,7 @@ from PIL import Image
 from programs import needs_c
 
 import orthocas as oc
+from orthocas.domains import sample_uniform
 from orthocas.reproduce.registry import FIGURES
 
 
@@ -264,3 +266,17 @@ def test_gradients_agree_with_pytorch() -> None:
     import gradients  # noqa: PLC0415, needs the optional torch
 
     assert len(gradients.main(quick=True)) == 2  # it checks values and gradients before timing
+
+
+@pytest.mark.slow
+def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -> None:
+    """The benchmark takes leaks straight from Jacobians; `evaluate` has formulas of its own."""
+    found = {name: numbers["leak rms [deg]"] for name, numbers in elbow_angle.main(quick=True).items()}
+    assert found["stereographic SEW"] > found["conventional SEW"] > 1.5 * found["linear"] > 1.5 * found["fitted"]
+    arm = oc.problems.get("iiwa")
+    task = oc.Task.named(arm.robot, "pose", arm.domain.centre)
+    chart = oc.fit(oc.Problem(arm.robot, task, domain=arm.domain), oc.SEW()).chart
+    points = sample_uniform(arm.domain, 500, 2)
+    assert oc.evaluate(chart, points=points).leak.rms == pytest.approx(
+        np.sqrt((elbow_angle.leaks(chart, points) ** 2).mean()), rel=1e-6
+    )

@@ -136,3 +136,17 @@ def _inertias(chart: oc.Chart) -> Array:
     J, M = chart.jacobian(points), chart.problem.robot.mass_matrix(points)
     half = np.linalg.inv(J)
     return np.asarray(half.transpose(0, 2, 1) @ M @ half)
+
+
+def test_the_fastest_mode_of_a_law_is_the_fastest_on_a_grid_of_its_domain(planar_chart: oc.Chart) -> None:
+    """The modes are omega^2 = eig(J M^-1 J^T K), by a solver for any matrix, on 40^3 points with all corners."""
+    law, domain = PDPlus.on_chart(planar_chart), planar_chart.problem.domain
+    steps = np.linspace(-1, 1, 40)
+    q = domain.centre + domain.half_width * np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    J, M = planar_chart.jacobian(q), planar_chart.problem.robot.mass_matrix(q)
+    squares = np.linalg.eigvals(J @ np.linalg.solve(M, J.transpose(0, 2, 1)) * law.stiffness).real
+    modes = law.modes()
+    fastest = modes.frequencies[-1, -1]  # the last posture is that of the search
+    assert fastest == modes.frequencies.max()
+    assert fastest >= (1 - 1e-6) * np.sqrt(squares.max()) / (2 * np.pi)
+    assert fastest > 1.02 * modes.frequencies[:-1].max()  # samples alone do not find it

@@ -66,7 +66,7 @@ class Card(Shown):
         angles, leak, conditioning = quality["task_angle_deg"], quality["leak_deg"], quality["conditioning"]
         return {
             "card": f"{self.name}, {model.robot}, {quality['n']} joints, {extra}",
-            "leak": f"rms {leak['rms']:.2f}, largest {leak['max']:.1f} deg (angle in the metric)",
+            "leak": f"rms {leak['rms']:.2f}, largest sampled {leak['max']:.1f} deg (angle in the metric)",
             "task angle": f"{_spread(angles)} (the paper's cosines)",
             "mutual angle": "none, r = 1" if quality["r"] == 1 else _spread(quality["mutual_angle_deg"]),
             "conditioning": f"mean {conditioning['mean']:.3f}, least {conditioning['min']:.3f}",

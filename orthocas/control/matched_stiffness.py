@@ -31,7 +31,8 @@ def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY, fastest
     Args:
         chart: a chart with a closed expression.
         frequency: omega > 0 of the springs [rad/s].
-        fastest: of all modes [rad/s], > 0; infinite: no bound. Single postures exceed it by some per cent.
+        fastest: of all modes [rad/s], > 0; infinite: no bound. It is kept at samples; in corners of
+            the domain modes are faster, see `modes` of a law.
 
     Source:
         ours, docs/derivations.md#stiffness

@@ -40,6 +40,7 @@ from orthocas.domains import sample_uniform
 from orthocas.problem import Problem
 from orthocas.robots.tip_turn import TipTurn
 from orthocas.showing import Shown
+from orthocas.worst_points import least_in_domain
 
 Coupling = Literal["coupled", "decoupled"]
 COUPLINGS: tuple[Coupling, ...] = ("coupled", "decoupled")
@@ -288,16 +289,27 @@ class _OperationalSpace(Shown):
         """Modes of the closed loop M_phi dde + D de + K e = 0 at rest, without disturbances.
 
         Args:
-            q: one posture (n,) or several (N, n); default: 256 uniform samples of the domain.
+            q: one posture (n,) or several (N, n); default: 256 uniform samples of the domain, and last the posture
+                of the fastest mode, which descents find (`least_in_domain`).
 
         Raises:
             ShapeError, InvalidValueError: if q has another shape, or is not finite.
         """
-        given = sample_uniform(self.problem.domain, _MODE_SAMPLES, 0) if q is None else q
-        points, single = as_point_set("q", given, self.chart.n)
+        points, single = as_point_set("q", self._mode_points() if q is None else q, self.chart.n)
         W = mobility(self.chart, points, self.model.robot(self.problem))
         found = modes_of(W, self.stiffness, self._damping_at(points))
         return Modes(*(values[0] for values in vars(found).values())) if single else found
+
+    def _mode_points(self) -> Array:
+        """Samples of the domain, and the posture with the fastest mode that a search finds, (N, n)."""
+        domain, robot, scale = self.problem.domain, self.model.robot(self.problem), np.sqrt(self.stiffness)
+
+        def slowness(q: Array) -> Array:
+            W = scale[:, None] * mobility(self.chart, q, robot) * scale
+            known = np.asarray(np.isfinite(W).all(axis=(1, 2)))
+            return np.where(known, -np.linalg.eigvalsh(np.where(known[:, None, None], W, 0))[:, -1], np.nan)
+
+        return np.vstack([sample_uniform(domain, _MODE_SAMPLES, 0), least_in_domain(slowness, domain)])
 
     def _damping_at(self, points: Array) -> Array:
         """D(q) with the law's gains at points (N, n), (N, n, n)."""

@@ -103,7 +103,7 @@ def fit(
     split_idle: bool = True,
     precision: str = PRECISIONS[0],
 ) -> Fit:
-    """Find coordinates xi(q) that are as orthogonal as possible to the task.
+    """Find coordinates xi(q) of a family that are nearly orthogonal to the task.
 
     The fit minimises the mean of [AS2023] eq. (24) over uniform samples of the domain, for A = M with angles in the
     metric. Joints that do not affect the task become coordinates themselves. With `Polynomial(degree, cyclic="auto")`,

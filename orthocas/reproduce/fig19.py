@@ -1,4 +1,4 @@
-"""[AS2023] Fig. 19: a section of joint space, task (x, y), and a fitted coordinate that is as orthogonal as possible.
+"""[AS2023] Fig. 19: a section of joint space, task (x, y), and a fitted coordinate that is nearly orthogonal.
 
 Our coordinate is a polynomial, that of the paper a neural network. Rectangles mark where self-motion curves cross the
 isosurfaces. They lie 0.03 rad above the surfaces, on the side of the viewer, so that their tilt is visible.

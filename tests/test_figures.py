@@ -1,0 +1,122 @@
+"""Every measured number of README and docs has a record in docs/records, and comes from it (tools/figures.py)."""
+
+import json
+from pathlib import Path
+
+import figures
+import pytest
+import ready_charts
+
+RECORDS = figures.records()
+CARDS = figures.Record("cards", "measured", tables=[["", *ready_charts.table()]])  # cards are records of their own
+PAGES = figures.pages()
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_measured_number_of_a_page_has_a_record(page: str) -> None:
+    assert figures.unrecorded(PAGES[page], [*RECORDS.values(), CARDS]) == []
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_what_a_record_prints_is_on_a_page(name: str) -> None:
+    """So a number that a script has measured anew must be on the pages, and no record outlives its sentence."""
+    missing = [phrase for phrase in RECORDS[name].phrases if not any(figures.places(p, phrase) for p in PAGES.values())]
+    assert missing == []
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_phrases_say_what_their_numbers_are(name: str) -> None:
+    """A bare number would explain every other one like it."""
+    assert [phrase for phrase in RECORDS[name].printed if figures.says_nothing(phrase)] == []
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_records_say_how_they_were_measured(name: str) -> None:
+    record = RECORDS[name]
+    if name in {"constants", "by_hand"}:
+        assert record.source == {"constants": "constants", "by_hand": "transcribed"}[name]
+        assert (record.command, record.values) == ("", {})
+        return
+    assert record.source in {"measured", "transcribed"}
+    words = record.command.split()
+    assert words[0] in {"python", "orthocas", "make"}
+    assert words[0] != "python" or (figures.ROOT / words[1]).exists()
+    assert not record.script or "\ndef main(" in (figures.ROOT / record.script).read_text()
+    assert record.source == "transcribed" or (record.script and record.cpu_seconds and record.tolerance)
+    assert set(record.values) == record.used
+
+
+PAGE = """# 3.5 is a heading
+
+The arm takes 2.5 s, and `9.9` is code; see [0.3](results.md#0.4). It has 7 joints, 50 % of them at 1e-3.
+
+| what | number |
+| --- | --- |
+| 3R arm | 12 |
+| two | 3, 4 |
+"""
+
+
+def test_measured_numbers_are_those_with_a_point_an_exponent_or_a_unit_and_cells_of_numbers() -> None:
+    found = [PAGE[slice(*span)] for span in figures.figures(PAGE)]
+    assert found == ["2.5", "0.3", "50", "1e-3", "12", "3", "4"]
+
+
+def test_a_number_without_a_record_and_a_stale_one_are_found() -> None:
+    known = figures.Record(
+        "a",
+        "measured",
+        values={"t": 2.51},
+        tables=[["", "| two | 3, 4 |"]],
+        printed=["takes {t|.1f} s", "[0.3]", "1e-3"],
+    )
+    assert [line.split(":")[0] for line in figures.unrecorded(PAGE, [known])] == ["line 3", "line 7"]
+    stale = figures.replace(known, values={"t": 2.61}, tables=[["", "| two | 3, 5 |"]])
+    assert len(figures.unrecorded(PAGE, [stale])) == 5  # 2.5, 50, 12, 3 and 4
+
+
+def test_longer_numbers_do_not_count_as_the_phrase() -> None:
+    assert figures.places("12.5 s, 2.55 s, 1,2.5 s", "2.5 s") == []
+    assert len(figures.places("it takes\n  2.5 s", "takes 2.5 s")) == 1
+
+
+SCRIPT = """
+def main(scale=1.0):
+    print("| case | time [s] | angle |\\n| --- | --- | --- |\\n| a 1 | 3.0 | {:.2f} |".format(2 * scale))
+    return {"arm": {"angle [deg]": 2.0 * scale, "other": 7}}
+"""
+
+
+def test_a_run_gives_values_and_tables_shows_what_moved_and_renews_pages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in ("docs/records", "examples"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "examples" / "case_of_figures.py").write_text(SCRIPT)
+    page = tmp_path / "README.md"
+    page.write_text("It is 2.0\ndegrees off.\n\n| A 1 | 3.0 | 2.00 |\n")
+    record = {
+        "source": "measured",
+        "command": "python examples/case_of_figures.py",
+        "script": "examples/case_of_figures.py",
+        "cpu_seconds": 1.0,
+        "tolerance": {"": 0.01, "time": 1.0},
+        "values": {"arm, angle [deg]": 2.0},
+        "tables": [["| case | time [s] | angle |", "| a 1 | 3.0 | 2.00 |"]],
+        "printed": ["is {arm, angle [deg]|.1f} degrees off"],
+    }
+    path = tmp_path / "docs" / "records" / "case.json"
+    path.write_text(json.dumps(record))
+    monkeypatch.setattr(figures, "ROOT", tmp_path)
+    monkeypatch.setattr(figures, "RECORDS", path.parent)
+    assert figures.unrecorded(page.read_text(), list(figures.records().values())) == []
+    assert figures.main([], keep=False) == 0  # nothing moved
+
+    changed = record | {"arguments": {"scale": 1.1}}
+    path.write_text(json.dumps(changed))
+    assert figures.main([], keep=False) == 1
+    assert page.read_text().startswith("It is 2.0\ndegrees")
+    figures.main(["case"], keep=True)
+    assert page.read_text() == "It is 2.2\ndegrees off.\n\n| A 1 | 3.0 | 2.20 |\n"
+    assert json.loads(path.read_text())["values"] == {"arm, angle [deg]": 2.2}
+    assert figures.main([], keep=False) == 0
