@@ -132,7 +132,7 @@ class OneToOneJudge:
 class ConvexJudge:
     """Proves that the symmetric part of P J is positive definite, for one P on all boxes and the true rows of J.
 
-    (q - p)^T P (phi(q) - phi(p)) is the integral of (q - p)^T P J (q - p) over the segment between two points of a convex
+    (q - p)^T P (phi(q) - phi(p)) is the integral of (q - p)^T P J (q - p) over the segment between points of a convex
     set, so it is positive. This is for rows that have bounds, but no derivatives in closed form.
     """
 
@@ -188,7 +188,8 @@ def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToO
     if tip is None or not known:
         true = replace(rows, task=true_gradients(chart.problem.task, active)[0])
         centre = chart.problem.domain.centre[None]
-        return ConvexJudge(true, np.linalg.pinv(true(centre, centre).centre[:, :, 0]), base.low, base.high)
+        inverse = np.asarray(np.linalg.pinv(true(centre, centre).centre[:, :, 0]), dtype=float)
+        return ConvexJudge(true, inverse, base.low, base.high)
     own: RowJets | None = None
     if rows.coordinates is not None:
         assert isinstance(coordinates, Coordinates)
