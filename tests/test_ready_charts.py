@@ -54,6 +54,32 @@ def test_figures_of_cards_are_found_at_other_samples(name: str) -> None:
     assert report.conditioning.min >= 0.95 * quality["conditioning"]["min"]
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_one_to_one_box_is_large_and_holds_no_two_points_with_the_same_phi(name: str) -> None:
+    """100,000 pairs, half of them near the pairs that come closest: J(c)^-1 (phi(q) - phi(p)) never comes near 0."""
+    chart = oc.charts.load(name)
+    assert chart.certificate is not None
+    box = chart.certificate.injective
+    assert box is not None
+    half, rng = (box.high - box.low) / 2, np.random.default_rng(11)
+    assert np.median(half) > 0.1
+    q, p = rng.uniform(box.low, box.high, (2, 50_000, chart.n))
+    q[::2] = np.where(rng.uniform(size=q[::2].shape) < 0.5, box.low, box.high)
+    near = np.argsort(_apart(chart, q, p))[:500]
+    q, p = (
+        np.repeat(points[near], 100, axis=0) + rng.normal(size=(50_000, chart.n)) * 0.05 * half for points in (q, p)
+    )
+    q, p = np.clip(q, box.low, box.high), np.clip(p, box.low, box.high)
+    assert _apart(chart, q, p).min() > 1e-3
+
+
+def _apart(chart: oc.Chart, q: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """|J(c)^-1 (phi(q) - phi(p))| / |q - p| at the middle c of pairs of points: 1 for a linear chart."""
+    steps = np.linalg.solve(chart.jacobian((q + p) / 2), (chart.phi(q) - chart.phi(p))[:, :, None])[:, :, 0]
+    ratio: np.ndarray = np.linalg.norm(steps, axis=1) / np.linalg.norm(q - p, axis=1)
+    return ratio
+
+
 def test_a_cyclic_joint_may_be_anywhere() -> None:
     """The Jacobian of a ready chart stays regular when the base joint turns over its whole range."""
     chart = oc.charts.load("panda-position")

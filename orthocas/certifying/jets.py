@@ -45,9 +45,7 @@ class Around:
 class Jets:
     """Some rows of J: their derivatives at the middle, and what these leave out of the average."""
 
-    derivatives: tuple[
-        Array, ...
-    ]  #: of order 0 to that of the boxes, (rows, columns, multi-indices of that order, boxes)
+    derivatives: tuple[Array, ...]  #: by order, each (rows, columns, multi-indices of the order, boxes)
     doubts: tuple[Array, ...]  #: bounds of their errors, of shapes that broadcast to theirs
     rest: Array  #: (rows, columns, boxes)
 
