@@ -80,9 +80,8 @@ def main(quick: bool = False) -> dict[str, int]:
             false += bool(len(pairs))
             print(f"{name}: {len(pairs)} second solutions")
     seconds = time.process_time() - begin
-    print(
-        f"{arms} arms and {len(names)} ready charts, {refused} refused, {proved} boxes proved, {false} of them falsely, {seconds:.0f} CPU s"
-    )
+    print(f"{arms} arms ({refused} refused) and {len(names)} ready charts in {seconds:.0f} CPU s:")
+    print(f"{proved} boxes proved, {false} of them falsely")
     return {"arms": arms, "refused": refused, "proved": proved, "false": false}
 
 
