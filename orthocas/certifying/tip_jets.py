@@ -2,9 +2,9 @@
 
 For joints i <= j <= ... <= l along the chain, the derivative of the tip position p is a_i x (a_j x ... (a_l x r)), with
 the axes a of the joints and the arm r from the origin of the last one to the tip. Each product is one with a unit
-vector, so the length is at most |r|. For the rotation R of the tip it is [a_i]x [a_j]x ... [a_l]x R, of norm 1. The rows of a
-rotation are those of the skew part of R(q) R(c)^T with R(c) constant, at the middle c of a box: they agree where
-x(q) = x(p).
+vector, so the length is at most |r|. For the rotation R of the tip it is [a_i]x [a_j]x ... [a_l]x R, of norm 1. The
+rows of a rotation are those of the skew part of R(q) R(c)^T with R(c) constant, at the middle c of a box: they agree
+where x(q) = x(p).
 """
 
 from dataclasses import dataclass
