@@ -113,11 +113,11 @@ def polynomial(coefficients: np.ndarray, t: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("task", ["position", "orientation", "axis", "pose:z", "position:xy", "position+axis"])
 def test_no_second_solution_is_found_in_a_proved_box_of_a_random_arm(task: str) -> None:
     held = 0
-    for seed in range(3):
+    for seed in range(2):
         known = arm_chart(seed, task)
         base = certifying.whole_domain(known.problem.domain)
         for scale in (1.0, 0.6, 0.3):
-            if proved(known, known.problem.domain.half_width * scale, 100):
+            if proved(known, known.problem.domain.half_width * scale, 50):
                 middle, half = known.problem.domain.centre, known.problem.domain.half_width * scale
                 assert not len(second_solutions(known, middle - half, middle + half, 1000, seed))
                 held += 1

@@ -23,7 +23,8 @@ from orthocas.minimising.watch import Monitor, Progress, silent
 
 _SAMPLES = 20_000  # points where folds are looked for before the proof
 _SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
-_FEW_BOXES, _MANY_BOXES, _HOPELESS = 300, 40_000, 2_000  # for one scale; then a search that goes too slowly ends
+_FEW_BOXES, _HOPELESS = 300, 2_000  # for one scale; then a search that goes too slowly ends
+_MANY_BOXES = (1_000, 40_000)  # the least and the most; between them, ten times what the proof without folds took
 _HELD_RANGE = 1.0  # half-width of a leading joint on which J does not depend, if its whole range is too wide
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
@@ -91,7 +92,8 @@ def certify(
         search.run(_shown(monitor, "regular"))
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
-            injective = _one_to_one(chart, rows, base, left, executor, monitor)
+            most = int(np.clip(10 * search.judged, *_MANY_BOXES))
+            injective = _one_to_one(chart, rows, base, Limits(left, boxes=most), executor, monitor)
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
     return so_far()
@@ -235,14 +237,14 @@ def _suspects(chart: Chart) -> Array:
 
 
 def _one_to_one(
-    chart: Chart, rows: ChartRows, base: Subdivision, seconds: float, executor: Executor | None, monitor: Monitor
+    chart: Chart, rows: ChartRows, base: Subdivision, limits: Limits, executor: Executor | None, monitor: Monitor
 ) -> Subdivision | None:
     """The largest of some boxes around the centre with a proof, and its parts; None if there is no proof for any.
 
     Leading joints on which J does not depend keep their whole range, or 1 rad. A few boxes are enough for most scales;
     from there, larger ones are tried with more, until one of them would take too many.
     """
-    end = time.monotonic() + seconds
+    end = time.monotonic() + limits.seconds
     judge = one_to_one_judge(chart, rows, base)
     best: Subdivision | None = None
     if judge is None:
@@ -254,8 +256,8 @@ def _one_to_one(
         middle, own = (part.low + part.high)[None] / 2, replace(judge, low=part.low, high=part.high)
         if not own(middle, middle).proved.all():  # the middle of points that may be farthest apart
             return False
-        limits = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=_HOPELESS)
-        search = Search(own, part, limits, largest_first(part), executor)
+        left = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=_HOPELESS)
+        search = Search(own, part, left, largest_first(part), executor)
         search.run(_shown(monitor, "one-to-one"))
         if search.finished:
             best = search.subdivision()
@@ -266,13 +268,13 @@ def _one_to_one(
     held, half = np.isin(joints, judge.still_joints), (base.high - base.low) / 2
     for range_ in (np.inf, _HELD_RANGE) if held.any() else (np.inf,):
         share = np.where(idle, 1.0, np.minimum(1.0, range_ / half))
-        _try_scales([np.where(idle | held, share, scale) for scale in _SCALES], proved)
+        _try_scales([np.where(idle | held, share, scale) for scale in _SCALES], proved, limits.boxes)
         if best is not None:
             break
     return best
 
 
-def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool]) -> None:
+def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool], most: int) -> None:
     """Ask for proofs of boxes of increasing size: the largest one, then by bisection with few boxes, then with many."""
     if proved(shares[-1], _FEW_BOXES):
         return
@@ -282,10 +284,10 @@ def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool]) -
         low, high = (middle + 1, high) if proved(shares[middle], _FEW_BOXES) else (low, middle)
     if low == 0:
         return
-    while low + 1 < len(shares) and proved(shares[low + 1], _MANY_BOXES):
+    while low + 1 < len(shares) and proved(shares[low + 1], most):
         low += 2
     if low < len(shares):
-        proved(shares[low], _MANY_BOXES)
+        proved(shares[low], most)
 
 
 def _scaled(base: Subdivision, share: Array) -> Subdivision:
