@@ -48,8 +48,9 @@ def second_solutions(chart: oc.Chart, low: np.ndarray, high: np.ndarray, starts:
     q[::2] = np.where(rng.uniform(size=(len(q[::2]), chart.n)) < 0.5, low, high)  # half of them in corners
     target = chart.phi(q)
     for _ in range(25):
-        J = chart.jacobian(p)
-        step = np.linalg.pinv(np.nan_to_num(J)) @ (target - chart.phi(p))[:, :, None]
+        J, missing = np.nan_to_num(chart.jacobian(p)), np.nan_to_num(target - chart.phi(p))
+        Jt = J.transpose(0, 2, 1)
+        step = np.linalg.solve(Jt @ J + 1e-9 * np.eye(chart.n), Jt @ missing[:, :, None])
         p = np.clip(p + np.clip(step[:, :, 0], -0.5, 0.5), low, high)
     same = np.abs(chart.phi(p) - target).max(axis=1) < 1e-10
     apart = np.abs(p - q).max(axis=1) > 1e-4
