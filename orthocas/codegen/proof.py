@@ -47,9 +47,8 @@ def check_c(
     Raises:
         CompileError: if there is no compiler, or compilation fails.
         ProofError: if a result differs by more than 1e-10 of its largest entry (single precision: 1e-3), or a status
-            differs. Near singularities, where one rounding of q changes commands by more than 1e-12 (1e-5), the
-            accepted difference is a hundred times that change. In single precision, the accepted difference of
-            commands also grows with the inverse square of the volume of the gradients, relative to its median, and
+            differs. Near singularities, where one rounding of q, or of one joint, changes commands by more than 1e-12
+            (1e-5), the accepted difference is a hundred times that change. In single precision, that of commands also grows with the inverse square of the volume of the gradients, relative to its median, and
             their status may be that of a place within 0.01 half-widths.
     """
     require_kind("chart", chart, Chart)
@@ -201,8 +200,13 @@ def _law_inputs(
 
 def _amplification(precision: Precision, controller: Controller, law: Batched, inputs: list[Array]) -> Array:
     """How much more than the tolerance the command may differ at each state, (N,) >= 1."""
-    (command, status), (moved, status_there) = law(*inputs), law(precision.next_above(inputs[0]), *inputs[1:])
-    change = np.where(status_there == status, _differences(moved, command)[:, None], 0)[:, 0]
+    q, others = inputs[0], inputs[1:]
+    command, status = law(*inputs)
+    change = np.zeros(len(q))
+    for joints in (np.ones(q.shape[1], dtype=bool), *np.eye(q.shape[1], dtype=bool)):  # effects of joints may cancel
+        moved, status_there = law(np.where(joints, precision.next_above(q), q), *others)
+        same = (status_there == status)[:, 0]
+        change = np.where(same, np.maximum(change, _differences(moved, command)), change)
     found: Array = change.clip(precision.sensitive, 1) / precision.sensitive
     volume = squared_volume(controller.graph)
     if precision is SINGLE and volume is not None:

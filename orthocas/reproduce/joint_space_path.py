@@ -65,12 +65,14 @@ def coordinate_grid(chart: Chart, start: Array, target: float, grid: Array) -> A
     nearest = [int(np.abs(values).argmin()) for values in grid]
     points = np.empty((len(grid[0]), len(grid[1]), 3))
     first, second = nearest
-    points[first, second] = chart.inverse([target, grid[0][first], grid[1][second]], start)
+    points[first, second] = chart.inverse([target, grid[0][first], grid[1][second]], start, outside=True)
     for row, before in _outwards(first, len(grid[0])):
-        points[row, second] = chart.inverse([target, grid[0][row], grid[1][second]], points[before, second])
+        points[row, second] = chart.inverse(
+            [target, grid[0][row], grid[1][second]], points[before, second], outside=True
+        )
     for column, before in _outwards(second, len(grid[1])):
         wanted = np.column_stack([np.full_like(grid[0], target), grid[0], np.full_like(grid[0], grid[1][column])])
-        points[:, column] = chart.inverse(wanted, points[:, before])
+        points[:, column] = chart.inverse(wanted, points[:, before], outside=True)
     return points
 
 
