@@ -48,8 +48,9 @@ def check_c(
         CompileError: if there is no compiler, or compilation fails.
         ProofError: if a result differs by more than 1e-10 of its largest entry (single precision: 1e-3), or a status
             differs. Near singularities, where one rounding of q, or of one joint, changes commands by more than 1e-12
-            (1e-5), the accepted difference is a hundred times that change. In single precision, that of commands also grows with the inverse square of the volume of the gradients, relative to its median, and
-            their status may be that of a place within 0.01 half-widths.
+            (1e-5), the accepted difference is a hundred times that change. In single precision, that of commands also
+            grows with the inverse square of the volume of the gradients, relative to its median, and their status may
+            be that of a place within 0.01 half-widths.
     """
     require_kind("chart", chart, Chart)
     n, precision = chart.n, SINGLE if generated.single_precision else DOUBLE
