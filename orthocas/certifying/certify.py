@@ -24,7 +24,7 @@ from orthocas.minimising.watch import Monitor, Progress, silent
 _SAMPLES = 20_000  # points where folds are looked for before the proof
 _SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
 _FEW_BOXES, _HOPELESS = 300, 2_000  # for one scale; then a search that goes too slowly ends
-_MANY_BOXES = (500, 40_000)  # the least and the most; between them, ten times what the proof without folds took
+_MANY_BOXES = (500, 40_000)  # the least and the most; between them, three times what the proof without folds took
 _HELD_RANGE = 1.0  # half-width of a leading joint on which J does not depend, if its whole range is too wide
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
@@ -92,7 +92,7 @@ def certify(
         search.run(_shown(monitor, "regular"))
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
-            most = int(np.clip(10 * search.judged, *_MANY_BOXES))
+            most = int(np.clip(3 * search.judged, *_MANY_BOXES))
             injective = _one_to_one(chart, rows, base, Limits(left, boxes=most), executor, monitor)
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
