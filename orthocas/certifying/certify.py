@@ -23,8 +23,8 @@ from orthocas.minimising.watch import Monitor, Progress, silent
 
 _SAMPLES = 20_000  # points where folds are looked for before the proof
 _SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
-_FEW_BOXES, _HOPELESS = 300, 2_000  # for one scale; then a search that goes too slowly ends
-_MANY_BOXES = (500, 40_000)  # the least and the most; between them, three times what the proof without folds took
+_FEW_BOXES = 300  # for one scale
+_MANY_BOXES = (500, 45_000)  # the least and the most; between them, three times what the proof without folds took
 _HELD_RANGE = 1.0  # half-width of a leading joint on which J does not depend, if its whole range is too wide
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
@@ -256,7 +256,7 @@ def _one_to_one(
         middle, own = (part.low + part.high)[None] / 2, replace(judge, low=part.low, high=part.high)
         if not own(middle, middle).proved.all():  # the middle of points that may be farthest apart
             return False
-        left = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=_HOPELESS)
+        left = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=most // 4)
         search = Search(own, part, left, largest_first(part), executor)
         search.run(_shown(monitor, "one-to-one"))
         if search.finished:
