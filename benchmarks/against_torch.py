@@ -98,7 +98,7 @@ def ours(setting: tuple[float, ...], seed: int) -> Attempt:
 
 def of_torch(compiled: bool, setting: tuple[float, ...], seed: int) -> Attempt:
     """Adam in PyTorch."""
-    from torch_peer import PeerSettings, train  # noqa: PLC0415, only the process that needs it loads it
+    from torch_peer import PeerSettings, train
 
     steps, batch, rate = setting
     settings = PeerSettings(steps=int(steps), batch=int(batch), learning_rate=rate, weights=WEIGHTS)
@@ -108,8 +108,8 @@ def of_torch(compiled: bool, setting: tuple[float, ...], seed: int) -> Attempt:
 
 def of_jax(setting: tuple[float, ...], seed: int) -> Attempt:
     """Adam in JAX."""
-    from jax_peer import train  # noqa: PLC0415
-    from torch_peer import PeerSettings  # noqa: PLC0415
+    from jax_peer import train
+    from torch_peer import PeerSettings
 
     steps, batch, rate = setting
     settings = PeerSettings(steps=int(steps), batch=int(batch), learning_rate=rate, weights=WEIGHTS)
@@ -119,7 +119,7 @@ def of_jax(setting: tuple[float, ...], seed: int) -> Attempt:
 
 def of_scipy(setting: tuple[float, ...], seed: int) -> Attempt:
     """L-BFGS of SciPy on gradients from JAX."""
-    from jax_peer import DescentSettings, descend  # noqa: PLC0415
+    from jax_peer import DescentSettings, descend
 
     hidden, samples, steps = map(int, setting)
     settings = DescentSettings(hidden, samples, steps, WEIGHTS)

@@ -86,7 +86,7 @@ def measured(case: Case, samples: int, wall: bool) -> Point:
 def peer(schedule: tuple[int, int, float], quick: bool) -> Point | None:
     """PyTorch's network with one schedule; None without PyTorch. Its conditioning is not measured."""
     try:
-        from torch_peer import PeerSettings, train  # noqa: PLC0415, needs the optional PyTorch
+        from torch_peer import PeerSettings, train
     except ModuleNotFoundError:
         return None
     steps, batch, rate = (2, 10, 1e-2) if quick else schedule

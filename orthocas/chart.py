@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
@@ -178,8 +177,9 @@ class Chart(InverseMethods, Shown):
         Raises:
             InvalidValueError: if the chart is not finite at the centre of the domain.
         """
-        figure: Figure = import_module("orthocas.plotting").self_motion_figure(self, reach=None)
-        return figure
+        from orthocas.judging.figures import self_motion_figure  # with matplotlib, which takes long to import
+
+        return self_motion_figure(self, reach=None)
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Write a self-contained chart file. It replaces a chart file of that name, and with `force` any other file.

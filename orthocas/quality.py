@@ -1,7 +1,6 @@
 """The quality of a chart on its domain: angles and conditioning ([AS2023] Figs. 20 and 27), leaks and folds (ours)."""
 
 from dataclasses import asdict, dataclass
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -74,8 +73,9 @@ class Report(Shown):
 
     def plot(self) -> "Figure":
         """Histograms of angles and leaks, as a matplotlib figure; see `orthocas.plotting.quality_figure`."""
-        figure: Figure = import_module("orthocas.plotting").quality_figure(self)
-        return figure
+        from orthocas.judging.figures import quality_figure  # with matplotlib, which takes long to import
+
+        return quality_figure(self)
 
     def facts(self) -> dict[str, str]:
         """Angles, conditioning, lengths, and the faults of the chart if there are any."""

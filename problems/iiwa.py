@@ -17,7 +17,7 @@ HALF_WIDTH = np.pi / 4  #: [rad]
 
 def urdf_path() -> AbstractContextManager[Path]:
     """The path of the arm's URDF file, valid while the context is open."""
-    return as_file(files("orthocas.problems") / "data" / "iiwa7_r800.urdf")
+    return as_file(files(__package__) / "data" / "iiwa7_r800.urdf")
 
 
 def robot() -> Robot:

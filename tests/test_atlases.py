@@ -15,9 +15,9 @@ from orthocas.atlases.chart_of_box import moved
 from orthocas.atlases.cube_basis import CubeBasis
 from orthocas.atlases.outcomes import Outcome
 from orthocas.atlases.plan import make_plan
-from orthocas.atlases.regions import read_postures
 from orthocas.checks import Array
 from orthocas.errors import InvalidValueError, PathFileError
+from orthocas.robots.postures_file import read_postures
 
 
 def test_seven_joint_arm_has_the_symmetries_of_its_spherical_joints(iiwa: oc.Problem) -> None:

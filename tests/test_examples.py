@@ -263,7 +263,7 @@ def test_benchmark_of_batches_prints_rows() -> None:
 
 def test_gradients_agree_with_pytorch() -> None:
     pytest.importorskip("torch")
-    import gradients  # noqa: PLC0415, needs the optional torch
+    import gradients
 
     assert len(gradients.main(quick=True)) == 2  # it checks values and gradients before timing
 

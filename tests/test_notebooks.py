@@ -104,8 +104,8 @@ def test_terminals_get_lines_and_files_nothing() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("nbclient") is None or find_spec("ipykernel") is None, reason="no nbclient and ipykernel")
 def test_a_notebook_runs_and_holds_pictures() -> None:
-    import nbclient  # type: ignore[import-not-found]  # noqa: PLC0415
-    import nbformat  # type: ignore[import-not-found]  # noqa: PLC0415
+    import nbclient  # type: ignore[import-not-found]
+    import nbformat  # type: ignore[import-not-found]
 
     cells = [
         "import orthocas as oc\nproblem = oc.problems.get('planar_3r_xy')",

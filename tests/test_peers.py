@@ -44,7 +44,7 @@ def test_the_model_of_the_peers_is_that_of_the_chart() -> None:
 @pytest.mark.slow
 def test_plans_in_xi_keep_the_tool_in_place() -> None:
     pytest.importorskip("ompl")
-    import planning  # noqa: PLC0415, needs the optional ompl
+    import planning
 
     rows = planning.main(quick=True)
     assert [row.split("|")[1].strip() for row in rows] == list(planning.SPACES)
@@ -54,7 +54,7 @@ def test_plans_in_xi_keep_the_tool_in_place() -> None:
 @pytest.mark.slow
 def test_regions_of_xi_are_free() -> None:
     pytest.importorskip("pydrake")
-    import convex_regions  # noqa: PLC0415, needs the optional drake
+    import convex_regions
 
     (row,) = convex_regions.main(quick=True)
     assert float(row.split("|")[4].split()[0]) > 98

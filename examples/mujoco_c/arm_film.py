@@ -72,7 +72,7 @@ def save_drawing(path: Path, log: Log, ticks: np.ndarray, chart: oc.Chart) -> No
 def _pictures(scene: Path, q: np.ndarray, pushes: np.ndarray) -> Iterator[np.ndarray]:
     if "DISPLAY" not in os.environ:
         os.environ.setdefault("MUJOCO_GL", "egl")  # else MuJoCo looks for a screen
-    import mujoco  # noqa: PLC0415, reads the variable
+    import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(scene))
     data = mujoco.MjData(model)

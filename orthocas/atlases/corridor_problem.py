@@ -3,13 +3,13 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.atlases.plan import joint_range
 from orthocas.checks import Array, as_number, as_point_set, require_kind
 from orthocas.domains import Box
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.idle_joints import idle_joints
 from orthocas.parametrisations.cyclic_joints import cyclic_joints, over_cyclic_joints
 from orthocas.postures.corridor import Corridor
+from orthocas.postures.joint_range import joint_range
 from orthocas.problem import Problem
 from orthocas.samples import sample_problem
 

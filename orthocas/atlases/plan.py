@@ -10,16 +10,14 @@ from orthocas.atlases.symmetry import Symmetries, find_symmetries, identity_only
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, as_number, require_at_least, require_count, require_kind
 from orthocas.domains import Box, sample_uniform
-from orthocas.errors import DomainError, InvalidValueError
+from orthocas.errors import InvalidValueError
 from orthocas.fitting.idle_joints import idle_joints
 from orthocas.parametrisations.cyclic_joints import leaf_cyclic_joints, over_cyclic_joints
+from orthocas.postures.joint_range import joint_range
 from orthocas.postures.row_scale import row_scale
 from orthocas.problem import Problem, task_jacobians
-from orthocas.robots import Robot
-from orthocas.robots.tree import PRISMATIC_ROOM
 from orthocas.samples import sample_problem
 
-_PRISMATIC_MARGIN = 0.02  # of the range of a prismatic joint
 _SCALE_SAMPLES, _FIRST_SAMPLES, _SEED = 2000, 200, 0
 _MOST_SPLITS = 16  # addresses of boxes in files have as many bits
 _MOST_TILES = 10**12
@@ -157,34 +155,6 @@ def make_plan(problem: Problem, settings: AtlasSettings, margin_deg: float) -> P
     points = sample_uniform(problem.domain, _SCALE_SAMPLES, _SEED)
     scale = row_scale(task_jacobians(local, points), problem.task.units)
     return Plan(problem, settings, idle, cyclic, lattice_of(problem, joints, maps, settings), maps, scale)
-
-
-def joint_range(robot: Robot, margin_deg: float) -> Box:
-    """The box of all joint positions farther than a margin from the limits. Endless joints have a full turn.
-
-    Raises:
-        DomainError: if a joint has no range left.
-    """
-    margin = np.radians(as_number("margin_deg", margin_deg))
-    if not 0 <= margin < np.pi:
-        raise InvalidValueError("margin_deg", margin_deg, "an angle from 0 to below 180 degrees")
-    prismatic = np.array(robot.tree.prismatic)
-    missing = np.isinf(robot.lower) | np.isinf(robot.upper)
-    middle = robot.tree.middle
-    low = np.where(missing, middle - PRISMATIC_ROOM, robot.lower)
-    high = np.where(missing, middle + PRISMATIC_ROOM, robot.upper)
-    room = np.where(prismatic, _PRISMATIC_MARGIN * (high - low), margin) * ~missing
-    low, high = low + room, high - room
-    endless = ~prismatic & (missing | (robot.upper - robot.lower >= 2 * np.pi))
-    low[endless], high[endless] = -np.pi, np.pi
-    empty = np.flatnonzero(low >= high)
-    if empty.size:
-        name = robot.joint_names[int(empty[0])]
-        raise DomainError(
-            f"joint '{name}' has no range left with a margin of {margin_deg:g} deg, expected a smaller one"
-        )
-    free = endless & np.isinf(robot.lower) & np.isinf(robot.upper)
-    return Box((low + high) / 2, (high - low) / 2, np.flatnonzero(free).tolist())
 
 
 def lattice_of(problem: Problem, joints: tuple[int, ...], maps: Symmetries, settings: AtlasSettings) -> Lattice:

@@ -1,7 +1,6 @@
 """Regions of joint space that an atlas covers: the joint range, or the neighbourhood of some postures (ours)."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -11,10 +10,7 @@ from orthocas.atlases.lattice import Lattice
 from orthocas.checks import Array, Indices, as_float_array, as_number, frozen_array
 from orthocas.domains import Domain
 from orthocas.errors import InvalidValueError
-from orthocas.files.csv_table import places, read_table
-from orthocas.robots import Robot
 
-_MOST_POSTURES = 1_000_000
 _SLACK = 1e-9  # [rad] or [m]
 _MOST_TILES = 2_000_000  # in the joint range; more would take days
 
@@ -128,16 +124,3 @@ def surroundings(postures: object, radius: float, joints: tuple[int, ...], domai
         raise InvalidValueError("radius", radius, "a positive number below pi")
     whole = joint_range_of(domain, joints)
     return Surroundings(whole.low, whole.high, given[:, list(joints)], size)
-
-
-def read_postures(path: Path, robot: Robot) -> Array:
-    """Postures (N, n) of a CSV file: a header with the names of joints in any order, and one posture a line.
-
-    Columns of other names, such as those of time and velocities, are left alone.
-
-    Raises:
-        PathFileError: names the file, the line, and what is wrong there.
-    """
-    return read_table(
-        path, "postures file", "postures", _MOST_POSTURES, lambda names: places(names, robot.joint_names), least=1
-    )

@@ -56,7 +56,7 @@ class Card(Shown):
     @property
     def licence_text(self) -> str:
         """The licence of the robot's model."""
-        return (files("orthocas.charts") / "licences" / f"{self.model.licence}.txt").read_text(encoding="utf-8")
+        return (files(__package__) / "licences" / f"{self.model.licence}.txt").read_text(encoding="utf-8")
 
     def facts(self) -> dict[str, str]:
         """Quality, domain, proof, and where the chart comes from."""

@@ -6,7 +6,7 @@ from orthocas.chart import Chart
 from orthocas.charts.card import Card
 from orthocas.checks import require_known
 
-_DATA = files("orthocas.charts") / "data"
+_DATA = files(__package__) / "data"
 _CARD = ".json"
 
 

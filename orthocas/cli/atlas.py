@@ -12,7 +12,6 @@ from orthocas.atlases.building import MARGIN_DEG, RADIUS, build_atlas
 from orthocas.atlases.coverage import evaluate_atlas
 from orthocas.atlases.pictures import draw_coverage
 from orthocas.atlases.plan import AtlasSettings
-from orthocas.atlases.regions import read_postures
 from orthocas.certifying.scheduler import scheduler_executor
 from orthocas.checks import require_count
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
@@ -20,6 +19,7 @@ from orthocas.cli.problem_argument import CHAIN, ProblemName, ProblemOptions, bu
 from orthocas.cli.progress import terminal_monitor
 from orthocas.errors import Interrupted
 from orthocas.files.atomic import output_folder
+from orthocas.robots.postures_file import read_postures
 
 atlas = typer.Typer(
     help="Build, evaluate and show atlases: charts that cover the joint range of an arm.",

@@ -8,7 +8,6 @@ import typer
 from orthocas.atlases.atlas import Atlas
 from orthocas.atlases.atlas_file import ATLAS
 from orthocas.atlases.part import AtlasPart
-from orthocas.atlases.regions import read_postures
 from orthocas.casadi_tools.interrupts import deferred
 from orthocas.chart import Chart
 from orthocas.cli.controller_argument import (
@@ -34,6 +33,7 @@ from orthocas.codegen import GeneratedC, Proof, check_c, check_c_of_atlas, gener
 from orthocas.control import Controller
 from orthocas.errors import InvalidValueError
 from orthocas.files.blocks import begins
+from orthocas.robots.postures_file import read_postures
 
 _NONE = "none"
 

@@ -6,11 +6,11 @@ from typing import Annotated
 import typer
 
 from orthocas.atlases.corridor_problem import RADIUS, corridor_problem
-from orthocas.atlases.regions import read_postures
 from orthocas.cli.output import number
 from orthocas.cli.problem_argument import ProblemOptions, build_problem
 from orthocas.errors import InvalidValueError
 from orthocas.problem import Problem
+from orthocas.robots.postures_file import read_postures
 
 CorridorPath = Annotated[
     Path | None,

@@ -1,6 +1,5 @@
 """Where the command line begins: signals first, then the imports, which take a second."""
 
-import importlib
 import os
 import signal
 import sys
@@ -30,9 +29,10 @@ def leave_on_ctrl_c() -> None:
 
 def main() -> None:
     """Run the command line."""
+    from orthocas.cli import commands  # takes a second
+
     watched = signal.getsignal(signal.SIGINT) is _leave
     os.environ["MPLBACKEND"] = "agg"  # pictures go to files; a name that is none would stop matplotlib
-    commands = importlib.import_module("orthocas.cli.commands")  # not above, since it takes a second
     app = commands.app_for(sys.argv[1:])  # which imports the command
     try:
         if watched:

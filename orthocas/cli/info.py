@@ -1,6 +1,5 @@
 """`orthocas info`: what a chart, a named problem or a robot file holds."""
 
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +37,7 @@ def info(target: ProblemName, words: ProblemOptions, json: AsJson = False) -> No
         data = _problem(build_problem(target, words))
     else:
         words.require_no_robot(f"the chart {target}")
-        chart = import_module("orthocas.chart").load(_chart_path(target))  # not above: problems need no charts
+        chart = _load(_chart_path(target))
         data = {
             **_problem(chart.problem),
             "parametrisation": chart.coordinates.label,
@@ -51,6 +50,12 @@ def info(target: ProblemName, words: ProblemOptions, json: AsJson = False) -> No
         print_json(data)
     else:
         print_rows({name: _text(value) for name, value in data.items()})
+
+
+def _load(path: Path) -> "Chart":
+    from orthocas.chart import load  # takes long to import, and problems and robots do not need it
+
+    return load(path)
 
 
 def _chart_path(target: str) -> Path:

@@ -3,9 +3,9 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
+from typing import Any
 
-from orthocas.minimising.watch import Monitor, silent
+from orthocas.minimising.watch import Monitor, Progress, silent
 
 
 @contextmanager
@@ -14,5 +14,26 @@ def terminal_monitor() -> Iterator[Monitor]:
     if not sys.stderr.isatty():
         yield silent
         return
-    with import_module("orthocas.cli.bars").stage_bars() as show:  # rich takes longer to import than the rest
+    with _stage_bars() as show:
+        yield show
+
+
+@contextmanager
+def _stage_bars() -> Iterator[Monitor]:
+    """A monitor that draws one bar per stage by rich."""
+    from rich.console import Console  # takes longer to import than the rest
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[detail]}"))
+    tasks: dict[str, Any] = {}
+    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+
+        def show(progress: Progress) -> None:
+            if progress.stage not in tasks:
+                for task in tasks.values():
+                    bars.update(task, completed=1.0)
+                tasks[progress.stage] = bars.add_task(progress.stage, total=1.0, detail="")
+            bars.update(tasks[progress.stage], completed=progress.fraction, detail=progress.detail)
+
         yield show

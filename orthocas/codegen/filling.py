@@ -7,4 +7,4 @@ from string import Template
 
 def filled(template: str, values: Mapping[str, str]) -> str:
     """A template of `templates/` with its placeholders filled in."""
-    return Template((files("orthocas.codegen") / "templates" / f"{template}.in").read_text()).substitute(values)
+    return Template((files(__package__) / "templates" / f"{template}.in").read_text()).substitute(values)

@@ -55,7 +55,7 @@ def loaded(library: Path) -> ctypes.CDLL:
 
 def template(name: str) -> str:
     """A file of `templates/`."""
-    return (files("orthocas.codegen") / "templates" / name).read_text()
+    return (files(__package__) / "templates" / name).read_text()
 
 
 def _compile(command: list[str]) -> None:

@@ -59,7 +59,7 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
         data, program = folder / "states", folder / "ticks"
         numbers = np.concatenate([part.ravel() for law, _ in cases for part in (_states(law), gain_numbers(law))])
         first.numbers(numbers).tofile(data)
-        source = files("orthocas.codegen") / "templates" / "ticks.c"
+        source = files(__package__) / "templates" / "ticks.c"
         (folder / "ticks.c").write_text(source.read_text())
         number = f"-DNUMBER={first.precision.c_name}"
         _run([compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -11,8 +11,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from orthocas.comparing.cells import CellResult
-from orthocas.comparing.report import Comparison, Summary
 from orthocas.showing.picture import Picture
+
+if TYPE_CHECKING:
+    from orthocas.comparing.report import Comparison, Summary
 
 Colour = tuple[float, float, float, float]
 _HUES = {"linear": "Greys", "polynomial": "Blues", "fourier": "Greens", "mlp": "Oranges", "sew": "Purples"}
@@ -22,7 +24,7 @@ _ROOM = 2.0  # the largest loss in the picture, over the largest final one
 _STYLES = ("-", "--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)))
 
 
-def front_figure(comparison: Comparison) -> Figure:
+def front_figure(comparison: "Comparison") -> Figure:
     """Task angle against mutual angle of all fits. Fits further down and left are better.
 
     The colour shows the parametrisation, the marker the solver, and the size the number of parameters. Each
@@ -59,7 +61,7 @@ def front_figure(comparison: Comparison) -> Figure:
     return figure
 
 
-def convergence_figure(comparison: Comparison) -> Figure:
+def convergence_figure(comparison: "Comparison") -> Figure:
     """Training loss over time, one line per fit, from the beginning of its last stage: that of all its parameters."""
     figure = Picture(figsize=(8.6, 5.2), layout="constrained")
     axes = figure.add_subplot()
@@ -82,7 +84,7 @@ def convergence_figure(comparison: Comparison) -> Figure:
     return figure
 
 
-def _problem(comparison: Comparison) -> str:
+def _problem(comparison: "Comparison") -> str:
     return comparison.results[0].problem if comparison.results else ""
 
 
@@ -106,16 +108,16 @@ def _size(parameters: int) -> float:
     return 30 + 25 * math.log10(1 + parameters)
 
 
-def _place(summary: Summary, single: bool) -> tuple[float, float]:
+def _place(summary: "Summary", single: bool) -> tuple[float, float]:
     """Where a summary lies in the picture."""
     return summary.task_std_deg, summary.conditioning_p01 if single else summary.mutual_std_deg
 
 
-def _key(summary: Summary) -> tuple[str, str]:
+def _key(summary: "Summary") -> tuple[str, str]:
     return summary.parametrisation, summary.solver
 
 
-def _draw_front(axes: Axes, summaries: Sequence[Summary], single: bool) -> None:
+def _draw_front(axes: Axes, summaries: "Sequence[Summary]", single: bool) -> None:
     """Connect the points that no other one beats in both directions; summaries have the least task angle first."""
     front: list[tuple[float, float]] = []
     for summary in summaries:
@@ -125,7 +127,7 @@ def _draw_front(axes: Axes, summaries: Sequence[Summary], single: bool) -> None:
     axes.plot(*zip(*front, strict=True), color="0.6", linewidth=1.0, zorder=0)
 
 
-def _label(axes: Axes, summaries: Sequence[Summary], single: bool, colours: Mapping[str, Colour]) -> None:
+def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Mapping[str, Colour]) -> None:
     """Write each parametrisation once, beside its least task angle; labels that would touch move up or down."""
     best: dict[str, Summary] = {}
     for summary in summaries:

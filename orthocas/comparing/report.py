@@ -5,7 +5,6 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
-from importlib import import_module
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -91,8 +90,9 @@ class Comparison(Shown):
 
     def plot(self) -> "Figure":
         """Errors of all fits over what they cost, as a matplotlib figure; see `orthocas.plotting.front_figure`."""
-        figure: Figure = import_module("orthocas.comparing.figures").front_figure(self)
-        return figure
+        from orthocas.comparing.figures import front_figure  # with matplotlib, which takes long to import
+
+        return front_figure(self)
 
     def rows(self) -> list[list[str]]:
         """The rows of a readable table, with the header first."""

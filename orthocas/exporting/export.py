@@ -121,7 +121,7 @@ def _indices(name: str, values: Sequence[int]) -> str:
 
 
 def _template(name: str) -> str:
-    return files("orthocas.exporting").joinpath("templates", f"{name}.py.in").read_text(encoding="utf-8")
+    return files(__package__).joinpath("templates", f"{name}.py.in").read_text(encoding="utf-8")
 
 
 def _filled(template: str, values: Mapping[str, str]) -> str:

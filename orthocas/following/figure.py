@@ -1,17 +1,19 @@
 """Pictures of joint motions: positions, speeds, and the quantities along the tool path."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from orthocas.checks import Array
-from orthocas.following.joint_motion import JointMotion
 from orthocas.showing.picture import Picture
 
+if TYPE_CHECKING:
+    from orthocas.following.joint_motion import JointMotion
 
-def motion_figure(motion: JointMotion) -> Figure:
+
+def motion_figure(motion: "JointMotion") -> Figure:
     """Joint positions and speeds on the left, task values and coordinates on the right, all over time."""
     figure = Picture(figsize=(10.5, 5.0), layout="constrained")
     grid: Any = figure.subplots(2, 2, sharex=True)

@@ -3,7 +3,6 @@
 import csv
 import io
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -83,8 +82,9 @@ class JointMotion(Shown):
 
     def plot(self) -> "Figure":
         """Joints, speeds, task values and coordinates over time, as a matplotlib figure."""
-        figure: Figure = import_module("orthocas.following.figure").motion_figure(self)
-        return figure
+        from orthocas.following.figure import motion_figure  # with matplotlib, which takes long to import
+
+        return motion_figure(self)
 
     def save_csv(self, path: str | Path, force: bool = False) -> None:
         """Write a CSV file: time_s, then q, dq and ddq of each joint, task values, and coordinates.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from orthocas.checks import Array
-from orthocas.fitting.loss import pairs
+from orthocas.judging.pairs import pairs
 from orthocas.samples import Samples
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from orthocas.casadi_tools.blocks import BlockFunction, fill
 from orthocas.casadi_tools.columns import ColumnFunction
 from orthocas.checks import Array
-from orthocas.fitting.loss import pairs
+from orthocas.judging.pairs import pairs
 from orthocas.judging.small_matrices import determinant_sign, laguerre, tridiagonal, unfinished, whitened
 from orthocas.samples import Samples
 

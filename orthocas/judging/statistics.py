@@ -8,8 +8,8 @@ import numpy as np
 
 from orthocas.casadi_tools.threads import in_threads
 from orthocas.checks import Array, Indices
-from orthocas.fitting.loss import pairs
 from orthocas.judging.gradients import Judged
+from orthocas.judging.pairs import pairs
 
 _BIN = 0.1  # [deg]; the middle angle lies in the middle of its bin
 _PIECE = 2**13  # samples that a thread takes at once

@@ -1,7 +1,7 @@
 """Figure of a run: controlled quantities with their references, joints, commands and storage over time."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +11,9 @@ from orthocas.checks import Array
 from orthocas.control.status import FROM_THE_LAW, ControlStatus
 from orthocas.problem import Problem
 from orthocas.showing.picture import Picture
-from orthocas.simulation.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from orthocas.simulation.trajectory import Trajectory
 
 ACTUAL, FALLBACK = "#3d85c6", "#d62728"
 _WANTED, _STORAGE = "#222222", "#1b9e77"
@@ -27,7 +29,7 @@ def units_of(problem: Problem) -> dict[str, str]:
     return units | {label: unit for label, unit in zip(problem.task.labels, problem.task.units, strict=True) if unit}
 
 
-def trajectory_figure(trajectory: Trajectory, units: Mapping[str, str] | None = None) -> Figure:
+def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None = None) -> Figure:
     """Draw controlled quantities on the left; joints, commands and storage on the right. Red: not the law.
 
     Args:
@@ -56,7 +58,7 @@ def trajectory_figure(trajectory: Trajectory, units: Mapping[str, str] | None = 
     return figure
 
 
-def draw_quantities(panels: Array, trajectory: Trajectory, units: Mapping[str, str], drawn: bool = True) -> None:
+def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str, str], drawn: bool = True) -> None:
     """Draw the reference and, if `drawn`, the actual value of each quantity in its own axes."""
     good = ~trajectory.fell_back & np.isfinite(trajectory.value).all(axis=1)
     seen = np.vstack(
@@ -75,7 +77,7 @@ def draw_quantities(panels: Array, trajectory: Trajectory, units: Mapping[str, s
         _style(axes, trajectory)
 
 
-def shade_fallback(axes: Axes, trajectory: Trajectory) -> None:
+def shade_fallback(axes: Axes, trajectory: "Trajectory") -> None:
     """Shade in red where the controller used its fallback."""
     edges = np.flatnonzero(np.diff(trajectory.status)) + 1
     for start, end in zip([0, *edges], [*edges, len(trajectory.times) - 1], strict=True):
@@ -84,7 +86,7 @@ def shade_fallback(axes: Axes, trajectory: Trajectory) -> None:
             axes.axvspan(trajectory.times[start], trajectory.times[end], color=FALLBACK, alpha=0.15, linewidth=0)
 
 
-def _draw_others(panels: Array, trajectory: Trajectory, units: Mapping[str, str]) -> None:
+def _draw_others(panels: Array, trajectory: "Trajectory", units: Mapping[str, str]) -> None:
     """Draw joints, commands and, for torque controllers, the storage."""
     torque = trajectory.kind == "torque"
     unit = " or ".join(sorted({units.get(name, "rad or m") for name in trajectory.joint_names}, reverse=True))
@@ -104,14 +106,14 @@ def _draw_others(panels: Array, trajectory: Trajectory, units: Mapping[str, str]
         _style(axes, trajectory)
 
 
-def _style(axes: Axes, trajectory: Trajectory) -> None:
+def _style(axes: Axes, trajectory: "Trajectory") -> None:
     axes.set_xlim(trajectory.times[0], max(trajectory.times[-1], 1e-9))
     axes.ticklabel_format(useOffset=False)
     axes.tick_params(labelsize=_SMALL)
     axes.grid(alpha=0.3)
 
 
-def _title(trajectory: Trajectory) -> str:
+def _title(trajectory: "Trajectory") -> str:
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
         text += f": {trajectory.outcome.value}, run ended early"

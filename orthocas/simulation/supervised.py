@@ -1,7 +1,6 @@
 """The supervised law of generated C in closed loops, called by a program that asks for the law again after a catch."""
 
 from collections.abc import Iterator
-from importlib import import_module
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -65,7 +64,8 @@ class SupervisedLaw:
 
 def _compiled(controller: Controller, safety: Safety) -> "Supervisor":
     """The supervised law in C. It stays loaded when its folder is gone."""
-    codegen = import_module("orthocas.codegen")  # not above: few runs need a code generator and a compiler
+    from orthocas import codegen  # few runs need a code generator and a compiler
+
     with draft_folder() as folder:
         generated = codegen.generate_c(controller.chart, folder / "law", controller, "law", safety=safety)
         library = codegen.compile_shared(generated, generated.folder)

@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -143,8 +142,9 @@ class Trajectory(Shown):
         Args:
             units: units of the quantities by label, as `orthocas.simulation.figure.units_of(problem)` has them.
         """
-        figure: Figure = import_module("orthocas.simulation.figure").trajectory_figure(self, units)
-        return figure
+        from orthocas.simulation.figure import trajectory_figure  # with matplotlib, which takes long to import
+
+        return trajectory_figure(self, units)
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Write an NPZ file with all arrays, names and units. The file appears whole or not at all.

@@ -1,17 +1,12 @@
 """The task term and the mutual term: cosines between gradients ([AS2023] eq. (24))."""
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import casadi as ca
 
 from orthocas.checks import require_shape
 from orthocas.fitting.loss.term import Data, Sizes
-
-
-def pairs(r: int) -> list[tuple[int, int]]:
-    """The pairs (i, j), i > j, of r coordinates in the order of the mutual cosines."""
-    return [(i, j) for j, i in combinations(range(r), 2)]
+from orthocas.judging.pairs import pairs
 
 
 def task_cosines(unit_task_gradients: ca.SX, coordinate_jacobian: ca.SX) -> ca.SX:
