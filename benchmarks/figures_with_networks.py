@@ -1,11 +1,16 @@
 """The figures of fits with networks in place of polynomials, several starts each: the numbers side by side (20 min)."""
 
 import argparse
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from orthocas.parametrisations import MLP
-from orthocas.reproduce import FIGURES, ChosenFit
-from orthocas.reproduce.chosen_fit import USUAL
+
+sys.path.append(str(Path(__file__).parent.parent / "examples"))
+
+from paper import FIGURES, ChosenFit
+from paper.chosen_fit import USUAL
 
 NUMBERS: dict[str, tuple[str, ...]] = {  # of each figure
     "fig19": ("mean_tilt_in_section_deg", "task_angle_std_deg"),

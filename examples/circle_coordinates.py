@@ -14,17 +14,9 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-
-import orthocas as oc
-from orthocas.checks import Array
-from orthocas.coordinates.fitted import Coordinates
-from orthocas.coordinates.turns import shortest
-from orthocas.parametrisations import JointSpace
-from orthocas.parametrisations.circle import CircleFamily
-from orthocas.parametrisations.product_basis import ProductFamily
-from orthocas.reproduce.chosen_fit import USUAL
-from orthocas.reproduce.planar_fit import freely_fitted, with_other_seed
-from orthocas.reproduce.planar_flow import (
+from paper.chosen_fit import USUAL
+from paper.planar_fit import freely_fitted, with_other_seed
+from paper.planar_flow import (
     NAMES,
     cell_centres,
     corners,
@@ -34,7 +26,15 @@ from orthocas.reproduce.planar_flow import (
     mark_singular,
     planar_problem,
 )
-from orthocas.reproduce.style import joint_plane
+from paper.style import joint_plane
+
+import orthocas as oc
+from orthocas.checks import Array
+from orthocas.coordinates.fitted import Coordinates
+from orthocas.coordinates.turns import shortest
+from orthocas.parametrisations import JointSpace
+from orthocas.parametrisations.circle import CircleFamily
+from orthocas.parametrisations.product_basis import ProductFamily
 from orthocas.samples import samples_at
 from orthocas.singularities import singular_points
 from orthocas.solvers import GaussNewton

@@ -19,12 +19,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-
-import orthocas as oc
-from orthocas import problems
-from orthocas.control.damping import DampingDesign
-from orthocas.reproduce.fig25 import parts
-from orthocas.reproduce.planar_loop import (
+from paper.fig25 import parts
+from paper.planar_loop import (
     ALL_OF_X,
     ALL_OF_XY,
     DAMPING_RATIO,
@@ -41,6 +37,10 @@ from orthocas.reproduce.planar_loop import (
     Run,
     follow,
 )
+
+import orthocas as oc
+from orthocas import problems
+from orthocas.control.damping import DampingDesign
 
 
 @dataclass(frozen=True)

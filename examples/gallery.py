@@ -3,9 +3,8 @@
 import argparse
 from pathlib import Path
 
+from paper import reproduce
 from PIL import Image
-
-from orthocas.reproduce import reproduce
 
 WIDTH = 1100  #: pixels, enough for a page
 

@@ -1,6 +1,6 @@
 """A posture spring hides behind a projector and then discharges; a spring in xi does not (3 s).
 
-The arm and both springs are those of Fig. 2 (`orthocas reproduce fig02`). At 1 s, both controllers receive a target
+The arm and both springs are those of Fig. 2 (`python -m examples.paper fig02`). At 1 s, both controllers get a target
 posture half a turn along the self-motion curve; at 8 s, a tip target 0.1 m nearer to the base. The projector cancels
 the torque of the posture spring, which stays loaded until the small motion of the tip frees it. The spring of impedance
 control in the chart has no such minimum: it is loaded while the arm moves, and then relaxes.
@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from paper.hidden_spring import POSTURE_STIFFNESS, XI_STIFFNESS, HiddenSpring
 
 import orthocas as oc
 from orthocas.control import Impedance, Projector, Reference
-from orthocas.reproduce.hidden_spring import POSTURE_STIFFNESS, XI_STIFFNESS, HiddenSpring
 from orthocas.simulation import Trajectory
 
 TASK_STIFFNESS = 500.0  # [N/m]

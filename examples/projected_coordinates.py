@@ -23,12 +23,12 @@ import hidden_spring
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from paper.hidden_spring import POSTURE_STIFFNESS, HiddenSpring
 
 import orthocas as oc
 from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector, Reference
 from orthocas.domains import sample_uniform
 from orthocas.metrics import metric_matrices
-from orthocas.reproduce.hidden_spring import POSTURE_STIFFNESS, HiddenSpring
 from orthocas.simulation import Trajectory
 
 SIZES = (0.3, 0.8)  # of the part of the domain, relative to its half-widths

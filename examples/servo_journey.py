@@ -11,12 +11,12 @@ import csv
 from pathlib import Path
 
 import numpy as np
+from paper.chosen_fit import USUAL
+from paper.fig28 import arm_chart, draw_log, journey
 
 from orthocas.chart import Chart
 from orthocas.checks import Array
 from orthocas.control import Kinematic
-from orthocas.reproduce.chosen_fit import USUAL
-from orthocas.reproduce.fig28 import arm_chart, draw_log, journey
 from orthocas.simulation import Elasticity, Friction, MuJoCoPlant, simulate
 
 TICK, LOGGED = 1e-3, 10  # period of the servos [s], and ticks between rows of the log
@@ -74,7 +74,7 @@ def coupling(chart: Chart, q: Array, desired: Array) -> dict[str, float]:
 
 
 def write_log(path: Path, chart: Chart, times: Array, q: Array, desired: Array) -> None:
-    """A CSV file that `orthocas reproduce fig28 --log` draws."""
+    """A CSV file that `python -m examples.paper fig28 --log` draws."""
     names = chart.problem.robot.joint_names
     with path.open("w", newline="") as file:
         writer = csv.writer(file)

@@ -17,6 +17,8 @@ import pinocchio as pin
 import pytest
 from charts import with_metric
 from matplotlib.figure import Figure
+from paper import FIGURES, Drawing
+from paper.__main__ import main as draw_paper
 from planar_atlas import built
 from programs import Run
 from simulate_command import SHORT
@@ -28,7 +30,6 @@ from orthocas.cli import main, simulate
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
 from orthocas.control import PDPlus, Reference
 from orthocas.fitting.fit import Fit
-from orthocas.reproduce import FIGURES, Drawing
 from orthocas.robots import files
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job starts with SIGINT ignored
@@ -205,6 +206,21 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureF
         monkeypatch.setattr(sys, "argv", ["orthocas", *words])
         with pytest.raises(SystemExit) as stop:
             main()
+        out, err = capsys.readouterr()
+        return int(stop.value.code or 0), out, err
+
+    return call
+
+
+@pytest.fixture
+def run_paper(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run `python -m examples.paper` in an empty folder, in this process."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["examples.paper", *words])
+        with pytest.raises(SystemExit) as stop:
+            draw_paper()
         out, err = capsys.readouterr()
         return int(stop.value.code or 0), out, err
 

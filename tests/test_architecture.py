@@ -17,7 +17,7 @@ SOURCES = {
     for path in sorted((ROOT / folder).rglob("*.py"))
 }
 MODULES = {name.removesuffix(".__init__"): path for name, path in SOURCES.items()}
-FACES = ("orthocas", "orthocas.__main__", "orthocas.cli", "orthocas.reproduce")  # what nothing else may import
+FACES = ("orthocas", "orthocas.__main__", "orthocas.cli", "paper")  # what nothing else may import
 LONGEST_CHAIN = 25
 FLAT_MODULES = 18
 

@@ -3,10 +3,10 @@
 import circle_coordinates
 import numpy as np
 import pytest
+from paper.planar_flow import deviations, planar_problem
 
 import orthocas as oc
 from orthocas.coordinates.turns import shortest
-from orthocas.reproduce.planar_flow import deviations, planar_problem
 
 
 @pytest.fixture(scope="module")

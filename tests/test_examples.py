@@ -32,12 +32,12 @@ import scaling
 import starts
 import suggested_domains
 import supervised_tick
+from paper.registry import FIGURES
 from PIL import Image
 from programs import needs_c
 
 import orthocas as oc
 from orthocas.domains import sample_uniform
-from orthocas.reproduce.registry import FIGURES
 
 
 @pytest.mark.slow

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from paper.joint_log import read_joint_log
 from programs import Run
 
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import PathFileError
-from orthocas.reproduce.joint_log import read_joint_log
 
 
 @pytest.fixture(scope="module")
@@ -44,14 +44,14 @@ def test_broken_logs_name_file_and_line(text: str, message: str, chart: oc.Chart
 
 
 @pytest.mark.slow
-def test_what_follow_writes_is_drawn_as_a_log(chart: oc.Chart, run: Run) -> None:
+def test_what_follow_writes_is_drawn_as_a_log(chart: oc.Chart, run_paper: Run) -> None:
     """The chart's coordinates of the log are those that were held, and the tool comes back."""
     start = chart.task(chart.problem.domain.centre)
     angle = np.linspace(0, 2 * np.pi, 30)
     circle = start + 0.05 * np.column_stack([np.cos(angle) - 1, np.sin(angle)])
     oc.follow(chart, circle, velocity_limits=1.0).save_csv("joints.csv")
     chart.save("arm.orthocas")
-    code, out, err = run("reproduce", "fig28", "--log", "joints.csv", "--chart", "arm.orthocas", "--out", "new")
+    code, out, err = run_paper("fig28", "--log", "joints.csv", "--chart", "arm.orthocas", "--out", "new")
     assert (code, err) == (0, "")
     numbers = {line.split()[0]: float(line.split()[1]) for line in out.splitlines() if line.startswith("  ")}
     assert numbers["difference_of_end_and_start_xi1"] < 1e-9

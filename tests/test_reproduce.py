@@ -16,20 +16,20 @@ import trimesh
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from paper import FIGURES, Drawing, Recipe, Scene, registry, reproduce, save, solids
+from paper.fig06 import embedded, torus_faces
+from paper.fig08 import encircles, postures
+from paper.leaves import glued, leaf, wall
+from paper.painting import Isolines, paint
+from paper.registry import chosen
+from paper.self_motion import pieces_in_cube, trace, wrapped
+from paper.style import add_3d, joint_cube, new_figure, pi_text
 from programs import Run
 
 from orthocas import problems
 from orthocas.errors import InvalidValueError, SolveError, UnknownNameError
 from orthocas.files.ours import LIST
 from orthocas.minimising.watch import Progress
-from orthocas.reproduce import FIGURES, Drawing, Recipe, Scene, registry, reproduce, save, solids
-from orthocas.reproduce.fig06 import embedded, torus_faces
-from orthocas.reproduce.fig08 import encircles, postures
-from orthocas.reproduce.leaves import glued, leaf, wall
-from orthocas.reproduce.painting import Isolines, paint
-from orthocas.reproduce.registry import chosen
-from orthocas.reproduce.self_motion import pieces_in_cube, trace, wrapped
-from orthocas.reproduce.style import add_3d, joint_cube, new_figure, pi_text
 
 Numbers = dict[str, float]
 
@@ -182,11 +182,11 @@ def test_unknown_figures_are_listed(word: str) -> None:
         chosen(word)
 
 
-def test_a_fit_is_chosen_for_figures_of_a_fit_only(run: Run, tmp_path: Path) -> None:
-    code, out, err = run("reproduce", "fig05", "--param", "mlp:4x4", "--out", "new")
+def test_a_fit_is_chosen_for_figures_of_a_fit_only(run_paper: Run, tmp_path: Path) -> None:
+    code, out, err = run_paper("fig05", "--param", "mlp:4x4", "--out", "new")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "fit is chosen for fig05, expected a figure of a fit: fig10, fig17" in err
-    code, _, err = run("reproduce", "fig20", "--log", "joints.csv", "--out", "new")
+    code, _, err = run_paper("fig20", "--log", "joints.csv", "--out", "new")
     assert (code, "--log is given for fig20, expected fig28" in err) == (2, True)
     assert not list(tmp_path.iterdir())
 
@@ -197,8 +197,8 @@ def test_unwritable_folder_is_refused(tmp_path: Path) -> None:
         reproduce("fig06", tmp_path / "file", True)
 
 
-def test_command_prints_rows_or_json(run: Run, two_figures: list[tuple[str, bool]], tmp_path: Path) -> None:
-    code, out, err = run("reproduce", "all", "--out", "new")
+def test_command_prints_rows_or_json(run_paper: Run, two_figures: list[tuple[str, bool]], tmp_path: Path) -> None:
+    code, out, err = run_paper("all", "--out", "new")
     assert (code, err) == (0, "")
     assert out.splitlines() == [
         "fig06: title of fig06",
@@ -207,7 +207,7 @@ def test_command_prints_rows_or_json(run: Run, two_figures: list[tuple[str, bool
         "  name  11",
         "files  new",
     ]
-    code, out, err = run("reproduce", "6", "--out", "new", "--quick", "--json")
+    code, out, err = run_paper("6", "--out", "new", "--quick", "--json")
     assert (code, json.loads(out), err) == (0, {"fig06": {"name": 6.0}}, "")
     assert two_figures == [("fig06", False), ("fig11", False), ("fig06", True)]
 
@@ -222,10 +222,10 @@ def test_command_prints_rows_or_json(run: Run, two_figures: list[tuple[str, bool
     ],
 )
 def test_command_refuses_before_any_work(
-    run: Run, two_figures: list[tuple[str, bool]], tmp_path: Path, words: tuple[str, ...], message: str
+    run_paper: Run, two_figures: list[tuple[str, bool]], tmp_path: Path, words: tuple[str, ...], message: str
 ) -> None:
     (tmp_path / "file").write_text("in the way")
-    code, out, err = run("reproduce", *words)
+    code, out, err = run_paper(*words)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert message in err
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

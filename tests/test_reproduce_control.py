@@ -4,14 +4,11 @@ import closed_loop_choices
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-
-from orthocas.chart import Chart
-from orthocas.domains import Box
-from orthocas.reproduce import Drawing
-from orthocas.reproduce.closed_loop_picture import draw_coordinates, draw_plane, moved
-from orthocas.reproduce.fig24 import largest_curvature
-from orthocas.reproduce.joint_space_path import coordinate_grid
-from orthocas.reproduce.planar_loop import (
+from paper import Drawing
+from paper.closed_loop_picture import draw_coordinates, draw_plane, moved
+from paper.fig24 import largest_curvature
+from paper.joint_space_path import coordinate_grid
+from paper.planar_loop import (
     ALL_OF_X,
     FOLDED,
     GENTLE,
@@ -26,6 +23,9 @@ from orthocas.reproduce.planar_loop import (
     out_of_reach,
     task_angle_std,
 )
+
+from orthocas.chart import Chart
+from orthocas.domains import Box
 
 pytestmark = pytest.mark.slow
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from paper import Drawing
+from paper.hidden_spring import HiddenSpring
 
 from orthocas.errors import SolveError
-from orthocas.reproduce import Drawing
-from orthocas.reproduce.hidden_spring import HiddenSpring
 
 pytestmark = pytest.mark.slow
 

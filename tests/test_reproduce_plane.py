@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-
-from orthocas.reproduce import Drawing
-from orthocas.reproduce.planar_flow import cosines_by_differences, deviations, flow_lines, grown_chart, planar_problem
+from paper import Drawing
+from paper.planar_flow import cosines_by_differences, deviations, flow_lines, grown_chart, planar_problem
 
 pytestmark = pytest.mark.slow
 

@@ -4,12 +4,12 @@ import casadi as ca
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from paper import FIGURES, ChosenFit, Drawing
+from paper.fig29 import unfolded
+from paper.pose_map import joints, pose, pose_jacobian
 
 import orthocas as oc
 from orthocas.parametrisations import JointSpace
-from orthocas.reproduce import FIGURES, ChosenFit, Drawing
-from orthocas.reproduce.fig29 import unfolded
-from orthocas.reproduce.pose_map import joints, pose, pose_jacobian
 
 pytestmark = pytest.mark.slow
 

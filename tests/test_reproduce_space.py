@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-
-from orthocas.reproduce import Drawing, Scene
-from orthocas.reproduce.charted_surface import add_with_edges, add_with_lines, part_below
-from orthocas.reproduce.painting import Isolines
-from orthocas.reproduce.section import curves_inside, section
+from paper import Drawing, Scene
+from paper.charted_surface import add_with_edges, add_with_lines, part_below
+from paper.painting import Isolines
+from paper.section import curves_inside, section
 
 pytestmark = pytest.mark.slow
 

@@ -12,6 +12,7 @@ from unittest.mock import patch
 
 import pytest
 from matplotlib.figure import Figure
+from paper import Drawing, Recipe, registry
 from programs import Run, python
 
 import orthocas as oc
@@ -22,7 +23,6 @@ from orthocas.errors import Interrupted
 from orthocas.minimising.best_point import BestPoint
 from orthocas.minimising.solver import Status
 from orthocas.minimising.watch import Progress
-from orthocas.reproduce import Drawing, Recipe, registry
 
 
 def ctrl_c_in_the_solver(progress: Progress) -> None:
@@ -60,7 +60,7 @@ def test_what_needs_a_finished_minimisation_ends_with_ctrl_c(planar_x: oc.Proble
         oc.distil(grown, oc.MLP((4,)), samples=200)
 
 
-def test_reproduce_does_not_draw_an_interrupted_fit(run: Run, planar_x: oc.Problem) -> None:
+def test_reproduce_does_not_draw_an_interrupted_fit(run_paper: Run, planar_x: oc.Problem) -> None:
     def draw(quick: bool) -> Drawing:
         return Drawing({"": Figure(figsize=(0.2, 0.2))}, {"one": 1.0})
 
@@ -70,7 +70,7 @@ def test_reproduce_does_not_draw_an_interrupted_fit(run: Run, planar_x: oc.Probl
 
     recipes = {"fig06": Recipe("first", draw), "fig11": Recipe("second", draw_fit)}
     with patch.dict(registry.FIGURES, recipes, clear=True):
-        code, out, err = run("reproduce", "all", "--out", "figures")
+        code, out, err = run_paper("all", "--out", "figures")
     assert (code, out, err) == (130, "", "orthocas: interrupted\n")
     assert {path.stem for path in Path("figures").glob("fig*")} == {"fig06"}
 
@@ -97,10 +97,10 @@ def swallowed_in_compiled_code(quick: bool) -> Drawing:
 
 
 @pytest.mark.parametrize("draw", [swallowed, turned_into_an_error, swallowed_in_compiled_code])
-def test_ctrl_c_that_a_library_swallows_is_not_lost(run: Run, draw: Callable[[bool], Drawing]) -> None:
+def test_ctrl_c_that_a_library_swallows_is_not_lost(run_paper: Run, draw: Callable[[bool], Drawing]) -> None:
     before = signal.getsignal(signal.SIGINT)
     with patch.dict(registry.FIGURES, {"fig06": Recipe("first", draw)}, clear=True):
-        code, _, err = run("reproduce", "fig06", "--out", "figures")
+        code, _, err = run_paper("fig06", "--out", "figures")
     assert (code, err) == (130, "orthocas: interrupted\n")
     assert signal.getsignal(signal.SIGINT) is before
 

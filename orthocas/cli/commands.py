@@ -15,7 +15,6 @@ COMMANDS = {
     "certify": "Prove that a chart does not fold anywhere on its domain, and keep the proof in its file.",
     "info": "Show a chart file, a named problem, or a robot file.",
     "compare": "Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts.",
-    "reproduce": "Redraw figures of the paper and print the numbers they show.",
     "simulate": "Run a controller in a chart's coordinates; write the run, pictures, an animation and a report.",
     "follow": "Follow a tool path; write joint positions, velocities and accelerations on time stamps.",
     "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",

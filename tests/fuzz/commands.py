@@ -136,11 +136,6 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--param": "polynomial:1", "--samples": "30", "--held-out": "50", "--jobs": "0"},
         (*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, "--solver", "--seeds", "--weights", "--out"),
     ),
-    "reproduce": (
-        ("fig99", "fig", "all?", "", "fig05"),
-        {"--out": "chart.orthocas"},
-        ("--param", "--seed", "--log", "--chart"),
-    ),
     "simulate": (
         _FILES,
         {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import public_objects
+from paper.joint_log import read_joint_log
 
 from fuzz.child import Finding, run
 from fuzz.mutants import TEXTS, Rng, flipped, pick
 from fuzz.sealed_files import judged
 from orthocas.following.path_file import read_path
-from orthocas.reproduce.joint_log import read_joint_log
 
 _CELLS = (
     "0",

@@ -63,7 +63,6 @@ COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is
     "codegen": ("codegen", "chart.orthocas", *_CONTROLLED, "--check"),
     "atlas": ("atlas", "build", "planar_3r_x", *_TILES, "--out", "out/a.orthocas-atlas", "--json"),
     "view": ("view", "chart.orthocas", "--export", "out/page.html"),
-    "reproduce": ("reproduce", "fig20", "--quick", "--out", "out"),
     "loop": ("-c", _LOOP),
 }
 _PYTHON_BEGINS = (  # what Python says of Ctrl-C before it reads a line of ours
