@@ -2,9 +2,9 @@
 
 import numpy as np
 
-import orthocas.growing.libigl as igl
 from orthocas.checks import Array, Indices, require_finite, require_shape
 from orthocas.errors import FoldedMapError, InvalidValueError
+from orthocas.growing import libigl as igl
 from orthocas.growing.level_surface import TriangleMesh, require_disk
 from orthocas.growing.mesh_improvement import cotangents
 

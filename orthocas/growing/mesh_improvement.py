@@ -7,8 +7,8 @@ trimesh has no flips.
 import numpy as np
 from numpy.typing import NDArray
 
-import orthocas.growing.libigl as igl
 from orthocas.checks import Array, Indices
+from orthocas.growing import libigl as igl
 from orthocas.growing.triangle_mesh import edge_keys, half_edges
 
 _MOST_ROUNDS = 200  # rounds of flips; a few dozen suffice, but there is no proof that they end on a curved surface

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-import orthocas.growing.libigl as igl
 from orthocas.checks import Array, Indices, frozen_array, frozen_indices, require_finite, require_shape
 from orthocas.errors import InvalidValueError
+from orthocas.growing import libigl as igl
 
 _CHUNK = 10_000  # points per call of libigl, which Ctrl-C cannot interrupt; 0.1 s on 200,000 triangles
 

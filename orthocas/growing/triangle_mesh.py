@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-import orthocas.growing.libigl as igl
 from orthocas.casadi_tools.cached import cached_property
 from orthocas.checks import Array, Indices, frozen_array, frozen_indices
 from orthocas.errors import NotADiskError
+from orthocas.growing import libigl as igl
 
 
 @dataclass(frozen=True, eq=False)
