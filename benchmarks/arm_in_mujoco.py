@@ -8,10 +8,10 @@ from compared_laws import COULOMB, Law
 from reference_motions import TICK, Motion
 
 import orthocas as oc
-from orthocas.checks import Array
-from orthocas.control.status import FROM_THE_LAW
+from orthocas.control.controller import FROM_THE_LAW
 from orthocas.errors import SimulationError
 from orthocas.simulation import Friction, MuJoCoPlant
+from orthocas.tools.checks import Array
 
 BITS, CUTOFF = 14, 100.0  # of the encoders; of the low pass behind the differences [Hz]
 GIVEN_UP = 100  # ticks without the law, after which a run ends

@@ -13,14 +13,13 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.atlases.atlas_file import ATLAS, add_results, header_of, plan_terms
-from orthocas.atlases.box_fit import BoxFitter
-from orthocas.atlases.cells import Cell
-from orthocas.atlases.outcomes import Outcome, Result
-from orthocas.atlases.plan import make_plan
-from orthocas.atlases.regions import joint_range_of
-from orthocas.checks import Array
-from orthocas.files.blocks import create
+from orthocas.atlas.atlas_file import ATLAS, add_results, header_of, plan_terms
+from orthocas.atlas.box_fit import BoxFitter
+from orthocas.atlas.lattice import Cell, Outcome, Result
+from orthocas.atlas.plan import make_plan
+from orthocas.atlas.regions import joint_range_of
+from orthocas.tools.block_file import create
+from orthocas.tools.checks import Array
 
 ROBOTS = {  # of the package example-robot-data: file and tip
     "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),

@@ -14,11 +14,11 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
+from orthocas.atlas.c_source import AtlasTables
 from orthocas.codegen import compile_shared
-from orthocas.codegen.atlas_tables import AtlasTables
 from orthocas.codegen.library import compilers
 from orthocas.control import PDPlus
+from orthocas.tools.checks import Array
 
 _POSITIONS = 2000
 _PROGRAM = r"""

@@ -21,9 +21,9 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
 from orthocas.codegen.library import compilers
-from orthocas.domains import sample_uniform
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.checks import Array
 
 NAMES = ("xi", "phi", "jacobian")
 RUNS = 3

@@ -15,8 +15,8 @@ import psutil
 from browser import Page, browser
 
 import orthocas as oc
-from orthocas.chart import Chart
-from orthocas.viewing import View
+from orthocas.charts.chart import Chart
+from orthocas.viewer import View
 
 SECONDS = 4.0  # of a sweep
 SIZES = (

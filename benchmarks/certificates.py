@@ -11,7 +11,7 @@ import numpy as np
 from benchmark import run, table
 
 import orthocas as oc
-from orthocas.postures.regular_box import regular_box
+from orthocas.tasks.regular_box import regular_box
 
 HEADER = (
     "| task | degree | half-width [rad] | boxes judged | parts | proved | find [s] | check [s] | one-to-one [rad] |\n"

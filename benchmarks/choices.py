@@ -8,9 +8,8 @@ from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.domains import sample_uniform
-from orthocas.fitting import spectral_start as spectral
-from orthocas.fitting import stages
+from orthocas.fitting import stages, starts
+from orthocas.tasks.domains import sample_uniform
 
 HEADER = (
     "| choice | task std [deg] | mutual std [deg] | conditioning mean | 1 % quantile |\n| --- | --- | --- | --- | --- |"
@@ -40,7 +39,7 @@ def main(quick: bool = False) -> None:
     print(row("default, degree 5", quick, degree=5), flush=True)
     with patch.object(stages, "sample_evenly", sample_uniform):
         print(row("independent training samples", quick), flush=True)
-    with patch.object(spectral, "_MIXING_ANGLE", np.radians(0)):
+    with patch.object(starts, "_MIXING_ANGLE", np.radians(0)):
         print(row("no mixing of the spectral start", quick), flush=True)
     print(row("no regularity term", quick, weights=(1000.0, 30.0)))
 

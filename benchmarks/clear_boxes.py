@@ -7,7 +7,7 @@ from folds import least
 from suggested_domains import robot_of
 
 import orthocas as oc
-from orthocas.postures.regular_box import regular_box
+from orthocas.tasks.regular_box import regular_box
 
 HEADER = (
     "| robot, half-width [rad] | least singular value | share of the box | fit [s] | task / mutual std [deg] "

@@ -6,7 +6,7 @@ from benchmark import run, table
 from numpy.typing import NDArray
 
 import orthocas as oc
-from orthocas.domains import sample_uniform
+from orthocas.tasks.domains import sample_uniform
 
 Numbers = NDArray[np.float64]
 HEADER = (

@@ -15,8 +15,8 @@ from scipy.integrate import solve_ivp
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
 from orthocas.control import PDPlus, Reference
+from orthocas.tools.checks import Array
 
 TOLERANCE = 1e-8
 DURATION = 10.0  # [s]

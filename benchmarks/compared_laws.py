@@ -11,11 +11,11 @@ from reference_motions import TICK, Motion
 from textbook_law import TextbookLaw
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import Supervisor
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
 from orthocas.control import ControlStatus, Impedance, PDPlus, Safety
-from orthocas.control.matched_stiffness import SPRING_FREQUENCY
+from orthocas.control.gains import SPRING_FREQUENCY
+from orthocas.tools.checks import Array
 
 COULOMB = (1.0, 1.0, 1.0, 1.0, 0.3, 0.3, 0.3)  # friction [N m]
 INTEGRAL = 3.0  # rate of the integral action [1/s]

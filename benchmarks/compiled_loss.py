@@ -8,9 +8,9 @@ import numpy as np
 from benchmark import run
 from c_timing import nanoseconds_per_call
 
-from orthocas.casadi_tools.columns import COLUMNS
-from orthocas.fitting.loss import Loss, Sizes, Weights
-from orthocas.fitting.loss.residuals import loss_columns
+from orthocas.fitting.residuals import Loss, loss_columns
+from orthocas.fitting.terms import Sizes, Weights
+from orthocas.tools.columns import COLUMNS
 
 BLOCKS = 16
 

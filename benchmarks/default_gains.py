@@ -22,11 +22,11 @@ from orthocas import problems
 from orthocas.codegen import Supervisor
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
 from orthocas.control import ControlStatus, PDPlus, Reference, Safety
-from orthocas.control.matched_stiffness import mobility
-from orthocas.domains import sample_uniform
+from orthocas.control.gains import mobility
 from orthocas.errors import UnreachableReferenceError
 from orthocas.problems.iiwa import urdf_path
 from orthocas.simulation import MuJoCoPlant
+from orthocas.tasks.domains import sample_uniform
 
 CASES = (  # robot, task, metric
     *(("iiwa", "position", "euclidean"), ("iiwa", "position", "inertia"), ("iiwa", "pose", "euclidean")),

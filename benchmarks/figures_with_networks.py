@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from orthocas.parametrisations import MLP
+from orthocas.bases import MLP
 
 sys.path.append(str(Path(__file__).parent.parent / "examples"))
 

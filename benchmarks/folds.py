@@ -7,8 +7,8 @@ from benchmark import run, table
 from suggested_domains import robot_of
 
 import orthocas as oc
-from orthocas.domains import sample_heavily, sample_uniform
-from orthocas.judging.gradients import Judged
+from orthocas.charts.point_quality import Judged
+from orthocas.tasks.domains import sample_heavily, sample_uniform
 
 HEADER = (
     "| problem | degree | fit [s] | task std [deg] | mutual std [deg] | least conditioning: the fit's search | uniform "

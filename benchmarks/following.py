@@ -13,9 +13,9 @@ from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
-from orthocas.following import JointMotion
-from orthocas.obstacles import Obstacle, Sphere
+from orthocas.paths import JointMotion
+from orthocas.robots.obstacles import Obstacle, Sphere
+from orthocas.tools.checks import Array
 
 T = TypeVar("T")
 HEADER = (

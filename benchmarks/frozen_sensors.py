@@ -13,10 +13,10 @@ import numpy as np
 from benchmark import run, table
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import PDPlus, Safety
 from orthocas.simulation import MuJoCoPlant
+from orthocas.tools.checks import Array
 
 ARMS = ("iiwa7", "panda", "xarm7", "ur5", "baxter-left", "z1")
 TICK, FROZEN, END = 1e-3, 400, 600

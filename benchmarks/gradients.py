@@ -17,13 +17,13 @@ from torch_loss import WEIGHTS, Step, basis_step, network_step
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.casadi_tools.threads import one_blas_thread
+from orthocas.bases import JointSpace, LinearFamily
 from orthocas.fitting.array_objective import ArrayObjective
+from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.gradients_of import gradients_of
-from orthocas.fitting.loss import Weights
-from orthocas.parametrisations import JointSpace, LinearFamily
-from orthocas.samples import sample_problem
+from orthocas.fitting.terms import Weights
+from orthocas.tasks.samples import sample_problem
+from orthocas.tools.batch import one_blas_thread
 
 HEADER = (
     "| what | samples | orthocas double / single [ms] | PyTorch float64, forward / reverse | float32, forward / "

@@ -15,8 +15,8 @@ from scipy.integrate import RK45
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
-from orthocas.growing import SundialsFlow, TaskFlow
+from orthocas.exact.flow import SundialsFlow, TaskFlow
+from orthocas.tools.checks import Array
 
 LEVEL = np.zeros(1)
 ROUNDS = 3

@@ -16,7 +16,7 @@ from benchmark import run
 import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import CompiledInverse
-from orthocas.domains import sample_uniform
+from orthocas.tasks.domains import sample_uniform
 
 REPEATS = 3
 TICKS = 100  # of the stream in C, timed together

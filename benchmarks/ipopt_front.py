@@ -13,7 +13,7 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.quality import Report
+from orthocas.charts.quality import Report
 
 Point = tuple[float, float]  # task and mutual deviation from a right angle, root mean square [deg]
 LAMBDA2 = (3.0, 10.0, 30.0, 100.0, 300.0)

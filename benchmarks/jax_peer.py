@@ -19,8 +19,8 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
 from torch_peer import PeerResult, PeerSettings, judged, samples
 
-from orthocas.checks import Array
-from orthocas.problem import Problem
+from orthocas.tasks.problem import Problem
+from orthocas.tools.checks import Array
 
 Layers = list[tuple[Any, Any]]  # weights (out, in) and biases
 _MOMENT, _SQUARE, _SMALL = 0.9, 0.999, 1e-8

@@ -8,9 +8,8 @@ import igl
 import numpy as np
 from benchmark import run, table
 
-from orthocas.growing.harmonic import harmonic_disk
-from orthocas.growing.level_surface import TriangleMesh, level_surface, require_disk
-from orthocas.growing.triangle_locator import TriangleLocator
+from orthocas.exact.harmonic import TriangleMesh, harmonic_disk, level_surface, require_disk
+from orthocas.exact.mesh import TriangleLocator
 
 HEADER = (
     "| triangles | surface [s] | harmonic map [s] | closest points [s] | libigl: harmonic map [s] "

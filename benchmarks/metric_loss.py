@@ -19,13 +19,13 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
 from orthocas.control import Controller, Impedance, PDPlus, Reference, matched_stiffness
 from orthocas.errors import OrthocasError
-from orthocas.fitting.loss import ANGLES
-from orthocas.postures.regular_box import regular_box
-from orthocas.problem import relative_singular_values, task_jacobians
+from orthocas.fitting.terms import ANGLES
 from orthocas.simulation import Outcome, coupling_index
+from orthocas.tasks.problem import relative_singular_values, task_jacobians
+from orthocas.tasks.regular_box import regular_box
+from orthocas.tools.checks import Array
 
 HALF_WIDTH = 0.5  # [rad] of boxes around places
 REGULAR = 0.05  # least relative singular value of the task at samples of a place

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 import orthocas as oc
-from orthocas.certificates.subdivision import Subdivision
-from orthocas.certifying.chart_rows import chart_rows
-from orthocas.certifying.one_to_one import one_to_one_judge
-from orthocas.certifying.search import Limits, Search, largest_first
+from orthocas.certificates.chart_rows import chart_rows
+from orthocas.certificates.one_to_one import one_to_one_judge
+from orthocas.certificates.search import Limits, Search, largest_first
+from orthocas.charts.certificate import Subdivision
 from orthocas.errors import OrthocasError
 
 sys.path.append(str(Path(__file__).parent.parent / "tests"))

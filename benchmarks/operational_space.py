@@ -18,7 +18,7 @@ from default_gains import problem_of, starts_of
 from reference_motions import RADIUS, TICK, Motion, circles, held, step_of
 
 import orthocas as oc
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 WEIGHTS = (1000, 30, 150, 1, 1000)
 STEP = 0.04  # in x [m]

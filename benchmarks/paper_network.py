@@ -18,7 +18,7 @@ from benchmark import table
 import orthocas as oc
 from orthocas import problems, solvers
 from orthocas.errors import Interrupted
-from orthocas.minimising.watch import Monitor, Progress
+from orthocas.tools.progress import Monitor, Progress
 
 HEADER = (
     "| inputs | parameters | weights | epochs | training [s] | task std [deg] | mutual std [deg] "

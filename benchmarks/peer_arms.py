@@ -9,7 +9,7 @@ import pinocchio as pin
 from default_gains import problem_of, robot_file
 
 import orthocas as oc
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 TICK = 0.01  # [s]
 RADIUS, PERIOD = 0.08, 2.0  # of the circle [m], [s]

@@ -15,12 +15,12 @@ from scipy.spatial import KDTree
 from textbook_law import TextbookLaw
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import CompiledLibrary, compile_shared
 from orthocas.control import PDPlus
-from orthocas.control.matched_stiffness import SPRING_FREQUENCY
+from orthocas.control.gains import SPRING_FREQUENCY
 from orthocas.errors import RobotError, SimulationError
 from orthocas.simulation import MuJoCoPlant
+from orthocas.tools.checks import Array
 
 KNOWN, TRIED = 20_000, 40  # joint positions of an atlas, and how many of them are tried
 

@@ -74,7 +74,7 @@ def measured(case: Case, samples: int, wall: bool) -> Point:
     """Fit and judge."""
     problem, clock = problems.get("iiwa"), time.perf_counter if wall else time.process_time
     oc.fit(problem, oc.Polynomial(1))  # the first call loads libraries
-    chosen = oc.parametrisations.parse_parametrisation(case.label)
+    chosen = oc.bases.parse_parametrisation(case.label)
     start = clock()
     fit = oc.fit(problem, chosen, weights=case.weights, precision=case.precision)
     seconds = clock() - start

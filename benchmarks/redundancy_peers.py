@@ -31,8 +31,8 @@ import numpy as np
 from peer_arms import MOVE, MOVE_TIME, TICK, Arm, Target, circles, lines, self_motion, smooth
 from peer_methods import SSIK, Method, Mink, OnAtlas, OnChart, OperationalSpace, Pink, methods
 
-from orthocas.checks import Array
-from orthocas.domains import sample_uniform
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.checks import Array
 
 ARMS, TASKS, PARTS = ("iiwa", "panda", "xarm7"), ("position", "pose"), ("motions", "shares")
 CLOSE, CLOSE_TURN = 1e-4, 1e-3  # a target is found: [m], [rad]

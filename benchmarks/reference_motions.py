@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.control import Reference, posture_reference
 from orthocas.errors import UnreachableReferenceError
+from orthocas.tools.checks import Array
 
 TICK = 1e-3  # [s]
 REST = 0.2  # at the start of every motion [s]

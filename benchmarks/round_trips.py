@@ -12,8 +12,8 @@ import numpy as np
 from benchmark import run, table
 
 import orthocas as oc
-from orthocas.checks import Array
-from orthocas.domains import Domain, borders, sample_uniform
+from orthocas.tasks.domains import Domain, borders, sample_uniform
+from orthocas.tools.checks import Array
 
 QUICK = ("panda-position", "ur5-position")
 SEVERAL = ("iiwa7-position", "ur5-position", "ur10-position", "xarm7-position", "panda-pose")  # for all solutions

@@ -10,8 +10,8 @@ from benchmark import run
 
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.comparing.report import Comparison
-from orthocas.minimising.solver import Solver
+from orthocas.fitting.comparison import Comparison
+from orthocas.solvers.protocol import Solver
 
 HEADER = (
     "| parametrisation | solver | task std [deg], smallest to largest | spread | mutual std [deg], smallest to largest "

@@ -9,7 +9,7 @@ from benchmark import run, table
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import DomainError
-from orthocas.postures.probe import judged_chart
+from orthocas.fitting.probe import judged_chart
 
 CASES = (  # robot, task, metric
     ("iiwa", "position", "euclidean"),

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from orthocas.checks import Array
 from orthocas.codegen import CompiledLibrary
+from orthocas.tools.checks import Array
 
 
 class TextbookLaw:

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 Step = Callable[[], tuple[float, Array]]
 WEIGHTS = (1000.0, 30.0)

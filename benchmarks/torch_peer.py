@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from orthocas.checks import Array
-from orthocas.domains import sample_uniform
-from orthocas.problem import Problem, task_jacobians
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tools.checks import Array
 
 
 @dataclass(frozen=True)

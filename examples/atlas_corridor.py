@@ -23,10 +23,10 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
 from orthocas.codegen import ChartReference, CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import ControlStatus, PDPlus
 from orthocas.simulation import MuJoCoPlant
+from orthocas.tools.checks import Array
 
 TICK = 1e-3
 OMEGA = 8.0  # with which xi comes to rest after a hand-over [rad/s]

@@ -18,8 +18,8 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.atlases.follow import follow_in_atlas
-from orthocas.checks import Array
+from orthocas.atlas.chart_along import follow_in_atlas
+from orthocas.tools.checks import Array
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from paper.planar_loop import (
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.control.damping import DampingDesign
+from orthocas.control.linear_algebra import DampingDesign
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,12 @@ from typing import Any
 import orthocas as oc
 from orthocas import problems, solvers
 from orthocas.cli.progress import terminal_monitor
-from orthocas.comparing.figures import convergence_figure, front_figure
-from orthocas.comparing.report import Comparison
-from orthocas.minimising.solver import Solver
-from orthocas.minimising.watch import Monitor, silent
+from orthocas.fitting.comparison import Comparison
+from orthocas.fitting.comparison_figures import convergence_figure, front_figure
+from orthocas.solvers.protocol import Solver
+from orthocas.tools.progress import Monitor, silent
 
-Parametrisations = Sequence[oc.parametrisations.Parametrisation | oc.SEW]
+Parametrisations = Sequence[oc.bases.Parametrisation | oc.SEW]
 
 WEIGHTS = oc.Weights(folds=0.0, angles="paper")  # angles alone, so that families differ in nothing else
 ADAM = solvers.Adam(epochs=60, learning_rate=5e-3)

@@ -31,8 +31,8 @@ from pydrake.solvers import MathematicalProgram
 from spheres import Places, Query, World
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.problems.iiwa import urdf_path
+from orthocas.tools.checks import Array
 
 THIN = 1e-3  # radius of the links [m]; that of the spheres is the query's, less this
 LINKS = range(2, 8)  # those that can collide

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.distil import Distilled
-from orthocas.parametrisations import Parametrisation
+from orthocas.bases import Parametrisation
+from orthocas.fitting.distil import Distilled
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:

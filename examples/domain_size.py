@@ -19,7 +19,7 @@ from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.postures.probe import judged_chart
+from orthocas.fitting.probe import judged_chart
 
 HALF_WIDTHS_DEG = (5, 10, 15, 20, 30, 37, 45, 52, 59)  # A4 meets its limit at 59.8 degrees
 DEGREES = (3, 4, 5)

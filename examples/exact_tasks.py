@@ -25,9 +25,9 @@ from matplotlib.figure import Figure
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
 from orthocas.problems.propellers import logarithms
 from orthocas.robots import KinematicTree
+from orthocas.tools.checks import Array
 
 LENGTHS = (1.0, 0.8, 0.7, 0.5)  # of the links [m]
 TURNED = np.tril(np.ones((4, 4)))  # absolute angles of the links from joint angles

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 import orthocas as oc
-from orthocas.following import JointMotion
-from orthocas.obstacles import Capsule, LinkDistances
+from orthocas.paths import JointMotion
+from orthocas.robots.obstacles import Capsule, LinkDistances
 
 START = np.array([0.6, 0.8, 0.8])
 RADIUS = 0.35  # of the tool path [m]

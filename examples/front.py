@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.quality import Report
+from orthocas.charts.quality import Report
 
 PAPER = (2.06, 3.44)
 LAMBDA2 = (1.0, 3.0, 10.0, 20.0, 30.0, 60.0, 100.0, 300.0)

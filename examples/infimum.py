@@ -24,10 +24,11 @@ from scipy.sparse.linalg import spsolve
 
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.casadi_tools.batch import Batched
-from orthocas.checks import Array
-from orthocas.fitting.loss import Loss, Sizes
-from orthocas.samples import Samples, samples_at
+from orthocas.fitting.residuals import Loss
+from orthocas.fitting.terms import Sizes
+from orthocas.tasks.samples import Samples, samples_at
+from orthocas.tools.batch import Batched
+from orthocas.tools.checks import Array
 
 WEIGHTS = oc.Weights(folds=0.0)  # the search for folds is no part of the integral
 FAMILIES = (oc.Linear(), oc.Polynomial(4), oc.Polynomial(8), oc.Fourier(3), oc.MLP((32, 32)), oc.MLP((64, 64)))

@@ -22,8 +22,8 @@ from scipy.stats import spearmanr
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.fitting.loss import DEFAULT_WEIGHTS, Weights
-from orthocas.samples import sample_problem
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
+from orthocas.tasks.samples import sample_problem
 
 METRICS = {"euclidean": "I", "inertia": "M"}
 COLOURS = {

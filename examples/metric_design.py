@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 ROTORS = (0.0, 0.3, 1.0, 3.0, 10.0)  # inertias b of the rotors, reflected to the joints [kg m^2]
 DEGREES = (3, 5)

@@ -26,8 +26,8 @@ from ompl import base, geometric, util
 from spheres import Evaluator, Places, Query, World
 
 import orthocas as oc
-from orthocas.checks import Array
-from orthocas.domains import borders
+from orthocas.tasks.domains import borders
+from orthocas.tools.checks import Array
 
 STEP = 0.05  # longest joint motion between two checks [rad]
 LIMIT = 10.0  # [s] for one plan

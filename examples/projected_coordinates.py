@@ -27,9 +27,9 @@ from paper.hidden_spring import POSTURE_STIFFNESS, HiddenSpring
 
 import orthocas as oc
 from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector, Reference
-from orthocas.domains import sample_uniform
-from orthocas.metrics import metric_matrices
 from orthocas.simulation import Trajectory
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.metric import metric_matrices
 
 SIZES = (0.3, 0.8)  # of the part of the domain, relative to its half-widths
 BOXES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)

@@ -17,9 +17,9 @@ from self_motion_picture import robot_file, save_trimmed
 
 import orthocas as oc
 from orthocas.charts import Card, Model
-from orthocas.reaching.fan import fan_along
-from orthocas.viewing.fan_picture import fan_picture, widest_coordinate
-from orthocas.viewing.urdf_look import urdf_look
+from orthocas.charts.self_motion import fan_along
+from orthocas.viewer.looks import urdf_look
+from orthocas.viewer.rendering import fan_picture, widest_coordinate
 
 ROOT = Path(__file__).parent.parent
 DATA = ROOT / "orthocas" / "charts" / "data"

@@ -8,9 +8,8 @@ import numpy as np
 from PIL import Image, ImageChops
 
 import orthocas as oc
-from orthocas.viewing.fan_picture import fan_picture
-from orthocas.viewing.rendering import Picture
-from orthocas.viewing.urdf_look import urdf_look
+from orthocas.viewer.looks import urdf_look
+from orthocas.viewer.rendering import Picture, fan_picture
 
 POSTURE = (0.0, -0.5, 0.0, -2.2, 0.0, 1.7, np.pi / 4)  #: of the solid arm [rad]
 WIDTH, HEIGHT, MARGIN = 1000, 780, 16  #: [pixels]

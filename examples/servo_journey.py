@@ -14,10 +14,10 @@ import numpy as np
 from paper.chosen_fit import USUAL
 from paper.fig28 import arm_chart, draw_log, journey
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.charts.chart import Chart
 from orthocas.control import Kinematic
 from orthocas.simulation import Elasticity, Friction, MuJoCoPlant, simulate
+from orthocas.tools.checks import Array
 
 TICK, LOGGED = 1e-3, 10  # period of the servos [s], and ticks between rows of the log
 BANDWIDTH = 2 * np.pi * 30  # of the servos [rad/s]

@@ -8,10 +8,10 @@ import casadi as ca
 import numpy as np
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen.library import CompiledLibrary, compile_shared
 from orthocas.control import ControlStatus
-from orthocas.domains import sample_uniform
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.checks import Array
 
 INNER = 0.9  # share of the domain for random postures
 BLOCKED = 0.7  # radius of the spheres, as a share of how far the link there is from where it is at the ends

@@ -1,6 +1,6 @@
 """Run the command line with `python -m orthocas`."""
 
-from orthocas.cli import main
+from orthocas.cli.entry import main
 
 if __name__ == "__main__":
     main()

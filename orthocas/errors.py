@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # NumPy takes long to load
+if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from orthocas.domains import Box
-from orthocas.problem import Problem
-from orthocas.robots import Robot
-from orthocas.tasks import Task
+from orthocas.robots.robot import Robot
+from orthocas.tasks.domains import Box
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.task import Task
 
 CENTRE = (0.0, 0.52, 0.0, -1.05, 0.0, 0.79, 0.0)  #: q0 [rad]
 HALF_WIDTH = np.pi / 4  #: [rad]

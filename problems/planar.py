@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from orthocas.domains import Box, Torus
-from orthocas.problem import Problem
-from orthocas.robots import Robot
-from orthocas.tasks import Task
+from orthocas.robots.robot import Robot
+from orthocas.tasks.domains import Box, Torus
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.task import Task
 
 _BENT = Box((0.6, 0.8, 0.8), np.pi / 8)  # [rad]; neither task is singular here
 

@@ -10,11 +10,12 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from orthocas.checks import Array
-from orthocas.domains import Box
-from orthocas.problem import Problem
-from orthocas.robots import KinematicTree, Robot
-from orthocas.tasks import Task
+from orthocas.robots.robot import Robot
+from orthocas.robots.tree import KinematicTree
+from orthocas.tasks.domains import Box
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 
 PROPELLERS = 6
 DRAG = 0.2  #: torque of a propeller about its axis, relative to its thrust times the length of an arm

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from orthocas.checks import require_known
-from orthocas.problem import Problem
 from orthocas.problems import iiwa, planar, propellers
+from orthocas.tasks.problem import Problem
+from orthocas.tools.checks import require_known
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "planar_2r": planar.planar_2r,

@@ -1,13 +1,13 @@
-"""Minimisers behind one protocol (`orthocas.minimising.objective.Solver`)."""
+"""Minimisers behind one protocol (`orthocas.solvers.protocol.Solver`)."""
 
-from orthocas.checks import require_known
-from orthocas.minimising.solver import Solver
 from orthocas.solvers.adam import Adam
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.gradient_flow import GradientFlow
 from orthocas.solvers.ipopt import Ipopt
 from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.protocol import Solver
 from orthocas.solvers.quasi_newton import QuasiNewton
+from orthocas.tools.checks import require_known
 
 __all__ = ["LBFGS", "SOLVERS", "Adam", "GaussNewton", "GradientFlow", "Ipopt", "QuasiNewton", "get"]
 

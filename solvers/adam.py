@@ -6,11 +6,9 @@ from itertools import repeat
 
 import numpy as np
 
-from orthocas.checks import Array, require_at_least, require_count
-from orthocas.minimising.best_point import BestPoint
-from orthocas.minimising.objective import Objective, SampledObjective
-from orthocas.minimising.solver import SolveResult, Status
-from orthocas.minimising.watch import UNWATCHED, Watch
+from orthocas.solvers.protocol import BestPoint, Objective, SampledObjective, SolveResult, Status
+from orthocas.tools.checks import Array, require_at_least, require_count
+from orthocas.tools.progress import UNWATCHED, Watch
 
 _MOMENT, _SQUARE, _SMALL = 0.9, 0.999, 1e-8  # the usual constants of [KB2015]
 _PART = 2**14  # parameters at a time, which stay in the cache

@@ -6,8 +6,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.interrupts import check
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
+from orthocas.tools.interrupts import check
 
 
 class ArrayNode(ca.Callback):

@@ -5,12 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from orthocas.checks import Array, require_at_least, require_count
 from orthocas.errors import InvalidValueError
-from orthocas.minimising.best_point import BestPoint
-from orthocas.minimising.objective import LeastSquaresObjective, Objective
-from orthocas.minimising.solver import SolveResult, Status
-from orthocas.minimising.watch import UNWATCHED, Watch
+from orthocas.solvers.protocol import BestPoint, LeastSquaresObjective, Objective, SolveResult, Status
+from orthocas.tools.checks import Array, require_at_least, require_count
+from orthocas.tools.progress import UNWATCHED, Watch
 
 _MAX_REJECTIONS = 16  # the damping may grow from its least to 400
 

@@ -6,14 +6,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.cached import building
-from orthocas.casadi_tools.interrupts import deferred
-from orthocas.checks import Array, require_at_least, require_count
-from orthocas.minimising.best_point import BestPoint
-from orthocas.minimising.objective import ConstrainedObjective, Objective, SmoothObjective
-from orthocas.minimising.solver import SolveResult, Status
-from orthocas.minimising.watch import UNWATCHED, Watch
 from orthocas.solvers.array_node import ArrayNode
+from orthocas.solvers.protocol import BestPoint, ConstrainedObjective, Objective, SmoothObjective, SolveResult, Status
+from orthocas.tools.cached import building
+from orthocas.tools.checks import Array, require_at_least, require_count
+from orthocas.tools.interrupts import deferred
+from orthocas.tools.progress import UNWATCHED, Watch
 
 _EXACT = 1500  # largest number of parameters for exact, dense Hessians
 _BARRIER = 1e-4  # starts are good; a stronger barrier would push away from them into worse minima

@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from orthocas.checks import Array
 from orthocas.errors import InvalidValueError
-from orthocas.minimising.objective import EstimatedObjective, Objective
-from orthocas.minimising.solver import SolveResult
-from orthocas.minimising.watch import UNWATCHED, State, Watch
 from orthocas.solvers.lbfgs import LBFGS, LBFGSRun
+from orthocas.solvers.protocol import EstimatedObjective, Objective, SolveResult
+from orthocas.tools.checks import Array
+from orthocas.tools.progress import UNWATCHED, State, Watch
 
 _DAMPING = 3e-3  # of the diagonal
 _RENEWED = 0.8  # share of the loss at the last matrix below which a new one is worth its time

@@ -5,7 +5,7 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from orthocas.files import archive, npy
+from orthocas.tools import archive
 
 
 def rewritten(path: Path, changes: dict[str, bytes], honest: bool = True, without: Sequence[str] = ()) -> Path:
@@ -32,7 +32,7 @@ def polynomial(degree: int, idle: list[object] | None = None) -> dict[str, objec
 def resealed(path: Path, header: dict[str, object] | None = None, **arrays: object) -> Path:
     """Another header, or other arrays, with checksums that match."""
     contents = {
-        f"{name}.npy": value if isinstance(value, bytes) else npy.to_npy(value) for name, value in arrays.items()
+        f"{name}.npy": value if isinstance(value, bytes) else archive.to_npy(value) for name, value in arrays.items()
     }  # type: ignore[arg-type]
     header = header or header_of(path)
     sums = {**header["sha256"], **{name: archive._digest(text) for name, text in contents.items()}}  # type: ignore[dict-item]

@@ -48,7 +48,7 @@ def main() -> None:
         for wanted in (
             "orthocas/problems/data/iiwa7_r800.urdf",
             "orthocas/py.typed",
-            "orthocas/solvers/lbfgs.py",
+            "solvers/lbfgs.py",
             "charts/licences/MPL-2.0.txt",
         ):
             assert wanted in names, wanted

@@ -3,9 +3,9 @@
 import numpy as np
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.control import Reference
 from orthocas.control.controller import Controller
+from orthocas.tools.checks import Array
 
 K = 60.0
 

@@ -25,12 +25,13 @@ from simulate_command import SHORT
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
-from orthocas.cli import main, simulate
+from orthocas.cli import simulate
+from orthocas.cli.entry import main
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
 from orthocas.control import PDPlus, Reference
 from orthocas.fitting.fit import Fit
-from orthocas.robots import files
+from orthocas.robots import urdf
+from orthocas.tools.checks import Array
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job starts with SIGINT ignored
 
@@ -59,8 +60,8 @@ def robot_data(relative: str) -> Path:
 def arm(name: str) -> tuple[pin.Model, str]:
     """Model and tip of one of ROBOTS, without the joints off the chain."""
     file, tip = ROBOTS[name]
-    full = files.read_urdf(robot_data(file))
-    return full if "both arms" in name else files.lock_off_chain(full, tip), tip
+    full = urdf.read_urdf(robot_data(file))
+    return full if "both arms" in name else urdf.lock_off_chain(full, tip), tip
 
 
 def pinocchio_position(model: pin.Model, q: np.ndarray) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from orthocas.checks import Array
 from orthocas.control.controller import Controller
+from orthocas.tools.checks import Array
 
 
 def torque(controller: Controller, *state: Array, **gains: Any) -> tuple[Array, int]:

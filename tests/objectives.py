@@ -5,10 +5,8 @@ from collections.abc import Callable
 import numpy as np
 
 from orthocas import solvers
-from orthocas.minimising.objective import (
-    Objective,
-)
-from orthocas.minimising.watch import State
+from orthocas.solvers.protocol import Objective
+from orthocas.tools.progress import State
 
 ALL = [
     solvers.GaussNewton(max_iterations=60, tolerance=1e-12),

@@ -8,7 +8,7 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.atlases.atlas_file import Stock
+from orthocas.atlas.atlas_file import Stock
 
 ASKED = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.8, splits=5)
 

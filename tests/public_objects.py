@@ -15,18 +15,11 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import control, problems, solvers
-from orthocas.atlases.asked_posture import AskedPosture
-from orthocas.atlases.hand_over import AtlasControl
-from orthocas.atlases.laws import BlendedImpedance, HandedOver
-from orthocas.casadi_tools.batch import Batched
-from orthocas.checks import Array
-from orthocas.comparing.report import Comparison
+from orthocas.atlas.laws import AskedPosture, BlendedImpedance, HandedOver
+from orthocas.atlas.simulate import AtlasControl
 from orthocas.control import Controller, Reference
-from orthocas.domains import sample_uniform
-from orthocas.fitting.clear_part import ClearPart
-from orthocas.fitting.fit import Fit
-from orthocas.metrics import Metric, metric_matrices
-from orthocas.samples import sample_problem
+from orthocas.fitting.comparison import Comparison
+from orthocas.fitting.fit import ClearPart, Fit
 from orthocas.simulation import (
     Elasticity,
     Friction,
@@ -40,6 +33,11 @@ from orthocas.simulation import (
     coupling_index,
     simulate,
 )
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.metric import Metric, metric_matrices
+from orthocas.tasks.samples import sample_problem
+from orthocas.tools.batch import Batched
+from orthocas.tools.checks import Array
 
 
 @cache

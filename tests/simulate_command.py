@@ -6,7 +6,7 @@ from typing import Any
 
 from programs import Run
 
-from orthocas.files.ours import LIST
+from orthocas.tools.files import LIST
 
 SHORT = {"duration": 1, "steps": [{"time": 0.1, "move": {"x": 0.1}}, {"time": 0.6, "to": {"xi1": 0.05}}]}
 

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import Supervisor
 from orthocas.control import ControlStatus
+from orthocas.tools.checks import Array
 
 TICK = 1e-3
 

@@ -11,9 +11,9 @@ from public_objects import CHARTS, circle, fitted, impedance, planar, points_of,
 
 import orthocas as oc
 from orthocas import control, problems, simulation, solvers
-from orthocas.checks import as_float_array, as_point, as_point_set
 from orthocas.codegen import check_c
 from orthocas.errors import InvalidValueError, NoExpressionError, OrthocasError, ShapeError, UnknownNameError
+from orthocas.tools.checks import as_float_array, as_point, as_point_set
 
 EVALUATIONS = ("xi", "task", "phi", "jacobian")
 

@@ -5,14 +5,13 @@ import pytest
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.atlases.asked_posture import AskedPosture
-from orthocas.atlases.blend import Blend
-from orthocas.atlases.laws import BlendedImpedance, HandedOver
-from orthocas.atlases.simulate import AtlasRun, simulate_in_atlas
-from orthocas.checks import Array
+from orthocas.atlas.evaluation import Blend
+from orthocas.atlas.laws import AskedPosture, BlendedImpedance, HandedOver
+from orthocas.atlas.simulate import AtlasRun, simulate_in_atlas
 from orthocas.control import PDPlus, Reference
 from orthocas.errors import InvalidValueError, PathError
 from orthocas.simulation import MuJoCoPlant, Push
+from orthocas.tools.checks import Array
 
 STIFFNESS = [400.0, 400.0, 50.0]
 START = np.array([0.3, 0.7, 1.5])

@@ -17,18 +17,15 @@ import pytest
 from planar_atlas import ASKED, built, cells_of, planar
 
 import orthocas as oc
-from orthocas.atlases.atlas_file import ATLAS, Stock, add_results, chart_type, header_of, plan_terms, read_stock
-from orthocas.atlases.build import opened
-from orthocas.atlases.cells import Cell
-from orthocas.atlases.jobs import Job, packed, run_job
-from orthocas.atlases.outcomes import Outcome, Result
-from orthocas.atlases.plan import make_plan
-from orthocas.atlases.processes import Processes
-from orthocas.atlases.regions import joint_range_of
-from orthocas.checks import Array
+from orthocas.atlas.atlas_file import ATLAS, Stock, add_results, chart_type, header_of, plan_terms, read_stock
+from orthocas.atlas.build import Job, Processes, opened, packed, run_job
+from orthocas.atlas.lattice import Cell, Outcome, Result
+from orthocas.atlas.plan import make_plan
+from orthocas.atlas.regions import joint_range_of
 from orthocas.errors import AtlasFileError
-from orthocas.files.blocks import create, owned, sealed
-from orthocas.files.npy import from_npy, to_npy
+from orthocas.tools.archive import from_npy, to_npy
+from orthocas.tools.block_file import create, owned, sealed
+from orthocas.tools.checks import Array
 
 
 def test_file_holds_the_same_atlas(planar_atlas: oc.Atlas, covered: Array) -> None:
@@ -254,7 +251,7 @@ class Deadly(Processes):
 def test_work_of_killed_processes_runs_again(
     planar_atlas: oc.Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("orthocas.atlases.build.Processes", Deadly)
+    monkeypatch.setattr("orthocas.atlas.build.Processes", Deadly)
     found = oc.build_atlas(planar(), tmp_path / "arm.orthocas-atlas", ASKED, jobs=1)
     assert Deadly.kills == 3
     assert cells_of(found.stock) == cells_of(planar_atlas.stock)
@@ -265,7 +262,7 @@ def test_build_goes_on_after_its_process_was_killed(planar_atlas: oc.Atlas, tmp_
     path = tmp_path / "arm.orthocas-atlas"
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        "import orthocas.atlases.build as build, planar_atlas as tests, pathlib\n"
+        "import orthocas.atlas.build as build, planar_atlas as tests, pathlib\n"
         f"build._FLUSH = 0.0; tests.built(pathlib.Path({str(path)!r}))"
     )
     process = subprocess.Popen([sys.executable, "-c", code])

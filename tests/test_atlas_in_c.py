@@ -8,10 +8,10 @@ import pytest
 from programs import Run, built, needs_c, output_of
 
 import orthocas as oc
-from orthocas.checks import Array
-from orthocas.codegen import CompiledLibrary, GeneratedC, check_c_of_atlas, compile_shared
+from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared
 from orthocas.control import ControlStatus
 from orthocas.errors import InvalidValueError, ProofError
+from orthocas.tools.checks import Array
 
 pytestmark = needs_c
 
@@ -158,14 +158,14 @@ def test_command_writes_the_charts_along_postures(way_atlas: oc.Atlas, run: Run,
 def test_proof_finds_a_wrong_coefficient(way_atlas: oc.Atlas, tmp_path: Path) -> None:
     part = oc.AtlasPart.along(way_atlas, WAY[:10])
     generated = oc.generate_c(part, tmp_path, name="arm")
-    assert max(check_c_of_atlas(generated, part, states=200).differences.values()) < 1e-12
+    assert max(check_c(generated, part, states=200).differences.values()) < 1e-12
     code = (tmp_path / "arm.c").read_text()
     fitted = part.index.rows(part.charts)[1][-1:]
     number = repr(float(part.evaluation.numbers(fitted)[0, 0, 1]))
     assert code.count(number) == 1
     (tmp_path / "arm.c").write_text(code.replace(number, "0.5"))
     with pytest.raises(ProofError, match="differs from Python by .* in xi"):
-        check_c_of_atlas(generated, part, states=200)
+        check_c(generated, part, states=200)
 
 
 def test_charts_of_another_atlas_and_rows_are_refused(way_atlas: oc.Atlas, tmp_path: Path) -> None:

@@ -14,11 +14,11 @@ from programs import built, needs_c, output_of
 from supervised import TICK, Arm
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import ChartReference, CompiledLibrary, GeneratedC, Supervisor, compile_shared, gain_numbers
 from orthocas.codegen.library import STRICT, compilers
 from orthocas.control import Controller, ControlStatus, Kinematic, PDPlus, Projector
 from orthocas.errors import InvalidValueError
+from orthocas.tools.checks import Array
 
 pytestmark = needs_c
 

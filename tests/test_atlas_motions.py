@@ -9,11 +9,11 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas.atlases.follow import follow_in_atlas
-from orthocas.checks import Array
+from orthocas.atlas.chart_along import follow_in_atlas
+from orthocas.atlas.view_session import AtlasSession
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
-from orthocas.viewing import export_page
-from orthocas.viewing.atlas_session import AtlasSession
+from orthocas.tools.checks import Array
+from orthocas.viewer import export_page
 
 
 def test_posture_is_asked_for_without_a_jump_where_charts_change(planar_atlas: oc.Atlas) -> None:

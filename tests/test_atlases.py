@@ -10,14 +10,14 @@ from planar_atlas import ASKED, built, planar
 from programs import Run
 
 import orthocas as oc
-from orthocas.atlases.align import align
-from orthocas.atlases.chart_of_box import moved
-from orthocas.atlases.cube_basis import CubeBasis
-from orthocas.atlases.outcomes import Outcome
-from orthocas.atlases.plan import make_plan
-from orthocas.checks import Array
+from orthocas.atlas.box_fit import CubeBasis
+from orthocas.atlas.building import align
+from orthocas.atlas.chart_of_box import moved
+from orthocas.atlas.lattice import Outcome
+from orthocas.atlas.plan import make_plan
 from orthocas.errors import InvalidValueError, PathFileError
-from orthocas.robots.postures_file import read_postures
+from orthocas.robots.homes import read_postures
+from orthocas.tools.checks import Array
 
 
 def test_seven_joint_arm_has_the_symmetries_of_its_spherical_joints(iiwa: oc.Problem) -> None:

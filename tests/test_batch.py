@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from orthocas.casadi_tools import batch
-from orthocas.casadi_tools.batch import Batched, dense_function
+from orthocas.tools import batch
+from orthocas.tools.batch import Batched, dense_function
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from orthocas.casadi_tools.blas_graph import NumpyGraph
+from orthocas.tools.blas_graph import NumpyGraph
 
 RNG = np.random.default_rng(7)
 

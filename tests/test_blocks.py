@@ -9,14 +9,13 @@ from public_objects import CHARTS
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.casadi_tools import blocks
-from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.casadi_tools.blocks import BlockedFunction
-from orthocas.casadi_tools.threads import using_threads
-from orthocas.checks import Array
-from orthocas.coordinates.fitted import Coordinates
-from orthocas.domains import sample_uniform
-from orthocas.parametrisations import JointSpace
+from orthocas.bases import JointSpace
+from orthocas.charts.coordinates import Coordinates
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools import columns
+from orthocas.tools.batch import Batched, dense_function, using_threads
+from orthocas.tools.checks import Array
+from orthocas.tools.columns import BlockedFunction
 
 MANY = 700  # three blocks, the last one not full
 
@@ -33,7 +32,7 @@ def points_of(n: int, count: int) -> Array:
     return np.random.default_rng(5).uniform(-1, 1, (count, n))
 
 
-@pytest.mark.parametrize("count", [0, 1, blocks.MANY, 256, 257, 5000])
+@pytest.mark.parametrize("count", [0, 1, columns.MANY, 256, 257, 5000])
 def test_values_are_those_of_numpy(count: int) -> None:
     """Rows of a matrix in their order, into part of a larger array, and nothing beside it."""
     A, q = np.arange(6.0).reshape(2, 3), ca.SX.sym("q", 3)

@@ -5,14 +5,13 @@ import pytest
 
 import orthocas as oc
 from orthocas import problems, solvers
+from orthocas.bases import JointSpace
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
-from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.bounded_mutual import BoundedMutual
-from orthocas.fitting.loss import Weights
+from orthocas.fitting.basis_objective import BasisObjective, BoundedMutual
 from orthocas.fitting.stages import missed_bound
-from orthocas.minimising.solver import SolveResult, Status
-from orthocas.parametrisations import JointSpace
-from orthocas.samples import sample_problem
+from orthocas.fitting.terms import Weights
+from orthocas.solvers.protocol import SolveResult, Status
+from orthocas.tasks.samples import sample_problem
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,11 @@ from public_objects import planar
 from typer.testing import CliRunner
 
 import orthocas as oc
-from orthocas.certificates import Subdivision
-from orthocas.certificates.subdivision import OPEN, PROVED
+from orthocas.charts.certificate import OPEN, PROVED, Subdivision
+from orthocas.charts.coordinates import Coordinates
 from orthocas.cli.commands import app_for
-from orthocas.coordinates.fitted import Coordinates
 from orthocas.errors import CertifyError, ChartFileError, Interrupted, InvalidValueError, SchedulerError
-from orthocas.minimising.watch import Progress
+from orthocas.tools.progress import Progress
 
 
 def test_a_certificate_is_void_when_one_coefficient_changes(tmp_path: Path) -> None:

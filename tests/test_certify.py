@@ -10,7 +10,7 @@ from public_objects import fitted, given, network, planar
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.certificates.subdivision import PROVED
+from orthocas.charts.certificate import PROVED
 from orthocas.errors import CertifyError, InvalidValueError
 
 

@@ -15,8 +15,8 @@ from orthocas import solvers
 from orthocas.errors import CheckpointError, Interrupted
 from orthocas.fitting import checkpoint
 from orthocas.fitting.checkpoint import Checkpoint
-from orthocas.minimising.solver import Solver, Status
-from orthocas.minimising.watch import Progress
+from orthocas.solvers.protocol import Solver, Status
+from orthocas.tools.progress import Progress
 
 
 @pytest.fixture(autouse=True)

@@ -9,14 +9,14 @@ import pytest
 
 import orthocas as oc
 from orthocas import solvers
+from orthocas.bases import JointSpace
+from orthocas.bases.circle import CircleFamily
+from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.phi import shortest
 from orthocas.codegen import check_c
 from orthocas.control import Kinematic, Reference
 from orthocas.control.turns import without_turns
-from orthocas.coordinates.fitted import Coordinates
-from orthocas.coordinates.turns import shortest
 from orthocas.errors import InvalidValueError
-from orthocas.parametrisations import JointSpace
-from orthocas.parametrisations.circle import CircleFamily
 
 RING = oc.Box([0.0, 1.2], [np.pi, 0.4], unbounded=[0])  # joint 1 turns without end
 

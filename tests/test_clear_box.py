@@ -15,14 +15,14 @@ from programs import Run, needs_c
 
 import orthocas as oc
 from orthocas import control
-from orthocas.certifying.check import check_certificate
+from orthocas.bases.cyclic import over_cyclic_joints
+from orthocas.certificates.check import check_certificate
+from orthocas.charts.worst_points import worst_points
 from orthocas.codegen import CompiledLibrary, check_c, compile_shared
 from orthocas.control import ControlStatus
-from orthocas.domains import sample_evenly, sample_heavily, sample_uniform
 from orthocas.errors import ChartFileError, DomainError, InvalidValueError, UnreachableReferenceError
-from orthocas.fitting.clear_part import clear_part
-from orthocas.parametrisations.cyclic_joints import over_cyclic_joints
-from orthocas.worst_points import worst_points
+from orthocas.fitting.fit import clear_part
+from orthocas.tasks.domains import sample_evenly, sample_heavily, sample_uniform
 
 Numbers = NDArray[np.float64]
 BOUND = 0.2

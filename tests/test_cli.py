@@ -15,8 +15,8 @@ from programs import Run, output_of
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.files.ours import LIST
 from orthocas.fitting.fit import Fit
+from orthocas.tools.files import LIST
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ from public_objects import clear
 
 import orthocas as oc
 from orthocas.errors import PathFileError
-from orthocas.following import joint_motion
-from orthocas.following.path_file import read_path
+from orthocas.paths import joint_motion
+from orthocas.paths.plan import read_path
 
 LIMITS = ("--velocity-limit", "1,1.5,2", "--acceleration-limit", "4")
 

@@ -14,9 +14,9 @@ from simulate_command import FILES, report_of, written
 import orthocas as oc
 from orthocas.cli.controller_argument import ControllerOptions, build_controller
 from orthocas.control import ControlStatus, matched_posture_stiffness, matched_stiffness
-from orthocas.domains import sample_uniform
 from orthocas.fitting.fit import Fit
 from orthocas.simulation import Trajectory
+from orthocas.tasks.domains import sample_uniform
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -14,9 +14,9 @@ from simulate_command import FILES, written
 
 import orthocas as oc
 from orthocas.cli import simulate as command
-from orthocas.files.atomic import published
-from orthocas.minimising.watch import Monitor, Progress
 from orthocas.simulation import Trajectory
+from orthocas.tools.files import published
+from orthocas.tools.progress import Monitor, Progress
 
 
 @pytest.mark.parametrize(

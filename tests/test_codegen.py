@@ -14,8 +14,8 @@ from programs import needs_c
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
 from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector
-from orthocas.domains import sample_uniform
 from orthocas.errors import CompileError, ProofError
+from orthocas.tasks.domains import sample_uniform
 
 pytestmark = needs_c
 

@@ -4,8 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from orthocas.casadi_tools.columns import COLUMNS, ColumnFunction, blocked, by_sample, shares
-from orthocas.casadi_tools.threads import using_threads
+from orthocas.tools.batch import using_threads
+from orthocas.tools.columns import COLUMNS, ColumnFunction, blocked, by_sample, shares
 
 
 def example() -> ca.Function:

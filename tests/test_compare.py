@@ -21,15 +21,15 @@ from programs import python
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.casadi_tools import batch
-from orthocas.comparing import cells, workers
-from orthocas.comparing.cells import Cell, CellResult, run_cell, run_cells
-from orthocas.comparing.figures import convergence_figure, front_figure
-from orthocas.comparing.report import Comparison
+from orthocas.bases import register
 from orthocas.errors import ArchiveError, ChartFileError, Interrupted, InvalidValueError
-from orthocas.fitting.loss import Weights
-from orthocas.minimising.watch import Progress
-from orthocas.parametrisations import register
+from orthocas.fitting import grid as cells
+from orthocas.fitting.comparison import Comparison
+from orthocas.fitting.comparison_figures import convergence_figure, front_figure
+from orthocas.fitting.grid import Cell, CellResult, run_cell, run_cells
+from orthocas.fitting.terms import Weights
+from orthocas.tools import batch, processes
+from orthocas.tools.progress import Progress
 
 QUICK: dict[str, Any] = {"samples": 150, "held_out": 500}
 
@@ -230,12 +230,12 @@ def test_process_that_dies_fails_alone(planar_x: oc.Problem) -> None:
 
 def test_processes_use_one_thread_each_and_leave_the_environment_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    with workers.starting_workers():
+    with processes.starting_workers():
         assert os.environ["OMP_NUM_THREADS"] == "1"
         assert batch._threads() == 1
     assert os.environ["OMP_NUM_THREADS"] == "7"
     monkeypatch.delenv("OMP_NUM_THREADS")
-    with workers.starting_workers():
+    with processes.starting_workers():
         pass
     assert "OMP_NUM_THREADS" not in os.environ
 
@@ -260,7 +260,7 @@ def test_full_shared_memory_is_named(planar_x: oc.Problem, monkeypatch: pytest.M
     def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("orthocas.comparing.workers.ProcessPoolExecutor", full)
+    monkeypatch.setattr("orthocas.tools.processes.ProcessPoolExecutor", full)
     with pytest.raises(ArchiveError, match=r"No space left on device, expected room in /dev/shm"):
         oc.compare(planar_x, [oc.Linear()], samples=30, held_out=50)
 

@@ -12,13 +12,13 @@ from programs import needs_c
 from public_objects import impedance, planar, second, steps
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.control import ControlStatus, Kinematic, PDPlus, Projector, Reference, Safety
 from orthocas.control.controller import Controller
 from orthocas.errors import InvalidValueError, UnknownNameError
 from orthocas.fitting.fit import Fit
-from orthocas.minimising.watch import Progress
 from orthocas.simulation import Friction, Noise, Outcome, Push, Stops, Trajectory, simulate
+from orthocas.tools.checks import Array
+from orthocas.tools.progress import Progress
 
 pytestmark = needs_c
 ARRAYS = ("times", "q", "dq", "command", "status", "value", "reference", "storage", "dissipated_power")
@@ -142,7 +142,7 @@ def test_many_runs_keep_their_order_on_any_executor(monkeypatch: pytest.MonkeyPa
     here = oc.simulate_many(law, reference, starts[0], changes, **settings)
     with ThreadPoolExecutor(1) as executor:
         there = oc.simulate_many(law, reference, starts[0], changes, executor=executor, **settings)
-    monkeypatch.setattr("orthocas.simulation.many.THREADS", 3)
+    monkeypatch.setattr("orthocas.simulation.run.THREADS", 3)
     compiled = oc.simulate_many(law, reference, starts[0], changes, compiled=True, **settings)
     for q, *runs in zip(starts, here, there, compiled, strict=True):
         for run in runs:

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh, sqrtm
 
-from orthocas.checks import Array
-from orthocas.control.damping import DAMPING_DESIGNS, damping_matrix
-from orthocas.control.linear_algebra import spd_inverse, square_root
+from orthocas.control.linear_algebra import DAMPING_DESIGNS, damping_matrix, spd_inverse, square_root
+from orthocas.tools.checks import Array
 
 RNG = np.random.default_rng(11)
 

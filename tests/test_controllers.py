@@ -11,7 +11,6 @@ from laws import torque
 from scipy.linalg import block_diag, sqrtm
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.control import (
     ControlStatus,
     Impedance,
@@ -22,12 +21,13 @@ from orthocas.control import (
     Reference,
 )
 from orthocas.control.controller import Controller
-from orthocas.domains import sample_uniform
 from orthocas.errors import (
     NoExpressionError,
     UnreachableReferenceError,
 )
 from orthocas.problems.iiwa import urdf_path
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.checks import Array
 
 RNG = np.random.default_rng(21)
 

@@ -11,12 +11,12 @@ from programs import Run
 
 import orthocas as oc
 from orthocas import codegen, problems
-from orthocas.certifying.chart_rows import chart_rows
-from orthocas.certifying.outside import judge_of
-from orthocas.checks import Array
+from orthocas.certificates.chart_rows import chart_rows
+from orthocas.certificates.outside import judge_of
 from orthocas.control import ControlStatus
-from orthocas.domains import sample_heavily, sample_uniform
 from orthocas.errors import DomainError, InvalidValueError, ShapeError, UnreachableReferenceError
+from orthocas.tasks.domains import sample_heavily, sample_uniform
+from orthocas.tools.checks import Array
 
 PATH = np.array([[0.0, 0.6, 0.8], [0.7, 0.9, 1.2], [0.9, 1.7, 1.2]])
 RADIUS = 0.3

@@ -11,17 +11,17 @@ from programs import Run
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.casadi_tools.batch import Batched
+from orthocas.bases import parse_parametrisation
+from orthocas.charts.chart_file import CHART
 from orthocas.codegen.proof import check_c
 from orthocas.control import ControlStatus, Kinematic, PDPlus
-from orthocas.domains import borders, sample_heavily, sample_uniform
 from orthocas.errors import DomainError, InvalidValueError
-from orthocas.files.archive import read_archive
-from orthocas.files.chart_file import CHART
 from orthocas.fitting.fit import Fit
-from orthocas.parametrisations import parse_parametrisation
-from orthocas.postures.probe import judged_chart, leak_and_conditioning
-from orthocas.samples import samples_at
+from orthocas.fitting.probe import judged_chart, leak_and_conditioning
+from orthocas.tasks.domains import borders, sample_heavily, sample_uniform
+from orthocas.tasks.samples import samples_at
+from orthocas.tools.archive import read_archive
+from orthocas.tools.batch import Batched
 
 FULL_TURN = np.linspace(-2.96, 2.96, 60)  # inside the limits of A1 [rad]
 

@@ -7,12 +7,11 @@ from test_taylor_models import values_at
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.casadi_tools.batch import dense_function
-from orthocas.casadi_tools.structure import gradient_dependences, periodic_joints
-from orthocas.casadi_tools.tape import to_tape
-from orthocas.certifying.chart_rows import joint_models, true_gradients
-from orthocas.certifying.derivative_graph import DerivativeGraph
+from orthocas.certificates.chart_rows import joint_models, true_gradients
+from orthocas.certificates.graph import DerivativeGraph
 from orthocas.errors import CertifyError
+from orthocas.tools.batch import dense_function
+from orthocas.tools.expressions import gradient_dependences, periodic_joints, to_tape
 
 C = 2.0**55  #: spacing of numbers there: 8
 

@@ -12,9 +12,9 @@ import pytest
 
 import orthocas
 from orthocas import codegen, control, parametrisations, simulation, solvers
-from orthocas.casadi_tools.cached import cached_property
-from orthocas.fitting.loss import registry as loss_terms
-from orthocas.parametrisations import registry as families
+from orthocas.bases import registry as families
+from orthocas.fitting import terms as loss_terms
+from orthocas.tools.cached import cached_property
 
 PACKAGES: tuple[ModuleType, ...] = (orthocas, control, simulation, solvers, parametrisations, codegen)
 FEWEST_EXAMPLES = 20

@@ -7,8 +7,8 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas.domains import Box, contains, default_box, require_within_limits, sample_evenly, sample_uniform
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
+from orthocas.tasks.domains import Box, contains, default_box, require_within_limits, sample_evenly, sample_uniform
 
 
 def panda() -> oc.Robot:

@@ -37,7 +37,7 @@ from PIL import Image
 from programs import needs_c
 
 import orthocas as oc
-from orthocas.domains import sample_uniform
+from orthocas.tasks.domains import sample_uniform
 
 
 @pytest.mark.slow

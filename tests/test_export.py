@@ -18,17 +18,16 @@ from public_objects import CHARTS, circle, fitted
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.casadi_tools.tape import BINARY, CODES, UNARY, to_tape
-from orthocas.checks import Array
-from orthocas.coordinates.fitted import Coordinates
-from orthocas.domains import sample_uniform
+from orthocas.bases import JointSpace
+from orthocas.charts.coordinates import Coordinates
+from orthocas.codegen.export import LIBRARIES, module_text
+from orthocas.codegen.export_forms import function_code
 from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError, UnknownNameError
-from orthocas.exporting import LIBRARIES
-from orthocas.exporting.export import module_text
-from orthocas.exporting.tapes import function_code
-from orthocas.parametrisations import JointSpace
-from orthocas.tasks import TASK_KINDS
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.task import TASK_KINDS
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.checks import Array
+from orthocas.tools.expressions import BINARY, CODES, UNARY, to_tape
 
 FITTED = [name for name in CHARTS if name not in ("circle chart", "disk chart", "linear leaf chart")]
 AGREED = 1e-10

@@ -68,9 +68,9 @@ except InvalidValueError as error:
 def test_loss_term_acts_and_its_gauss_newton_matrix_and_hessian_are_right(tmp_path: Path) -> None:
     more = """
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.parametrisations import JointSpace
-from orthocas.samples import samples_at
-from orthocas.domains import sample_evenly
+from orthocas.bases import JointSpace
+from orthocas.tasks.samples import samples_at
+from orthocas.tasks.domains import sample_evenly
 weights = oc.Weights(extra={"quiet": 3000.0}, angles="metric")
 points = np.repeat(sample_evenly(problem.domain, 30, 3), 2, axis=0)  # every second one makes the Gauss-Newton matrix
 family = oc.Polynomial(2).family(JointSpace.of(problem), 2)
@@ -143,7 +143,7 @@ def test_names_are_taken_once(kind: str) -> None:
 from dataclasses import replace
 from types import SimpleNamespace
 import orthocas as oc
-from orthocas.fitting.loss import term_of
+from orthocas.fitting.terms import term_of
 try:
     {TAKEN[kind]}
 except oc.errors.InvalidValueError as error:

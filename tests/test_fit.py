@@ -12,9 +12,8 @@ import orthocas as oc
 from orthocas import solvers
 from orthocas.errors import Interrupted, InvalidValueError, MemoryNeedError, ShapeError, UnknownNameError
 from orthocas.fitting.fit import Fit
-from orthocas.minimising.objective import Objective
-from orthocas.minimising.solver import SolveResult, Status
-from orthocas.minimising.watch import UNWATCHED, Progress, Watch
+from orthocas.solvers.protocol import Objective, SolveResult, Status
+from orthocas.tools.progress import UNWATCHED, Progress, Watch
 
 
 @pytest.mark.slow

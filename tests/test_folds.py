@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas.domains import sample_heavily
+from orthocas.bases import JointSpace
+from orthocas.charts.point_quality import Judged
+from orthocas.charts.worst_points import least_in_domain, worst_points
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fold_search import FoldSearch
-from orthocas.fitting.loss import LEAST_CONDITIONING, Loss, Sizes, Weights
-from orthocas.fitting.loss.residuals import sample_loss
-from orthocas.fitting.mirror import Mirror, find_mirror
-from orthocas.judging.gradients import Judged
-from orthocas.parametrisations import JointSpace
-from orthocas.samples import sample_problem
-from orthocas.worst_points import least_in_domain, worst_points
+from orthocas.fitting.residuals import Loss, sample_loss
+from orthocas.fitting.starts import Mirror, find_mirror
+from orthocas.fitting.terms import LEAST_CONDITIONING, Sizes, Weights
+from orthocas.tasks.domains import sample_heavily
+from orthocas.tasks.samples import sample_problem
 
 ACTIVE = list(range(6))
 SPACE = JointSpace(np.zeros(2), np.ones(2), (False, False), ("a", "b"))

@@ -14,17 +14,14 @@ from scipy.integrate import trapezoid
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
 from orthocas.errors import InvalidValueError, NoExpressionError, PathError, PathFileError, ShapeError
-from orthocas.following import JointMotion
-from orthocas.following.checks import Limits
-from orthocas.following.choose_xi import XiChoice
-from orthocas.following.costs import Costs
-from orthocas.following.joint_curve import JointCurve
-from orthocas.following.plan import Plan
-from orthocas.following.solver import Solver
-from orthocas.following.walk import walk
-from orthocas.obstacles import LinkDistances, Sphere
+from orthocas.paths import JointMotion
+from orthocas.paths.checks import Limits
+from orthocas.paths.choose_xi import Costs, XiChoice, walk
+from orthocas.paths.joint_curve import JointCurve, Solver
+from orthocas.paths.plan import Plan
+from orthocas.robots.obstacles import LinkDistances, Sphere
+from orthocas.tools.checks import Array
 
 START = np.array([0.6, 0.8, 0.8])
 

@@ -9,17 +9,12 @@ from laws import torque
 from scipy.linalg import eigvalsh
 
 import orthocas as oc
-from orthocas.checks import Array
-from orthocas.control import (
-    Impedance,
-    PDPlus,
-    matched_posture_stiffness,
-    matched_stiffness,
-)
-from orthocas.domains import sample_uniform
+from orthocas.control import Impedance, PDPlus, matched_posture_stiffness, matched_stiffness
 from orthocas.errors import (
     InvalidValueError,
 )
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.checks import Array
 
 
 def test_matched_stiffness_has_its_modes_around_the_frequency(planar_chart: oc.Chart, arm_chart: oc.Chart) -> None:

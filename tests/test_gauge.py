@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas.checks import Array
+from orthocas.bases import JointSpace
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.gauge import aligned, in_gauge
-from orthocas.parametrisations import JointSpace
-from orthocas.samples import sample_problem
+from orthocas.fitting.fit import aligned, in_gauge
+from orthocas.tasks.samples import sample_problem
+from orthocas.tools.checks import Array
 
 
 def parallel(a: oc.Chart, b: oc.Chart) -> Array:

@@ -10,6 +10,7 @@ from charts import planar_2r
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.charts.chart_file import CHART
 from orthocas.errors import (
     ChartFileError,
     GrowError,
@@ -23,10 +24,11 @@ from orthocas.errors import (
     ShapeError,
     UnknownNameError,
 )
-from orthocas.files.archive import read_archive, write_archive
-from orthocas.files.chart_file import CHART
-from orthocas.growing import Arrival, GrownCoordinates, TaskFlow, leaf_from_arrays
-from orthocas.metrics import metric_matrices
+from orthocas.exact.flow import Arrival, TaskFlow
+from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.leaves import leaf_from_arrays
+from orthocas.tasks.metric import metric_matrices
+from orthocas.tools.archive import read_archive, write_archive
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
 CELL = oc.Box([np.pi / 2, 0, 0], [np.pi / 2, np.pi, np.pi])

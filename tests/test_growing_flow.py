@@ -8,9 +8,8 @@ from scipy.integrate import solve_ivp
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import GrowError
-from orthocas.growing import Arrival, SundialsFlow, TaskFlow
-from orthocas.growing.dormand_prince import BatchedFlow
-from orthocas.metrics import metric_matrices
+from orthocas.exact.flow import Arrival, BatchedFlow, SundialsFlow, TaskFlow
+from orthocas.tasks.metric import metric_matrices
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
 STIFFNESS = np.diag([3.0, 2.0, 1.0]) + 0.2

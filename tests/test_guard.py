@@ -8,8 +8,6 @@ from charts import linear_on_the_torus
 from laws import torque
 
 import orthocas as oc
-from orthocas.casadi_tools.batch import Batched
-from orthocas.checks import Array
 from orthocas.control import (
     ControlStatus,
     Impedance,
@@ -18,14 +16,15 @@ from orthocas.control import (
     PDPlus,
     Projector,
 )
-from orthocas.control.controller import Controller
-from orthocas.control.status import FROM_THE_LAW
-from orthocas.domains import sample_uniform
+from orthocas.control.controller import FROM_THE_LAW, Controller
 from orthocas.errors import (
     InvalidValueError,
     ShapeError,
     UnknownNameError,
 )
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.batch import Batched
+from orthocas.tools.checks import Array
 
 
 @pytest.fixture(scope="module")

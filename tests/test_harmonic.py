@@ -8,10 +8,16 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
 from test_level_surface import arm_leaf
 
-from orthocas.checks import Array
 from orthocas.errors import FoldedMapError, InvalidValueError, NotADiskError, ShapeError
-from orthocas.growing.harmonic import harmonic_disk, signed_areas, solve_dirichlet
-from orthocas.growing.level_surface import TriangleMesh, level_surface, require_disk
+from orthocas.exact.harmonic import (
+    TriangleMesh,
+    harmonic_disk,
+    level_surface,
+    require_disk,
+    signed_areas,
+    solve_dirichlet,
+)
+from orthocas.tools.checks import Array
 
 
 def square(cells: int = 12) -> TriangleMesh:

@@ -14,9 +14,9 @@ from chart_files import header_of, polynomial, resealed, rewritten
 
 import orthocas as oc
 from orthocas.errors import ChartFileError, TrajectoryFileError
-from orthocas.files import archive, npy
 from orthocas.fitting.fit import Fit
 from orthocas.simulation import Trajectory
+from orthocas.tools import archive
 
 
 def test_links_other_files_and_odd_targets_are_refused(planar_fit: Fit, tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_failed_write_leaves_the_old_file(planar_fit: Fit, saved: Path, monkeypa
     def full_disk(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("orthocas.files.atomic.os.fsync", full_disk)
+    monkeypatch.setattr("orthocas.tools.files.os.fsync", full_disk)
     with pytest.raises(ChartFileError, match="No space left"):
         planar_fit.chart.save(saved)
     assert saved.read_bytes() == before
@@ -251,7 +251,7 @@ def test_notes_hold_texts_and_finite_numbers(saved: Path, text: str, message: st
         ({"robot_translations": np.full((3, 3), 1e300)}, r"largest entry of translations is 1e\+300"),
         ({"robot_lower": [np.inf] * 3, "robot_upper": [np.inf] * 3}, r"limits \[inf, inf\]"),
         ({"theta": np.zeros(34, dtype=complex) * 2}, "contains an array that cannot be read: theta.npy"),
-        ({"theta": npy.to_npy(np.zeros(3))[:-1]}, "23 bytes for the shape"),
+        ({"theta": archive.to_npy(np.zeros(3))[:-1]}, "23 bytes for the shape"),
         ({"scale": np.full(2, 1e308), "offset": np.full(2, -1e308)}, "xi is not finite at any of 8 points"),
     ],
 )

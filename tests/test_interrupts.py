@@ -11,10 +11,10 @@ import pytest
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.casadi_tools import interrupts
 from orthocas.errors import Interrupted
-from orthocas.minimising.solver import Status
-from orthocas.minimising.watch import Progress
+from orthocas.solvers.protocol import Status
+from orthocas.tools import interrupts
+from orthocas.tools.progress import Progress
 
 FITS = {
     "network, lbfgs": (oc.MLP((32, 32)), solvers.LBFGS(max_iterations=100_000, tolerance=0.0), {}),

@@ -8,11 +8,11 @@ from public_objects import circle
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.domains import borders, sample_uniform
+from orthocas.charts.inverse import beyond_reach
+from orthocas.charts.newton import inverses
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
-from orthocas.inverting.arm_length import beyond_reach
-from orthocas.inverting.newton import inverses
+from orthocas.tasks.domains import borders, sample_uniform
 
 FOUND = oc.InverseStatus.FOUND
 BEYOND = (oc.InverseStatus.OUTSIDE_DOMAIN, oc.InverseStatus.LIMIT)

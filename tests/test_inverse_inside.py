@@ -7,9 +7,9 @@ from charts import beyond_domain
 from public_objects import clear
 
 import orthocas as oc
-from orthocas.domains import sample_uniform
+from orthocas.charts.inside import Programs, minimum
 from orthocas.fitting.fit import Fit
-from orthocas.inverting.box_programs import Programs, minimum
+from orthocas.tasks.domains import sample_uniform
 
 FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
 

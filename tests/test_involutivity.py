@@ -15,11 +15,11 @@ from scipy.linalg import inv, sqrtm
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.casadi_tools.batch import Batched
-from orthocas.checks import Array
-from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.problems.iiwa import urdf_path
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.batch import Batched
+from orthocas.tools.checks import Array
 
 BOX = oc.Box([0.6, 0.8, 0.8], 0.3)
 

@@ -10,12 +10,11 @@ from charts import with_metric
 from programs import Run
 
 import orthocas as oc
-from orthocas.domains import sample_uniform
+from orthocas.charts.angles import judge_by_columns, judge_by_lapack
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.fitting.fit import Fit
-from orthocas.judging.by_lapack import judge_by_lapack
-from orthocas.judging.formulas import judge_by_columns
-from orthocas.samples import samples_at
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import samples_at
 
 
 def leaks_by_hand(chart: oc.Chart, q: np.ndarray) -> np.ndarray:

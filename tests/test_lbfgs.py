@@ -7,9 +7,9 @@ from objectives import START, LastState, Valley
 
 from orthocas import solvers
 from orthocas.errors import CheckpointError
-from orthocas.minimising.solver import Status
-from orthocas.minimising.watch import Watch
-from orthocas.solvers.line_search import Trial, wolfe_step
+from orthocas.solvers.lbfgs import Trial, wolfe_step
+from orthocas.solvers.protocol import Status
+from orthocas.tools.progress import Watch
 
 
 @pytest.mark.parametrize("pair", [np.ones((2, 3)), np.array([[1.0, 0.0], [-1.0, 0.0]]), np.full((2, 2), np.nan)])

@@ -9,10 +9,9 @@ from scipy.optimize import brentq
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.growing import TaskFlow
-from orthocas.growing.circle_leaf import circle_leaf
-from orthocas.growing.disk_leaf import disk_leaf
-from orthocas.growing.linear_leaf import linear_leaf
+from orthocas.exact.disk_leaf import disk_leaf
+from orthocas.exact.flow import TaskFlow
+from orthocas.exact.leaves import circle_leaf, linear_leaf
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
 START = np.array([np.pi / 3, 0.0])

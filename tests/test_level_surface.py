@@ -8,10 +8,10 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose
 
-from orthocas.checks import Array
 from orthocas.errors import InvalidValueError, NotADiskError, ShapeError
-from orthocas.growing.level_surface import Function, TriangleMesh, level_surface, require_disk
-from orthocas.growing.mesh_improvement import flip_to_delaunay
+from orthocas.exact.harmonic import Function, TriangleMesh, level_surface, require_disk
+from orthocas.exact.mesh import flip_to_delaunay
+from orthocas.tools.checks import Array
 
 PI = np.pi
 ARM_BOX = ((0.0, -PI, -PI), (PI, PI, PI))  # of the joints of a planar 3R arm; its leaves are disks

@@ -12,7 +12,7 @@ from orthocas.control import Kinematic, PDPlus, Reference
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots.kinematics import point_jacobian
 from orthocas.simulation import Push, Stops, simulate
-from orthocas.simulation.loads import Loads
+from orthocas.simulation.disturbances import Loads
 
 
 def test_stops_push_back_in_proportion_and_never_pull(planar_x: oc.Problem) -> None:

@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 
 import orthocas as oc
+from orthocas.bases import JointSpace
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import graph_objective
 from orthocas.fitting.array_objective import ArrayObjective
+from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.gradients_of import gradients_of
 from orthocas.fitting.graph_objective import GraphObjective
-from orthocas.fitting.loss import REGULAR_VOLUME, Loss, Sizes, Weights, mutual_cosines, pairs, task_cosines
-from orthocas.fitting.spectral_start import spectral_start
-from orthocas.parametrisations import JointSpace
-from orthocas.samples import Draw, Samples, sample_problem, samples_at
+from orthocas.fitting.residuals import Loss
+from orthocas.fitting.starts import spectral_start
+from orthocas.fitting.terms import REGULAR_VOLUME, Sizes, Weights, mutual_cosines, pairs, task_cosines
+from orthocas.tasks.samples import Draw, Samples, sample_problem, samples_at
 
 WEIGHTS = Weights.of((1000.0, 30.0))
 REGULAR = Weights(1000.0, 30.0, 120.0)

@@ -11,13 +11,13 @@ from programs import Run
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.domains import sample_evenly
+from orthocas.bases import JointSpace, Parametrisation
 from orthocas.errors import CheckpointError, UnknownNameError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.graph_objective import GraphObjective
-from orthocas.fitting.loss import Weights
-from orthocas.parametrisations import JointSpace, Parametrisation
-from orthocas.samples import Samples, sample_problem
+from orthocas.fitting.terms import Weights
+from orthocas.tasks.domains import sample_evenly
+from orthocas.tasks.samples import Samples, sample_problem
 
 IN_METRIC = Weights(1000.0, 30.0, 0.0, angles="metric")
 

@@ -10,7 +10,7 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, MetricError, ShapeError, UnknownNameError
-from orthocas.metrics import Metric, metric_matrices
+from orthocas.tasks.metric import Metric, metric_matrices
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (10, 2))
 

@@ -9,8 +9,8 @@ import pytest
 
 import orthocas as oc
 from orthocas.errors import RobotError, UnknownNameError
-from orthocas.robots.files import lock_joints
 from orthocas.robots.mjcf import model_from_mjcf
+from orthocas.robots.urdf import lock_joints
 
 mujoco = pytest.importorskip("mujoco", minversion="4")  # older ones find principal axes to 1e-7 only
 

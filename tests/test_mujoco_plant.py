@@ -10,10 +10,10 @@ from conftest import ROBOTS, arm, pinocchio_position
 from scipy.integrate import solve_ivp
 
 import orthocas as oc
-from orthocas import checks
-from orthocas.checks import Array
 from orthocas.errors import InvalidValueError, MissingExtraError, ShapeError, SimulationError
 from orthocas.simulation import Elasticity, Friction, MuJoCoPlant, Payload, Wall
+from orthocas.tools import checks
+from orthocas.tools.checks import Array
 
 pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[sim] is not installed")
 

@@ -11,8 +11,7 @@ import pytest
 from public_objects import comparison, fitted, joint_motion, trajectory
 
 import orthocas as oc
-from orthocas.minimising.watch import Progress
-from orthocas.showing.progress import NotebookBars, TerminalLines, as_bars, in_notebook
+from orthocas.tools.progress import NotebookBars, Progress, TerminalLines, as_bars, in_notebook
 
 EVIL = "<img src=x>"
 

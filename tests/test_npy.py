@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from orthocas.files.npy import from_npy, to_npy
+from orthocas.tools.archive import from_npy, to_npy
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

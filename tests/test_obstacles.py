@@ -10,9 +10,9 @@ import pytest
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
 from orthocas.errors import InvalidValueError
-from orthocas.obstacles import Capsule, LinkDistances, Obstacle, Plane, Sphere
+from orthocas.robots.obstacles import Capsule, LinkDistances, Obstacle, Plane, Sphere
+from orthocas.tools.checks import Array
 
 RADIUS = 0.04
 

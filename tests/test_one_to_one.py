@@ -11,13 +11,13 @@ from public_objects import network, planar
 from random_arms import random_arm, second_solutions
 
 import orthocas as oc
-from orthocas.certificates.subdivision import PROVED, Subdivision
-from orthocas.certifying.chart_rows import chart_rows
-from orthocas.certifying.jets import Jets
-from orthocas.certifying.one_to_one import OneToOneJudge, one_to_one_judge
-from orthocas.certifying.search import Limits, Search, largest_first
+from orthocas.certificates.chart_rows import chart_rows
+from orthocas.certificates.jets import Jets
+from orthocas.certificates.one_to_one import OneToOneJudge, one_to_one_judge
+from orthocas.certificates.search import Limits, Search, largest_first
+from orthocas.charts.certificate import PROVED, Subdivision
 
-certifying = importlib.import_module("orthocas.certifying.certify")  # a function has the name of the module
+certifying = importlib.import_module("orthocas.certificates.certify")  # a function has the name of the module
 
 
 def judge_on(known: oc.Chart, half: np.ndarray) -> tuple[OneToOneJudge, Subdivision]:

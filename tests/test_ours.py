@@ -15,10 +15,8 @@ import pytest
 
 import orthocas as oc
 from orthocas.errors import ArchiveError, ChartFileError
-from orthocas.files import drafts
-from orthocas.files.atomic import output_folder, published
-from orthocas.files.drafts import draft_folder
-from orthocas.files.ours import LIST, is_listed
+from orthocas.tools import files
+from orthocas.tools.files import LIST, draft_folder, is_listed, output_folder, published
 
 
 def publish(folder: Path, text: str, force: bool = False) -> None:
@@ -86,10 +84,10 @@ def test_a_broken_list_knows_nothing(tmp_path: Path, text: str) -> None:
 def test_drafts_of_dead_processes_are_swept_and_no_others(tmp_path: Path) -> None:
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    alive = tmp_path / f".orthocas-{drafts._HOST}-{os.getpid()}-abcd"
+    alive = tmp_path / f".orthocas-{files._HOST}-{os.getpid()}-abcd"
     elsewhere = tmp_path / f".orthocas-another-{dead.pid}-abcd"
-    left = tmp_path / f".orthocas-{drafts._HOST}-{dead.pid}-abcd"
-    mine = tmp_path / f".orthocas-{drafts._HOST}-{dead.pid}-file"
+    left = tmp_path / f".orthocas-{files._HOST}-{dead.pid}-abcd"
+    mine = tmp_path / f".orthocas-{files._HOST}-{dead.pid}-file"
     for folder in (alive, elsewhere, left):
         folder.mkdir()
         (folder / "part").write_text("half")
@@ -182,8 +180,8 @@ def test_ctrl_c_while_drafts_are_made_or_removed_leaves_none(tmp_path: Path, mon
         remove(folder, ignore_errors=ignore_errors)
 
     for name, place, replacement in (
-        ("mkdtemp", drafts.tempfile, interrupted_make),
-        ("rmtree", drafts.shutil, interrupted_remove),
+        ("mkdtemp", files.tempfile, interrupted_make),
+        ("rmtree", files.shutil, interrupted_remove),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(place, name, replacement)

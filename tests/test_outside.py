@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas.certifying.chart_rows import chart_rows
-from orthocas.certifying.outside import judge_of
-from orthocas.certifying.search import Limits, Search, largest_first
+from orthocas.certificates.chart_rows import chart_rows
+from orthocas.certificates.outside import judge_of
+from orthocas.certificates.search import Limits, Search, largest_first
 
-certifying = importlib.import_module("orthocas.certifying.certify")  # a function has the name of the module
+certifying = importlib.import_module("orthocas.certificates.certify")  # a function has the name of the module
 BOUND = 0.1
 
 

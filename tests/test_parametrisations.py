@@ -6,13 +6,11 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas.casadi_tools.columns import COLUMNS, by_sample
-from orthocas.coordinates.point_functions import point_functions
+from orthocas.bases import JointSpace, ProductFamily, component_gradients, parse_parametrisation
+from orthocas.charts.coordinates import point_functions
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
-from orthocas.fitting.basis_gradients import BasisGradients
-from orthocas.fitting.product_gradients import BoxGradients, ProductGradients
-from orthocas.fitting.sparse_gradients import SparseGradients
-from orthocas.parametrisations import JointSpace, ProductFamily, component_gradients, parse_parametrisation
+from orthocas.fitting.basis_gradients import BasisGradients, BoxGradients, ProductGradients, SparseGradients
+from orthocas.tools.columns import COLUMNS, by_sample
 
 SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))
 SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE.joint_names)

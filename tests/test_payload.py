@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import ArrayLike
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.errors import InvalidValueError
 from orthocas.problems.iiwa import urdf_path
+from orthocas.tools.checks import Array
 
 
 def random_payload(rng: np.random.Generator) -> Array:

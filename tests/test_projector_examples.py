@@ -11,8 +11,8 @@ import pytest
 import self_motion_on_command
 
 import orthocas as oc
-from orthocas.casadi_tools.batch import Batched
 from orthocas.control import Impedance
+from orthocas.tools.batch import Batched
 
 pytestmark = pytest.mark.slow
 

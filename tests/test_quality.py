@@ -6,13 +6,13 @@ import pytest
 import scipy.linalg
 
 import orthocas as oc
-from orthocas.chart import Chart
-from orthocas.coordinates.fitted import Coordinates
-from orthocas.domains import sample_uniform
+from orthocas.bases import JointSpace
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.quality import AngleStatistics
 from orthocas.errors import InvalidValueError, MemoryNeedError, SingularTaskError
 from orthocas.fitting.fit import Fit
-from orthocas.judging.statistics import AngleStatistics
-from orthocas.parametrisations import JointSpace
+from orthocas.tasks.domains import sample_uniform
 
 
 def chart_with_normals(normals: list[list[float]], metric: object = "euclidean") -> Chart:

@@ -10,9 +10,9 @@ from scipy.optimize import fsolve
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.checks import Array
+from orthocas.charts.self_motion import SelfMotionCurve, StopKind
 from orthocas.errors import InvalidValueError
-from orthocas.reaching import SelfMotionCurve, StopKind
+from orthocas.tools.checks import Array
 
 LINKS = 3
 

@@ -10,8 +10,8 @@ import ready_charts
 from programs import Run
 
 import orthocas as oc
-from orthocas.domains import sample_uniform
 from orthocas.errors import UnknownNameError
+from orthocas.tasks.domains import sample_uniform
 
 ROOT = Path(__file__).parent.parent
 NAMES = oc.charts.names()

@@ -6,9 +6,9 @@ import pytest
 from conftest import ROBOTS, robot_data
 
 import orthocas as oc
-from orthocas.domains import default_box, require_within_limits
-from orthocas.postures.regular_box import regular_box
 from orthocas.problems.iiwa import robot as iiwa_robot
+from orthocas.tasks.domains import default_box, require_within_limits
+from orthocas.tasks.regular_box import regular_box
 
 
 def arm(name: str) -> oc.Robot:

@@ -7,8 +7,8 @@ import pytest
 import self_motion_picture
 from PIL import Image
 
-from orthocas.viewing.rendering import Camera, Layer, render
-from orthocas.viewing.solids import Solid, ball
+from orthocas.viewer.looks import Solid, ball
+from orthocas.viewer.rendering import Camera, Layer, render
 
 CAMERA = Camera((5.0, 0.0, 0.0), (0.0, 0.0, 0.0), 60.0)
 RED, BLUE = (200, 20, 20), (20, 20, 200)

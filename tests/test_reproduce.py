@@ -28,8 +28,8 @@ from programs import Run
 
 from orthocas import problems
 from orthocas.errors import InvalidValueError, SolveError, UnknownNameError
-from orthocas.files.ours import LIST
-from orthocas.minimising.watch import Progress
+from orthocas.tools.files import LIST
+from orthocas.tools.progress import Progress
 
 Numbers = dict[str, float]
 

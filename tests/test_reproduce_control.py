@@ -24,8 +24,8 @@ from paper.planar_loop import (
     task_angle_std,
 )
 
-from orthocas.chart import Chart
-from orthocas.domains import Box
+from orthocas.charts.chart import Chart
+from orthocas.tasks.domains import Box
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from paper.fig29 import unfolded
 from paper.pose_map import joints, pose, pose_jacobian
 
 import orthocas as oc
-from orthocas.parametrisations import JointSpace
+from orthocas.bases import JointSpace
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ from conftest import ROBOTS, arm, one_joint, robot_data
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, OrthocasError, RobotError, ShapeError, UnknownNameError
-from orthocas.robots import files
+from orthocas.robots import urdf
 from orthocas.robots.planar import planar_model
 
 
@@ -115,7 +115,7 @@ def test_joints_of_any_type_off_the_chain_are_locked_unless_a_model_is_taken_who
     path.write_text(path.read_text().replace("</robot>", floating))
     assert oc.Robot.from_urdf(path, "a").joint_names == ("j",)
     with pytest.raises(RobotError, match="'free' .*--lock free=0"):
-        oc.Robot.from_model(files.read_urdf(path), "a")
+        oc.Robot.from_model(urdf.read_urdf(path), "a")
 
 
 def test_locked_must_be_a_mapping_to_numbers() -> None:

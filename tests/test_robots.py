@@ -11,7 +11,7 @@ from conftest import ROBOTS, arm, pinocchio_position, robot_data
 import orthocas as oc
 from orthocas.errors import RobotError
 from orthocas.problems.iiwa import robot as iiwa_robot
-from orthocas.robots import files
+from orthocas.robots import urdf
 
 
 @pytest.mark.slow
@@ -187,7 +187,7 @@ def test_mimic_joint_on_the_way_names_the_joint_to_lock() -> None:
 def test_joints_off_the_way_are_locked_next_to_zero_and_those_of_the_user_where_asked() -> None:
     path = robot_data("panda_description/urdf/panda.urdf")
     q = np.full(7, 0.3)
-    model = files.lock_joints(files.read_urdf(path), {"panda_finger_joint1": 0.0})
+    model = urdf.lock_joints(urdf.read_urdf(path), {"panda_finger_joint1": 0.0})
     want = oc.Robot.from_model(model, "panda_hand").mass_matrix(q)
     np.testing.assert_allclose(oc.Robot.from_urdf(path, "panda_hand").mass_matrix(q), want, atol=1e-12)
     opened = oc.Robot.from_urdf(path, "panda_hand", {"panda_finger_joint1": 0.04}).mass_matrix(q)

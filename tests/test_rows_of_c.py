@@ -11,11 +11,11 @@ from programs import needs_c
 from public_objects import cyclic, fitted, given, network, with_idle_joint
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import GeneratedC
 from orthocas.codegen.library import NO_DOUBLE, STRICT, compilers
-from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.checks import Array
 
 pytestmark = needs_c
 OK, NOT_FINITE = 0, 3

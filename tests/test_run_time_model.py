@@ -11,10 +11,10 @@ from test_controllers import State, by_hand, called, torque
 from test_payload import arm_model, loaded, random_payload
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import check_c
 from orthocas.control import ControlStatus, Impedance, PDPlus, RunTimeModel, matched_stiffness
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
+from orthocas.tools.checks import Array
 
 K, Z = np.linspace(10, 200, 7), np.linspace(0.3, 1.0, 7)
 ONE_BLOCK = [slice(0, 7)]

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 import orthocas as oc
-from orthocas.certificates.subdivision import Subdivision
-from orthocas.certifying.judges import UNKNOWN, Verdicts
-from orthocas.certifying.search import Limits, Search, largest_first
+from orthocas.certificates.judges import UNKNOWN, Verdicts
+from orthocas.certificates.search import Limits, Search, largest_first
+from orthocas.charts.certificate import Subdivision
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from programs import needs_c
 from scipy.linalg import sqrtm
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import check_c
 from orthocas.control import ControlStatus, Impedance, KinematicProjector, Projector, Reference
 from orthocas.control.controller import Controller
@@ -22,6 +21,7 @@ from orthocas.errors import (
     SingularTaskError,
     UnreachableReferenceError,
 )
+from orthocas.tools.checks import Array
 
 RNG = np.random.default_rng(15)
 

@@ -11,22 +11,22 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
+from orthocas.bases.sew import SEW_KINDS, sew_angle
 from orthocas.errors import RobotError, UnknownNameError
-from orthocas.parametrisations.shoulder_elbow_wrist import SEW_KINDS, sew_angle
 from orthocas.problems.iiwa import CENTRE, urdf_path
 from orthocas.problems.iiwa import robot as iiwa_robot
-from orthocas.robots import files
+from orthocas.robots import urdf
 
 Z = np.array([0.0, 0.0, 1.0])
 
 
 def iiwa_model() -> pin.Model:
     with urdf_path() as path:
-        return files.read_urdf(path)
+        return urdf.read_urdf(path)
 
 
 def panda_model() -> pin.Model:
-    return files.lock_off_chain(files.read_urdf(robot_data("panda_description/urdf/panda.urdf")), "panda_hand")
+    return urdf.lock_off_chain(urdf.read_urdf(robot_data("panda_description/urdf/panda.urdf")), "panda_hand")
 
 
 def changed(robot: oc.Robot, **changes: Any) -> oc.Robot:
@@ -195,8 +195,8 @@ def test_robots_without_shoulder_elbow_and_wrist_are_refused() -> None:
 
 
 def test_axes_that_do_not_meet_are_named_with_their_distance() -> None:
-    torso = files.read_urdf(robot_data("tiago_description/robots/tiago.urdf"))
-    arm = files.lock_joints(files.lock_off_chain(torso, "arm_tool_link"), {"torso_lift_joint": 0.1})
+    torso = urdf.read_urdf(robot_data("tiago_description/robots/tiago.urdf"))
+    arm = urdf.lock_joints(urdf.lock_off_chain(torso, "arm_tool_link"), {"torso_lift_joint": 0.1})
     with pytest.raises(RobotError, match="'arm_1_joint' and 'arm_2_joint' are 0.125 m apart, expected axes that meet"):
         sew_angle(oc.Robot.from_model(arm, "arm_tool_link"), "conventional")
     iiwa = iiwa_robot()

@@ -12,11 +12,9 @@ from public_objects import CONTROLLERS, OBJECTS, comparison, fitted, impedance, 
 
 import orthocas as oc
 from orthocas import control, problems
+from orthocas.charts.quality import AngleStatistics, Conditioning
 from orthocas.cli.output import report_rows
-from orthocas.judging.statistics import AngleStatistics
-from orthocas.quality import Conditioning
-from orthocas.showing import Shown, listed, number_list
-from orthocas.showing.facts import as_html, as_text
+from orthocas.tools.display import Shown, as_html, as_text, listed, number_list
 
 EVIL = "<b>&'\"\n</td>"  # a text that a file of others may hold
 NAME = EVIL.replace("\n", "")  # names are printable

@@ -16,13 +16,12 @@ from paper import Drawing, Recipe, registry
 from programs import Run, python
 
 import orthocas as oc
-from orthocas.casadi_tools.interrupts import deferred, ended_in_order, remembered
 from orthocas.cli import entry
-from orthocas.comparing.cells import run_cells
 from orthocas.errors import Interrupted
-from orthocas.minimising.best_point import BestPoint
-from orthocas.minimising.solver import Status
-from orthocas.minimising.watch import Progress
+from orthocas.fitting.grid import run_cells
+from orthocas.solvers.protocol import BestPoint, Status
+from orthocas.tools.interrupts import deferred, ended_in_order, remembered
+from orthocas.tools.progress import Progress
 
 
 def ctrl_c_in_the_solver(progress: Progress) -> None:

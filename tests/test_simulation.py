@@ -11,7 +11,6 @@ from closed_loops import K, resting, torque_at
 from scipy.integrate import solve_ivp
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Projector, Reference
 from orthocas.errors import InvalidValueError
 from orthocas.problems.iiwa import urdf_path
@@ -22,6 +21,7 @@ from orthocas.simulation import (
     simulate,
     task_acceleration_breakdown,
 )
+from orthocas.tools.checks import Array
 
 
 def test_run_agrees_with_another_integrator_on_pinocchios_dynamics(

@@ -7,10 +7,8 @@ import pytest
 from closed_loops import K, resting
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.control import ControlStatus, Impedance, Kinematic, KinematicProjector, PDPlus, Projector, Reference
 from orthocas.errors import Interrupted, InvalidValueError, ShapeError, UnreachableReferenceError
-from orthocas.minimising.watch import Progress
 from orthocas.simulation import (
     Friction,
     Noise,
@@ -18,6 +16,8 @@ from orthocas.simulation import (
     Push,
     simulate,
 )
+from orthocas.tools.checks import Array
+from orthocas.tools.progress import Progress
 
 
 def test_unreachable_reference_is_reported_before_the_run(planar_chart: oc.Chart, planar_q0: Array) -> None:

@@ -5,12 +5,12 @@ import pytest
 from charts import with_metric, with_upper_limit
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.control import Impedance, Kinematic, PDPlus, Reference
 from orthocas.errors import Interrupted, InvalidValueError, UnknownNameError
-from orthocas.minimising.watch import Progress
 from orthocas.simulation import Friction, MuJoCo, Noise, Outcome, Payload, Push, Stops, Wall, simulate
 from orthocas.simulation.run import Plant
+from orthocas.tools.checks import Array
+from orthocas.tools.progress import Progress
 
 pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[sim] is not installed")
 

@@ -5,7 +5,6 @@ import pytest
 from closed_loops import K, resting
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.control import Impedance, PDPlus, Reference
 from orthocas.errors import InvalidValueError
 from orthocas.simulation import (
@@ -13,6 +12,7 @@ from orthocas.simulation import (
     Push,
     simulate,
 )
+from orthocas.tools.checks import Array
 
 
 def test_push_displaces_as_far_as_the_stiffness_lets_it(planar_chart: oc.Chart, planar_q0: Array) -> None:

@@ -14,14 +14,12 @@ from PIL import Image
 import orthocas as oc
 from orthocas.control import ControlStatus, Kinematic, PDPlus, Reference
 from orthocas.errors import ArchiveError, InvalidValueError, UnknownNameError
-from orthocas.files.atomic import published
-from orthocas.files.ours import LIST
 from orthocas.fitting.fit import Fit
-from orthocas.minimising.watch import Progress
 from orthocas.simulation import Outcome, Trajectory, animation
-from orthocas.simulation.animation import save_animation
+from orthocas.simulation.animation import MovingPicture, save_animation
 from orthocas.simulation.figure import ACTUAL, trajectory_figure, units_of
-from orthocas.simulation.moving_picture import MovingPicture
+from orthocas.tools.files import LIST, published
+from orthocas.tools.progress import Progress
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ from closed_loops import K, resting, torque_at
 from scipy.integrate import solve_ivp
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.control import Impedance, PDPlus, Reference
 from orthocas.errors import InvalidValueError
 from orthocas.simulation import (
@@ -16,6 +15,7 @@ from orthocas.simulation import (
     Push,
     simulate,
 )
+from orthocas.tools.checks import Array
 
 
 def test_sampled_control_approaches_continuous_control(

@@ -13,7 +13,6 @@ import pytest
 from programs import Run, built, needs_c, output_of
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, check_c, compile_shared, gain_numbers
 from orthocas.codegen.library import compilers
 from orthocas.codegen.precision import SINGLE
@@ -27,9 +26,10 @@ from orthocas.control import (
     Projector,
     Safety,
 )
-from orthocas.domains import borders
 from orthocas.errors import ProofError
 from orthocas.fitting.fit import Fit
+from orthocas.tasks.domains import borders
+from orthocas.tools.checks import Array
 
 pytestmark = needs_c
 

@@ -7,8 +7,8 @@ from charts import planar_2r
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.charts.singularities import jumps, singular_points
 from orthocas.errors import GrowError
-from orthocas.singularities import jumps, singular_points
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])

@@ -30,7 +30,7 @@ def contents(page: str) -> set[str]:
 def test_every_public_name_is_in_the_reference_once() -> None:
     found = described()
     assert len(found) == len(set(found)) > 100
-    packages = (orthocas.control, orthocas.simulation, orthocas.obstacles, orthocas.following, orthocas.plotting)
+    packages = (orthocas.control, orthocas.simulation, orthocas.robots.obstacles, orthocas.paths, orthocas.plotting)
     wanted = {f"orthocas.{name}" for name in orthocas.__all__}
     for package in packages:
         own = {f"{package.__name__}.{name}" for name in package.__all__}

@@ -8,16 +8,12 @@ from objectives import START, Bowl, SmoothValley, TwoFaced, Valley
 
 import orthocas as oc
 from orthocas import problems, solvers
+from orthocas.bases import JointSpace
 from orthocas.errors import InvalidValueError, SolveError
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.spectral_start import spectral_start
-from orthocas.minimising.objective import (
-    ConstrainedObjective,
-    Objective,
-)
-from orthocas.minimising.solver import Solver, Status
-from orthocas.parametrisations import JointSpace
-from orthocas.samples import sample_problem
+from orthocas.fitting.starts import spectral_start
+from orthocas.solvers.protocol import ConstrainedObjective, Objective, Solver, Status
+from orthocas.tasks.samples import sample_problem
 
 
 def test_ipopt_keeps_constraints() -> None:

@@ -9,15 +9,17 @@ from objectives import ALL, SHORT, START, Bowl, Broken, Interrupted, LastState, 
 
 from orthocas import solvers
 from orthocas.errors import InvalidValueError, SolveError, UnknownNameError
-from orthocas.minimising.objective import (
+from orthocas.solvers.protocol import (
     ConstrainedObjective,
     EstimatedObjective,
     LeastSquaresObjective,
     Objective,
     SmoothObjective,
+    Solver,
+    SolveResult,
+    Status,
 )
-from orthocas.minimising.solver import Solver, SolveResult, Status
-from orthocas.minimising.watch import Progress, State, Watch
+from orthocas.tools.progress import Progress, State, Watch
 
 
 @pytest.mark.parametrize("solver", ALL, ids=lambda s: s.name)

@@ -1,6 +1,5 @@
 """What is imported when: little at first, and nothing twice under two names."""
 
-import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -8,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import orthocas as oc
-from orthocas.cli.commands import COMMANDS, app_for
-from orthocas.comparing import workers
+from orthocas.cli.commands import app_for, helped
+from orthocas.tools import processes
 
 INIT = Path(oc.__file__)
 HEAVY = {"casadi", "numpy", "pinocchio", "scipy", "matplotlib", "trimesh", "igl", "skimage", "rich", "PIL", "mujoco"}
@@ -35,37 +34,32 @@ def test_help_imports_nothing_heavy() -> None:
     assert not HEAVY & loaded
 
 
-@pytest.mark.parametrize("module", ["orthocas.chart", "orthocas.fitting.fit", "orthocas.cli.info", "orthocas.control"])
+@pytest.mark.parametrize(
+    "module", ["orthocas.charts.chart", "orthocas.fitting.fit", "orthocas.cli.info", "orthocas.control"]
+)
 def test_parts_of_scipy_and_pictures_wait_until_they_are_needed(module: str) -> None:
     late = {"scipy.interpolate", "scipy.optimize", "scipy.spatial", "scipy.special", "scipy.sparse", "scipy.linalg"}
     late |= {"igl", "matplotlib", "trimesh", "rich", "PIL", "mujoco", "distributed"}
     assert not late & modules_after(f"import {module}")
 
 
-def test_names_in_the_package_agree() -> None:
-    """What type checkers read, what is imported on first use, and the public names."""
-    body = ast.parse(INIT.read_text()).body
-    (typed,) = [node for node in body if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"]
-    places = {
-        alias.asname or alias.name: (node.module, alias.name)
-        for node in typed.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    modules = {name for name, (home, _) in places.items() if home == "orthocas"}
-    assert {name: place for name, place in places.items() if name not in modules} == oc._PLACES
-    assert set(oc.__all__) == set(places)
-    assert oc.__all__ == sorted(oc.__all__, key=lambda name: (not name.isupper(), not name[0].isupper(), name))
-    for name, (home, own_name) in oc._PLACES.items():
-        assert getattr(oc, name) is getattr(sys.modules[home], own_name)
+def test_every_stated_name_is_what_its_module_has() -> None:
+    assert set(oc.__all__) == set(oc._HOMES)
+    for name, (home, own_name) in oc._HOMES.items():
+        public = getattr(oc, name)
+        assert public in (sys.modules.get(f"{home}.{own_name}"), getattr(sys.modules[home], own_name, None)), name
+
+
+def test_former_names_of_packages_lead_to_the_new_ones() -> None:
+    assert (oc.parametrisations, oc.following) == (oc.bases, oc.paths)
 
 
 def test_functions_stay_functions_beside_modules_of_their_names() -> None:
     code = (
-        "import orthocas.grow, orthocas.involutivity\nimport orthocas as oc\nfrom orthocas import distil\n"
-        "import orthocas.distil\nassert all(map(callable, (oc.grow, oc.involutivity, distil, oc.distil)))"
+        "import orthocas.charts.grow, orthocas.exact.involutivity\nimport orthocas as oc\nfrom orthocas import distil\n"
+        "import orthocas.fitting.distil\nassert all(map(callable, (oc.grow, oc.involutivity, distil, oc.distil)))"
     )
-    assert "orthocas.distil" in modules_after(code)
+    assert "orthocas.fitting.distil" in modules_after(code)
 
 
 def test_unknown_names_are_errors() -> None:
@@ -75,18 +69,18 @@ def test_unknown_names_are_errors() -> None:
 
 
 def test_help_tells_the_first_lines_of_all_commands() -> None:
-    app = app_for(list(COMMANDS))
+    app = app_for(list(helped()))
     commands = {command.name: command for command in app.registered_commands}
     groups = {group.name: group for group in app.registered_groups}
-    assert [*commands, *groups] == list(COMMANDS)
+    assert [*commands, *groups] == list(helped())
     for name, group in groups.items():
         assert group.typer_instance is not None
-        assert group.typer_instance.info.help == COMMANDS[name]
+        assert group.typer_instance.info.help == helped()[name]
     for name, command in commands.items():
         assert command.callback is not None
-        assert (command.callback.__doc__ or "").splitlines()[0] == COMMANDS[name]
+        assert (command.callback.__doc__ or "").splitlines()[0] == helped()[name]
         assert sys.modules[f"orthocas.cli.{name}"] is not None
 
 
 def test_workers_are_known_by_the_same_variable() -> None:
-    assert f'"{workers._PARENT}" in _os.environ' in INIT.read_text()
+    assert f'"{processes._PARENT}" in _os.environ' in INIT.read_text()

@@ -11,13 +11,13 @@ from public_objects import suggestion
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.domains import sample_heavily
+from orthocas.charts.quality import evaluate
 from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, SingularTaskError, UnknownNameError
-from orthocas.minimising.watch import Progress
-from orthocas.postures.home import home_posture
-from orthocas.postures.probe import Prober, judged_chart, leak_and_conditioning
-from orthocas.quality import evaluate
-from orthocas.samples import samples_at
+from orthocas.fitting.probe import Prober, judged_chart, leak_and_conditioning
+from orthocas.tasks.domains import sample_heavily
+from orthocas.tasks.regular_box import home_posture
+from orthocas.tasks.samples import samples_at
+from orthocas.tools.progress import Progress
 
 HOME = (0.6, 0.8, 0.8)
 

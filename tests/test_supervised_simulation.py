@@ -9,12 +9,12 @@ import pytest
 from programs import Run, needs_c
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import library
 from orthocas.control import ControlStatus, Kinematic, PDPlus, Projector, Reference, Safety, matched_stiffness
 from orthocas.errors import CompileError, InvalidValueError, ShapeError
 from orthocas.simulation import Outcome, Push, Trajectory, simulate
 from orthocas.simulation.figure import trajectory_figure
+from orthocas.tools.checks import Array
 
 pytestmark = [needs_c, pytest.mark.slow]
 

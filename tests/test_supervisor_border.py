@@ -8,9 +8,9 @@ from programs import needs_c
 from supervised import TICK, Arm, at_rest, moving, run
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import ControlStatus, PDPlus, Safety
+from orthocas.tools.checks import Array
 
 pytestmark = needs_c
 

@@ -9,11 +9,11 @@ from programs import built, needs_c
 from supervised import TICK, Arm, at_rest, moving, run
 
 import orthocas as oc
-from orthocas.checks import Array
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
-from orthocas.codegen.generated import GeneratedC
+from orthocas.codegen.library import GeneratedC
 from orthocas.control import Controller, ControlStatus, PDPlus, Safety
 from orthocas.simulation import MuJoCoPlant
+from orthocas.tools.checks import Array
 
 pytestmark = needs_c
 

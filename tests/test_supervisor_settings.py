@@ -9,7 +9,7 @@ from supervised import TICK, Arm, at_rest, run
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
-from orthocas.codegen.generated import GeneratedC
+from orthocas.codegen.library import GeneratedC
 from orthocas.control import Controller, Kinematic, Projector, Reference, Safety
 from orthocas.errors import InvalidValueError, ShapeError
 

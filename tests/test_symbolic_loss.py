@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas.domains import sample_evenly
+from orthocas.bases import JointSpace, Parametrisation
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.graph_objective import GraphObjective
-from orthocas.parametrisations import JointSpace, Parametrisation
-from orthocas.samples import samples_at
+from orthocas.tasks.domains import sample_evenly
+from orthocas.tasks.samples import samples_at
 
 EVERY_TERM = oc.Weights(length=3.0, angles="paper")
 CASES = [

@@ -7,10 +7,10 @@ import pytest
 from conftest import arm, robot_data
 
 import orthocas as oc
-from orthocas.casadi_tools.tape import from_tape, to_tape
-from orthocas.domains import default_box
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.problems.iiwa import robot as iiwa_robot
+from orthocas.tasks.domains import default_box
+from orthocas.tools.expressions import from_tape, to_tape
 
 Q = np.array([0.3, 0.7, -0.4, -1.0, 0.5, 0.9, 0.2])
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])  # of the Panda: its hand points down

@@ -10,18 +10,15 @@ from certified_charts import chart, fourier
 from public_objects import given, network
 
 import orthocas as oc
-from orthocas.casadi_tools.batch import dense_function
-from orthocas.certifying import functions
-from orthocas.certifying.chart_rows import chart_rows, joint_models
-from orthocas.certifying.elementary import exponential, hyperbolic_tangent, sine_and_cosine
-from orthocas.certifying.elimination import in_singular_basis, lower_bound, pivots
-from orthocas.certifying.graph import TaylorGraph
-from orthocas.certifying.monomials import monomials
-from orthocas.certifying.rounding import above, sum_error
-from orthocas.certifying.taylor import TaylorModel
-from orthocas.certifying.volume import conditioning_bound
-from orthocas.checks import Array
-from orthocas.samples import samples_at
+from orthocas.certificates import functions
+from orthocas.certificates.chart_rows import chart_rows, joint_models
+from orthocas.certificates.functions import exponential, hyperbolic_tangent, sine_and_cosine
+from orthocas.certificates.graph import TaylorGraph
+from orthocas.certificates.judges import conditioning_bound, in_singular_basis, lower_bound, pivots
+from orthocas.certificates.taylor import TaylorModel, above, monomials, sum_error
+from orthocas.tasks.samples import samples_at
+from orthocas.tools.batch import dense_function
+from orthocas.tools.checks import Array
 
 ROUNDING = 1e-13  # of numbers of size 1 in the plain evaluation that a model is compared with
 

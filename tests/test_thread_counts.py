@@ -13,9 +13,9 @@ from threadpoolctl import threadpool_info
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.casadi_tools.threads import in_threads, in_threads_with, one_blas_thread, using_threads
-from orthocas.fitting import normal_blocks
-from orthocas.minimising.solver import Solver
+from orthocas.fitting import basis_objective
+from orthocas.solvers.protocol import Solver
+from orthocas.tools.batch import in_threads, in_threads_with, one_blas_thread, using_threads
 
 
 def blas_threads() -> list[int]:
@@ -81,7 +81,7 @@ def test_normal_blocks_are_sums_of_products() -> None:
     found = []
     for count in (1, 2, 5):
         with using_threads(count):
-            found.append(normal_blocks.normal_matrix(derivatives, gradients, [(1, 0, 2, 1)]))
+            found.append(basis_objective.normal_matrix(derivatives, gradients, [(1, 0, 2, 1)]))
     for j, part in enumerate((slice(K), slice(K, None))):
         np.testing.assert_allclose(found[0][part, part], np.einsum("srk,srl->kl", X[j], X[j]), rtol=0, atol=5e-2)
     np.testing.assert_allclose(found[0][K:, :K], X[1][:, 2].T @ X[0][:, 1], rtol=0, atol=5e-2)  # of sums near 1e4
@@ -150,7 +150,7 @@ os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = sys.argv[1]
 import numpy as np
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.casadi_tools.batch import THREADS
+from orthocas.tools.batch import THREADS
 from threadpoolctl import threadpool_info
 
 assert THREADS == int(sys.argv[1])

@@ -32,16 +32,15 @@ from public_objects import (
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.atlases import atlas as atlas_module
-from orthocas.atlases.asked_posture import AskedPosture
-from orthocas.atlases.laws import AtlasLaw
-from orthocas.casadi_tools.batch import Batched
-from orthocas.casadi_tools.blas_graph import NumpyGraph
-from orthocas.casadi_tools.cached import cached_property
-from orthocas.checks import Array
+from orthocas.atlas import atlas as atlas_module
+from orthocas.atlas.laws import AskedPosture, AtlasLaw
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import Controller
 from orthocas.simulation import MuJoCoPlant, simulate
+from orthocas.tools.batch import Batched
+from orthocas.tools.blas_graph import NumpyGraph
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
 
 THREADS = 8
 Call = Callable[[int], Any]  #: the k-th call of a series

@@ -13,7 +13,7 @@ import pytest
 from public_objects import CONTROLLERS, OBJECTS, circle, fitted, numbers, planar
 
 import orthocas as oc
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 ROOT = Path(__file__).parent.parent
 

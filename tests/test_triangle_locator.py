@@ -11,12 +11,11 @@ from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_allclose
 from test_level_surface import arm_leaf, sphere
 
-from orthocas.checks import Array
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.growing import triangle_locator
-from orthocas.growing.harmonic import harmonic_disk
-from orthocas.growing.level_surface import TriangleMesh
-from orthocas.growing.triangle_locator import Located, TriangleLocator
+from orthocas.exact import mesh as triangle_locator
+from orthocas.exact.harmonic import TriangleMesh, harmonic_disk
+from orthocas.exact.mesh import Located, TriangleLocator
+from orthocas.tools.checks import Array
 
 ROUNDING = 1e-13  # of distances between points of size 1 to 10
 

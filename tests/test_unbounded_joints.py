@@ -11,15 +11,13 @@ from conftest import ROBOTS, robot_data
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.certificates import Certificate, Subdivision
-from orthocas.certificates.certificate import METHOD
-from orthocas.certificates.subdivision import PROVED
-from orthocas.certifying.certify import whole_domain
-from orthocas.coordinates.fitted import Coordinates
+from orthocas.bases import JointSpace, Parametrisation
+from orthocas.bases.cyclic import leaves_stay
+from orthocas.certificates.certify import whole_domain
+from orthocas.charts.certificate import METHOD, PROVED, Certificate, Subdivision
+from orthocas.charts.chart_file import fingerprint
+from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError, ChartFileError
-from orthocas.files.chart_file import fingerprint
-from orthocas.parametrisations import JointSpace, Parametrisation
-from orthocas.parametrisations.cyclic_joints import leaves_stay
 
 
 def two_joints() -> oc.Robot:

@@ -17,8 +17,8 @@ from fuzz.views import views
 
 import orthocas as oc
 from orthocas.errors import ViewError
-from orthocas.viewing import window
-from orthocas.viewing.guard import Guard
+from orthocas.viewer import window
+from orthocas.viewer.window import Guard
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'")
 TOKEN = "/secret"
@@ -174,7 +174,7 @@ def test_other_servers_are_not_guarded_and_an_unguarded_viser_is_closed(monkeypa
     before = server.serve
     with oc.view(oc.Robot.planar([1.0, 1.0], [1.0, 1.0]), port=0):
         assert server.serve is before
-    monkeypatch.setattr("orthocas.viewing.guard._VISER", "another.module")
+    monkeypatch.setattr("orthocas.viewer.window._VISER", "another.module")
     closed = []
     monkeypatch.setattr(window, "close_window", lambda server: (closed.append(server), server.stop()))
     with pytest.raises(ViewError, match="can be guarded"):

@@ -18,7 +18,7 @@ from programs import Run, python
 import orthocas as oc
 from orthocas.fitting.fit import Fit
 from orthocas.problems.iiwa import urdf_path
-from orthocas.viewing import cyclic_motions, export_page
+from orthocas.viewer import cyclic_motions, export_page
 
 pytestmark = [
     pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'"),

@@ -14,12 +14,10 @@ import orthocas as oc
 from orthocas.errors import (
     RobotError,
 )
-from orthocas.robots.files import lock_off_chain, read_urdf
-from orthocas.viewing.body_poses import BodyPoses
-from orthocas.viewing.solids import ball, block, by_colour, capsule, drum
-from orthocas.viewing.stick_arm import stick_arm
-from orthocas.viewing.urdf_look import urdf_look
-from orthocas.viewing.view import shape_of
+from orthocas.robots.urdf import lock_off_chain, read_urdf
+from orthocas.viewer.arm import BodyPoses
+from orthocas.viewer.looks import ball, block, by_colour, capsule, drum, stick_arm, urdf_look
+from orthocas.viewer.view import shape_of
 
 
 def test_body_poses_are_those_of_pinocchio() -> None:

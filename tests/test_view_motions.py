@@ -14,9 +14,9 @@ from orthocas.errors import (
     PathFileError,
 )
 from orthocas.fitting.fit import Fit
-from orthocas.viewing import cyclic_motions
-from orthocas.viewing.motion import read_joint_motion, read_run
-from orthocas.viewing.view import subject
+from orthocas.viewer import cyclic_motions
+from orthocas.viewer.motion import read_joint_motion, read_run
+from orthocas.viewer.view import subject
 
 
 def test_runs_and_paths_are_played_from_their_files(tmp_path: Path) -> None:

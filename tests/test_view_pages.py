@@ -15,7 +15,7 @@ from public_objects import clear, cyclic, fitted, joint_motion, trajectory
 
 import orthocas as oc
 from orthocas.errors import ArchiveError, ViewError
-from orthocas.viewing import cyclic_motions, export_page
+from orthocas.viewer import cyclic_motions, export_page
 
 pytestmark = [
     pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'"),

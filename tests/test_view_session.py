@@ -7,14 +7,14 @@ import pytest
 from public_objects import circle, clear, cyclic, fitted
 
 import orthocas as oc
+from orthocas.charts.self_motion import fan_along
 from orthocas.errors import (
     InvalidValueError,
     NoExpressionError,
     UnknownNameError,
 )
 from orthocas.fitting.fit import Fit
-from orthocas.reaching.fan import fan_along
-from orthocas.viewing.session import Session
+from orthocas.viewer.session import Session
 
 
 def test_a_coordinate_moves_the_joints_and_holds_the_task(iiwa_fit: Fit) -> None:

@@ -14,18 +14,18 @@ from programs import Run
 from public_objects import circle, fitted, joint_motion, trajectory
 
 import orthocas as oc
-from orthocas import checks, problems
+from orthocas import problems
 from orthocas.errors import (
     InvalidValueError,
     MissingExtraError,
     NoExpressionError,
     ViewError,
 )
-from orthocas.viewing import Motion, export_page, window
-from orthocas.viewing.guard import is_local
-from orthocas.viewing.loop import Loop
-from orthocas.viewing.panel import ChartPanel, PlayerPanel, RobotPanel
-from orthocas.viewing.session import Session
+from orthocas.tools import checks
+from orthocas.viewer import Motion, export_page, window
+from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel
+from orthocas.viewer.session import Session
+from orthocas.viewer.window import Loop, is_local
 
 
 def test_panels_hold_the_numbers_and_escape_names() -> None:

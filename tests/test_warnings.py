@@ -11,7 +11,7 @@ def warn(category: type[Warning], module: str) -> None:
     warnings.warn_explicit("told by a test", category, "file.py", 1, module)
 
 
-@pytest.mark.parametrize("module", ["orthocas.chart", "orthocas.solvers.lbfgs", "test_chart", "conftest"])
+@pytest.mark.parametrize("module", ["orthocas.charts.chart", "orthocas.solvers.lbfgs", "test_chart", "conftest"])
 def test_announcements_to_us_are_errors(module: str) -> None:
     for category in ANNOUNCEMENTS:
         with pytest.raises(category):
@@ -26,7 +26,7 @@ def test_announcements_to_others_are_shown(module: str) -> None:
         assert [warning.category for warning in shown] == [category]
 
 
-@pytest.mark.parametrize("module", ["orthocas.chart", "numpy._core._methods"])
+@pytest.mark.parametrize("module", ["orthocas.charts.chart", "numpy._core._methods"])
 def test_trouble_with_numbers_is_an_error_wherever_it_is_found(module: str) -> None:
     """NumPy warns of the mean of nothing in its own name."""
     with pytest.raises(RuntimeWarning):

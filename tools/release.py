@@ -27,7 +27,7 @@ CONDA_NAMES = {"pin": "pinocchio", "libigl": "igl", "matplotlib": "matplotlib-ba
 IN_WHEEL = (
     "orthocas/py.typed",
     "orthocas/problems/data/iiwa7_r800.urdf",
-    "orthocas/solvers/lbfgs.py",
+    "solvers/lbfgs.py",
     "licenses/LICENSE",
 )
 NOT_IN_WHEEL = ("tests/", "docs/", "benchmarks/", "examples/", "tools/")

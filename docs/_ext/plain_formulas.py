@@ -13,7 +13,7 @@ from sphinx.ext.napoleon import Config, GoogleDocstring
 from sphinx.util.typing import stringify_annotation
 
 import orthocas
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 NAMES = ["alpha", "beta", "delta", "epsilon", "theta", "lambda", "xi", "rho", "sigma", "tau", "phi", "psi", "pi"]
 GREEK = dict(zip(NAMES, "αβδεθλξρστφψπ", strict=True))

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from orthocas.chart import load
+from orthocas.bases import parse_parametrisation
+from orthocas.charts.chart import load
 from orthocas.cli.commands import run
 from orthocas.cli.output import AsJson, Force, print_json, print_rows, whole_number
 from orthocas.cli.progress import terminal_monitor
 from orthocas.errors import InvalidValueError
-from orthocas.files.atomic import output_folder
-from orthocas.parametrisations import parse_parametrisation
+from orthocas.tools.files import output_folder
 
 from .chosen_fit import ChosenFit
 from .registry import FIGURES, chosen, reproduce_log, require_fit

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.judging.statistics import AngleStatistics
+from orthocas.charts.quality import AngleStatistics
 
 from .style import LABEL, TICK
 

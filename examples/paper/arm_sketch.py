@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from matplotlib.patches import Arc
 
-from orthocas.checks import Array
 from orthocas.robots import Robot
+from orthocas.tools.checks import Array
 
 from .style import GREY, INK, LABEL
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.colors import to_rgb
 
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 from .painting import Isolines, Numbers, cut, paint
 from .scene import Scene

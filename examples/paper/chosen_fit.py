@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from orthocas.chart import Chart
+from orthocas.bases import Parametrisation
+from orthocas.charts.chart import Chart
 from orthocas.fitting.fit import fit
-from orthocas.fitting.loss import Weights
-from orthocas.parametrisations import Parametrisation
-from orthocas.problem import Problem
+from orthocas.fitting.terms import Weights
 from orthocas.solvers import LBFGS
+from orthocas.tasks.problem import Problem
 
 from .paper_loss import PAPER_LOSS
 

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.charts.chart import Chart
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .planar_loop import GENTLE, INTERLEAVED, Arm, Run, follow, task_angle_std

@@ -9,7 +9,7 @@ from pathlib import Path
 import trimesh
 from matplotlib.figure import Figure
 
-from orthocas.files.atomic import published
+from orthocas.tools.files import published
 
 from .style import DPI
 

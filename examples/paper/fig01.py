@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.colors import to_rgba
 from matplotlib.patheffects import withStroke
 
-from orthocas.checks import Array
-from orthocas.growing.grown import GrownCoordinates
-from orthocas.problem import task_jacobians
+from orthocas.exact.grown import GrownCoordinates
+from orthocas.tasks.problem import task_jacobians
+from orthocas.tools.checks import Array
 
 from .charted_surface import add_with_lines
 from .drawing import Drawing

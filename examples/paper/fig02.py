@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.checks import Array
-from orthocas.domains import contains
+from orthocas.tasks.domains import contains
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .hidden_spring import POSTURE_STIFFNESS, RADIUS, HiddenSpring

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .fig03 import pose_box

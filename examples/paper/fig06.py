@@ -10,9 +10,9 @@ from matplotlib.colors import Normalize
 from matplotlib.patheffects import withStroke
 
 from orthocas import problems
-from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.checks import Array
-from orthocas.tasks import Task
+from orthocas.tasks.task import Task
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .painting import Isolines

@@ -14,8 +14,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 from orthocas import problems
-from orthocas.checks import Array
-from orthocas.tasks import Task
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .leaves import glued, leaf, wall

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.lines import Line2D
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.samples import samples_at
+from orthocas.charts.chart import Chart
+from orthocas.tasks.samples import samples_at
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .planar_flow import (

@@ -12,14 +12,14 @@ import casadi as ca
 import numpy as np
 from matplotlib.patheffects import withStroke
 
-from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.growing.flow import TaskFlow
-from orthocas.involutivity import TaskBrackets, lie_bracket
-from orthocas.parametrisations import Polynomial
-from orthocas.problem import Problem
-from orthocas.tasks import Task
+from orthocas.bases import Polynomial
+from orthocas.charts.chart import Chart
+from orthocas.exact.flow import TaskFlow
+from orthocas.exact.involutivity import TaskBrackets, lie_bracket
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.task import Task
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.checks import Array
 
 from .chosen_fit import USUAL, ChosenFit
 from .drawing import Drawing

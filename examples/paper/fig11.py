@@ -3,8 +3,8 @@
 import numpy as np
 
 from orthocas import problems
-from orthocas.checks import Array
-from orthocas.tasks import Task
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .fig08 import postures

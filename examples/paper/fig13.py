@@ -17,10 +17,10 @@ from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.domains import sample_uniform
-from orthocas.singularities import Jump, SingularPoint, jumps, singular_points
+from orthocas.charts.chart import Chart
+from orthocas.charts.singularities import Jump, SingularPoint, jumps, singular_points
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .planar_flow import (

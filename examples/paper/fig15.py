@@ -13,16 +13,15 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb, to_rgba
 
 from orthocas import problems
-from orthocas.checks import Array
-from orthocas.domains import Box, sample_uniform
-from orthocas.grow import grow
-from orthocas.growing.disk_leaf import DiskLeaf, disk_leaf
-from orthocas.growing.flow import TaskFlow
-from orthocas.growing.grown import GrownCoordinates
-from orthocas.growing.harmonic import signed_areas
-from orthocas.growing.level_surface import level_surface
-from orthocas.problem import Problem, task_jacobians
-from orthocas.tasks import Task
+from orthocas.charts.grow import grow
+from orthocas.exact.disk_leaf import DiskLeaf, disk_leaf
+from orthocas.exact.flow import TaskFlow
+from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.harmonic import level_surface, signed_areas
+from orthocas.tasks.domains import Box, sample_uniform
+from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 
 from .charted_surface import add_with_edges, add_with_lines, part_below
 from .drawing import Drawing

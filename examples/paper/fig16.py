@@ -9,9 +9,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.checks import Array
-from orthocas.parametrisations import MLP, JointSpace
-from orthocas.parametrisations.mlp import MLPFamily
+from orthocas.bases import MLP, JointSpace
+from orthocas.bases.mlp import MLPFamily
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .style import EXTRA, GREY, INK, LABEL, TASK, THIRD, new_figure

@@ -12,11 +12,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.growing.circle_leaf import circle_leaf
-from orthocas.growing.flow import TaskFlow
-from orthocas.singularities import singular_points
+from orthocas.charts.chart import Chart
+from orthocas.charts.singularities import singular_points
+from orthocas.exact.flow import TaskFlow
+from orthocas.exact.leaves import circle_leaf
+from orthocas.tools.checks import Array
 
 from .chosen_fit import USUAL, ChosenFit
 from .drawing import Drawing

@@ -8,7 +8,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.ticker import MaxNLocator
 
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 from .chosen_fit import USUAL, ChosenFit
 from .drawing import Drawing

@@ -9,13 +9,13 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.domains import sample_uniform
-from orthocas.involutivity import involutivity
-from orthocas.parametrisations import Polynomial
-from orthocas.problem import Problem
-from orthocas.quality import evaluate
+from orthocas.bases import Polynomial
+from orthocas.charts.chart import Chart
+from orthocas.charts.quality import evaluate
+from orthocas.exact.involutivity import involutivity
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.problem import Problem
+from orthocas.tools.checks import Array
 
 from .chosen_fit import USUAL, ChosenFit
 from .drawing import Drawing

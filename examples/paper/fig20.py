@@ -6,8 +6,8 @@ The arm is the planar arm with three joints and A = M, with the task x (exact co
 """
 
 from orthocas import problems
-from orthocas.parametrisations import Polynomial
-from orthocas.quality import Report, evaluate
+from orthocas.bases import Polynomial
+from orthocas.charts.quality import Report, evaluate
 
 from .angle_histogram import draw_histogram
 from .chosen_fit import USUAL, ChosenFit

@@ -11,14 +11,14 @@ import numpy as np
 from matplotlib.patches import Circle, FancyBboxPatch
 
 from orthocas import problems
-from orthocas.casadi_tools.batch import Batched
-from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.bases import Polynomial
+from orthocas.charts.chart import Chart
 from orthocas.control import PDPlus, Reference
 from orthocas.control.reference import DAMPING_RATIO, NATURAL_FREQUENCY
-from orthocas.domains import sample_uniform
 from orthocas.fitting.fit import fit
-from orthocas.parametrisations import Polynomial
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.batch import Batched
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .paper_loss import PAPER_LOSS

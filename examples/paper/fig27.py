@@ -1,6 +1,6 @@
 """[AS2023] Fig. 27: angles of the coordinates of the 7-DoF arm, those of Fig. 28."""
 
-from orthocas.quality import evaluate
+from orthocas.charts.quality import evaluate
 
 from .angle_histogram import draw_histogram
 from .chosen_fit import USUAL, ChosenFit

@@ -14,12 +14,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from orthocas import problems
-from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.bases import Polynomial
+from orthocas.charts.chart import Chart
+from orthocas.charts.quality import evaluate
 from orthocas.control import Kinematic, Reference
-from orthocas.parametrisations import Polynomial
-from orthocas.quality import evaluate
 from orthocas.simulation import coupling_index, simulate
+from orthocas.tools.checks import Array
 
 from .chosen_fit import USUAL, ChosenFit
 from .drawing import Drawing

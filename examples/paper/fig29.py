@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from matplotlib.patches import Arc, Polygon
 
-from orthocas.checks import Array, Indices
-from orthocas.growing.disk_leaf import DiskLeaf, disk_leaf
+from orthocas.exact.disk_leaf import DiskLeaf, disk_leaf
+from orthocas.tools.checks import Array, Indices
 
 from .charted_surface import add_with_edges
 from .drawing import Drawing

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from matplotlib.lines import Line2D
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.domains import sample_uniform
-from orthocas.singularities import SingularPoint, singular_points
+from orthocas.charts.chart import Chart
+from orthocas.charts.singularities import SingularPoint, singular_points
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.checks import Array
 
 from .drawing import Drawing
 from .fig06 import above, embedded, torus_faces

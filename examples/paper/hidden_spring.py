@@ -13,13 +13,13 @@ import numpy as np
 from scipy.optimize import root
 
 from orthocas import problems
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.domains import Box
+from orthocas.bases import Polynomial
+from orthocas.charts.chart import Chart
 from orthocas.errors import SolveError
 from orthocas.fitting.fit import fit
-from orthocas.parametrisations import Polynomial
-from orthocas.problem import Problem
+from orthocas.tasks.domains import Box
+from orthocas.tasks.problem import Problem
+from orthocas.tools.checks import Array
 
 from .paper_loss import PAPER_LOSS
 from .self_motion import trace

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.charts.chart import Chart
 from orthocas.errors import PathFileError
-from orthocas.files.csv_table import LONGEST, places, read_table
+from orthocas.tools.checks import Array
+from orthocas.tools.csv_table import LONGEST, column_places, read_table
 
 _TIME, _WANTED = "time_s", "desired_"
 _MOST = 1_000_000
@@ -61,4 +61,4 @@ def _columns(names: Sequence[str], chart: Chart) -> tuple[list[int], list[str]]:
         if name not in {*needed, *unused, *(_WANTED + label for label in chart.labels)}:
             known = f"{', '.join(needed)}, and {_WANTED}{chart.labels[0]} and so on if they are known"
             raise ValueError(f"line 1: unknown column {name[:LONGEST]!r}, expected {known}")
-    return places(names, (*needed, *(_WANTED + label for label in desired))), desired
+    return column_places(names, (*needed, *(_WANTED + label for label in desired))), desired

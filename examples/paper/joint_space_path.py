@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.growing.level_surface import level_surface
+from orthocas.charts.chart import Chart
+from orthocas.exact.harmonic import level_surface
+from orthocas.tools.checks import Array
 
 from .closed_loop_picture import COLOURS
 from .planar_loop import Run

@@ -5,8 +5,8 @@ import trimesh
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from orthocas.checks import Array
-from orthocas.tasks import Task
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 
 from .style import TURN
 

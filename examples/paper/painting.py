@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 Numbers = NDArray[np.intp]  #: indices of vertices or triangles
 

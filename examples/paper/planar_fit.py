@@ -11,17 +11,17 @@ from functools import lru_cache, partial
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.coordinates.fitted import Coordinates
-from orthocas.domains import sample_evenly
+from orthocas.bases import MLP, Fourier, JointSpace, LinearFamily, Parametrisation
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.loss import Weights
-from orthocas.parametrisations import MLP, Fourier, JointSpace, LinearFamily, Parametrisation
-from orthocas.problem import Problem
-from orthocas.samples import sample_problem, samples_at
+from orthocas.fitting.terms import Weights
 from orthocas.solvers import GaussNewton
+from orthocas.tasks.domains import sample_evenly
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import sample_problem, samples_at
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.checks import Array
 
 from .chosen_fit import ChosenFit
 from .planar_flow import grown_chart, planar_problem

@@ -10,16 +10,16 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from orthocas import problems
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.domains import Torus
-from orthocas.grow import grow
-from orthocas.growing.circle_leaf import CircleLeaf
-from orthocas.growing.flow import TaskFlow
-from orthocas.growing.grown import GrownCoordinates
-from orthocas.problem import Problem
-from orthocas.samples import samples_at
-from orthocas.singularities import SingularPoint
+from orthocas.charts.chart import Chart
+from orthocas.charts.grow import grow
+from orthocas.charts.singularities import SingularPoint
+from orthocas.exact.flow import TaskFlow
+from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.leaves import CircleLeaf
+from orthocas.tasks.domains import Torus
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import samples_at
+from orthocas.tools.checks import Array
 
 from .self_motion import pieces_in_cube, wrapped
 from .style import INK, TURN

@@ -17,19 +17,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.bases import CombinableFamily, Linear, Polynomial
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.quality import evaluate
 from orthocas.control import Impedance, PDPlus, Reference
-from orthocas.control.damping import DampingDesign
-from orthocas.coordinates.fitted import Coordinates
-from orthocas.domains import Box, Domain, Torus
+from orthocas.control.linear_algebra import DampingDesign
 from orthocas.fitting.fit import fit
-from orthocas.parametrisations import CombinableFamily, Linear, Polynomial
-from orthocas.problem import Problem
-from orthocas.quality import evaluate
 from orthocas.robots import Robot
 from orthocas.simulation import Coupling, Trajectory, coupling_index, simulate
-from orthocas.tasks import Task
+from orthocas.tasks.domains import Box, Domain, Torus
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 
 from .chosen_fit import USUAL, ChosenFit
 

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.colors import to_rgba
 
 from orthocas import problems
-from orthocas.checks import Array
-from orthocas.tasks import Task
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 
 from .charted_surface import add_with_lines
 from .fig06 import embedded

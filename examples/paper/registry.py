@@ -5,10 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from orthocas.chart import Chart
+from orthocas.charts.chart import Chart
 from orthocas.errors import InvalidValueError, UnknownNameError
-from orthocas.files.atomic import output_folder, require_replaceable_files
-from orthocas.minimising.watch import Monitor, Progress, silent
+from orthocas.tools.files import output_folder, require_replaceable_files
+from orthocas.tools.progress import Monitor, Progress, silent
 
 from . import (
     fig01,

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 from . import solids
 from .painting import Isolines, Numbers, paint

@@ -3,13 +3,13 @@
 import numpy as np
 
 from orthocas import problems
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.domains import Box
-from orthocas.growing.level_surface import level_surface
-from orthocas.growing.triangle_mesh import TriangleMesh
-from orthocas.problem import Problem
-from orthocas.tasks import Task
+from orthocas.charts.chart import Chart
+from orthocas.exact.harmonic import level_surface
+from orthocas.exact.mesh import TriangleMesh
+from orthocas.tasks.domains import Box
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 
 from .self_motion import trace
 

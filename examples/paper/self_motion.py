@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from orthocas.checks import Array
 from orthocas.errors import SolveError
-from orthocas.tasks import Task
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 
 from .style import TURN
 

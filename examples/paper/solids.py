@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array
+from orthocas.tools.checks import Array
 
 from .painting import Numbers
 

@@ -1,6 +1,11 @@
-"""Certificates of charts, and the subdivisions of boxes that they consist of. `orthocas.certifying` makes them."""
+"""Proofs that a chart does not fold and is one-to-one, and their check.
 
-from orthocas.certificates.certificate import Certificate
-from orthocas.certificates.subdivision import Subdivision
+- `certify` proves, `check` checks; `search` divides the domain, `judges` and `one_to_one` judge boxes.
+- `chart_rows`, `task_rows`, `product_rows` and `jets` bound rows of the Jacobian, `outside` what lies beyond a box.
+- `taylor`, `functions` and `graph` are the arithmetic: Taylor models with remainders that cover rounding.
+"""
 
-__all__ = ["Certificate", "Subdivision"]
+from orthocas.certificates.certify import certified_box, certify
+from orthocas.certificates.check import check_certificate
+
+__all__ = ["certified_box", "certify", "check_certificate"]

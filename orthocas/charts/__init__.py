@@ -4,7 +4,6 @@
 `make charts` makes them again; docs/charts.md shows all.
 """
 
-from orthocas.charts.card import Card, Model
-from orthocas.charts.catalogue import card, load, names
+from orthocas.charts.ready import Card, Model, card, load, names
 
 __all__ = ["Card", "Model", "card", "load", "names"]

@@ -11,18 +11,22 @@ from typing import Annotated
 
 import typer
 
-from orthocas import certifying
-from orthocas.certificates import Certificate
-from orthocas.certificates.certificate import METHOD
-from orthocas.certifying.scheduler import scheduler_executor
-from orthocas.chart import Chart
-from orthocas.checks import require_count
+from orthocas import certificates
+from orthocas.charts.certificate import METHOD, Certificate
+from orthocas.charts.chart import Chart
+from orthocas.charts.chart_file import CHART
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
 from orthocas.cli.progress import terminal_monitor
-from orthocas.comparing.workers import begin_worker, starting_workers, worker_pool, workers_killed_on_error
 from orthocas.errors import Interrupted
-from orthocas.files.archive import require_free
-from orthocas.files.chart_file import CHART
+from orthocas.tools.archive import require_free
+from orthocas.tools.checks import require_count
+from orthocas.tools.processes import (
+    begin_worker,
+    scheduler_executor,
+    starting_workers,
+    worker_pool,
+    workers_killed_on_error,
+)
 
 _NOT_PROVED = 1  # exit code
 
@@ -60,12 +64,12 @@ def certify(
     with _executor(workers, scheduler) as executor, terminal_monitor() as monitor:
         start = time.monotonic()
         if check:
-            holds = certifying.check_certificate(known, executor=executor, monitor=monitor)
+            holds = certificates.check_certificate(known, executor=executor, monitor=monitor)
             _report_check(known.certificate, holds, time.monotonic() - start, json)
             raise typer.Exit(0 if holds else _NOT_PROVED)
         resume = _unfinished(known, bound)
         try:
-            found = certifying.certify(
+            found = certificates.certify(
                 known,
                 resume.bound if bound is None and resume else bound or 0.0,
                 time_limit=seconds,

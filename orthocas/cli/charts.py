@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from orthocas.charts import Card, card, load, names
+from orthocas.charts.ready import Card, card, load, names
 from orthocas.cli.output import AsJson, Force, print_json, print_rows, print_table
 from orthocas.errors import InvalidValueError
 

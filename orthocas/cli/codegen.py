@@ -5,11 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.atlases.atlas import Atlas
-from orthocas.atlases.atlas_file import ATLAS
-from orthocas.atlases.part import AtlasPart
-from orthocas.casadi_tools.interrupts import deferred
-from orthocas.chart import Chart
+from orthocas.charts.chart import Chart
 from orthocas.cli.controller_argument import (
     CONTROLLERS,
     ControllerOptions,
@@ -29,11 +25,13 @@ from orthocas.cli.controller_argument import (
     require_options,
 )
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows
-from orthocas.codegen import GeneratedC, Proof, check_c, check_c_of_atlas, generate_c
-from orthocas.control import Controller
+from orthocas.codegen.generate import generate_c
+from orthocas.codegen.library import GeneratedC
+from orthocas.codegen.proof import Proof, check_c
 from orthocas.errors import InvalidValueError
-from orthocas.files.blocks import begins
-from orthocas.robots.postures_file import read_postures
+from orthocas.robots.homes import read_postures
+from orthocas.tools.interrupts import deferred
+from orthocas.tools.plugins import opened
 
 _NONE = "none"
 
@@ -87,13 +85,13 @@ def codegen(
     elif options != ControllerOptions() or limit is not None:
         raise InvalidValueError("--controller", _NONE, "a controller, because a controller option was given")
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
-        part, loaded = _opened(chart, along, radius)
+        shown, loaded = _opened(chart, along, radius)
         loaded.function("xi")  # raises for grown charts
         law = None if controller == _NONE else build_controller(controller, loaded, options, limit)
-        generated = generate_c(part or loaded, out, law, name, force, single_precision=single_precision)
+        generated = generate_c(shown, out, law, name, force, single_precision=single_precision)
         remarks = [] if law is None else law.remarks()
-    proof = _proof(generated, part, loaded, law) if check else None
-    report = _report(generated, proof) | ({} if part is None else {"charts": len(part)})
+    proof = check_c(generated, shown, law) if check else None
+    report = _report(generated, proof) | ({} if shown is loaded else {"charts": len(shown)})
     if json:
         print_json(report)
     else:
@@ -102,25 +100,19 @@ def codegen(
         note(remark)
 
 
-def _opened(path: Path, along: Path | None, radius: float | None) -> tuple[AtlasPart | None, Chart]:
-    """The part of an atlas, or None for the file of a chart; and the chart, or the first one of the part."""
-    if not begins(path, ATLAS):
+def _opened(path: Path, along: Path | None, radius: float | None) -> tuple[Any, Chart]:
+    """What C is written from: the chart of a file, or a part of its charts; and the chart, or the first one."""
+    several = opened(path)
+    if several is None:
         for name, value in (("--along", along), ("--radius", radius)):
             if value is not None:
                 raise InvalidValueError(name, value, "an atlas file to take a part of")
-        return None, Chart.load(path)
-    atlas = Atlas.load(path)
-    if along is None:
-        if radius is not None:
-            raise InvalidValueError("--radius", radius, "--along, because it is a distance from postures")
-        part = AtlasPart.whole(atlas)
-    else:
-        part = AtlasPart.along(atlas, read_postures(along, atlas.problem.robot), radius or 0.0)
-    return part, atlas.chart(int(part.charts[0]))
-
-
-def _proof(generated: GeneratedC, part: AtlasPart | None, chart: Chart, law: Controller | None) -> Proof:
-    return check_c(generated, chart, law) if part is None else check_c_of_atlas(generated, part, law)
+        chart = Chart.load(path)
+        return chart, chart
+    if along is None and radius is not None:
+        raise InvalidValueError("--radius", radius, "--along, because it is a distance from postures")
+    part = several.part(None if along is None else read_postures(along, several.problem.robot), radius or 0.0)
+    return part, part.first_chart
 
 
 def _report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:

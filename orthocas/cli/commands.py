@@ -2,13 +2,16 @@
 
 from collections.abc import Sequence
 from importlib import import_module
+from typing import Any
 
 import typer
 
-from orthocas.casadi_tools.interrupts import ended_in_order, remembered
 from orthocas.cli.entry import INTERRUPTED
 from orthocas.errors import OrthocasError, one_line
+from orthocas.tools.interrupts import ended_in_order, remembered
+from orthocas.tools.plugins import plug_ins
 
+_GROUP = "orthocas.commands"
 COMMANDS = {
     "fit": "Fit extra coordinates to a problem and save the chart.",
     "evaluate": "Measure the quality of a chart on held-out samples of its domain.",
@@ -21,8 +24,13 @@ COMMANDS = {
     "export": "Write task, xi, phi and Jacobian of a chart as one Python module that needs the library only.",
     "view": "Show a chart, an atlas, a robot or a motion in the browser, until Ctrl-C.",
     "charts": "List the ready charts of known arms, show the card of one, or write it to a file.",
-    "atlas": "Build, evaluate and show atlases: charts that cover the joint range of an arm.",
-}  #: names of the commands, modules of this package, and the first lines of their help
+}  #: names of our own commands, modules of this package, and the first lines of their help
+
+
+def helped() -> dict[str, str]:
+    """The first line of the help of every command, those of plug-ins last."""
+    added = {name: (make.__doc__ or "").partition("\n")[0] for name, make in plug_ins(_GROUP).items()}
+    return COMMANDS | added
 
 
 def app_for(words: Sequence[str]) -> typer.Typer:
@@ -35,13 +43,20 @@ def app_for(words: Sequence[str]) -> typer.Typer:
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
     )
-    for name, summary in COMMANDS.items():
-        command = getattr(import_module(f"orthocas.cli.{name}"), name) if name in words else _idle
+    for name, summary in helped().items():
+        command = _command(name) if name in words else _idle
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name)
         else:
             app.command(name, help=None if name in words else summary)(command)
     return app
+
+
+def _command(name: str) -> Any:
+    """One of our own commands, or that of a plug-in."""
+    if name in COMMANDS:
+        return getattr(import_module(f"{__package__}.{name}"), name)
+    return plug_ins(_GROUP)[name]()
 
 
 def _idle() -> None:

@@ -5,25 +5,30 @@ from typing import Annotated
 
 import typer
 
-from orthocas.cli.fit_argument import (
+from orthocas.bases.registry import parse_parametrisation
+from orthocas.cli.output import AsJson, Force, note, print_json, print_table, whole_number
+from orthocas.cli.problem_argument import (
+    CHAIN,
+    DOMAIN,
     WEIGHTS_TEXT,
     AnglesName,
     PrecisionName,
+    ProblemName,
+    ProblemOptions,
     SampleCount,
     WeightsText,
+    build_problem,
     parse_weights,
+    with_options,
 )
-from orthocas.cli.output import AsJson, Force, note, print_json, print_table, whole_number
-from orthocas.cli.problem_argument import CHAIN, DOMAIN, ProblemName, ProblemOptions, build_problem, with_options
 from orthocas.cli.progress import terminal_monitor
-from orthocas.comparing.compare import compare as compare_fits
-from orthocas.comparing.figures import convergence_figure, front_figure
-from orthocas.comparing.report import Comparison
 from orthocas.errors import Interrupted, printable
-from orthocas.files.atomic import output_folder, published, require_replaceable_files
+from orthocas.fitting.compare import compare as compare_fits
+from orthocas.fitting.comparison import Comparison
+from orthocas.fitting.comparison_figures import convergence_figure, front_figure
 from orthocas.fitting.settings import PRECISIONS
-from orthocas.parametrisations import parse_parametrisation
 from orthocas.solvers import get as get_solver
+from orthocas.tools.files import output_folder, published, require_replaceable_files
 
 _FILES = ("comparison.csv", "comparison.json", "front.png", "convergence.png")
 _PARAMETRISATIONS = ["linear", "polynomial:2", "polynomial:3", "polynomial:4", "mlp:32x32"]

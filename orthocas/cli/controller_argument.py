@@ -5,11 +5,12 @@ from typing import Annotated
 
 import typer
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.charts.chart import Chart
 from orthocas.cli.problem_argument import parse_numbers
-from orthocas.control import Controller, Law, law_names, law_of
+from orthocas.control.controller import Controller, Law
+from orthocas.control.registry import law_names, law_of
 from orthocas.errors import InvalidValueError
+from orthocas.tools.checks import Array
 
 CONTROLLERS = law_names()
 _OF_THE_PLANT = ("mass_factor", "friction")  # options for laws that command torques

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from orthocas import quality
-from orthocas.chart import Chart
+from orthocas.charts import quality
+from orthocas.charts.chart import Chart
 from orthocas.cli.output import AsJson, print_json, print_rows, report_rows, whole_number
 
 

@@ -5,21 +5,22 @@ from typing import Annotated
 
 import typer
 
-from orthocas import exporting
-from orthocas.chart import Chart
+from orthocas.charts.chart import Chart
 from orthocas.cli.output import AsJson, Force, print_json, print_rows
+from orthocas.codegen.export import LIBRARIES
+from orthocas.codegen.export import export as export_chart
 
 
 def export(
     chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
-    to: Annotated[str, typer.Option("--to", help=f"Library: {', '.join(exporting.LIBRARIES)}.")],
+    to: Annotated[str, typer.Option("--to", help=f"Library: {', '.join(LIBRARIES)}.")],
     out: Annotated[Path, typer.Option("--out", help="The module to write, NAME.py.")],
     force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Write task, xi, phi and Jacobian of a chart as one Python module that needs the library only."""
     loaded = Chart.load(chart)
-    module = exporting.export(loaded, to, out, force)
+    module = export_chart(loaded, to, out, force)
     if json:
         print_json({"module": str(module), "library": to, "joints": loaded.n, "labels": list(loaded.labels)})
     else:

@@ -6,42 +6,42 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.cli.corridor_argument import CorridorPath, CorridorRadius, corridor_or_box
-from orthocas.cli.fit_argument import (
-    WEIGHTS_TEXT,
-    AnglesName,
-    PrecisionName,
-    SampleCount,
-    WeightsText,
-    parse_weights,
-)
+from orthocas.bases.family import Parametrisation
+from orthocas.bases.registry import parse_parametrisation
+from orthocas.charts.chart_file import CHART
+from orthocas.charts.quality import Report, evaluate
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, report_rows, whole_number
 from orthocas.cli.problem_argument import (
     CHAIN,
     DOMAIN,
+    WEIGHTS_TEXT,
+    AnglesName,
+    CorridorPath,
+    CorridorRadius,
     DomainText,
+    PrecisionName,
     ProblemName,
     ProblemOptions,
+    SampleCount,
+    WeightsText,
+    corridor_or_box,
+    parse_weights,
+    suggested,
     with_options,
 )
 from orthocas.cli.progress import terminal_monitor
-from orthocas.cli.suggested_problem import suggested
 from orthocas.errors import Interrupted, InvalidValueError
-from orthocas.files.archive import require_free
-from orthocas.files.chart_file import CHART
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
-from orthocas.fitting.loss import Weights
+from orthocas.fitting.probe import Bounds
 from orthocas.fitting.settings import PRECISIONS, default_parametrisation
-from orthocas.minimising.solver import Status
-from orthocas.parametrisations import Parametrisation, parse_parametrisation
-from orthocas.postures.probe import Bounds
-from orthocas.postures.suggest import CONDITIONING, LEAK_DEG
-from orthocas.postures.suggestion import DomainSuggestion
-from orthocas.problem import Problem
-from orthocas.quality import Report, evaluate
-from orthocas.showing import number_list
+from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion
+from orthocas.fitting.terms import Weights
 from orthocas.solvers import get as get_solver
+from orthocas.solvers.protocol import Status
+from orthocas.tasks.problem import Problem
+from orthocas.tools.archive import require_free
+from orthocas.tools.display import number_list
 
 _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 

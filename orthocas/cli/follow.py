@@ -8,17 +8,17 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.casadi_tools.interrupts import deferred
-from orthocas.chart import Chart
-from orthocas.checks import Array, require_known
+from orthocas.charts.chart import Chart
 from orthocas.cli.output import AsJson, Force, number, print_json, print_rows
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.errors import InvalidValueError
-from orthocas.following.follow import HOLD, OBJECTIVE
-from orthocas.following.follow import follow as follow_path
-from orthocas.following.joint_motion import JointMotion, require_place
-from orthocas.following.path_file import read_path
-from orthocas.obstacles.shapes import Capsule, Obstacle, Plane, Sphere
+from orthocas.paths.follow import HOLD, OBJECTIVE
+from orthocas.paths.follow import follow as follow_path
+from orthocas.paths.joint_motion import JointMotion, require_place
+from orthocas.paths.plan import read_path
+from orthocas.robots.obstacles import Capsule, Obstacle, Plane, Sphere
+from orthocas.tools.checks import Array, require_known
+from orthocas.tools.interrupts import deferred
 
 SCHEDULE = "schedule"
 _CHOICES = (HOLD, SCHEDULE, OBJECTIVE)

@@ -4,6 +4,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthocas import problems
+from orthocas.bases.cyclic import cyclic_joints
+from orthocas.charts.coordinates import InvertibleMap
 from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.cli.problem_argument import (
     ROBOT,
@@ -14,18 +16,16 @@ from orthocas.cli.problem_argument import (
     is_robot_file,
     with_options,
 )
-from orthocas.coordinates.map import InvertibleMap
-from orthocas.domains import Domain
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.files.json import plain
-from orthocas.involutivity import involutivity
-from orthocas.parametrisations import cyclic_joints
-from orthocas.postures.clear_box import ClearBox
-from orthocas.problem import Problem, check
-from orthocas.robots import Robot
+from orthocas.exact.involutivity import involutivity
+from orthocas.robots.robot import Robot
+from orthocas.tasks.clear_box import ClearBox
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.problem import Problem, check
+from orthocas.tools.json import plain
 
 if TYPE_CHECKING:
-    from orthocas.chart import Chart
+    from orthocas.charts.chart import Chart
 
 
 @with_options(*ROBOT)
@@ -53,7 +53,7 @@ def info(target: ProblemName, words: ProblemOptions, json: AsJson = False) -> No
 
 
 def _load(path: Path) -> "Chart":
-    from orthocas.chart import load  # takes long to import, and problems and robots do not need it
+    from orthocas.charts.chart import load  # takes long to import, and problems and robots do not need it
 
     return load(path)
 

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orthocas.errors import one_line, printable
-from orthocas.files.json import to_json
+from orthocas.tools.json import to_json
 
 if TYPE_CHECKING:
-    from orthocas.quality import Report
+    from orthocas.charts.quality import Report
 
 
 def whole_number(text: str) -> int:

@@ -1,8 +1,8 @@
-"""Builds a problem from command-line options: a named problem or a robot file, with overrides."""
+"""Arguments that describe a problem: a name or a robot file, task, metric, domain, weights."""
 
 import inspect
 from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,22 +11,23 @@ import numpy as np
 import typer
 
 from orthocas import problems
-from orthocas.checks import Array
-from orthocas.cli.output import number
-from orthocas.domains import default_box
+from orthocas.bases.family import Parametrisation
+from orthocas.cli.output import number, whole_number
 from orthocas.errors import InvalidValueError, UnknownNameError
-from orthocas.postures.regular_box import regular_box
-from orthocas.problem import Problem
-from orthocas.robots import Robot
-from orthocas.tasks import Task
+from orthocas.fitting.corridor_problem import RADIUS, corridor_problem
+from orthocas.fitting.probe import Bounds
+from orthocas.fitting.suggest_domain import DomainSuggestion, suggest_domain
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
+from orthocas.robots.homes import read_postures
+from orthocas.robots.robot import Robot
+from orthocas.tasks.domains import default_box
+from orthocas.tasks.metric import Metric
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.regular_box import regular_box
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
+from orthocas.tools.progress import Monitor
 
-ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem or a URDF file.")]
-DomainText = Annotated[
-    str | None,
-    typer.Option(
-        "--domain", help="auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning."
-    ),
-]
 _OPTIONS: dict[str, Any] = {
     "tip": Annotated[
         str | None, typer.Option("--tip", help="Tip frame of a robot file; default: the end of its chain.")
@@ -71,6 +72,15 @@ ROBOT = ("tip", "lock", "tool")
 CHAIN = (*ROBOT, "task", "metric")
 DOMAIN = ("centre", "home", "half_width")
 _WORDS = "words"  # the parameter of a command that takes its `ProblemOptions`
+_NUMBERS = ("task", "mutual", "regularity", "length", "folds")
+
+ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem or a URDF file.")]
+DomainText = Annotated[
+    str | None,
+    typer.Option(
+        "--domain", help="auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning."
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -207,3 +217,106 @@ def locked_joints(words: tuple[str, ...]) -> dict[str, float]:
             raise InvalidValueError("--lock", word, "JOINT=VALUE")
         locked[joint] = float(parse_numbers(f"--lock {joint}", value)[0])
     return locked
+
+
+SampleCount = Annotated[
+    int | None,
+    typer.Option("--samples", parser=whole_number, help="Number of training samples; default: from the problem size."),
+]
+WeightsText = Annotated[
+    str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3, lambda4 and lambda5.')
+]
+AnglesName = Annotated[
+    str | None,
+    typer.Option(
+        "--angles",
+        help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia.",
+    ),
+]
+PrecisionName = Annotated[
+    str,
+    typer.Option(
+        "--precision", help="Of the large products of a fit: double, or single, which is faster and takes less memory."
+    ),
+]
+WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _NUMBERS)
+
+
+def parse_weights(text: str, angles: str | None) -> Weights:
+    """Read two to five numbers, such as "1000,30" or "1000,30,150,0.01,1000", with the kind of angles."""
+    numbers = parse_numbers("--weights", text).tolist()
+    if not 2 <= len(numbers) <= 5:
+        raise InvalidValueError("--weights", repr(text), "two to five numbers")
+    return replace(Weights.of(numbers), angles=angles)
+
+
+def suggested(
+    name: str,
+    options: ProblemOptions,
+    parametrisation: Parametrisation | None,
+    bounds: Bounds,
+    seed: int,
+    monitor: Monitor,
+) -> tuple[Problem, DomainSuggestion]:
+    """Build the problem of `--domain auto`, and the suggestion that its domain comes from.
+
+    Raises:
+        UnknownNameError: if `name` is neither a named problem nor a robot file.
+        OrthocasError: if anything does not fit together.
+    """
+    if options.half_width is not None:
+        raise InvalidValueError("--half-width", options.half_width, "none with --domain auto, which finds it")
+    if options.least_singular_value is not None:
+        given = options.least_singular_value
+        raise InvalidValueError("--least-singular-value", given, "none with --domain auto, which stays clear by itself")
+    base = None if is_robot_file(name) else build_problem(name, options)
+    robot = build_robot(name, options) if base is None else base.robot
+    task = Task.named(robot, options.task or "position") if base is None else base.task
+    metric: Metric | str = (options.metric or "euclidean") if base is None else base.metric
+    home: Array | str | None = chosen_centre(robot, options) if base is None else base.domain.centre
+    if options.home is not None:
+        home = options.home
+    found = suggest_domain(
+        robot,
+        task,
+        home,
+        metric,
+        leak_deg=bounds.leak_deg,
+        conditioning=bounds.conditioning,
+        parametrisation=parametrisation,
+        seed=seed,
+        monitor=monitor,
+    )
+    return Problem(robot, task, metric, found.domain, Path(name).stem if base is None else base.name), found
+
+
+CorridorPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--corridor",
+        metavar="POSTURES.csv",
+        help="Domain: the surroundings of a path of postures, one a line, with the joint names in the first line.",
+    ),
+]
+CorridorRadius = Annotated[
+    float | None,
+    typer.Option("--radius", parser=number, help=f"Of the corridor [rad]; default {RADIUS:g}."),
+]
+
+
+def corridor_or_box(name: str, options: ProblemOptions, path: Path | None, radius: float | None) -> Problem:
+    """The problem of a command line, near the postures of a file if one is given.
+
+    Raises:
+        OrthocasError: if anything does not fit together.
+    """
+    if path is None:
+        if radius is not None:
+            raise InvalidValueError("--radius", radius, "--corridor with it")
+        return build_problem(name, options)
+    for option in ("centre", "home", "half_width", "least_singular_value"):
+        value = getattr(options, option)
+        if value is not None:
+            raise InvalidValueError(f"--{option.replace('_', '-')}", value, "none with --corridor, which is the domain")
+    known = build_problem(name, options)
+    return corridor_problem(known, read_postures(path, known.robot), RADIUS if radius is None else radius)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from orthocas.minimising.watch import Monitor, Progress, silent
+from orthocas.tools.progress import Monitor, Progress, silent
 
 
 @contextmanager

@@ -5,16 +5,18 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.chart import Chart
-from orthocas.control import Controller, ControlStatus, Reference
-from orthocas.domains import contains
+from orthocas.charts.chart import Chart
+from orthocas.charts.quality import evaluate
+from orthocas.control.controller import Controller, ControlStatus
+from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.files.json import plain
-from orthocas.problem import Problem
-from orthocas.quality import evaluate
-from orthocas.simulation import Outcome, Trajectory, coupling_index
+from orthocas.simulation.coupling import coupling_index
 from orthocas.simulation.figure import units_of
 from orthocas.simulation.steps_file import Plan
+from orthocas.simulation.trajectory import Outcome, Trajectory
+from orthocas.tasks.domains import contains
+from orthocas.tasks.problem import Problem
+from orthocas.tools.json import plain
 
 _REASONS = {
     ControlStatus.OUTSIDE_DOMAIN: "the arm left the domain",

@@ -8,9 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.casadi_tools.interrupts import deferred
-from orthocas.chart import Chart
-from orthocas.checks import require_known
+from orthocas.charts.chart import Chart
 from orthocas.cli.controller_argument import (
     CONTROLLERS,
     ControllerOptions,
@@ -30,19 +28,24 @@ from orthocas.cli.output import AsJson, Force, note, number, print_json, print_r
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.cli.progress import terminal_monitor
 from orthocas.cli.run_report import fallback_text, run_report, run_rows
-from orthocas.control import Controller, Reference, Safety, posture_reference
+from orthocas.control.controller import Controller
+from orthocas.control.posture import posture_reference
+from orthocas.control.reference import Reference
+from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, Interrupted, InvalidValueError
-from orthocas.files.atomic import output_folder, published, require_replaceable_files, require_writable
-from orthocas.files.json import to_json
-from orthocas.files.ours import is_listed
-from orthocas.minimising.watch import Monitor
-from orthocas.robots import Robot
-from orthocas.simulation import Friction, MuJoCo, Noise, Outcome, Trajectory
+from orthocas.robots.robot import Robot
 from orthocas.simulation.animation import FORMATS, require_format, save_animation
+from orthocas.simulation.disturbances import Friction, Noise
 from orthocas.simulation.figure import trajectory_figure, units_of
-from orthocas.simulation.mujoco_scene import MUJOCO
+from orthocas.simulation.mujoco_scene import MUJOCO, MuJoCo
 from orthocas.simulation.run import simulate as run_closed_loop
 from orthocas.simulation.steps_file import Plan, read_steps
+from orthocas.simulation.trajectory import Outcome, Trajectory
+from orthocas.tools.checks import require_known
+from orthocas.tools.files import is_listed, output_folder, published, require_replaceable_files, require_writable
+from orthocas.tools.interrupts import deferred
+from orthocas.tools.json import to_json
+from orthocas.tools.progress import Monitor
 
 _FILES = ("trajectory.npz", "coordinates.png", "report.json")
 CVODES = "cvodes"  #: the default plant

@@ -8,29 +8,18 @@ from typing import Annotated, Any
 import typer
 
 from orthocas import problems
-from orthocas.atlases.atlas import Atlas
-from orthocas.atlases.atlas_file import ATLAS
-from orthocas.casadi_tools.interrupts import deferred
-from orthocas.chart import Chart
+from orthocas.charts.chart import Chart
 from orthocas.cli.output import AsJson, Force, note, print_json, print_rows, whole_number
-from orthocas.cli.problem_argument import (
-    ROBOT,
-    ProblemOptions,
-    build_robot,
-    is_robot_file,
-    locked_joints,
-    with_options,
-)
+from orthocas.cli.problem_argument import ROBOT, ProblemOptions, build_robot, is_robot_file, locked_joints, with_options
 from orthocas.errors import InvalidValueError
-from orthocas.files.blocks import begins
-from orthocas.following.path_file import read_path
-from orthocas.robots import Robot
-from orthocas.viewing import View, cyclic_motions, export_page
-from orthocas.viewing import view as open_view
-from orthocas.viewing.guard import is_local
-from orthocas.viewing.motion import read_joint_motion, read_run
-from orthocas.viewing.view import PORT, require_page
-from orthocas.viewing.window import LOCAL, require_free
+from orthocas.paths.plan import read_path
+from orthocas.robots.robot import Robot
+from orthocas.tools.interrupts import deferred
+from orthocas.tools.plugins import opened
+from orthocas.viewer import view as open_view
+from orthocas.viewer.motion import cyclic_motions, read_joint_motion, read_run
+from orthocas.viewer.view import PORT, View, export_page, require_page
+from orthocas.viewer.window import LOCAL, is_local, require_free
 
 _RUN = "trajectory.npz"  # in the folders of `orthocas simulate`
 
@@ -112,7 +101,7 @@ def _asked(target: str, chart: Path | None, meshes: Path | None, words: ProblemO
         return _Asked(motion, owner, meshes, locked)
     if chart is not None:
         raise InvalidValueError("--chart", chart, f"no chart beside the chart {target}")
-    return _Asked(Atlas.load(place) if begins(place, ATLAS) else Chart.load(place), None, meshes, locked)
+    return _Asked(opened(place) or Chart.load(place), None, meshes, locked)
 
 
 def _owner(chart: Path | None, meshes: Path | None, words: ProblemOptions) -> Robot | Chart:

@@ -8,18 +8,16 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.codegen.border_condition import border_units
-from orthocas.codegen.description import chart_values
-from orthocas.codegen.filling import filled
-from orthocas.codegen.numbers import flags, numbers
+from orthocas.charts.chart import Chart
+from orthocas.codegen.boundary import border_units
+from orthocas.codegen.description import chart_values, filled, flags, numbers, words
 from orthocas.codegen.precision import Precision, bounds_inside
-from orthocas.codegen.words import words
-from orthocas.control import Controller, Safety
-from orthocas.domains import Conditioned, Domain, borders, contains, reach
+from orthocas.control.controller import Controller
+from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
-from orthocas.postures.corridor import Corridor
+from orthocas.tasks.corridor import Corridor
+from orthocas.tasks.domains import Conditioned, Domain, borders, contains, reach
+from orthocas.tools.checks import Array
 
 
 @dataclass(frozen=True, eq=False)

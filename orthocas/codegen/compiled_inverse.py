@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.casadi_tools.cached import cached_property
-from orthocas.casadi_tools.threads import in_threads
-from orthocas.chart import Chart
-from orthocas.checks import Array, require_kind
+from orthocas.charts.chart import Chart
+from orthocas.charts.newton import SUSPICIOUS, Attempt, Newton
+from orthocas.charts.solutions import Solutions
 from orthocas.codegen.chart_source import ChartSource
-from orthocas.codegen.kept_libraries import kept_library, loaded, template
+from orthocas.codegen.compiled import kept_library, loaded, template
 from orthocas.codegen.library import STRICT
 from orthocas.codegen.library_files import write_library
-from orthocas.files.drafts import draft_folder
-from orthocas.inverting import Attempt, Newton, Solutions
-from orthocas.inverting.newton import SUSPICIOUS
-from orthocas.showing import Shown
+from orthocas.tools.batch import in_threads
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, require_kind
+from orthocas.tools.display import Shown
+from orthocas.tools.files import draft_folder
 
 _FLAGS = (*STRICT, "-O3")
 _ROWS = "inverse_rows.c"

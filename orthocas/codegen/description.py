@@ -1,14 +1,20 @@
-"""What the header of generated C says about robot, frames, task and chart."""
+"""Texts of generated C: templates, numbers, names, and what a header says of its chart."""
+
+import re
+from collections.abc import Iterable, Mapping
+from importlib.resources import files
+from string import Template
 
 import numpy as np
+from numpy.typing import NDArray
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.codegen.words import words
-from orthocas.domains import Conditioned, Domain, borders
-from orthocas.files.chart_file import fingerprint
-from orthocas.robots.tip_turn import TipTurn
-from orthocas.tasks import Task
+from orthocas.charts.chart import Chart
+from orthocas.charts.chart_file import fingerprint
+from orthocas.control.controller import Controller
+from orthocas.robots.kinematics import TipTurn
+from orthocas.tasks.domains import Conditioned, Domain, borders
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 
 _ORIENTATION = (
     "2 sin(angle / 2) axis of the rotation from the reference to the tip, in world axes: near the reference, the\n"
@@ -26,6 +32,33 @@ _ANGLE = (
     "\n *   {label} is an angle [rad] from -pi to pi. The inverse map and the laws take the shorter way around, so"
     "\n *   targets and references may have whole turns more or less."
 )
+_IN_DOMAIN = "OUTSIDE_DOMAIN: q lies outside the domain of the chart."
+_EVERYWHERE = "This law uses no chart, so the status is never OUTSIDE_DOMAIN."
+
+
+def numbers(values: Array) -> str:
+    """C literals that convert back to exactly the same numbers."""
+    words = {np.inf: "INFINITY", -np.inf: "-INFINITY"}
+    return ", ".join(words.get(float(value), repr(float(value))) for value in values)
+
+
+def flags(values: NDArray[np.bool_]) -> str:
+    """Truth values as C has them."""
+    return ", ".join(str(int(value)) for value in values)
+
+
+def words(names: Iterable[str]) -> list[str]:
+    """Names on one printable line each, safe in C comments (also with trigraphs) and in CMake templates."""
+    return [re.sub(r"[@\\]+|/(?=\*)|\*(?=/)|\?(?=\?)", " ", _printable(name)) for name in names]
+
+
+def _printable(text: str) -> str:
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+def filled(template: str, values: Mapping[str, str]) -> str:
+    """A template of `templates/` with its placeholders filled in."""
+    return Template((files(__package__) / "templates" / f"{template}.in").read_text()).substitute(values)
 
 
 def description_values(chart: Chart) -> dict[str, str]:
@@ -112,3 +145,35 @@ def clear_line(domain: Domain) -> str:
     if not isinstance(domain, Conditioned):
         return ""
     return f"\n *   and the {domain.heading},\n *   or else the status is OUTSIDE_DOMAIN"
+
+
+def control_values(controller: Controller) -> dict[str, str]:
+    """Values of the placeholders that describe the law."""
+    gains = controller.gains
+    torque = controller.command == "torque"
+    return {
+        "k": str(len(controller.labels)),
+        "reference_labels": ", ".join(words(controller.labels)),
+        "gain_fields": "\n".join(f"  double {gain}[{len(gains[gain])}];{_remark(controller, gain)}" for gain in gains),
+        "gain_values": ",\n".join(f"  {{{numbers(value)}}}" for value in gains.values()),
+        "gain_table": "\n".join(f"| `{gain}` | {numbers(value)} |" for gain, value in gains.items()),
+        "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
+        "commands_torque": str(int(torque)),
+        "law": controller.formula,
+        "fallback": _fallback(controller),
+        "where": _EVERYWHERE if controller.chart is None else _IN_DOMAIN,
+        "command": controller.command,
+    }
+
+
+def _fallback(controller: Controller) -> str:
+    if controller.command == "velocity":
+        return "zero velocity"
+    if controller.settings.get("gravity") == "robot":
+        return "zero torque, because the robot compensates gravity"
+    return "the gravity torque, or zero where it is not finite"
+
+
+def _remark(controller: Controller, gain: str) -> str:
+    units = controller.gain_units.get(gain)
+    return "" if units is None else f" /* {words([units])[0]} */"

@@ -1,22 +1,28 @@
 """`generate_c`: writes charts, the robot's dynamics and a controller as a small C library."""
 
 from pathlib import Path
+from typing import Protocol
 
-from orthocas.atlases.atlas import Atlas
-from orthocas.atlases.part import AtlasPart
-from orthocas.chart import Chart
-from orthocas.checks import require_kind
-from orthocas.codegen.atlas_source import AtlasSource
+from orthocas.charts.chart import Chart
+from orthocas.codegen.boundary import Source
 from orthocas.codegen.chart_source import ChartSource
-from orthocas.codegen.generated import GeneratedC
+from orthocas.codegen.library import GeneratedC
 from orthocas.codegen.library_files import write_library
-from orthocas.codegen.source import Source
-from orthocas.control import Controller, Safety
+from orthocas.control.controller import Controller
+from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
 
 
+class Charts(Protocol):
+    """Several charts that become one library: an atlas, or a part of one."""
+
+    def c_source(self) -> Source:
+        """What C is written from."""
+        ...
+
+
 def generate_c(
-    chart: Chart | Atlas | AtlasPart,
+    chart: Chart | Charts,
     out: str | Path,
     controller: Controller | None = None,
     name: str | None = None,
@@ -63,16 +69,15 @@ def generate_c(
         ['CMakeLists.txt', 'README.md', 'arm.c', 'arm.h', 'arm.pc.in']
     """
     source = _source(chart)
-    if rows and isinstance(source, AtlasSource):
+    if rows and not isinstance(source, ChartSource):
         raise InvalidValueError("rows", rows, "False for an atlas, whose charts are evaluated one position at a time")
     return write_library(source, out, controller, name, force, safety, single_precision, rows)
 
 
-def _source(chart: Chart | Atlas | AtlasPart) -> Source:
+def _source(charts: Chart | Charts) -> Source:
     """What C is written from."""
-    if isinstance(chart, Atlas):
-        chart = AtlasPart.whole(chart)
-    if isinstance(chart, AtlasPart):
-        return AtlasSource.of(chart)
-    require_kind("chart", chart, Chart)
-    return ChartSource(chart)
+    if isinstance(charts, Chart):
+        return ChartSource(charts)
+    if not hasattr(charts, "c_source"):
+        raise InvalidValueError("chart", f"a {type(charts).__name__}", "a Chart, an Atlas or a part of one")
+    return charts.c_source()

@@ -1,19 +1,147 @@
-"""CasADi functions as C code to embed in our files: static, free of warnings, without CasADi's own interface."""
+"""CasADi functions as C kernels, with work arrays on the stack."""
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
 
-from orthocas.codegen.own_code import with_own_code
-from orthocas.codegen.work_arrays import compacted
+from orthocas.control.linear_algebra import LARGE_INVERSE
+from orthocas.errors import CompileError
 
+_VERSION = f"by CasADi {ca.CasadiMeta.version()}"
+_PLACE = re.compile(r"\*w(\d+)=w\+(\d+)")
+_CALL = re.compile(r"\bcasadi_f\d+(?=\(arg1, res1, iw, w, 0\))")
+_HAND_ON = re.compile(r"(?<=\(arg1, res1, iw, w), 0\)")
+# The sweeps of `orthocas.control.linear_algebra`, in place, on the lower triangle. It takes less of `w` than the graph.
+_INVERSE = """{
+  casadi_real *a = w, *column = w + SIZE * SIZE, volume = 1.0;
+  casadi_int i, j, k;
+  (void)iw;
+  for (i = 0; i < SIZE * SIZE; ++i) a[i] = arg[0][i];
+  for (k = 0; k < SIZE; ++k) {
+    const casadi_real pivot = a[k * SIZE + k], scale = 1.0 / pivot;
+    volume *= pivot;
+    for (j = 0; j <= k; ++j) column[j] = a[k * SIZE + j];
+    for (i = k + 1; i < SIZE; ++i) column[i] = a[i * SIZE + k];
+    for (i = 0; i < SIZE; ++i) {
+      const casadi_real share = column[i] * scale;
+      for (j = 0; j <= i; ++j) a[i * SIZE + j] -= share * column[j];
+    }
+    for (j = 0; j < k; ++j) a[k * SIZE + j] = column[j] * scale;
+    for (i = k + 1; i < SIZE; ++i) a[i * SIZE + k] = column[i] * scale;
+    a[k * SIZE + k] = -scale;
+  }
+  if (res[0] != 0)
+    for (i = 0; i < SIZE; ++i)
+      for (j = 0; j <= i; ++j) res[0][i * SIZE + j] = res[0][j * SIZE + i] = -a[i * SIZE + j];
+  if (res[1] != 0) res[1][0] = volume;
+  return 0;
+}"""
 _OPTIONS: dict[str, Any] = {"with_header": False, "with_export": False, "casadi_int": "int"}
 _FUNCTION = re.compile(r"^(?:static |inline |const )*\w+\s?\*?\s+\**(\w+)\((.*)", re.DOTALL)
 _DATA = re.compile(r"^static const \w+ (\w+)\[")
+_PRODUCT = re.compile(r"casadi_mtimes_dense\((\w+), (\d+), (\d+), (\w+), (\d+), (\w+), 0\)")
+
+
+def compacted(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dict[str, str], dict[str, int]]:
+    """C code with smaller work arrays, and the number of doubles that each function needs.
+
+    Args:
+        blocks: C code by name; called functions are casadi_f0, casadi_f1, ... in the order in which CasADi meets them.
+        functions: the functions that the code was generated from, in the same order.
+
+    Raises:
+        CompileError: if a new version of CasADi lays the code out in another way.
+    """
+    names = {hash(f): f"casadi_f{number}" for number, f in enumerate(in_order_of_generation(functions))}
+    changed = dict(blocks)
+    needed: dict[str, int] = {}
+
+    def need(function: ca.Function) -> int:
+        name = names[hash(function)]
+        if name not in needed:
+            callees = _callees(function)
+            if set(_CALL.findall(blocks[name])) != {names[hash(callee)] for callee in callees}:
+                raise CompileError(f"the C code of {function.name()} does not call what its graph calls, {_VERSION}")
+            below = max(map(need, callees), default=0)
+            changed[name], needed[name] = _moved(blocks[name], function, below)
+        return needed[name]
+
+    return changed, {function.name(): need(function) for function in functions}
+
+
+def in_order_of_generation(functions: list[ca.Function]) -> list[ca.Function]:
+    """The functions and all that they call, callers before callees."""
+    found: dict[int, ca.Function] = {}
+
+    def visit(function: ca.Function) -> None:
+        if hash(function) not in found:
+            found[hash(function)] = function
+            for callee in _callees(function):
+                visit(callee)
+
+    for function in functions:
+        visit(function)
+    return list(found.values())
+
+
+def _callees(function: ca.Function) -> list[ca.Function]:
+    if not function.is_a("MXFunction"):
+        return []
+    calls = [k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CALL]
+    return [function.instruction_MX(k).which_function() for k in calls]
+
+
+def _moved(block: str, function: ca.Function, below: int) -> tuple[str, int]:
+    """Code whose slots in the work array begin at `below`, and the end of these slots."""
+    body = _PLACE.sub("", block.split("{", 1)[1])
+    if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
+        return block, function.sz_w()  # an operation uses the array in a way of its own
+    sizes = _place_sizes(function)
+    places = sorted((int(offset), sizes[int(place)]) for place, offset in _PLACE.findall(block))
+    for (offset, size), (following, _) in pairwise(places):
+        if offset + size > following:
+            raise CompileError(f"work slots at {offset} and {following} of {function.name()} overlap, {_VERSION}")
+    if not places:
+        return block, below
+    shift = below - places[0][0]
+    return _PLACE.sub(lambda found: f"*w{found[1]}=w+{int(found[2]) + shift}", block), sum(places[-1]) + shift
+
+
+def _place_sizes(function: ca.Function) -> dict[int, int]:
+    """Size of every slot of the work array, in numbers."""
+    found: dict[int, int] = {}
+    for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
+        node = function.instruction_MX(k)
+        places = [] if function.instruction_id(k) == ca.OP_OUTPUT else function.instruction_output(k)
+        for index, place in enumerate(places):
+            if function.instruction_id(k) == ca.OP_CALL:
+                found[place] = node.which_function().nnz_out(index)
+            else:
+                found[place] = (node.get_output(index) if len(places) > 1 else node).nnz()
+    return {place: size for place, size in found.items() if place >= 0}
+
+
+def with_own_code(blocks: dict[str, str], functions: list[ca.Function], bodies: Mapping[str, str]) -> dict[str, str]:
+    """C code by name, with that of inverses and of functions with given bodies replaced.
+
+    Args:
+        blocks: as in `work_arrays.compacted`.
+        functions: as in `work_arrays.compacted`.
+        bodies: C bodies by name of the function. If there are any, calls hand `mem` on.
+    """
+    changed = {name: _HAND_ON.sub(", mem)", block) for name, block in blocks.items()} if bodies else dict(blocks)
+    for number, function in enumerate(in_order_of_generation(functions)):
+        own = _INVERSE.replace("SIZE", str(function.size1_in(0))) if function.name() == LARGE_INVERSE else None
+        body = bodies.get(function.name(), own)
+        if body is not None:
+            name = f"casadi_f{number}"
+            changed[name] = blocks[name].split("{", 1)[0] + body
+    return changed
 
 
 @dataclass(frozen=True)
@@ -69,9 +197,6 @@ def _with_explicit_conditions(code: str) -> str:
     code = re.sub(rf"\({name}\?", r"((\1 != 0)?", code)
     code = re.sub(rf"\(! ?{name} ?\)", r"(\1 == 0)", code)
     return re.sub(rf"\({name}(&&|\|\|){name}\)", r"((\1 != 0)\2(\3 != 0))", code)
-
-
-_PRODUCT = re.compile(r"casadi_mtimes_dense\((\w+), (\d+), (\d+), (\w+), (\d+), (\w+), 0\)")
 
 
 def _with_products_of_known_sizes(text: str) -> str:

@@ -8,22 +8,20 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.scalar_code import fast_form, scalar_code
-from orthocas.chart import Chart
-from orthocas.checks import as_path, require_kind, require_shape
-from orthocas.codegen.border_condition import border_condition
-from orthocas.codegen.filling import filled
-from orthocas.codegen.generated import GeneratedC
-from orthocas.codegen.interface import template_values
+from orthocas.charts.chart import Chart
+from orthocas.codegen.boundary import Source, border_condition
+from orthocas.codegen.description import filled
+from orthocas.codegen.interface import supervision_kernels, template_values
 from orthocas.codegen.kernels import Kernels, generate_kernels
+from orthocas.codegen.library import GeneratedC
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
 from orthocas.codegen.rows import names_of_files, rows_files
-from orthocas.codegen.source import Source
-from orthocas.codegen.supervision import supervision_kernels
-from orthocas.control import Controller, Safety
-from orthocas.control.controller import require_controller
+from orthocas.control.controller import Controller, require_controller
+from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, InvalidValueError
-from orthocas.files.atomic import output_folder, published, require_writable
+from orthocas.tools.checks import as_path, require_kind, require_shape
+from orthocas.tools.expressions import fast_form, scalar_code
+from orthocas.tools.files import output_folder, published, require_writable
 
 _LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/test_c_safety.py)
 _TAKEN = (  # names of C headers and libraries

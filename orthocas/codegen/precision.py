@@ -1,4 +1,4 @@
-"""The number types of generated C, and what depends on them: limits, tolerances, literals."""
+"""The number type of generated C, and what its check allows."""
 
 import ctypes
 import re
@@ -8,11 +8,28 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.checks import Array
-from orthocas.control import Controller
-from orthocas.control.controller import with_smallest_volume
-from orthocas.control.status import LARGEST, SMALLEST_VOLUME
-from orthocas.domains import Domain, borders, reach
+from orthocas.charts.chart import Chart
+from orthocas.codegen.description import numbers
+from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, with_smallest_volume
+from orthocas.tasks.domains import Domain, borders, reach
+from orthocas.tools.checks import Array
+
+_EXPONENT = re.compile(r"e\+?(-?)0*")  # 1e+06 becomes 1e6, and 1e-05 1e-5
+_RANGE = float(np.finfo(np.float32).max)
+_MATHEMATICS = frozenset(
+    (
+        *("acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "copysign", "cos", "cosh", "erf"),
+        *("exp", "expm1", "fabs", "floor", "fmax", "fmin", "fmod", "hypot", "log", "log10", "log1p", "log2", "pow"),
+        *("remainder", "rint", "round", "sin", "sinh", "sqrt", "tan", "tanh", "trunc"),
+    )
+)
+_TOKEN = re.compile(
+    r"(?P<kept>/\*.*?\*/|\"[^\"\n]*\"|^#\s*include[^\n]*)"
+    r"|(?P<call>[a-z]\w*)(?=\()|(?P<word>[A-Za-z_]\w*)"
+    r"|(?P<literal>\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)"
+    r"|\d+\w*",
+    re.DOTALL | re.MULTILINE,
+)
 
 
 @dataclass(frozen=True)
@@ -100,23 +117,6 @@ SINGLE = Precision(
     sensitive=1e-5,
 )
 
-_EXPONENT = re.compile(r"e\+?(-?)0*")  # 1e+06 becomes 1e6, and 1e-05 1e-5
-_RANGE = float(np.finfo(np.float32).max)
-_MATHEMATICS = frozenset(
-    (
-        *("acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil", "copysign", "cos", "cosh", "erf"),
-        *("exp", "expm1", "fabs", "floor", "fmax", "fmin", "fmod", "hypot", "log", "log10", "log1p", "log2", "pow"),
-        *("remainder", "rint", "round", "sin", "sinh", "sqrt", "tan", "tanh", "trunc"),
-    )
-)
-_TOKEN = re.compile(
-    r"(?P<kept>/\*.*?\*/|\"[^\"\n]*\"|^#\s*include[^\n]*)"
-    r"|(?P<call>[a-z]\w*)(?=\()|(?P<word>[A-Za-z_]\w*)"
-    r"|(?P<literal>\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)"
-    r"|\d+\w*",
-    re.DOTALL | re.MULTILINE,
-)
-
 
 def _in_single_precision(token: re.Match[str]) -> str:
     if token["call"] in _MATHEMATICS:
@@ -144,3 +144,27 @@ def _is_beyond(domain: Domain, q: Array, precision: Precision) -> Any:
     distance, largest = abs(q - domain.centre), reach(domain)
     in_c = precision.rounded(abs(q - precision.rounded(domain.centre)))
     return (distance > largest) | (in_c > precision.rounded(largest))
+
+
+def check_values(chart: Chart, controller: Controller | None, q: Array, precision: Precision) -> dict[str, str]:
+    """Values of the placeholders: a state, and what every function gives there."""
+    n, robot = chart.n, chart.problem.robot
+    dq = precision.rounded(np.round(np.linspace(0.1, -0.2, n), 3))
+    values = {
+        "check_q": q,
+        "check_dq": dq,
+        "check_phi": chart.phi(q),
+        "check_jacobian": chart.jacobian(q).ravel(),
+        "check_curvature": chart.function("second_derivative")(q, dq, dq).full().ravel(),
+        "check_mass_matrix": robot.mass_matrix(q).ravel(),
+        "check_bias": robot.bias(q, dq),
+    }
+    if controller is not None:
+        value = controller.measured(q).full().ravel() + 0.001
+        reference = [precision.rounded(part) for part in (value, *np.full((2, len(value)), 0.01))]
+        command, _ = controller.function(q, dq, *reference, *controller.gains.values())
+        values["check_command"] = command.full().ravel()
+    words = {name: numbers(value) for name, value in values.items()}
+    if controller is not None:
+        words["check_reference"] = ", ".join(f"{{{numbers(part)}}}" for part in reference)
+    return words

@@ -1,29 +1,82 @@
-"""`--check`: compares compiled C with the Python that it was generated from."""
+"""`check_c`: compiles C with gcc and clang, and compares it with Python at random states."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.casadi_tools.batch import Batched
-from orthocas.chart import Chart
-from orthocas.checks import Array, require_kind
-from orthocas.codegen.generated import GeneratedC
-from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
+from orthocas.charts.chart import Chart
+from orthocas.charts.phi import shortest
+from orthocas.codegen.library import CompiledLibrary, GeneratedC, compile_shared, compilers, gain_numbers
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, bounds_inside
-from orthocas.codegen.random_inputs import corner_cases, random_gains, spoiled
-from orthocas.control import Controller, ControlStatus
-from orthocas.control.controller import squared_volume
-from orthocas.control.status import FROM_THE_LAW
-from orthocas.coordinates.turns import shortest
-from orthocas.domains import Domain, contains
-from orthocas.errors import ProofError
-from orthocas.files.drafts import draft_folder
+from orthocas.control.controller import FROM_THE_LAW, Controller, ControlStatus, squared_volume
+from orthocas.errors import InvalidValueError, ProofError
+from orthocas.tasks.domains import Domain, contains
+from orthocas.tools.batch import Batched
+from orthocas.tools.checks import Array
+from orthocas.tools.files import draft_folder
 
+_BAD = (np.nan, np.inf, -np.inf, 1e200)
 _REACH = 1.2  # random states lie in the domain enlarged by this factor
 _NEARBY = 0.01  # [half-widths] in single precision, a status may be that of a place so near
+
+
+def corner_cases(n: int) -> Array:
+    """Centre, two corners and centres of the faces of the box from -1 to 1, (3 + 2 n, n)."""
+    return np.vstack([np.zeros(n), np.full(n, -1), np.full(n, 1), -np.eye(n), np.eye(n)])
+
+
+def spoiled(rng: np.random.Generator, *arrays: Array) -> list[Array]:
+    """Copies with a NaN, infinite or huge number in every twentieth row of one array; corner cases stay as they are."""
+    copies = [array.copy() for array in arrays]
+    for row in range(0, len(arrays[0]) - len(corner_cases(arrays[0].shape[1])), 20):
+        array = copies[rng.integers(len(copies))]
+        array[row, rng.integers(array.shape[1])] = _BAD[rng.integers(len(_BAD))]
+    return copies
+
+
+def random_gains(controller: Controller, rows: int, rng: np.random.Generator) -> list[Array]:
+    """Random gains around those of the controller, (rows, length) each; limits are finite or, at times, infinite."""
+    gains = []
+    for name, gain in controller.gains.items():
+        values = _RANDOM.get(name, _scaled)(gain, rows, rng)
+        if name == "limit":
+            values[::3] = np.inf  # states of a weak arm may all saturate, which would say little of the law
+            values[7::40, 0] = rng.choice([0.0, -1.0, np.nan, np.inf], size=len(values[7::40]))
+        gains.append(values)
+    return gains
+
+
+def _scaled(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    return np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
+
+
+def _shifted(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    return np.asarray(gain + rng.normal(size=(rows, len(gain))))
+
+
+def _payloads(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    """Payloads of up to 2 kg, within some 0.1 m of the tip, with positive definite inertias."""
+    mass, factors = rng.uniform(0, 2, (rows, 1)), 0.05 * rng.normal(size=(rows, 3, 3))
+    inertia = factors @ factors.transpose(0, 2, 1)
+    return np.hstack([mass, 0.1 * rng.normal(size=(rows, 3)), inertia[:, *np.triu_indices(3)]])
+
+
+def _symmetric(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    """The matrix (n * n,) times one factor and plus a diagonal, so that it stays symmetric positive definite."""
+    n = round(len(gain) ** 0.5)
+    diagonal = np.eye(n) * rng.uniform(0, 0.1, (rows, 1, n))
+    return np.asarray((gain.reshape(n, n) * rng.uniform(0.5, 1.5, (rows, 1, 1)) + diagonal).reshape(rows, -1))
+
+
+_RANDOM: Mapping[str, Callable[[Array, int, np.random.Generator], Array]] = {  # inputs that are not just positive
+    "payload": _payloads,
+    "mass_matrix": _symmetric,
+    **dict.fromkeys(("wrench", "extra_torque", "coriolis_torque", "gravity_torque"), _shifted),
+}
 
 
 @dataclass(frozen=True)
@@ -35,10 +88,29 @@ class Proof:
     differences: dict[str, float]
 
 
+class CheckedCharts(Protocol):
+    """Several charts that compare their library with Python themselves."""
+
+    def check_c(self, generated: GeneratedC, controller: Controller | None, states: int, seed: int) -> Proof:
+        """As `check_c`."""
+        ...
+
+
 def check_c(
-    generated: GeneratedC, chart: Chart, controller: Controller | None = None, states: int = 1000, seed: int = 0
+    generated: GeneratedC,
+    chart: Chart | CheckedCharts,
+    controller: Controller | None = None,
+    states: int = 1000,
+    seed: int = 0,
 ) -> Proof:
     """Compile with gcc and clang (C99, warnings as errors), if installed, and compare with Python.
+
+    Args:
+        generated: what `generate_c` returned.
+        chart: the chart that it was made from; or an atlas or a part of one, which have a comparison of their own.
+        controller: the law of the library, if it has one.
+        states: number of random states.
+        seed: of the states.
 
     Compares numbers and statuses at random states inside and around the domain, some with NaN, infinite or huge
     numbers. It also compares them at rest, at the centre of the domain, its lowest and highest corners, and the centres
@@ -52,7 +124,10 @@ def check_c(
             grows with the inverse square of the volume of the gradients, relative to its median, and their status may
             be that of a place within 0.01 half-widths.
     """
-    require_kind("chart", chart, Chart)
+    if not isinstance(chart, Chart):
+        if not hasattr(chart, "check_c"):
+            raise InvalidValueError("chart", f"a {type(chart).__name__}", "a Chart, an Atlas or a part of one")
+        return chart.check_c(generated, controller, states, seed)
     n, precision = chart.n, SINGLE if generated.single_precision else DOUBLE
     q = _positions(chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, n)), precision)
     differences: dict[str, float] = {}

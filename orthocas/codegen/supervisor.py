@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
-from orthocas.codegen.chart_reference import ChartReference
-from orthocas.codegen.library import CompiledLibrary, gain_numbers
+from orthocas.codegen.library import ChartReference, CompiledLibrary, gain_numbers
 from orthocas.codegen.precision import Precision
-from orthocas.control import Controller, ControlStatus, Safety
-from orthocas.control.controller import require_controller
+from orthocas.control.controller import Controller, ControlStatus, require_controller
+from orthocas.control.safety import Safety
+from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 
 _POINTER = ctypes.c_void_p
 

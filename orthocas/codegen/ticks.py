@@ -7,16 +7,17 @@ from importlib.resources import files
 
 import numpy as np
 
-from orthocas.casadi_tools.interrupts import deferred
-from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.charts.chart import Chart
 from orthocas.codegen.chart_source import ChartSource
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
 from orthocas.codegen.library_files import write_library
-from orthocas.control import Controller, PDPlus
-from orthocas.domains import contains
+from orthocas.control.controller import Controller
+from orthocas.control.operational_space import PDPlus
 from orthocas.errors import CompileError
-from orthocas.files.drafts import draft_folder
+from orthocas.tasks.domains import contains
+from orthocas.tools.checks import Array
+from orthocas.tools.files import draft_folder
+from orthocas.tools.interrupts import deferred
 
 _STATES = 64  # as in templates/ticks.c
 _MICROSECONDS = 3e5  # to spend on one measurement

@@ -1,10 +1,15 @@
-"""Checks of gains, which are given as one number for all quantities or one number per quantity."""
+"""Gains by stiffness and damping ratio, and stiffness that two laws have in common."""
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from orthocas.checks import Array, as_float_array, frozen_array, require_shape
+from orthocas.charts.chart import Chart
 from orthocas.errors import InvalidValueError
+from orthocas.robots.robot import Robot
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.problem import Problem
+from orthocas.tools.checks import Array, as_float_array, as_number, frozen_array, require_kind, require_shape
 
 STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT, SECOND_FORCE = (  #: units of gains, in words
     "J per squared unit of the quantity, > 0",
@@ -13,6 +18,10 @@ STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT, SECOND_FORCE = (  #: units of gains, 
     "largest command per joint, > 0; INFINITY for no limit",
     "J per unit of the second quantity",
 )
+SPRING_FREQUENCY = 12 * np.pi  #: [rad/s], 6 Hz: arms whose masses are 20 % off stay in their boxes (docs/control.md)
+FASTEST = 36 * np.pi  #: [rad/s], 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7
+_SAMPLES, _SEED = 512, 0
+_TOO_FAST = 3000.0  # weight of the squared logarithm by which a mode exceeds the fastest frequency
 
 
 def positive_gains(name: str, value: ArrayLike, length: int) -> Array:
@@ -58,3 +67,71 @@ def _require(name: str, gains: Array, good: NDArray[np.bool_], want: str) -> Non
     bad = np.flatnonzero(~good)
     if bad.size:
         raise InvalidValueError(f"{name}[{bad[0]}]", gains[bad[0]], want)
+
+
+def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY, fastest: float = FASTEST) -> Array:
+    """Stiffness of [x; xi], (n,), with which the closed loop has its modes around a frequency, and none too fast.
+
+    At rest the loop is M_phi dde + D de + K e = 0 with M_phi = (J M^-1 J^T)^-1, so the squared frequencies lambda_i of
+    its modes are the eigenvalues of K^1/2 J M^-1 J^T K^1/2. K minimises the mean over the domain of
+    sum_i log^2(lambda_i / omega^2) + 3000 sum_i max(0, log(lambda_i / fastest^2))^2. As long as no mode comes near
+    `fastest`, the geometric mean of all modes is omega. Single modes lie on both sides of it, because M_phi is not
+    diagonal and varies; `modes` of a law tells where. Delays make fast modes unstable, so `fastest` takes stiffness
+    from the coordinates that move light wrists.
+
+    Args:
+        chart: a chart with a closed expression.
+        frequency: omega > 0 of the springs [rad/s].
+        fastest: of all modes [rad/s], > 0; infinite: no bound. It is kept at samples; in corners of
+            the domain modes are faster, see `modes` of a law.
+
+    Source:
+        ours, docs/derivations.md#stiffness
+    """
+    require_kind("chart", chart, Chart)
+    chart.function("xi")  # raises for grown charts
+    points = _points(chart.problem)
+    return _matched(mobility(chart, points, chart.problem.robot), frequency, fastest)
+
+
+def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUENCY, fastest: float = FASTEST) -> Array:
+    """Stiffness of springs in the joints, from the modes of (K_q, M) in the same way, (n,)."""
+    require_kind("problem", problem, Problem)
+    return _matched(np.linalg.inv(problem.robot.mass_matrix(_points(problem))), frequency, fastest)
+
+
+def mobility(chart: Chart, points: ArrayLike, robot: Robot) -> Array:
+    """M_phi^-1 = J M^-1 J^T of a robot at points (N, n), (N, n, n)."""
+    J, M = chart.jacobian(points), robot.mass_matrix(points)
+    return np.asarray(J @ np.linalg.solve(M, J.transpose(0, 2, 1)))
+
+
+def _points(problem: Problem) -> Array:
+    return sample_uniform(problem.domain, _SAMPLES, _SEED)
+
+
+def _matched(mobilities: Array, frequency: float, fastest: float) -> Array:
+    """The stiffness for M_phi^-1 at several postures, (N, n, n); singular postures are left out."""
+    omega = float(positive_gains("frequency", frequency, 1)[0])
+    if not as_number("fastest", fastest) > 0:
+        raise InvalidValueError("fastest", fastest, "a number > 0 or infinity")
+    W = mobilities[np.isfinite(mobilities).all(axis=(1, 2))]
+    W = W[np.linalg.eigvalsh(W)[:, 0] > 0]
+    start = -np.log(np.median(np.diagonal(W, axis1=1, axis2=2), axis=0))  # the solution where W is diagonal
+    bound = 2 * np.log(fastest / omega)
+    found = scipy.optimize.minimize(_eigenvalue_spread, start, (W, bound), method="BFGS", jac=True)
+    return np.asarray(omega**2 * np.exp(found.x))
+
+
+def _eigenvalue_spread(log_stiffness: Array, W: Array, bound: float) -> tuple[float, Array]:
+    """Mean of sum_i log^2(lambda_i) + 3000 max(0, log(lambda_i) - bound)^2 for K = exp(log_stiffness); gradient.
+
+    With unit eigenvectors v_i, d log(lambda_i) / d log(K_j) = v_ij^2.
+    """
+    root = np.exp(log_stiffness / 2)
+    values, vectors = np.linalg.eigh(root[:, None] * W * root)
+    logs = np.log(values.clip(np.finfo(float).tiny))
+    excess = (logs - bound).clip(0)
+    slopes = 2 * (logs + _TOO_FAST * excess)
+    cost = (logs**2 + _TOO_FAST * excess**2).sum(axis=1).mean()
+    return float(cost), (vectors**2 @ slopes[..., None])[..., 0].mean(axis=0)

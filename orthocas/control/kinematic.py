@@ -7,17 +7,17 @@ from typing import Any, ClassVar, Self
 import casadi as ca
 from numpy.typing import ArrayLike
 
-from orthocas.casadi_tools.cached import cached_property
-from orthocas.chart import Chart
-from orthocas.checks import Array, require_kind
+from orthocas.charts.chart import Chart
 from orthocas.control.controller import Command, fallback_function, guarded_graph, law_facts, named_inputs
 from orthocas.control.gains import FEEDBACK, LIMIT, command_limit, non_negative_gains
-from orthocas.control.inertia import block_inertia, median_volume
-from orthocas.control.reachability import joint_path
+from orthocas.control.linear_algebra import block_inertia, median_volume
+from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.control.turns import without_turns
-from orthocas.problem import Problem
-from orthocas.showing import Shown
+from orthocas.tasks.problem import Problem
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, require_kind
+from orthocas.tools.display import Shown
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -1,18 +1,22 @@
-"""Inverse and square root of small symmetric positive definite matrices, as smooth CasADi expressions without branches.
-
-Generated C contains them, so they use no eigenvectors (which jump) and no loops with a data-dependent length.
-"""
+"""Small symmetric systems as CasADi expressions: Cholesky, inertia in phi, and damping design."""
 
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
+import numpy as np
 
-from orthocas.casadi_tools.scalar_code import WRITTEN_OUT
-from orthocas.parametrisations.family import Expression
+from orthocas.bases.family import Expression
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.metric import Metric
+from orthocas.tasks.problem import Problem
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.expressions import WRITTEN_OUT
 
 LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
 _ROUNDS = 8  # accurate to rounding up to a condition number of 1e6 (tests/test_control_algebra.py)
+_SAMPLES, _SEED = 256, 0
+_SOFTEST = 1e-6  # smallest squared frequency in double_diagonal, relative to the largest: K_i = 0 divides by zero
 
 
 def spd_inverse(matrix: Expression) -> tuple[Any, Any]:
@@ -90,3 +94,76 @@ def _symmetric(matrix: Any) -> Any:
 def kind_of(k: int) -> Any:
     """SX for matrices with few rows, which are fastest written out; MX for others, which then take C too long."""
     return ca.SX if k <= WRITTEN_OUT else ca.MX
+
+
+def block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
+    """J (k, n), A (n, n) -> B = A^-1 J^T (n, k), Lambda (k, k), volume (1, 1).
+
+    The rows of J are divided into blocks, k = sum(blocks). Lambda is block diagonal with (J_b A^-1 J_b^T)^-1, [AS2023]
+    eqs. (30), (31); one block gives the full M_phi. The volume is the product of det(J_b A^-1 J_b^T), which is 0 in
+    singularities.
+    """
+    k = sum(blocks)
+    kind = kind_of(n)
+    J, A = kind.sym("J", k, n), kind.sym("A", n, n)
+    B = spd_inverse(A)[0] @ J.T
+    parts, volume, start = [], kind(1), 0
+    for size in blocks:
+        rows = list(range(start, start + size))
+        inverse, determinant = spd_inverse(J[rows, :] @ B[:, rows])
+        parts.append(inverse)
+        volume *= determinant
+        start += size
+    return ca.Function("inertia", [J, A], [ca.densify(B), ca.densify(ca.diagcat(*parts)), volume])
+
+
+def median_volume(problem: Problem, jacobian: ca.Function, metric: str | Metric, blocks: tuple[int, ...]) -> float:
+    """Median of the volume of `block_inertia` over the domain. It sets the scale for "near singular"."""
+    metric = Metric.from_spec(problem.robot, metric) if isinstance(metric, str) else metric
+    q = ca.MX.sym("q", problem.n)
+    volume = block_inertia(problem.n, blocks)(jacobian(q), metric.function(q))[2]
+    points = sample_uniform(problem.domain, _SAMPLES, _SEED)
+    return float(np.nanmedian(Batched(dense_function("volume", [q], [volume]))(points)[0]))
+
+
+DampingDesign = Literal["square_root", "double_diagonal"]
+DAMPING_DESIGNS: tuple[DampingDesign, ...] = ("square_root", "double_diagonal")
+
+
+def damping_matrix(
+    design: DampingDesign, inertia: Expression, stiffness: Expression, damping_ratio: Expression
+) -> Expression:
+    """Damping matrix D(q), (k, k), for an inertia (k, k) and the diagonals of K and Z, (k, 1).
+
+    - square_root: D = M^1/2 Z K^1/2 + K^1/2 Z M^1/2. Symmetric, but not always positive semi-definite.
+    - double_diagonal: D = 2 Z^1/2 (M # K) Z^1/2, always positive semi-definite, with the geometric mean
+      M # K = K^1/2 (K^-1/2 M K^-1/2)^1/2 K^1/2. With one damping ratio z for all coordinates, D is diagonal in the
+      generalised eigenvectors of (K, M), and every mode has the damping ratio z. A spring softer than 1e-6 of the
+      stiffest one, also K_i = 0, is damped as if it had that stiffness, so hardly.
+
+    Source:
+        square_root: [AS2023] eq. (29); double diagonalisation: [AOFH2003]; its form without eigenvectors and for
+        several ratios is ours, docs/derivations.md#damping.
+    """
+    if design == "square_root":
+        half = square_root(inertia) * _row(damping_ratio * ca.sqrt(stiffness))
+        return half + half.T
+    root_K = ca.sqrt(_not_too_soft(stiffness, inertia))
+    mean = square_root(inertia / (root_K @ root_K.T))
+    scale = root_K * ca.sqrt(damping_ratio)
+    return 2 * (scale @ scale.T) * mean
+
+
+def _not_too_soft(stiffness: Expression, inertia: Expression) -> Expression:
+    """The stiffness with springs as soft as the rounds of the square root can resolve; K_i < 0 and NaN stay invalid.
+
+    Squared frequencies K_i / M_ii are at least 1e-6 of the largest one, and 1e-12 1/s^2.
+    """
+    mass = ca.diag(inertia)
+    floor = mass * ca.fmax(_SOFTEST * ca.mmax(stiffness / mass), _SOFTEST**2)
+    return ca.if_else(stiffness < 0, stiffness, ca.if_else(stiffness < floor, floor, stiffness))
+
+
+def _row(diagonal: Expression) -> Expression:
+    """The vector (k, 1) repeated in every row of (k, k); an entrywise product with it scales columns."""
+    return ca.repmat(diagonal.T, diagonal.shape[0], 1)

@@ -1,4 +1,4 @@
-"""References: smooth motions phi_d(t) of named quantities, as low-pass filtered steps or splines through points."""
+"""References over time: steps, splines, and low-pass filters of what is measured."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,18 +11,52 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.casadi_tools.cached import cached_property
-from orthocas.checks import Array, as_float_array, frozen_array, require_kind, require_known, require_shape
-from orthocas.control.low_pass import low_pass_response
 from orthocas.errors import InvalidValueError
-from orthocas.showing import Shown, listed, number_list
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, as_float_array, frozen_array, require_kind, require_known, require_shape
+from orthocas.tools.display import Shown, listed, number_list
 
 NATURAL_FREQUENCY = 2 * np.pi  #: omega0 [rad/s] of [AS2023] Sec. 8
 DAMPING_RATIO = 0.7  #: zeta of [AS2023] Sec. 8
 _GRID = 0.05  # [s]
 _SWING = 0.3  # [rad] phase of the low-pass oscillation between two grid times; 0.048 s for the paper's filter
 _DEGREE = 5  # of splines through points
+
+
+@lru_cache(32)
+def low_pass_response(k: int, natural_frequency: float, damping_ratio: float) -> ca.Function:
+    """Response of k equal low-pass filters to a constant target, from any start.
+
+    The error e = value - target obeys dd_e + 2 zeta omega0 d_e + omega0^2 e = 0, solved in closed form for
+    underdamped, critically damped and overdamped filters.
+
+    Args:
+        k: number of quantities.
+        natural_frequency: omega0 > 0 [rad/s].
+        damping_ratio: zeta >= 0.
+
+    Returns:
+        A function of time t >= 0 and [target; value at t = 0; velocity at t = 0] (3 k, 1) -> value, velocity and
+        acceleration, each (k, 1).
+    """
+    t, parameters = ca.SX.sym("t"), ca.SX.sym("parameters", 3 * k)
+    target, value0, velocity0 = parameters[:k], parameters[k : 2 * k], parameters[2 * k :]
+    decay, beat = damping_ratio * natural_frequency, natural_frequency * np.sqrt(abs(1 - damping_ratio**2))
+    if np.isclose(damping_ratio, 1.0, rtol=0, atol=1e-9):
+        cosine, sine = ca.exp(-decay * t), t * ca.exp(-decay * t)
+    elif damping_ratio < 1:
+        cosine, sine = ca.exp(-decay * t) * ca.cos(beat * t), ca.exp(-decay * t) * ca.sin(beat * t) / beat
+    else:  # hyperbolic functions, written so that they do not overflow
+        slow, fast = ca.exp((beat - decay) * t), ca.exp(-(beat + decay) * t)
+        cosine, sine = (slow + fast) / 2, (slow - fast) / (2 * beat)
+    e0 = value0 - target
+    e = e0 * cosine + (velocity0 + decay * e0) * sine
+    velocity = velocity0 * cosine - (decay * velocity0 + natural_frequency**2 * e0) * sine
+    acceleration = -2 * decay * velocity - natural_frequency**2 * e
+    return dense_function("low_pass", [t, parameters], [target + e, velocity, acceleration])
+
+
 Change = tuple[float, Mapping[str, float]]  #: a time [s] and the new targets by label
 
 

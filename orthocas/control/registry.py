@@ -1,12 +1,11 @@
 """Control laws by name, for the command line, and how to add your own."""
 
-from orthocas.checks import require_known
 from orthocas.control.controller import Law
 from orthocas.control.kinematic import Kinematic
-from orthocas.control.kinematic_projector import KinematicProjector
 from orthocas.control.operational_space import Impedance, PDPlus
-from orthocas.control.projector import Projector
+from orthocas.control.projector import KinematicProjector, Projector
 from orthocas.errors import InvalidValueError
+from orthocas.tools.checks import require_known
 
 _LAWS: dict[str, type[Law]] = {}
 

@@ -8,11 +8,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_float_array, frozen_array, require_finite, require_known, require_shape
 from orthocas.errors import InvalidValueError
-from orthocas.problem import Problem
-from orthocas.robots.payload import payload_numbers
+from orthocas.robots.dynamics import payload_numbers
 from orthocas.robots.robot import Robot
+from orthocas.tasks.problem import Problem
+from orthocas.tools.checks import Array, as_float_array, frozen_array, require_finite, require_known, require_shape
 
 Source = Literal["own", "given"]
 Gravity = Literal["law", "robot"]

@@ -7,11 +7,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.checks import Array, as_float_array, as_number, require_count, require_shape
 from orthocas.control.controller import Command, Controller, require_controller
-from orthocas.domains import sample_uniform
 from orthocas.errors import InvalidValueError
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.checks import Array, as_float_array, as_number, require_count, require_shape
 
 _SAMPLES, _SEED = 256, 0
 _RATE = {"torque": 1000.0, "velocity": 20.0}  # [N m/s] as on many arms, 1 N m in a millisecond; [rad/s^2]

@@ -5,12 +5,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
-from orthocas.coordinates.fitted import Coordinates
-from orthocas.coordinates.turns import shortest
-from orthocas.domains import Box
-from orthocas.parametrisations import CyclicParametrisation
+from orthocas.bases.family import CyclicParametrisation
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.phi import shortest
+from orthocas.tasks.domains import Box
+from orthocas.tools.checks import Array
 
 
 def without_turns(chart: Chart, difference: Any) -> Any:

@@ -1,13 +1,12 @@
-"""Fitting coordinates to a problem.
+"""Fitting coordinates to a problem, choosing its domain, and comparing fits.
 
-- `fit` is the entry point. `settings` checks the arguments, and `stages` runs the minimisations.
-- `idle_joints` splits off joints that are exact coordinates; `spectral_start` finds the initial coefficients of bases.
-- `loss` is a package with one module per term, the weights, and the residuals of one sample.
+- `fit` is the entry point. `settings` checks the arguments, `stages` runs the minimisations, `starts` begins them.
+- `terms` has the terms and weights of the loss, `residuals` the loss of one sample.
 - `basis_objective` (with `basis_gradients`) evaluates the loss for families linear in theta, `array_objective` for
-  networks, `graph_objective` for all others. `bounded_mutual` adds a bound on mutual angles. `symbolic_loss` gives the
-  loss as one CasADi expression.
-- `gauge` fixes what the loss leaves free: offset, scale, order and sign of the coordinates.
-- `checkpoint` keeps the state of a long fit in a file.
+  networks, `graph_objective` for all others. `symbolic_loss` gives the loss as one CasADi expression.
+- `fold_search` finds folds, `checkpoint` keeps the state of a long fit in a file.
+- `suggest_domain` (with `probe`) and `corridor_problem` choose domains. `distil` fits grown coordinates.
+- `compare` fits a `grid`; `comparison` is its result.
 """
 
 __all__: list[str] = []

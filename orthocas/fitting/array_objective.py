@@ -7,14 +7,13 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from orthocas.casadi_tools.columns import Run, blocked, by_sample, shares
-from orthocas.casadi_tools.threads import in_threads, in_threads_with, thread_count
-from orthocas.checks import Array
-from orthocas.fitting.loss import Loss, Sizes, Weights
-from orthocas.fitting.loss.residuals import loss_columns, value_columns
-from orthocas.parametrisations import ArrayFamily
-from orthocas.parametrisations.array_memory import ArrayMemory, Memories
-from orthocas.samples import Draw, Samples, even_parts
+from orthocas.bases.family import ArrayFamily, ArrayMemory, Memories
+from orthocas.fitting.residuals import Loss, loss_columns, value_columns
+from orthocas.fitting.terms import Sizes, Weights
+from orthocas.tasks.samples import Draw, Samples, even_parts
+from orthocas.tools.batch import in_threads, in_threads_with, thread_count
+from orthocas.tools.checks import Array
+from orthocas.tools.columns import Run, blocked, by_sample, shares
 
 _ORIENTING = 200  # samples that determine the orientation of the start
 _ENTRIES = 2**18  # of the largest array of a piece of samples; larger ones leave the cache

@@ -1,15 +1,18 @@
-"""Gradients of the basis functions of a linear family at samples, stored so that few products give J_xi (ours)."""
+"""Gradients of basis functions at the samples: dense, sparse, or as tables of products."""
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import DTypeLike, NDArray
 
-from orthocas.casadi_tools.cached import cached_property
-from orthocas.casadi_tools.columns import ColumnFunction, blocked
-from orthocas.checks import Array
-from orthocas.parametrisations import LinearFamily
+from orthocas.bases.family import LinearFamily
+from orthocas.bases.products import ProductFamily
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
+from orthocas.tools.columns import ColumnFunction, blocked
 
 _PART = 16  # blocks
 
@@ -19,7 +22,7 @@ class BasisGradients(ABC):
 
     At every sample some numbers X are known, in g groups of S, and J_xi = T X with a table T of coefficients
     (g, n r / g, S) that is linear in C. The rows of T X are the columns of J_xi, one joint after the other. Samples are
-    stored in the blocks of `orthocas.casadi_tools.columns`, (B, g, S, c) for B blocks of c samples.
+    stored in the blocks of `orthocas.tools.columns`, (B, g, S, c) for B blocks of c samples.
 
     Args:
         family: the basis.
@@ -79,3 +82,170 @@ class BasisGradients(ABC):
     def _columns(self) -> ColumnFunction:
         q = ca.SX.sym("q", self.n)
         return ColumnFunction(ca.Function("basis_gradients", [q], [ca.densify(self._numbers(q))]))
+
+
+class ProductGradients(BasisGradients):
+    """X holds the functions psi' of (1, psi) that occur in derivatives: d psi / dq_i = D_i psi', in a single group.
+
+    For polynomials of degree d in n joints these are the C(n + d - 1, n) terms up to degree d - 1, where the gradients
+    have n C(n + d - 1, n) entries that are not zero. So X needs an n-th of the memory, and products with it take less
+    time than to read the gradients.
+    """
+
+    def __init__(self, family: ProductFamily, n: int, dtype: DTypeLike = np.float64) -> None:
+        super().__init__(family, n, dtype)
+        matrices = [family.derivative_matrix(i)[1:] for i in range(n)]
+        self._places = np.unique(np.concatenate([D.indices for D in matrices]))  # of psi' in (1, psi)
+        matrices = [D[:, self._places] for D in matrices]
+        self._upright = scipy.sparse.vstack(matrices).tocsr()  # all D_i, (n K, S)
+        self._lying = scipy.sparse.vstack([D.T for D in matrices]).tocsr()  # all D_i^T, (n S, K)
+        self._back = self._lying.T.tocsr()
+        self._parts: dict[tuple[bytes, str], Any] = {}  # of all D_i, for some of the functions
+
+    @property
+    def groups(self) -> int:
+        """One."""
+        return 1
+
+    def table(self, C: Array) -> Array:
+        """T = C D_i, (1, n r, S)."""
+        rows = (self._lying @ C.T).reshape(self.n, -1, len(C)).transpose(0, 2, 1)
+        return np.ascontiguousarray(rows, dtype=self.dtype).reshape(1, self.n * len(C), -1)
+
+    def collected(self, slopes: Array) -> Array:
+        """The sum over the joints of dL/dT D_i^T."""
+        by_joint = slopes.reshape(self.n, -1, slopes.shape[2]).transpose(0, 2, 1)
+        found: Array = (self._back @ by_joint.reshape(-1, by_joint.shape[2])).T
+        return found
+
+    def dense_part(
+        self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
+    ) -> Array:
+        """D_i psi'."""
+        assert X.shape[3] % every == 0
+        kind = X.dtype if dtype is None else np.dtype(dtype)
+        values = X[:, 0, :, ::every].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, : -(-samples // every)]
+        found = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
+        return np.ascontiguousarray(found.T).reshape(found.shape[1], self.n, int(kept.sum()))
+
+    def _part(self, kept: NDArray[np.bool_], kind: "np.dtype[Any]") -> Any:
+        """The rows of some functions in all D_i, (n kept, S)."""
+        key = kept.tobytes(), kind.str
+        if key not in self._parts:
+            self._parts[key] = self._upright[np.tile(kept, self.n)].astype(kind)
+        return self._parts[key]
+
+    def _numbers(self, q: ca.SX) -> ca.SX:
+        return ca.vertcat(1, self.family.basis(q))[self._places.tolist()]
+
+
+class BoxGradients(BasisGradients):
+    """Those of a family on the cube [-1, 1]^n in the units of one box: d psi / dq_i = d psi / du_i / half_width_i.
+
+    Boxes share the compiled basis, and the numbers at points of the cube that all of them use.
+
+    Args:
+        cube: gradients on the cube.
+        half_width: of the box, (n,).
+        shared: points of the cube, (N, n); `at` recognises this array.
+        known: the result of `cube.at(shared)`.
+    """
+
+    def __init__(self, cube: ProductGradients, half_width: Array, shared: Array, known: Array) -> None:
+        super().__init__(cube.family, cube.n, cube.dtype)
+        self._cube, self._scale, self._shared, self._known = cube, 1 / half_width, shared, known
+
+    @property
+    def groups(self) -> int:
+        """As on the cube."""
+        return self._cube.groups
+
+    def at(self, points: Array) -> Array:
+        """The numbers at points of the cube (N, n)."""
+        return self._known if points is self._shared else self._cube.at(points)
+
+    def table(self, C: Array) -> Array:
+        """That of the cube, in the units of the box."""
+        table = self._cube.table(C)
+        return table * np.repeat(self._scale, len(C))[:, None]
+
+    def collected(self, slopes: Array) -> Array:
+        """The same for slopes."""
+        r = slopes.shape[1] // self.n
+        return self._cube.collected(slopes * np.repeat(self._scale, r)[:, None])
+
+    def dense_part(
+        self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
+    ) -> Array:
+        """The gradients in the units of the box."""
+        dense = self._cube.dense_part(X, samples, kept, every, dtype)
+        dense *= self._scale[:, None].astype(dense.dtype)
+        return dense
+
+    def _numbers(self, q: ca.SX) -> ca.SX:
+        return self._cube._numbers(q)
+
+
+class SparseGradients(BasisGradients):
+    """X holds d psi_k / dq_i for the functions that depend on joint i, a group for each joint.
+
+    CasADi's sparsity pattern of the Jacobian tells which entries are not zero.
+    """
+
+    @property
+    def groups(self) -> int:
+        """One for each joint."""
+        return self.n
+
+    @cached_property
+    def terms_of_joints(self) -> NDArray[np.int_]:
+        """Indices of the functions that depend on each joint, (n, S). Shorter rows are padded with -1."""
+        functions, joints = self._jacobian.sparsity_out(0).get_triplet()
+        rows: list[list[int]] = [[] for _ in range(self.n)]
+        for k, i in zip(functions, joints, strict=True):
+            rows[i].append(k)
+        width = max(len(row) for row in rows)
+        return np.array([sorted(row) + [-1] * (width - len(row)) for row in rows])
+
+    def table(self, C: Array) -> Array:
+        """The coefficients of the functions of each joint, (n, r, S)."""
+        return np.ascontiguousarray(C[:, self.terms_of_joints].transpose(1, 0, 2), dtype=self.dtype)
+
+    def collected(self, slopes: Array) -> Array:
+        """The sum over the joints."""
+        total = np.zeros((slopes.shape[1], self.family.width))
+        for places, part in zip(self.terms_of_joints, slopes, strict=True):
+            known = places >= 0
+            total[:, places[known]] += part[:, known]
+        return total
+
+    def dense_part(
+        self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
+    ) -> Array:
+        """The numbers in their places."""
+        B, n, _, c = X.shape
+        assert c % every == 0
+        place = np.cumsum(kept) - 1
+        dense = np.zeros((B, c // every, n, kept.sum()), dtype=X.dtype if dtype is None else dtype)
+        for i, functions in enumerate(self.terms_of_joints):
+            rows = np.flatnonzero((functions >= 0) & kept[functions])
+            columns = place[functions[rows]]
+            for block, part in zip(dense, X[:, i, :, ::every], strict=True):
+                block[:, i, columns] = part[rows].T
+        return dense.reshape(-1, *dense.shape[2:])[: -(-samples // every)]
+
+    def _numbers(self, q: ca.SX) -> ca.SX:
+        J = self._jacobian(q)
+        return ca.vertcat(*(J[int(k), i] if k >= 0 else 0 for i, row in enumerate(self.terms_of_joints) for k in row))
+
+    @cached_property
+    def _jacobian(self) -> ca.Function:
+        q = ca.SX.sym("q", self.n)
+        return ca.Function("jacobian", [q], [ca.jacobian(self.family.basis(q), q)])
+
+
+def gradients_of(family: LinearFamily, n: int, dtype: DTypeLike = np.float64) -> BasisGradients:
+    """Gradients of a family of n joints, with numbers of a type."""
+    return (
+        ProductGradients(family, n, dtype) if isinstance(family, ProductFamily) else SparseGradients(family, n, dtype)
+    )

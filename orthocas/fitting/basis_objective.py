@@ -1,28 +1,92 @@
-"""The loss of families linear in theta: basis gradients are sampled once, the rest is dense products (ours)."""
+"""The loss of bases as least squares: J_xi is linear in theta, normal equations come in blocks."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
+from functools import partial
+from math import ceil
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.casadi_tools.columns import COLUMNS, Run, blocked, by_sample, shares
-from orthocas.casadi_tools.threads import in_threads, in_threads_with, thread_count
-from orthocas.checks import Array
-from orthocas.fitting.basis_gradients import BasisGradients
-from orthocas.fitting.gradients_of import gradients_of
-from orthocas.fitting.loss import Loss, Pairs, Sizes, Weights
-from orthocas.fitting.loss.residuals import curvature_columns, loss_columns, residual_columns, value_columns
-from orthocas.fitting.normal_blocks import normal_matrix
-from orthocas.parametrisations import LinearFamily
-from orthocas.samples import Draw, Samples, even_parts
+from orthocas.bases.family import LinearFamily
+from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
+from orthocas.fitting.residuals import Loss, Pairs, curvature_columns, loss_columns, residual_columns, value_columns
+from orthocas.fitting.terms import Sizes, Weights
+from orthocas.tasks.samples import Draw, Samples, even_parts
+from orthocas.tools.batch import in_threads, in_threads_with, thread_count
+from orthocas.tools.checks import Array
+from orthocas.tools.columns import COLUMNS, Run, blocked, by_sample, shares
 
+_ROWS_IN_CACHE = 512  # samples in a product: the rows stay in the cache
 _CHUNK = 512  # samples per product of the Hessian, so that the rows stay in the cache
 _BLOCKS = 8  # blocks of samples per thread: a fixed number, so that sums do not depend on the number of threads
 STRIDE = 2  #: every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
 _MOST_STRIDE = 16  # of rough estimates; a divisor of the samples in a block
 _ROUGH = 12  # residuals per coefficient in a rough estimate
+
+Shared = Sequence[tuple[int, int, int, int]]
+
+
+def normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array], shared: Shared) -> Array:
+    """Sums over samples of X_j^T X_j, and of x_i^T x_j for residuals that two coordinates share, (size, size).
+
+    X_j = D_j G_j are the derivatives of the residuals of coordinate j with respect to its coefficients. Products are
+    taken over chunks of samples, and added in double precision in the order of the chunks.
+
+    Args:
+        derivatives: D_j of every coordinate, (N, rows, n).
+        gradients: G_j of every coordinate, (N, n, K_j).
+        shared: coordinates i > j and the places of their shared residual among the rows of X_i and of X_j.
+    """
+    r, ends = len(derivatives), np.cumsum([G.shape[2] for G in gradients])
+    places = [slice(end - G.shape[2], end) for G, end in zip(gradients, ends, strict=True)]
+    H = np.zeros((ends[-1], ends[-1]))
+    chunks = range(0, len(gradients[0]), _ROWS_IN_CACHE)
+    together = ceil(thread_count() / r)  # chunks, so that there is work for all threads
+    for k in range(0, len(chunks), together):
+        _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
+    for i, j, *_ in shared:
+        H[places[j], places[i]] = H[places[i], places[j]].T
+    return H
+
+
+def _add(
+    H: Array,
+    places: Sequence[slice],
+    starts: Sequence[int],
+    derivatives: Sequence[Array],
+    gradients: Sequence[Array],
+    shared: Shared,
+) -> None:
+    """Add the products of some chunks: every block by one thread, in the order of the chunks."""
+
+    def rows(piece: tuple[int, int]) -> Array:
+        start, j = piece
+        part = slice(start, start + _ROWS_IN_CACHE)
+        product: Array = derivatives[j][part] @ gradients[j][part]  # (chunk, rows, K_j)
+        return product
+
+    def square(j: int) -> None:
+        for start in starts:
+            flat = X[start, j].reshape(-1, X[start, j].shape[2])
+            H[places[j], places[j]] += flat.T @ flat
+
+    def mixed(pair: tuple[int, int]) -> None:
+        i, j = pair
+        for start in starts:
+            for row, other in rows_of[i, j]:
+                H[places[i], places[j]] += X[start, i][:, row].T @ X[start, j][:, other]
+
+    r = len(derivatives)
+    rows_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, j, row, other in shared:
+        rows_of.setdefault((i, j), []).append((row, other))
+    pieces = [(start, j) for start in starts for j in range(r)]
+    X = dict(zip(pieces, in_threads(rows, pieces), strict=True))
+    work: list[Callable[[], None]] = [partial(square, j) for j in range(r)]
+    work += [partial(mixed, pair) for pair in rows_of]
+    in_threads(lambda block: block(), work)
 
 
 class BasisObjective:
@@ -33,7 +97,7 @@ class BasisObjective:
     CasADi. The residual of task i and coordinate j depends only on row j of C, so the Gauss-Newton matrix is built
     block by block from few rows per sample.
 
-    Samples are stored in the blocks of `orthocas.casadi_tools.columns`: X is (B, g, S, c) and J_xi is (B, n r, c).
+    Samples are stored in the blocks of `orthocas.tools.columns`: X is (B, g, S, c) and J_xi is (B, n r, c).
 
     Args:
         family: the coordinates.
@@ -42,7 +106,7 @@ class BasisObjective:
         start: parameters, (size,), whose orientation the regularity term keeps.
         draw: draws fresh samples.
         kept: the coefficients (r, K) that may differ from zero; theta holds only these. Default: all.
-        exchanged: pairs of components whose sum and difference are coordinates, see `orthocas.fitting.mirror`. Then
+        exchanged: pairs of components whose sum and difference are coordinates, see `orthocas.fitting.starts`. Then
             C and J_xi are those of the components.
         gradients: gradients of the basis, if they are known already, or of another type than float64; products with
             them are computed with numbers of that type. Default: those of the family.
@@ -271,3 +335,67 @@ def expanded(theta: Array, kept: NDArray[np.bool_]) -> Array:
     C = np.zeros(kept.shape)
     C[kept] = theta
     return C.ravel()
+
+
+class BoundedMutual:
+    """Minimise the task term of (24) subject to a bound on the mutual term, and to a gauge condition.
+
+    min  E[sum of task cosines^2] lambda1 / (2 m r)  (plus the regularity term, if there is one)
+    s.t. E[mean of mutual cosines^2] <= bound^2  and  E|grad xi_j|^2 = 1 for every coordinate j.
+
+    The scales of the coordinates change neither term. The gauge condition fixes them, so that the solution is an
+    isolated point. Up to terms of third order, sqrt(E cos^2) is the root mean square deviation of mutual angles from
+    a right angle [rad].
+
+    Args:
+        objective: the weighted loss on its samples. Its lambda2 is not used.
+        bound: upper bound on the root mean square mutual cosine, > 0.
+
+    Source:
+        ours, docs/derivations.md#constrained-form.
+    """
+
+    def __init__(self, objective: BasisObjective, bound: float) -> None:
+        weights, self._gram = objective.weights, objective.gram  # sampled once, and shared by the objectives below
+        self._task = objective.reweighted(Weights(weights.task, 0.0, weights.regularity, angles=weights.angles))
+        only_mutual = Weights(0.0, 2.0, 0.0, angles=weights.angles)  # 2 cancels the factor 1/2 of the loss
+        self._mutual = objective.reweighted(only_mutual)
+        self._r, self._K, self._bound = objective.r, objective.K, bound
+
+    def value(self, theta: Array) -> float:
+        """Task term (and regularity term)."""
+        return self._task.value(theta)
+
+    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
+        """Task term (and regularity term) and its gradient, (size,)."""
+        return self._task.value_and_gradient(theta)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of `constraints`, (1 + r,) each."""
+        ones = np.ones(self._r)
+        return np.concatenate([[-np.inf], ones]), np.concatenate([[1.0], ones])
+
+    def constraints(self, theta: Array) -> tuple[Array, Array]:
+        """Mutual term over its bound, then the gauge of every coordinate, (1 + r,), and their Jacobian."""
+        value, gradient = self._mutual.value_and_gradient(theta)
+        C = theta.reshape(self._r, self._K)
+        raised = C @ self._gram
+        gauge = np.zeros((self._r, self._r, self._K))
+        gauge[np.arange(self._r), np.arange(self._r)] = 2 * raised
+        values = np.concatenate([[value / self._bound**2], (raised * C).sum(axis=1)])
+        return values, np.vstack([gradient / self._bound**2, gauge.reshape(self._r, -1)])
+
+    def lagrangian_hessian(self, theta: Array, factor: float, multipliers: Array) -> Array:
+        """Hessian of factor L + multipliers . constraints, (size, size)."""
+        H: Array = factor * self._task.hessian(theta) + multipliers[0] / self._bound**2 * self._mutual.hessian(theta)
+        for j, multiplier in enumerate(multipliers[1:]):
+            block = slice(j * self._K, (j + 1) * self._K)
+            H[block, block] += 2 * multiplier * self._gram
+        return H
+
+    def in_gauge(self, theta: Array) -> Array:
+        """The same coordinates with E|grad xi_j|^2 = 1."""
+        C = theta.reshape(self._r, self._K)
+        scaled: Array = C / np.sqrt(((C @ self._gram) * C).sum(axis=1))[:, None]
+        return scaled.ravel()

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.checks import Array, as_float_array, frozen_array, require_count, require_text
 from orthocas.errors import CheckpointError, InvalidValueError, OrthocasError
-from orthocas.files.archive import Kind, read_archive, write_archive
-from orthocas.files.atomic import require_writable
-from orthocas.minimising.solver import SolveResult, Status
-from orthocas.minimising.watch import State
+from orthocas.solvers.protocol import SolveResult, Status
+from orthocas.tools.archive import Kind, read_archive, write_archive
+from orthocas.tools.checks import Array, as_float_array, frozen_array, require_count, require_text
+from orthocas.tools.files import require_writable
+from orthocas.tools.progress import State
 
 CHECKPOINT = Kind("checkpoint", 1, CheckpointError)
 _NUMBERS = ("iterations", "evaluations", "seconds", "damping", "stretch", "scale", "converged")

@@ -1,42 +1,272 @@
-"""Fit coordinates to a problem: split off idle joints, start spectrally, raise the degree, minimise."""
+"""`fit`: fits coordinates to a problem, along stages, and fixes what the loss leaves free."""
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import scipy
+from numpy.typing import NDArray
 
-from orthocas.casadi_tools.interrupts import remembered
-from orthocas.casadi_tools.threads import using_threads
-from orthocas.chart import Chart
-from orthocas.checks import as_path, require_count, require_kind
-from orthocas.coordinates.fitted import Coordinates
-from orthocas.errors import Interrupted
-from orthocas.fitting.checkpoint import Checkpoint, Stage
-from orthocas.fitting.clear_part import ClearPart, clear_part
-from orthocas.fitting.continuation import Continuation
-from orthocas.fitting.fold_search import FoldSearch
-from orthocas.fitting.gauge import aligned, in_closed_form, in_gauge, normalised
-from orthocas.fitting.idle_joints import idle_joints
-from orthocas.fitting.loss import DEFAULT_WEIGHTS, WeightNumbers, Weights
-from orthocas.fitting.settings import PRECISIONS, FitSettings, default_parametrisation
-from orthocas.fitting.stages import StageRunner
-from orthocas.minimising.solver import Solver, Status
-from orthocas.minimising.watch import Monitor, silent
-from orthocas.parametrisations import (
+from orthocas.bases.circle import CircleFamily
+from orthocas.bases.cyclic import over_cyclic_joints
+from orthocas.bases.family import (
     CyclicParametrisation,
+    Family,
+    GradedFamily,
+    GradedParametrisation,
     JointSpace,
     Parametrisation,
-    warn_unless_savable,
+    ReorderableFamily,
 )
-from orthocas.parametrisations.cyclic_joints import over_cyclic_joints
-from orthocas.problem import Problem, ProblemCheck, check
-from orthocas.samples import Samples, sample_problem
-from orthocas.showing import Shown, listed
-from orthocas.worst_points import WorstPoints
+from orthocas.bases.registry import warn_unless_savable
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.worst_points import WorstPoints
+from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
+from orthocas.fitting.checkpoint import Checkpoint, Stage
+from orthocas.fitting.fold_search import FoldSearch
+from orthocas.fitting.settings import PRECISIONS, FitSettings, default_parametrisation
+from orthocas.fitting.stages import Plan, StageRunner
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, LEAST_CONDITIONING, WeightNumbers, Weights
+from orthocas.solvers.protocol import Solver, Status
+from orthocas.tasks.clear_box import ClearBox
+from orthocas.tasks.corridor import Corridor
+from orthocas.tasks.domains import Box
+from orthocas.tasks.problem import Problem, ProblemCheck, check
+from orthocas.tasks.samples import Samples, idle_joints, sample_problem
+from orthocas.tools.batch import using_threads
+from orthocas.tools.checks import Array, as_path, require_count, require_kind
+from orthocas.tools.display import Shown, listed
+from orthocas.tools.interrupts import remembered
+from orthocas.tools.progress import Monitor, silent
 
+_STEP = 0.05  # of the bounds that are offered
+_FAILS = 0.05  # conditioning below which a chart is of no use; folds have less than 0
+_MOST = 0.9  # share of such points that a bound should leave out
+_LARGEST = 0.25  # bound; charts that fail at larger singular values have other reasons
+_ANY = 1e-12  # bound of a ClearBox that only measures
+_DIGITS = 6  # of gradients at the centre that count for the order: fits end with about as many
+_SEARCHED = 3  # degree from which worst points are searched: those of lower degrees differ from the last ones
+_ROUNDS = 4  # of the last degree
+_LEAST_GAIN = 0.01  # of the conditioning in a round
 _FIRST_SAMPLES = 1000  # seed tag of the samples that scale coordinates; stages use other tags
+
+
+@dataclass(frozen=True)
+class ClearPart:
+    """A bound on the relative singular value of the task that leaves out near-singular positions where charts fail."""
+
+    least_singular_value: float
+    share: float  #: of the box that is left
+
+    @property
+    def told(self) -> str:
+        """The offer in words."""
+        return f"least singular value {self.least_singular_value:g} stays clear, on {self.share:.1%} of the box"
+
+
+def clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints | None) -> ClearPart | None:
+    """What to offer after a fit: a bound if the domain touches near-singular positions, or if charts fail near them.
+
+    The bound leaves out nine in ten of the points with a conditioning below 0.05 that the fit's search found.
+
+    Returns:
+        The offer; None if nothing is wrong, if charts fail elsewhere too, or if the centre itself would be left out.
+    """
+    domain = problem.domain
+    failed = np.zeros((0, problem.n)) if worst is None else worst.below(_FAILS)
+    if not isinstance(domain, Box) or isinstance(domain, Corridor) or not (len(failed) or check.singular_samples):
+        return None
+    try:
+        measured = domain if isinstance(domain, ClearBox) else ClearBox(domain, problem.task, _ANY)
+        values = measured.singular_values(failed)
+        wanted = float(np.quantile(values, _MOST)) if len(failed) else 0.0
+        if not wanted <= _LARGEST:
+            return None
+        bound = round(_STEP * (1 + wanted // _STEP), 2)
+        return ClearPart(bound, ClearBox(domain, problem.task, bound, measured.scale, measured.rows).share)
+    except DomainError:  # the centre is not clear
+        return None
+
+
+def in_closed_form(problem: Problem, parametrisation: Parametrisation, samples: Samples) -> Coordinates:
+    """Coordinates in closed form, which need no fit; see `orthocas.bases.ClosedForm`."""
+    assert parametrisation.closed_form is not None
+    found = parametrisation.closed_form(problem)
+    r = problem.r
+    raw = Coordinates(parametrisation, JointSpace.of(problem), (), found.theta, np.zeros(r), np.ones(r))
+    origin = problem.domain.centre if found.origin is None else found.origin
+    scaled = normalised(raw, origin, samples)
+    return scaled if found.scaled else replace(scaled, scale=np.ones(r))
+
+
+def normalised(raw: Coordinates, origin: Array, samples: Samples) -> Coordinates:
+    """Shift and scale fitted coordinates so that they vanish at the origin, and their mean gradient length is 1.
+
+    Raises:
+        OrthocasError: if the gradient of a coordinate vanishes on the domain.
+    """
+    r = len(raw.offset)
+    if isinstance(raw.family, CircleFamily):  # an angle keeps its period
+        return replace(raw, theta=raw.family.turned(raw.theta, raw.once("xi", origin[None, :])[0, :r]))
+    lengths = np.linalg.norm(raw.once("jacobian", samples.points)[:, :r], axis=2).mean(axis=0)
+    if not lengths.min() > 0:
+        raise OrthocasError(f"coordinate {int(np.argmin(lengths))} has a vanishing gradient on the domain")
+    return replace(raw, offset=raw.once("xi", origin[None, :])[0, :r], scale=1 / lengths)
+
+
+def in_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
+    """Reorder coordinates and choose their signs, independently of how a fit found them.
+
+    Coordinates that move the first joints come first. They are sorted by the mean index of the joints that move,
+    sum_k k g_k^2 / |g|^2, with the gradient g at the centre of the domain. The joint with the largest |g_k| moves in
+    the positive direction. Coordinates that change places in the arm's mirror have the same mean; the one that moves
+    the first joint on which they differ further comes first. Idle joints stay last.
+    """
+    g = coordinates.once("jacobian", centre[None, :])[0, : len(coordinates.offset)]
+    size = (g**2).sum(axis=1)
+    moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)  # g = 0: a fold at the centre
+    largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]
+    signs = np.where(largest < 0, -1.0, 1.0)
+    keys = np.round(np.column_stack([moved, -signs[:, None] * g]), _DIGITS)
+    return _rearranged(coordinates, np.lexsort(keys.T[::-1]), signs)
+
+
+def aligned(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordinates:
+    """Reorder coordinates and choose their signs so that they are closest to those of a chart.
+
+    Each is matched with the coordinate of the chart whose gradient is most parallel, on average over samples.
+
+    Raises:
+        InvalidValueError: if the chart has other joints, another number of coordinates, or other idle joints.
+    """
+    fitted = len(coordinates.offset)
+    if chart.n != coordinates.space.n or chart.r != coordinates.r:
+        raise InvalidValueError(
+            "align_to",
+            f"a chart with n = {chart.n}, r = {chart.r}",
+            f"one with n = {coordinates.space.n}, r = {coordinates.r}",
+        )
+    ours, theirs = (
+        J / np.linalg.norm(J, axis=2, keepdims=True)
+        for J in (coordinates.jacobian(samples.points)[:, :fitted], chart.coordinates.jacobian(samples.points))
+    )
+    parallel = np.einsum("sin,sjn->ij", ours, theirs[:, :fitted]) / len(samples)
+    theirs_in_order, order = scipy.optimize.linear_sum_assignment(-np.abs(parallel.T))
+    signs = np.sign(parallel.T[theirs_in_order, order])
+    back = np.empty(fitted)
+    back[order] = signs
+    return _rearranged(coordinates, order, back)
+
+
+def _rearranged(coordinates: Coordinates, order: NDArray[np.int_], signs: Array) -> Coordinates:
+    """Coordinates in another order, each times a sign. Families that cannot be reordered keep their order.
+
+    Args:
+        coordinates: the coordinates.
+        order: the old place of each new place.
+        signs: signs of the coordinates in their old places.
+    """
+    family = coordinates.family
+    if not isinstance(family, ReorderableFamily):
+        return replace(coordinates, scale=coordinates.scale * signs)
+    places = [int(k) for k in order]
+    return replace(
+        coordinates,
+        theta=family.reordered(coordinates.theta, places),
+        offset=coordinates.offset[places],
+        scale=(coordinates.scale * signs)[places],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Finished minimisations, the parametrisation that they reached, and its worst points if a search was made."""
+
+    stages: tuple[Stage, ...]
+    parametrisation: Parametrisation
+    worst: WorstPoints | None
+
+    @property
+    def theta(self) -> Array:
+        """Parameters found by the last minimisation."""
+        return self.stages[-1].result.theta
+
+
+class Continuation:
+    """Solves a low degree from a spectral start, embeds the result, and solves the next degree.
+
+    The worst points of each degree join the loss of the next one. The last degree is solved again until its least
+    conditioning is large enough or, without a fold, no longer grows. If folds remain after some rounds, the domain
+    forces them: then the last stage leaves the fold term out.
+
+    Args:
+        runner: runs single stages.
+        r: number of coordinates of the active joints.
+    """
+
+    def __init__(self, runner: StageRunner, r: int) -> None:
+        self._runner, self._r = runner, r
+        self._stages: list[Stage] = []
+        self._reached: tuple[Parametrisation, Family] | None = None
+
+    def run(self) -> Solved:
+        """Run all stages. After Ctrl-C, the last one is marked as interrupted."""
+        steps = self._steps(self._runner.settings.parametrisation)
+        try:
+            for step in steps:
+                self._solve(step, step.label, final=step is steps[-1])
+            self._unfold(steps[-1])
+        except KeyboardInterrupt:  # also between minimisations
+            if self._reached is None:
+                raise
+            self._stages[-1] = self._stages[-1].interrupted()
+        assert self._reached is not None
+        return Solved(tuple(self._stages), self._reached[0], self._runner.folds.found)
+
+    def _steps(self, target: Parametrisation) -> Sequence[Parametrisation]:
+        if not isinstance(target, GradedParametrisation):
+            return [target]
+        self._runner.require_memory(target, self._r)
+        return [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
+
+    def _solve(self, step: Parametrisation, label: str, final: bool) -> None:
+        """Run a stage, and search the worst points of its result."""
+        runner, degree = self._runner, step.degree if isinstance(step, GradedParametrisation) else 0
+        family = runner.family(step, self._r)
+        solver = runner.settings.solver if final else runner.settings.solver.coarser()
+        stage = runner.run(Plan(label, family, self._start(family), solver, degree, final))
+        self._stages.append(stage)
+        self._reached = step, family
+        if stage.result.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        if final or degree >= _SEARCHED:
+            runner.folds.search(stage, step, len(self._stages), runner.monitor)
+
+    def _start(self, family: Family) -> Array | None:
+        """The last result, embedded."""
+        if self._reached is None:
+            return None
+        theta, before = self._stages[-1].result.theta, self._reached[1]
+        if theta.size == family.size:
+            return theta
+        assert isinstance(family, GradedFamily)
+        assert isinstance(before, GradedFamily)
+        return family.embed(theta, before)
+
+    def _unfold(self, step: Parametrisation) -> None:
+        """Solve the last step again until there is no point of small conditioning."""
+        folds, before = self._runner.folds, 0.0
+        for k in range(2, 2 + _ROUNDS):
+            if folds.least >= LEAST_CONDITIONING or 0 <= folds.least < before + _LEAST_GAIN:
+                break
+            before = folds.least
+            self._solve(step, f"{step.label}, round {k}", final=True)
+        if folds.least < 0:
+            folds.give_up()
+            self._solve(step, f"{step.label}, with folds", final=True)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

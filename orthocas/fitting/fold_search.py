@@ -4,25 +4,25 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from orthocas.checks import Array
-from orthocas.coordinates.fitted import Coordinates
+from orthocas.bases.family import JointSpace, Parametrisation
+from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.worst_points import WorstPoints, worst_points
 from orthocas.fitting.array_objective import ArrayObjective
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.checkpoint import Stage
 from orthocas.fitting.graph_objective import GraphObjective
-from orthocas.fitting.loss import FOLD_TERM, LEAST_CONDITIONING
-from orthocas.minimising.objective import (
+from orthocas.fitting.terms import FOLD_TERM, LEAST_CONDITIONING
+from orthocas.solvers.protocol import (
     EstimatedObjective,
     LeastSquaresObjective,
     Objective,
     SampledObjective,
     SmoothObjective,
 )
-from orthocas.minimising.watch import Monitor, Progress
-from orthocas.parametrisations import JointSpace, Parametrisation
-from orthocas.problem import Problem
-from orthocas.samples import samples_at
-from orthocas.worst_points import WorstPoints, worst_points
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import samples_at
+from orthocas.tools.checks import Array
+from orthocas.tools.progress import Monitor, Progress
 
 _COLLECTED = 1.5 * LEAST_CONDITIONING  # points below it are collected, before they become worse
 

@@ -9,13 +9,13 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.blas_graph import NumpyGraph
-from orthocas.casadi_tools.tape import replay
-from orthocas.checks import Array
-from orthocas.fitting.loss import Loss, Sizes, Weights
-from orthocas.fitting.loss.residuals import loss_columns
-from orthocas.parametrisations import Family
-from orthocas.samples import Draw, Samples, even_parts
+from orthocas.bases.family import Family
+from orthocas.fitting.residuals import Loss, loss_columns
+from orthocas.fitting.terms import Sizes, Weights
+from orthocas.tasks.samples import Draw, Samples, even_parts
+from orthocas.tools.blas_graph import NumpyGraph
+from orthocas.tools.checks import Array
+from orthocas.tools.expressions import replay
 
 _ORIENTING = 200  # samples that determine the orientation of the start
 _CHUNK_ENTRIES = 2**20  # entries of the largest matrix in a graph; larger ones leave the cache

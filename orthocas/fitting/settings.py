@@ -5,17 +5,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocas.checks import as_number, require_count, require_kind, require_known
-from orthocas.domains import Torus
+from orthocas.bases.family import GradedParametrisation, Parametrisation
+from orthocas.bases.products import Polynomial
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.loss import WeightNumbers, Weights
-from orthocas.minimising.solver import Solver
-from orthocas.parametrisations import GradedParametrisation, Parametrisation, Polynomial
-from orthocas.postures.clear_box import ClearBox
-from orthocas.postures.corridor import Corridor
-from orthocas.problem import Problem
-from orthocas.samples import sample_problem
-from orthocas.solvers import LBFGS, GaussNewton, Ipopt, QuasiNewton
+from orthocas.fitting.terms import WeightNumbers, Weights
+from orthocas.solvers.gauss_newton import GaussNewton
+from orthocas.solvers.ipopt import Ipopt
+from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.protocol import Solver
+from orthocas.solvers.quasi_newton import QuasiNewton
+from orthocas.tasks.clear_box import ClearBox
+from orthocas.tasks.corridor import Corridor
+from orthocas.tasks.domains import Torus
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import sample_problem
+from orthocas.tools.checks import as_number, require_count, require_kind, require_known
 
 PRECISIONS = ("double", "single")  #: of the large products of a fit
 _MANY_JOINTS = 8  # with more, coordinates are many as well, and the matrix grows with their square

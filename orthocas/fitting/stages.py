@@ -7,40 +7,29 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.casadi_tools.cached import cached_property
-from orthocas.casadi_tools.interrupts import deferred
-from orthocas.casadi_tools.threads import one_blas_thread
-from orthocas.checks import Array, require_memory
-from orthocas.domains import sample_evenly
+from orthocas.bases.family import ArrayFamily, Family, GradedParametrisation, JointSpace, LinearFamily, Parametrisation
+from orthocas.bases.products import Fourier, Polynomial
+from orthocas.charts.angles import pairs
 from orthocas.errors import CheckpointError, InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.array_objective import ArrayObjective
-from orthocas.fitting.basis_gradients import BasisGradients
-from orthocas.fitting.basis_objective import STRIDE, BasisObjective, expanded
-from orthocas.fitting.bounded_mutual import BoundedMutual
+from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
+from orthocas.fitting.basis_objective import STRIDE, BasisObjective, BoundedMutual, expanded
 from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.fold_search import FoldSearch
-from orthocas.fitting.gradients_of import gradients_of
 from orthocas.fitting.graph_objective import GraphObjective
-from orthocas.fitting.loss import DEFAULT_WEIGHTS, pairs
-from orthocas.fitting.mirror import Mirror, find_mirror
 from orthocas.fitting.settings import FitSettings
-from orthocas.fitting.spectral_start import spectral_start
-from orthocas.minimising.objective import Objective
-from orthocas.minimising.solver import Solver, SolveResult, Status
-from orthocas.minimising.watch import Monitor, Progress, Watch
-from orthocas.parametrisations import (
-    ArrayFamily,
-    Family,
-    Fourier,
-    GradedParametrisation,
-    JointSpace,
-    LinearFamily,
-    Parametrisation,
-    Polynomial,
-)
-from orthocas.problem import Problem
-from orthocas.samples import Samples, sample_problem, samples_at
-from orthocas.solvers import GaussNewton
+from orthocas.fitting.starts import Mirror, find_mirror, spectral_start
+from orthocas.fitting.terms import DEFAULT_WEIGHTS
+from orthocas.solvers.gauss_newton import GaussNewton
+from orthocas.solvers.protocol import Objective, Solver, SolveResult, Status
+from orthocas.tasks.domains import sample_evenly
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import Samples, sample_problem, samples_at
+from orthocas.tools.batch import one_blas_thread
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, require_memory
+from orthocas.tools.interrupts import deferred
+from orthocas.tools.progress import Monitor, Progress, Watch
 
 MLP_SAMPLES = 2000  #: default sample count of families that are not linear in theta
 _START_SEED = 0  # seed of the samples of spectral starts, the same for all fits

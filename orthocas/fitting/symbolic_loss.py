@@ -6,15 +6,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_point_set, frozen_array, require_count, require_kind
-from orthocas.domains import sample_evenly
-from orthocas.fitting.loss import DEFAULT_WEIGHTS, Loss, Sizes, WeightNumbers, Weights
-from orthocas.fitting.loss.residuals import sample_loss
+from orthocas.bases.family import Family, JointSpace, LinearFamily, Parametrisation
+from orthocas.fitting.residuals import Loss, sample_loss
 from orthocas.fitting.settings import require_parametrisation
-from orthocas.fitting.spectral_start import spectral_start
-from orthocas.parametrisations import Family, JointSpace, LinearFamily, Parametrisation
-from orthocas.problem import Problem
-from orthocas.samples import Samples, samples_at
+from orthocas.fitting.starts import spectral_start
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, Sizes, WeightNumbers, Weights
+from orthocas.tasks.domains import sample_evenly
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import Samples, samples_at
+from orthocas.tools.checks import Array, as_point_set, frozen_array, require_count, require_kind
 
 
 def loss(

@@ -1,16 +1,23 @@
-"""Named postures of a robot: group states of an SRDF file, or keyframes of an MJCF file."""
+"""Named postures of a robot from SRDF and MJCF files, and postures from CSV files."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
-from orthocas.checks import Array
-from orthocas.robots.xml_files import read_xml
+from orthocas.robots.xml import read_xml
+from orthocas.tools.checks import Array
+from orthocas.tools.csv_table import column_places, read_table
+
+if TYPE_CHECKING:
+    from orthocas.robots.robot import Robot
+
+_NOT_IN_THE_FILE = "qpos0"  # Pinocchio's name for the zero posture of an MJCF file
+_MOST_POSTURES = 1_000_000
 
 States = dict[str, dict[str, float]]  #: name of a posture -> joint -> position [rad] or [m]
-_NOT_IN_THE_FILE = "qpos0"  # Pinocchio's name for the zero posture of an MJCF file
 
 
 def srdf_states(urdf: str | Path) -> States:
@@ -71,3 +78,21 @@ def _number(text: str) -> float | None:
 def _joint_position(part: Array) -> float:
     """The position of a joint. Pinocchio stores cos and sin of a continuous joint."""
     return float(part[0]) if len(part) == 1 else float(np.arctan2(part[1], part[0]))
+
+
+def read_postures(path: Path, robot: "Robot") -> Array:
+    """Postures (N, n) of a CSV file: a header with the names of joints in any order, and one posture a line.
+
+    Columns of other names, such as those of time and velocities, are left alone.
+
+    Raises:
+        PathFileError: names the file, the line, and what is wrong there.
+    """
+    return read_table(
+        path,
+        "postures file",
+        "postures",
+        _MOST_POSTURES,
+        lambda names: column_places(names, robot.joint_names),
+        least=1,
+    )

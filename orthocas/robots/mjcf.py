@@ -13,8 +13,7 @@ from orthocas.robots.mjcf_document import MAIN, Document
 from orthocas.robots.mjcf_efforts import Ranges, effort_of_actuators
 from orthocas.robots.mjcf_inertias import MassRules, Placed, body_inertia
 from orthocas.robots.mjcf_poses import Angles, pose, shape_pose
-from orthocas.robots.xml_files import MOST_LINKS
-from orthocas.robots.xml_values import Attributes
+from orthocas.robots.xml import MOST_LINKS, Attributes
 
 _GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2], MuJoCo's default
 _LEAST_TOTAL = 1e-15  # [kg], as in MuJoCo

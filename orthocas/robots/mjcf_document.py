@@ -6,8 +6,7 @@ from xml.etree.ElementTree import Element
 
 from orthocas.errors import RobotError
 from orthocas.robots.mjcf_schema import ACTUATORS, DEFAULTS, KNOWN, ORIENTATIONS, SECTIONS
-from orthocas.robots.xml_files import MOST_DEPTH, MOST_ELEMENTS, read_xml
-from orthocas.robots.xml_values import Attributes
+from orthocas.robots.xml import MOST_DEPTH, MOST_ELEMENTS, Attributes, read_xml
 
 MAIN = "main"  #: the default class of elements that name none
 

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocas.checks import Array
 from orthocas.robots.mjcf_document import Document
 from orthocas.robots.mjcf_schema import ACTUATORS
-from orthocas.robots.xml_values import Attributes
+from orthocas.robots.xml import Attributes
+from orthocas.tools.checks import Array
 
 
 @dataclass(frozen=True, slots=True)

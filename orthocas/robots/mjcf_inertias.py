@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from orthocas.checks import Array
 from orthocas.robots.mjcf_poses import Angles, pose, shape_pose
 from orthocas.robots.mjcf_schema import ORIENTATIONS
-from orthocas.robots.xml_values import Attributes
+from orthocas.robots.xml import Attributes
+from orthocas.tools.checks import Array
 
 Placed = tuple[pin.SE3, Attributes]  # an element, with the pose of its frame in the body
 

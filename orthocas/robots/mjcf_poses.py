@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from orthocas.checks import Array
 from orthocas.robots.mjcf_schema import ORIENTATIONS
-from orthocas.robots.xml_values import Attributes
+from orthocas.robots.xml import Attributes
+from orthocas.tools.checks import Array
 
 _ELONGATED = ("capsule", "cylinder", "ellipsoid", "box")  # shapes that fromto can place
 _TINY = 1e-10  # MuJoCo's limit below which a vector counts as parallel to z

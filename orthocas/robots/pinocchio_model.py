@@ -3,10 +3,10 @@
 import numpy as np
 import pinocchio as pin
 
-from orthocas.checks import Array, require_known
 from orthocas.errors import RobotError
 from orthocas.robots.spatial import rotation_z_to, snap
 from orthocas.robots.tree import JointKind, KinematicTree
+from orthocas.tools.checks import Array, require_known
 
 _UNLIMITED = 1e10  # Pinocchio uses the largest double for "no limit"
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from orthocas.checks import frozen_array
 from orthocas.errors import InvalidValueError
+from orthocas.tools.checks import frozen_array
 
 TIP = "tip"
 GRAVITY = 9.81  #: [m/s^2]

@@ -10,19 +10,27 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from orthocas.casadi_tools.batch import Batched, dense_function
-from orthocas.casadi_tools.cached import BuiltOnUse, cached_property
-from orthocas.casadi_tools.scalar_code import WRITTEN_OUT
-from orthocas.checks import Array, as_float_array, as_path, as_point_set, frozen_array, require_kind, require_known
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.robots import dynamics, files, kinematics, planar
+from orthocas.robots import dynamics, kinematics, planar, urdf
+from orthocas.robots.dynamics import PAYLOAD, with_payload
 from orthocas.robots.homes import model_states, postures, srdf_states
+from orthocas.robots.kinematics import with_tool
 from orthocas.robots.mjcf import model_from_mjcf
-from orthocas.robots.payload import PAYLOAD, with_payload
 from orthocas.robots.pinocchio_model import frame_index, tree_from_model
-from orthocas.robots.tool import with_tool
 from orthocas.robots.tree import KinematicTree
-from orthocas.showing import Shown, listed, number_list
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import BuiltOnUse, cached_property
+from orthocas.tools.checks import (
+    Array,
+    as_float_array,
+    as_path,
+    as_point_set,
+    frozen_array,
+    require_kind,
+    require_known,
+)
+from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.expressions import WRITTEN_OUT
 
 Locked = Mapping[str, float] | None  #: joint -> position at which it is locked [rad] or [m]
 Tool = ArrayLike | None
@@ -70,7 +78,7 @@ class Robot(Shown):
         """
         require_kind("model", model, pin.Model)
         frame_index(model, tip)
-        tree = tree_from_model(files.lock_joints(model, locked or {}), tip)
+        tree = tree_from_model(urdf.lock_joints(model, locked or {}), tip)
         return cls(tree, postures(model_states(model), tree.joint_names))
 
     @classmethod
@@ -98,7 +106,7 @@ class Robot(Shown):
     @classmethod
     def from_urdf(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
         """Build the chain that moves the tip from a URDF file; see `from_file`."""
-        robot = cls._chain(files.read_urdf(as_path("path", path)), tip, locked, tool)
+        robot = cls._chain(urdf.read_urdf(as_path("path", path)), tip, locked, tool)
         return cls(robot.tree, postures(srdf_states(path), robot.joint_names))
 
     @classmethod
@@ -160,8 +168,8 @@ class Robot(Shown):
     @classmethod
     def _chain(cls, model: pin.Model, tip: str | None, locked: Locked, tool: Tool) -> Self:
         """The robot of the joints that move the tip, without those that the user locks."""
-        tip = tip or files.default_tip(model)
-        robot = cls.from_model(files.lock_off_chain(files.lock_joints(model, locked or {}), tip), tip)
+        tip = tip or urdf.default_tip(model)
+        robot = cls.from_model(urdf.lock_off_chain(urdf.lock_joints(model, locked or {}), tip), tip)
         return robot if tool is None else robot.with_tool(tool)
 
     @property

@@ -4,8 +4,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, frozen_array
 from orthocas.errors import InvalidValueError
+from orthocas.tools.checks import Array, frozen_array
 
 _ROUNDING = 1e-14  # entries of rotations this close to 0 or +-1 are rounding of rpy -> matrix
 

@@ -1,12 +1,10 @@
 """Simulation of controllers in closed loop with the full dynamics, and evaluation of the runs."""
 
-from orthocas.simulation.breakdown import Breakdown, task_acceleration_breakdown
-from orthocas.simulation.coupling import Coupling, coupling_index
+from orthocas.simulation.coupling import Breakdown, Coupling, coupling_index, task_acceleration_breakdown
 from orthocas.simulation.disturbances import Friction, Noise, Push, Stops
-from orthocas.simulation.many import simulate_many
 from orthocas.simulation.mujoco_plant import MuJoCoPlant
 from orthocas.simulation.mujoco_scene import Elasticity, MuJoCo, Payload, Wall
-from orthocas.simulation.run import simulate
+from orthocas.simulation.run import simulate, simulate_many
 from orthocas.simulation.trajectory import Outcome, Trajectory
 
 __all__ = [

@@ -8,16 +8,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.casadi_tools.cached import cached_property
-from orthocas.casadi_tools.interrupts import deferred
-from orthocas.casadi_tools.scalar_code import scalar_code
-from orthocas.checks import Array
 from orthocas.control.controller import Controller
 from orthocas.control.reference import Reference
 from orthocas.errors import SimulationError
-from orthocas.robots import Robot, dynamics
-from orthocas.simulation.disturbances import Friction, Stops
-from orthocas.simulation.loads import Loads
+from orthocas.robots import dynamics
+from orthocas.robots.robot import Robot
+from orthocas.simulation.disturbances import Friction, Loads, Stops
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
+from orthocas.tools.expressions import scalar_code
+from orthocas.tools.interrupts import deferred
 
 KEPT = 32  #: functions of each kind that a process remembers
 

@@ -1,18 +1,56 @@
-"""Disturbances that the model leaves out: pushes, friction and sensor noise."""
+"""Disturbances that the model leaves out: pushes, friction, sensor noise, and where they act."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_float_array, frozen_array, require_count, require_shape
 from orthocas.control.gains import non_negative_gains, positive_gains
 from orthocas.errors import InvalidValueError
-from orthocas.robots import KinematicTree
-from orthocas.simulation.places import Link, require_link
+from orthocas.robots.kinematics import point_jacobian
+from orthocas.robots.tree import KinematicTree
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, as_float_array, frozen_array, require_count, require_known, require_shape
 
 _STICTION_SPEED = 0.01  # [rad/s] or [m/s]: above twice this speed, Coulomb friction is nearly at its full value
+
+Link = str | int | None  #: a link, by the name or the index of the joint that moves it; None: the tip
+
+
+class Place(NamedTuple):
+    """A point of a body."""
+
+    body: int  #: index of the joint that moves it, -1 for the base
+    point: tuple[float, float, float]  #: in the frame of the body in `KinematicTree` [m]
+
+
+def place_of(tree: KinematicTree, link: Link, point: Array) -> Place:
+    """The place of a point (3,) in the frame of a link, or of the tip.
+
+    Raises:
+        UnknownNameError, InvalidValueError: if the robot has no such link.
+    """
+    if link is None:
+        x, y, z = tree.tip_translation + tree.tip_rotation @ point
+        return Place(tree.tip_parent, (float(x), float(y), float(z)))
+    if isinstance(link, str):
+        require_known("link, named by the joint that moves it,", link, tree.joint_names)
+        link = tree.joint_names.index(link)
+    require_link(link, tree.n)
+    return Place(int(link), tuple(point.tolist()))
+
+
+def require_link(link: object, n: int | None = None) -> None:
+    """Raise InvalidValueError unless the link is a name, None, or an index (of n joints, if n is known)."""
+    if link is None or isinstance(link, str):
+        return
+    whole = isinstance(link, int | np.integer) and not isinstance(link, bool)
+    if not whole or link < 0 or (n is not None and link >= n):  # type: ignore[operator]
+        most = "" if n is None else f" from 0 to {n - 1}"
+        raise InvalidValueError("link", repr(link)[:80], f"the name of a joint, or the index of one{most}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,3 +184,60 @@ class Noise:
         """Measurement errors of q and dq, (ticks, 2 n)."""
         rng = np.random.default_rng(self.seed)
         return np.asarray(rng.normal(size=(ticks, 2 * n)) * np.repeat([self.position, self.velocity], n))
+
+
+class Loads:
+    """The pushes of a run, as rows [force at each of P places (3 P); torque of the joints (n)].
+
+    Raises:
+        UnknownNameError, InvalidValueError, ShapeError: if a push does not fit the robot.
+    """
+
+    def __init__(self, tree: KinematicTree, pushes: Sequence[Push] = ()) -> None:
+        self.pushes = tuple(pushes)
+        self._tree = tree
+        self._of_push = [place_of(tree, push.link, push.point) for push in self.pushes]
+        self._rows  # noqa: B018 (refuses torques of other robots at once)
+
+    @cached_property
+    def places(self) -> tuple[Place, ...]:
+        """The different places where forces act."""
+        return tuple(dict.fromkeys(self._of_push))
+
+    @property
+    def size(self) -> int:
+        """Length of a row, 3 P + n."""
+        return 3 * len(self.places) + self._tree.n
+
+    def shares(self, starts: Array, length: float) -> Array:
+        """How much of each interval of equal length each push lasts, (N, pushes): short pushes keep their impulses."""
+        shares = [
+            np.maximum(np.minimum(starts + length, push.end) - np.maximum(starts, push.start), 0.0) / length
+            for push in self.pushes
+        ]
+        return np.array(shares).reshape(-1, len(starts)).T
+
+    def mean(self, starts: Array, length: float) -> Array:
+        """Mean rows over time intervals of equal length, (N, 3 P + n)."""
+        return np.asarray(self.shares(starts, length) @ self._rows)
+
+    def at(self, times: Array) -> Array:
+        """Rows at times (N,), (N, 3 P + n). A push acts from its start until just before its end."""
+        active = [(times >= push.start) & (times < push.end) for push in self.pushes]
+        return np.asarray(np.array(active).reshape(-1, len(times)).T @ self._rows)
+
+    def joint_torques(self, q: ca.SX, row: ca.SX) -> ca.SX:
+        """J^T f at every place, plus the torque of the joints, (n, 1), for a row (3 P + n, 1)."""
+        torque = row[3 * len(self.places) :]
+        for k, place in enumerate(self.places):
+            torque += point_jacobian(self._tree, q, place.body, np.array(place.point)).T @ row[3 * k : 3 * k + 3]
+        return torque
+
+    @cached_property
+    def _rows(self) -> Array:
+        """The row of each push while it acts, (pushes, 3 P + n)."""
+        rows = np.zeros((len(self.pushes), self.size))
+        for row, push, place in zip(rows, self.pushes, self._of_push, strict=True):
+            load, k = push.load(self._tree.n), self.places.index(place)
+            row[3 * k : 3 * k + 3], row[3 * len(self.places) :] = load[:3], load[3:]
+        return rows

@@ -7,10 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from orthocas.checks import Array
-from orthocas.control.status import FROM_THE_LAW, ControlStatus
-from orthocas.problem import Problem
-from orthocas.showing.picture import Picture
+from orthocas.control.controller import FROM_THE_LAW, ControlStatus
+from orthocas.tasks.problem import Problem
+from orthocas.tools.checks import Array
+from orthocas.tools.picture import Picture
 
 if TYPE_CHECKING:
     from orthocas.simulation.trajectory import Trajectory

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.checks import Array, as_number, frozen_array, require_at_least, require_kind
 from orthocas.control.gains import non_negative_gains, positive_gains
 from orthocas.errors import InvalidValueError
-from orthocas.robots import Robot
-from orthocas.robots.tree_checks import require_body
+from orthocas.robots.robot import Robot
+from orthocas.robots.tree import require_body
+from orthocas.tools.checks import Array, as_number, frozen_array, require_at_least, require_kind
 
 MUJOCO = "mujoco"  #: name of this plant
 TIMESTEP = 1e-3  #: longest step of the physics [s]

@@ -1,19 +1,300 @@
-"""`simulate`: runs a controller, a reference and a robot in closed loop."""
+"""`simulate` and `simulate_many`: a controller, a reference and a robot in closed loop."""
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.control.controller import Controller
+from orthocas.charts.phi import shortest
+from orthocas.control.controller import Controller, require_controller
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
-from orthocas.minimising.watch import Monitor, silent
-from orthocas.simulation.disturbances import Friction, Noise, Push, Stops
-from orthocas.simulation.prepared import Settings, prepare
-from orthocas.simulation.run_checks import Plant
-from orthocas.simulation.trajectory import Trajectory
+from orthocas.errors import Interrupted, InvalidValueError, SimulationError
+from orthocas.robots.robot import Robot
+from orthocas.simulation.closed_loop import ClosedLoop, Piece
+from orthocas.simulation.disturbances import Friction, Loads, Noise, Push, Stops
+from orthocas.simulation.loops import CompiledLoop, integrate, run_ticks
+from orthocas.simulation.mujoco_scene import MUJOCO, MuJoCo
+from orthocas.simulation.physics import SupervisedLaw, run_physics, run_supervised
+from orthocas.simulation.trajectory import Outcome, Trajectory
+from orthocas.tools.batch import THREADS, Batched
+from orthocas.tools.checks import Array, as_number, as_point, require_executor, require_kind, require_known
+from orthocas.tools.progress import Monitor, Progress, silent
 
+_MOST_TICKS = 1e7  # of a sampled run
 TOLERANCE = 1e-8  #: relative and absolute, of the integrator
+_POSITIONAL = ("controller", "reference", "q_start")
+
+Plant = Robot | MuJoCo | Literal["mujoco"] | None  #: the true robot, or MuJoCo with it; None: the controller's model
+
+
+def plant_of(plant: Plant, controller: Controller) -> tuple[Robot, MuJoCo | None]:
+    """The true robot, and the scene if MuJoCo simulates it.
+
+    Raises:
+        InvalidValueError: if the plant is something else.
+    """
+    model = controller.problem.robot
+    scene = MuJoCo() if isinstance(plant, str) and plant == MUJOCO else plant
+    if scene is None or isinstance(scene, Robot):
+        return scene or model, None
+    if isinstance(scene, MuJoCo):
+        return scene.robot or model, scene
+    given = repr(plant)[:80] if isinstance(plant, str | int | float) else f"a {type(plant).__name__}"
+    raise InvalidValueError("plant", given, f"a Robot, '{MUJOCO}' or a MuJoCo")
+
+
+def require_kinds(
+    controller: Controller, reference: Reference, pushes: Sequence[Push], optional: Mapping[type, object]
+) -> None:
+    """Raise InvalidValueError for objects of the wrong class."""
+    require_controller(controller)
+    require_kind("reference", reference, Reference)
+    for kind, value in optional.items():
+        if value is not None:
+            require_kind(kind.__name__.lower(), value, kind)
+    require_kind("pushes", pushes, Sequence)
+    for push in pushes:
+        require_kind("an entry of pushes", push, Push)
+
+
+def require_fitting(
+    loop: ClosedLoop,
+    reference: Reference,
+    friction: Friction | None,
+    noise: Noise | None,
+    control_rate: float | None,
+    in_mujoco: bool,
+    safety: Safety | None,
+) -> None:
+    """Raise InvalidValueError for arguments that would be ignored, or fail later with a less clear message."""
+    controller = loop.controller
+    if reference.labels != controller.labels:
+        raise InvalidValueError(
+            "labels of the reference", reference.labels, f"those of the controller {controller.labels}"
+        )
+    if loop.n != controller.problem.n:
+        raise InvalidValueError("joints of the plant", loop.n, f"{controller.problem.n}, as in the controller's robot")
+    forces = loop.loads.pushes or friction is not None or loop.stops is not None
+    if not loop.torque and (forces or loop.plant is not controller.problem.robot):
+        raise InvalidValueError(
+            "pushes, friction, stops or plant",
+            "given",
+            "none of them, because forces do not affect a velocity controller",
+        )
+    late = [push.start for push in loop.loads.pushes if push.start >= reference.duration]
+    if late:
+        raise InvalidValueError("start of a push", late[0], f"a time before the end at {reference.duration:g} s")
+    if control_rate is not None and as_number("control_rate", control_rate) * reference.duration < 1:
+        raise InvalidValueError("control_rate", control_rate, f"at least one tick in {reference.duration:g} s")
+    if control_rate is not None and as_number("control_rate", control_rate) * reference.duration > _MOST_TICKS:
+        raise InvalidValueError(
+            "control_rate", control_rate, f"at most {_MOST_TICKS:g} ticks in {reference.duration:g} s"
+        )
+    if noise is not None and control_rate is None:
+        raise InvalidValueError(
+            "noise", noise, "no noise without control_rate, because white noise needs control ticks"
+        )
+    if safety is not None and control_rate is None:
+        raise InvalidValueError("control_rate", None, "a number, because a supervised law runs tick by tick")
+    if in_mujoco:
+        _require_for_mujoco(loop, control_rate)
+
+
+def _require_for_mujoco(loop: ClosedLoop, control_rate: float | None) -> None:
+    """Raise InvalidValueError for what MuJoCo does not simulate."""
+    if control_rate is None:
+        raise InvalidValueError("control_rate", None, "a number, because MuJoCo runs with a sampled controller")
+    if not loop.torque:
+        raise InvalidValueError("plant", MUJOCO, "no MuJoCo with a velocity controller, which commands no torques")
+    if loop.stops is not None:
+        raise InvalidValueError("stops", "given", "none with MuJoCo, which has its own: MuJoCo(stops=True)")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Settings:
+    """The keyword arguments of `simulate`."""
+
+    dq_start: ArrayLike | None
+    step: float
+    control_rate: float | None
+    plant: Plant
+    pushes: Sequence[Push]
+    friction: Friction | None
+    stops: Stops | None
+    noise: Noise | None
+    safety: Safety | None
+    resume_after: float
+    must_be_reachable: bool
+    tolerance: float
+    compiled: bool
+
+    def require_numbers(self) -> None:
+        """Raise InvalidValueError unless step, tolerance and rate are finite and positive."""
+        rate = 1.0 if self.control_rate is None else self.control_rate
+        for name, value in (("step", self.step), ("tolerance", self.tolerance), ("control_rate", rate)):
+            if not 0 < as_number(name, value) < np.inf:
+                raise InvalidValueError(name, value, "a finite number > 0")
+
+
+def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, settings: Settings) -> "Prepared":
+    """Check the arguments of `simulate`, and build what the run needs."""
+    friction, noise, rate = settings.friction, settings.noise, settings.control_rate
+    require_kinds(controller, reference, settings.pushes, {Friction: friction, Stops: settings.stops, Noise: noise})
+    robot, scene = plant_of(settings.plant, controller)
+    loop = ClosedLoop(controller, robot, friction or Friction(), Loads(robot.tree, settings.pushes), settings.stops)
+    settings.require_numbers()
+    require_fitting(loop, reference, friction, noise, rate, scene is not None, settings.safety)
+    _require_compilable(settings, scene)
+    start = _start_state(loop, q_start, settings.dq_start)
+    if settings.must_be_reachable:
+        controller.require_reachable(reference, start[: loop.n])
+    compiled = CompiledLoop(loop, reference) if settings.compiled else None
+    if rate is None:
+        pieces = partial(integrate, step=settings.step, tolerance=settings.tolerance, compiled=compiled)
+    else:
+        law = None
+        if settings.safety is not None:
+            law = SupervisedLaw(controller, settings.safety, settings.resume_after, 1 / rate)
+        ticks = _ticks(scene, settings.tolerance, law, compiled)
+        pieces = partial(ticks, rate=rate, noise=noise or Noise())
+    return Prepared(loop, reference, start, pieces, compiled)
+
+
+def _require_compilable(settings: Settings, scene: MuJoCo | None) -> None:
+    """Raise InvalidValueError where a compiled run is asked of something else."""
+    require_kind("compiled", settings.compiled, bool)
+    if settings.compiled and (scene is not None or settings.safety is not None):
+        what = "safety" if scene is None else "MuJoCo"
+        raise InvalidValueError("compiled", True, f"False with {what}, which runs tick by tick from Python")
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A closed loop that is ready to run, once."""
+
+    loop: ClosedLoop
+    reference: Reference
+    start: Array  #: state at t = 0
+    pieces: Callable[[ClosedLoop, Reference, Array], Iterator[Piece]]
+    compiled: CompiledLoop | None
+
+    def run(self, monitor: Monitor) -> Trajectory:
+        """Simulate.
+
+        Raises:
+            Interrupted: after Ctrl-C; its `result` is the trajectory up to there, with outcome INTERRUPTED.
+        """
+        pieces: list[Piece] = []
+        outcome = Outcome.COMPLETE
+        try:
+            for piece in self.pieces(self.loop, self.reference, self.start):
+                pieces.append(piece)
+                monitor(_progress(self.loop.controller.name, piece.times[-1], self.reference.duration))
+        except KeyboardInterrupt:
+            outcome = Outcome.INTERRUPTED
+        except SimulationError:
+            outcome = Outcome.DIVERGED
+        try:
+            run = self._trajectory(pieces, outcome)
+        except KeyboardInterrupt:  # keep the run up to here
+            run = self._trajectory(pieces, Outcome.INTERRUPTED)
+        if run.outcome is Outcome.INTERRUPTED:
+            raise Interrupted(run)
+        return run
+
+    def _trajectory(self, pieces: Sequence[Piece], outcome: Outcome) -> Trajectory:
+        """Join the pieces, and add what follows from the states and the reference."""
+        loop, controller, n = self.loop, self.loop.controller, self.loop.n
+        times = np.concatenate([[0.0], *(piece.times for piece in pieces)])
+        states = np.vstack([self.start, *(piece.states for piece in pieces)])
+        q = states[:, :n]
+        wanted = self.reference.sample(np.minimum(times, self.reference.duration))
+        dq = states[:, n:] if loop.torque else np.zeros_like(q)
+        command, status, cause = self._commands(pieces, q, dq, *wanted)
+        energy = controller.energy if self.compiled is None else controller.energy_graph
+        unknown = [np.full((len(times), 1), np.nan)] * 2
+        storage, power = unknown if energy is None else self._rows("energy", q, dq, *wanted)
+        return Trajectory(
+            controller=controller.name,
+            kind=controller.command,
+            outcome=outcome,
+            labels=controller.labels,
+            joint_names=loop.plant.joint_names,
+            times=times,
+            q=q,
+            dq=dq if loop.torque else command,
+            command=command,
+            status=status.ravel().astype(int),
+            value=_near(controller, self._rows("measured", q)[0], wanted[0]),
+            reference=wanted[0],
+            reference_velocity=wanted[1],
+            reference_acceleration=wanted[2],
+            storage=storage[:, 0],
+            dissipated_power=power[:, 0],
+            cause=cause.astype(int),
+        )
+
+    def _commands(self, pieces: Sequence[Piece], *arguments: Array) -> tuple[Array, Array, Array]:
+        """Commands, status and causes: those that were held, the last one also for the end, or those of the law."""
+        held = [piece.held for piece in pieces if piece.held is not None]
+        if not held:
+            command, status = self._rows("command", *arguments)
+            return command, status, np.zeros(len(command))
+        columns = ([part.commands for part in held], [part.status for part in held], [part.cause for part in held])
+        command, status, cause = (np.concatenate([*parts, parts[-1][-1:]]) for parts in columns)
+        return command, status, cause
+
+    def _rows(self, name: str, *arguments: Array) -> list[Array]:
+        """`command`, `energy` or `measured` of the law for N rows of arguments."""
+        if self.compiled is not None:
+            return self.compiled.rows(name, *arguments)
+        controller = self.loop.controller
+        if name == "measured":
+            return Batched(controller.measured)(*arguments)
+        function = controller.function if name == "command" else controller.energy
+        assert function is not None
+        gains = [np.tile(gain, (len(arguments[0]), 1)) for gain in controller.gains.values()]
+        return Batched(function)(*arguments, *gains)
+
+
+def _ticks(
+    scene: MuJoCo | None, tolerance: float, law: SupervisedLaw | None, compiled: CompiledLoop | None
+) -> Callable[..., Iterator[Piece]]:
+    """What runs a sampled controller: MuJoCo, CVODES or compiled C, with the law alone or the supervised one."""
+    if scene is not None:
+        return partial(run_physics, scene=scene, supervised=law)
+    if law is not None:
+        return partial(run_supervised, tolerance=tolerance, law=law)
+    return partial(run_ticks, tolerance=tolerance, compiled=compiled)
+
+
+def _progress(name: str, time: float, duration: float) -> Progress:
+    return Progress(f"simulate {name}", time / duration, f"{time:.1f} s")
+
+
+def _start_state(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | None) -> Array:
+    q = as_point("q_start", q_start, loop.n)
+    if not loop.torque:
+        if dq_start is not None:
+            raise InvalidValueError(
+                "dq_start", dq_start, "None, because velocity is not a state with a velocity controller"
+            )
+        return q
+    return np.concatenate([q, np.zeros(loop.n) if dq_start is None else as_point("dq_start", dq_start, loop.n)])
+
+
+def _near(controller: Controller, value: Array, wanted: Array) -> Array:
+    """Measured quantities (N, k), circle-valued ones with the whole turns that bring them nearest to the reference."""
+    chart = controller.chart
+    if chart is None or controller.labels != chart.labels:
+        return value
+    return np.asarray(wanted + shortest(value - wanted, chart.turns)) if chart.turns.any() else value
 
 
 def simulate(
@@ -105,3 +386,112 @@ def simulate(
         compiled=compiled,
     )
     return prepare(controller, reference, q_start, settings).run(monitor)
+
+
+_DEFAULTS = {
+    name: parameter.default
+    for name, parameter in inspect.signature(simulate).parameters.items()
+    if name not in (*_POSITIONAL, "monitor")
+}
+
+
+def simulate_many(
+    controller: Controller,
+    reference: Reference,
+    q_start: ArrayLike,
+    changes: Sequence[Mapping[str, Any]],
+    *,
+    executor: Executor | None = None,
+    monitor: Monitor = silent,
+    **settings: Any,
+) -> tuple[Trajectory, ...]:
+    """Simulate one run for each entry of `changes`, which holds the arguments of `simulate` that differ in it.
+
+    Args:
+        controller: as in `simulate`, as are reference and q_start.
+        reference: the motion to follow.
+        q_start: joint positions at t = 0, (n,) [rad] or [m].
+        changes: for each run, arguments of `simulate` by name: plant, pushes, friction, noise, controller, q_start, ...
+        executor: shares the runs, for example `concurrent.futures.ProcessPoolExecutor`, or
+            `distributed.Client(...).get_executor()` of Dask. Default: this process, with as many threads as
+            OMP_NUM_THREADS or the number of cores says where runs are compiled.
+        monitor: called with progress.
+        settings: further arguments of `simulate` that all runs share, such as `control_rate` and `compiled`. With
+            `compiled=True`, runs that differ in masses, friction, gains or sizes of pushes share one library.
+
+    Returns:
+        The trajectories in the order of `changes`.
+
+    Raises:
+        UnknownNameError: if `simulate` has no such argument.
+        UnreachableReferenceError, ShapeError, InvalidValueError, CompileError: as `simulate`.
+        Interrupted: after Ctrl-C; its `result` has the trajectories that were ready.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> problem = problems.get("planar_3r_xy")
+        >>> chart = oc.fit(problem, oc.Polynomial(degree=2), samples=300).chart
+        >>> controller, centre = oc.control.PDPlus(chart, stiffness=50.0), problem.domain.centre
+        >>> reference = oc.control.Reference.steps(chart.labels, chart.phi(centre), [], duration=0.2)
+        >>> heavier = [{"plant": problem.robot.with_scaled_masses(scale)} for scale in (1.0, 1.2)]
+        >>> runs = oc.simulate_many(controller, reference, centre, heavier)
+        >>> [bool(abs(run.q - centre).max() > 1e-3) for run in runs]  # the heavier arm sags
+        [False, True]
+    """
+    require_executor(executor)
+    common = {"controller": controller, "reference": reference, "q_start": q_start, **settings}
+    calls = _calls(common, changes)
+    if executor is not None:
+        return _shared(executor, [partial(simulate, **call) for call in calls], monitor)
+    ready = [partial(_prepared(call).run, silent) for call in calls]  # CasADi must not build functions in threads
+    if THREADS > 1 and all(call.get("compiled") for call in calls):
+        with ThreadPoolExecutor(THREADS) as pool:
+            return _shared(pool, ready, monitor)
+    return _one_by_one(ready, monitor)
+
+
+def _calls(common: Mapping[str, Any], changes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Arguments of `simulate` for each run."""
+    require_kind("changes", changes, Sequence)
+    for k, change in enumerate(changes):
+        require_kind(f"changes[{k}]", change, Mapping)
+        for name in (*common, *change):
+            require_known("argument of simulate", name, (*_POSITIONAL, *_DEFAULTS))
+    return [{**common, **change} for change in changes]
+
+
+def _prepared(call: Mapping[str, Any]) -> Prepared:
+    given = {**_DEFAULTS, **call}
+    controller, reference, q_start = (given.pop(name) for name in _POSITIONAL)
+    return prepare(controller, reference, q_start, Settings(**given))
+
+
+def _one_by_one(runs: Sequence[Callable[[], Trajectory]], monitor: Monitor) -> tuple[Trajectory, ...]:
+    done: list[Trajectory] = []
+    try:
+        for run in runs:
+            done.append(run())
+            _report(monitor, len(done), len(runs))
+    except KeyboardInterrupt:
+        raise Interrupted(tuple(done)) from None
+    return tuple(done)
+
+
+def _shared(executor: Executor, runs: Sequence[Callable[[], Trajectory]], monitor: Monitor) -> tuple[Trajectory, ...]:
+    futures = [executor.submit(run) for run in runs]
+    try:
+        for done, future in enumerate(as_completed(futures), start=1):
+            future.result()  # a run that fails ends all
+            _report(monitor, done, len(runs))
+        return tuple(future.result() for future in futures)
+    except KeyboardInterrupt:
+        ready = tuple(future.result() for future in futures if future.done() and not future.exception())
+        raise Interrupted(ready) from None
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _report(monitor: Monitor, done: int, count: int) -> None:
+    monitor(Progress("simulate many", done / count, f"{done} of {count} runs"))

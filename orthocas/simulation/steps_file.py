@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.chart import Chart
-from orthocas.checks import Array
+from orthocas.charts.chart import Chart
 from orthocas.control.reference import DAMPING_RATIO, NATURAL_FREQUENCY, Reference
 from orthocas.errors import OrthocasError, StepsFileError
 from orthocas.simulation.disturbances import Push
-from orthocas.simulation.strict_json import Reader
+from orthocas.tools.checks import Array
+from orthocas.tools.json import Reader
 
 _MOST_INSTANTS = 1e6
 _LONGEST = 200  # most characters of the names of joints in an error

@@ -1,7 +1,7 @@
 """The result of a simulation: arrays over time with names and units, stored in NPZ files."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
@@ -11,14 +11,21 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from orthocas.checks import Array, as_float_array, as_path, frozen_indices, require_known, require_shape, require_text
-from orthocas.control.status import FROM_THE_LAW, ControlStatus
+from orthocas.control.controller import FROM_THE_LAW, ControlStatus
 from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
-from orthocas.files.atomic import published, require_writable
-from orthocas.files.json import part
-from orthocas.files.ours import is_numpy_archive, require_replaceable
-from orthocas.showing import Shown, listed, number_list
-from orthocas.simulation.run_file import read_run_file
+from orthocas.tools.archive import Stored, from_npy, unpacking
+from orthocas.tools.checks import (
+    Array,
+    as_float_array,
+    as_path,
+    frozen_indices,
+    require_known,
+    require_shape,
+    require_text,
+)
+from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.files import is_numpy_archive, published, require_replaceable, require_writable
+from orthocas.tools.json import from_strict_json, part
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,9 +46,35 @@ _ARRAYS = {  #: array fields and their units
     "cause": "orthocas.control.ControlStatus",
 }
 _LATER = ("cause",)  #: arrays that older files do not have
-_REQUIRED = tuple(name for name in _ARRAYS if name not in _LATER)
 _SINGLE = ("times", "status", "storage", "dissipated_power", "cause")  #: one number at each instant
 _OF_JOINTS = ("q", "dq", "command")  #: one number for every joint; the others for every label
+
+
+def read_run_file(
+    path: Path, version: int, names: Sequence[str], later: Sequence[str] = ()
+) -> tuple[dict[str, Any], dict[str, Stored]]:
+    """Header and the named arrays of a run, and the later ones if the file has them; other entries are left alone.
+
+    Raises:
+        TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
+    """
+    with unpacking(path, "trajectory", TrajectoryFileError) as zipped:
+        entries = ["header", *names, *(name for name in later if f"{name}.npy" in zipped.sizes)]
+        zipped.require_room([f"{name}.npy" for name in entries])
+        try:
+            stored = {name: from_npy(zipped.read(f"{name}.npy")) for name in entries}
+            header = from_strict_json(str(stored.pop("header")))
+        except ValueError as error:
+            if isinstance(error, TrajectoryFileError):
+                raise
+            raise TrajectoryFileError(f"{path} contains an array or a header that cannot be read: {error}") from None
+    if not isinstance(header, dict) or header.get("version") != version:
+        found = header.get("version") if isinstance(header, dict) else None
+        raise TrajectoryFileError(f"{path} has version {found}, this orthocas reads {version}")
+    return header, stored
+
+
+_REQUIRED = tuple(name for name in _ARRAYS if name not in _LATER)
 
 
 class Outcome(Enum):

@@ -17,9 +17,9 @@ import orthocas as oc
 from fuzz.child import Finding, run
 from fuzz.mutants import Rng, changed_array, changed_data, flipped, pick
 from fuzz.sealed_files import judged
-from orthocas.atlases.atlas_file import ATLAS, chart_type
-from orthocas.atlases.coverage import evaluate_atlas
-from orthocas.files.blocks import scan, sealed
+from orthocas.atlas.atlas_file import ATLAS, chart_type
+from orthocas.atlas.coverage import evaluate_atlas
+from orthocas.tools.block_file import scan, sealed
 
 _PREFIX, _BLOCK, _CHECK = struct.Struct("<16sQ32s"), struct.Struct("<4sIQQ"), struct.Struct("<I")
 VALUES = (0.0, -1.0, 0.5, 1e-320, 1e-9, 1e9, 1e300, 1e308, -1e308, np.nan, np.inf, -np.inf)

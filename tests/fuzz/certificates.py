@@ -18,7 +18,7 @@ import public_objects
 import orthocas as oc
 from fuzz.child import Finding, run, verdict
 from fuzz.mutants import Rng, entries_of, npy, packed, pick, sealed
-from orthocas.files.npy import from_npy
+from orthocas.tools.archive import from_npy
 
 _ARM = "planar_3r_xy"
 Way = tuple[Any, ...]  #: keys and indices down to a number of a header

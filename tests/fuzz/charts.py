@@ -16,8 +16,8 @@ import orthocas as oc
 from fuzz.child import Finding, run
 from fuzz.mutants import Rng, entries_of, npy, packed, pick, sealed
 from fuzz.sealed_files import bomb, judged, mutant
-from orthocas.domains import sample_uniform
 from orthocas.errors import OrthocasError
+from orthocas.tasks.domains import sample_uniform
 
 
 def _torus() -> oc.Chart:

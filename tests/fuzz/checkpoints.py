@@ -15,7 +15,7 @@ from fuzz.sealed_files import bomb, judged, mutant
 from orthocas import solvers
 from orthocas.errors import CheckpointError, OrthocasError
 from orthocas.fitting import checkpoint
-from orthocas.minimising.watch import Progress
+from orthocas.tools.progress import Progress
 
 
 class KilledError(Exception):

@@ -17,7 +17,7 @@ from public_objects import atlas, circle, fitted, joint_motion
 from fuzz.child import Finding, run
 from fuzz.robots import text_of, urdf_chain
 from fuzz.words import NAMES, NUMBERS, Rng, pick
-from orthocas.cli import main
+from orthocas.cli.entry import main
 
 _EXIT_CODES = (0, 1, 2, 130)
 _PROBLEMS = ("planar_2r", "planar_3r_x", "planar_3r_xy", "arm.urdf", "chart.orthocas", "grown.orthocas", "nothing.urdf")

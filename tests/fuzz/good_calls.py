@@ -26,11 +26,11 @@ from public_objects import (
 
 import orthocas as oc
 from orthocas import control, parametrisations, plotting, problems, simulation, solvers, viewing
-from orthocas.atlases.hand_over import AtlasControl
-from orthocas.atlases.laws import BlendedImpedance, HandedOver
+from orthocas.atlas.laws import BlendedImpedance, HandedOver
+from orthocas.atlas.simulate import AtlasControl
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
-from orthocas.viewing.session import Session
+from orthocas.viewer.session import Session
 
 Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments that it takes
 

@@ -12,7 +12,7 @@ import numpy as np
 import orthocas as oc
 from fuzz.child import Finding, run, verdict
 from fuzz.words import NAMES, NUMBERS, VECTORS, Rng, pick
-from orthocas.viewing.urdf_look import urdf_look
+from orthocas.viewer.looks import urdf_look
 
 _EVALUATED = 30  # joints of robots whose dynamics are built: it takes long for many
 _KINDS = (

@@ -26,8 +26,8 @@ from PIL import Image
 
 import orthocas as oc
 from fuzz.child import Finding, run
-from orthocas.files.json import plain
 from orthocas.simulation import Trajectory
+from orthocas.tools.json import plain
 
 KILLS = 5  #: of one round
 _ROOT = Path(__file__).parent.parent.parent

@@ -8,7 +8,7 @@ import numpy as np
 
 from fuzz.child import Finding, run, verdict
 from fuzz.mutants import TEXTS, Rng, pick
-from orthocas.viewing.guard import Guard
+from orthocas.viewer.window import Guard
 
 OWN = ("localhost:8080", "LOCALHOST", "127.0.0.1:8080", "127.0.0.9:1", "[::1]:8080", "[::1]")
 PARTS = (

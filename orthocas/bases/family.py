@@ -1,0 +1,334 @@
+"""Interfaces of parametrisations xi_theta(q): families by what they can do, and bases of functions."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar, runtime_checkable
+
+import casadi as ca
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, require_shape
+
+if TYPE_CHECKING:
+    from orthocas.tasks.problem import Problem
+
+
+class ArrayMemory:
+    """Arrays by name. One computation at a time uses them; the next one overwrites their values."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[tuple[Any, ...], NDArray[Any]] = {}
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """The array of this name, shape and type; its first values are arbitrary."""
+        key = (name, shape, np.dtype(dtype))
+        if key not in self._arrays:
+            self._arrays[key] = np.empty(shape, dtype)
+        return self._arrays[key]
+
+
+class Memories:
+    """Memories that threads borrow."""
+
+    def __init__(self) -> None:
+        self._spare: list[ArrayMemory] = []
+
+    @contextmanager
+    def borrowed(self, count: int) -> Iterator[list[ArrayMemory]]:
+        """So many memories that nobody else uses meanwhile."""
+        found: list[ArrayMemory] = []
+        for _ in range(count):
+            try:
+                found.append(self._spare.pop())
+            except IndexError:
+                found.append(ArrayMemory())
+        try:
+            yield found
+        finally:
+            self._spare.extend(reversed(found))
+
+
+Expression = TypeVar("Expression", ca.SX, ca.MX)
+Pulled = Callable[[Array, Array], Array]  #: a derivative that is pulled back, and the array that takes the result
+
+
+@dataclass(frozen=True, eq=False)
+class JointSpace:
+    """The joints that a family depends on: the box for scaling, and which joints are prismatic."""
+
+    centre: Array  #: (n,)
+    half_width: Array  #: (n,), > 0
+    prismatic: tuple[bool, ...]
+    joint_names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, problem: "Problem") -> "JointSpace":
+        """All joints of a problem."""
+        robot, domain = problem.robot, problem.domain
+        return cls(domain.centre, domain.half_width, robot.tree.prismatic, robot.joint_names)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.centre)
+
+    def restricted_to(self, joints: list[int]) -> "JointSpace":
+        """The space of some of the joints."""
+        return JointSpace(
+            self.centre[joints],
+            self.half_width[joints],
+            tuple(self.prismatic[i] for i in joints),
+            tuple(self.joint_names[i] for i in joints),
+        )
+
+
+class Family(Protocol):
+    """Functions xi_theta of n joints with r components and `size` explicit parameters theta."""
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        ...
+
+    @property
+    def outputs(self) -> int:
+        """Number r of components."""
+        ...
+
+    @property
+    def as_matrices(self) -> bool:
+        """Whether the family consists of dense products. Then it needs MX graphs with samples as columns, not SX."""
+        ...
+
+    @property
+    def width(self) -> int:
+        """Largest number of intermediate values per sample. It limits how many samples fit into the cache."""
+        ...
+
+    def expression(self, q: Expression, theta: Expression) -> Expression:
+        """xi_theta(q), (r, N), for N joint positions side by side as columns (n, N); theta (size, 1)."""
+        ...
+
+    def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
+        """Gradients of the components, r matrices (n, N). Column s of matrix j is dxi_j/dq at joint position s."""
+        ...
+
+    def initial(self, seed: int) -> Array:
+        """A seeded starting point, (size,)."""
+        ...
+
+
+@runtime_checkable
+class ArrayFamily(Family, Protocol):
+    """A family whose coordinate gradients NumPy computes, with their derivative, in any precision."""
+
+    def pullback(self, points: Array, theta: Array, memory: ArrayMemory | None = None) -> tuple[Array, Pulled]:
+        """J_xi at points, and the derivative of any function L of it.
+
+        Args:
+            points: joint positions, (N, n).
+            theta: parameters, (size,). Products are computed with numbers of its type.
+            memory: arrays of earlier calls, which this one overwrites. Nobody else may use them meanwhile.
+
+        Returns:
+            J_xi, (N, r, n), and the map from dL/dJ_xi (N, r, n) to dL/dtheta. It writes to an array (size,) of theta's
+            type and returns it.
+        """
+        ...
+
+
+@runtime_checkable
+class ReorderableFamily(Family, Protocol):
+    """A family whose components can be reordered."""
+
+    def reordered(self, theta: Array, order: Sequence[int]) -> Array:
+        """Parameters of the components in another order, (size,)."""
+        ...
+
+
+@runtime_checkable
+class CombinableFamily(Family, Protocol):
+    """A family that contains all linear combinations of its components."""
+
+    def combined(self, theta: Array, B: Array) -> Array:
+        """Parameters of B xi, (size,), for a matrix B (r, r)."""
+        ...
+
+
+@runtime_checkable
+class LinearFamily(Family, Protocol):
+    """A family linear in its parameters: xi_theta(q) = C psi(q), where theta holds the rows of C (r, K) in a row.
+
+    No basis function is constant: a constant does not change J_xi. `BasisFamily` builds such a family for any basis.
+    """
+
+    def basis(self, q: Expression) -> Expression:
+        """psi(q), (K, N), for q (n, N); K is the `width` of the family."""
+        ...
+
+
+@runtime_checkable
+class GradedFamily(LinearFamily, Protocol):
+    """A linear family whose basis contains the bases of lower degrees."""
+
+    def embed(self, theta: Array, coarser: Self) -> Array:
+        """Convert parameters of a family of lower degree to this family, (size,)."""
+        ...
+
+
+@runtime_checkable
+class SelfDerivativeFamily(LinearFamily, Protocol):
+    """A linear family whose derivatives are sums of its own functions. Controllers and C need no other basis."""
+
+    def derivative_tables(self, theta: Array) -> Array:
+        """C_i with d xi / d q_i = C_i (1, psi), (n, r, 1 + K)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedForm:
+    """Parameters of coordinates that need no fit."""
+
+    theta: Array  #: parameters of the family, (size,)
+    origin: Array | None = None  #: joint position where xi = 0, (n,). Default: the centre of the domain
+    scaled: bool = True  #: whether coordinates are scaled to a mean gradient length of 1
+
+
+@runtime_checkable
+class Parametrisation(Protocol):
+    """The choice of a family, before the joints are known. It holds plain settings only."""
+
+    @property
+    def label(self) -> str:
+        """Short name, as used on the command line, for example 'polynomial:4'."""
+        ...
+
+    @property
+    def linear(self) -> bool:
+        """Whether its families are linear in their parameters. Then `fit` minimises by Gauss-Newton or QuasiNewton."""
+        ...
+
+    @property
+    def closed_form(self) -> "Callable[[Problem], ClosedForm] | None":
+        """The function that gives the parameters without a fit, or None if they are fitted."""
+        ...
+
+    def for_problem(self, problem: "Problem") -> "Parametrisation":
+        """The parametrisation for this problem. It is the object itself if it does not depend on the problem."""
+        ...
+
+    def family(self, space: JointSpace, outputs: int) -> Family:
+        """The family on the given joints, with `outputs` components."""
+        ...
+
+
+@runtime_checkable
+class GradedParametrisation(Parametrisation, Protocol):
+    """A parametrisation with a degree. Families of higher degree contain those of lower degree."""
+
+    @property
+    def degree(self) -> int:
+        """Total degree."""
+        ...
+
+    def of_degree(self, degree: int) -> Self:
+        """The same parametrisation with another degree."""
+        ...
+
+    def term_count(self, n: int) -> int:
+        """Number of basis functions for n joints, without building them."""
+        ...
+
+    def family(self, space: JointSpace, outputs: int) -> GradedFamily:
+        """The family on the given joints."""
+        ...
+
+
+@runtime_checkable
+class CyclicParametrisation(Parametrisation, Protocol):
+    """A parametrisation that can reduce joints to one linear term each, so that charts hold at all their positions."""
+
+    @property
+    def cyclic(self) -> Sequence[str]:
+        """Names of these joints, after `for_problem`."""
+        ...
+
+
+def component_gradients(xi: Expression, q: Expression) -> list[Expression]:
+    """dxi_j/dq of every component j by reverse automatic differentiation, r matrices (n, N).
+
+    Args:
+        xi: expression (r, N). Its column s depends only on column s of q.
+        q: symbols (n, N).
+    """
+    gradients = []
+    for j in range(xi.shape[0]):
+        seed = type(q)(*xi.shape)
+        seed[j, :] = 1
+        gradients.append(ca.jtimes(xi, q, seed, True))
+    return gradients
+
+
+@dataclass(frozen=True, eq=False)
+class BasisFamily:
+    """xi_theta(q) = C psi(q), where theta holds the rows of C (r, K) one after the other.
+
+    Args:
+        space: the joints.
+        outputs: number r of components.
+        functions: psi, a map of SX or MX columns q (n, N) to (K, N), column by column. No function may be constant.
+    """
+
+    space: JointSpace
+    outputs: int
+    functions: Callable[[Any], Any]
+    as_matrices: bool = False
+
+    @cached_property
+    def width(self) -> int:
+        """Number of basis functions K."""
+        psi = self.functions(ca.SX.sym("q", self.space.n))
+        require_shape("the basis psi(q)", psi.shape, (None, 1))
+        return int(psi.shape[0])
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients r K."""
+        return self.outputs * self.width
+
+    def basis(self, q: Expression) -> Expression:
+        """psi(q), (K, N), for q (n, N)."""
+        if isinstance(q, ca.SX) and q.shape[1] == 1:
+            return self._of_one(q)
+        values: Expression = self.functions(q)
+        return values
+
+    @cached_property
+    def _of_one(self) -> ca.Function:
+        """psi for one joint position: built once, since expressions take longer to build than to copy."""
+        q = ca.SX.sym("q", self.space.n)
+        return ca.Function("basis", [q], [self.functions(q)])
+
+    def expression(self, q: Expression, theta: Expression) -> Expression:
+        """xi_theta(q), (r, N), for q (n, N)."""
+        return ca.reshape(theta, self.width, self.outputs).T @ self.basis(q)
+
+    def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
+        """Gradients of the components, r matrices (n, N)."""
+        return component_gradients(self.expression(q, theta), q)
+
+    def initial(self, seed: int) -> Array:
+        """Random coefficients, (size,)."""
+        return np.random.default_rng(seed).normal(size=self.size)
+
+    def reordered(self, theta: Array, order: Sequence[int]) -> Array:
+        """The rows of C in another order, (size,)."""
+        return theta.reshape(self.outputs, self.width)[list(order)].ravel()
+
+    def combined(self, theta: Array, B: Array) -> Array:
+        """Coefficients of B xi, (size,), for a matrix B (r, r)."""
+        coefficients: Array = (B @ theta.reshape(self.outputs, self.width)).ravel()
+        return coefficients

@@ -1,0 +1,403 @@
+"""Bases of products of one-joint functions: polynomials, Fourier terms, and linear coordinates."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from math import comb, sqrt
+from typing import Any, ClassVar, Literal
+
+import casadi as ca
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from orthocas.bases import cyclic as cyclic_choice
+from orthocas.bases.cyclic import Cyclic
+from orthocas.bases.family import BasisFamily, ClosedForm, JointSpace
+from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.tasks.metric import metric_matrices
+from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, frozen_array, require_count, require_known
+
+Term = tuple[int, ...]  #: index of the one-joint function of every joint; 0 is the constant 1
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ProductFamily(BasisFamily):
+    """psi_k(q) = prod_i f_i,k_i(q_i) over the joints. Use `product_family` to build one.
+
+    Derivatives of terms are sums of terms. So with each term, the family contains the terms of its derivatives.
+    """
+
+    terms: tuple[Term, ...]
+    one_joint_derivatives: Callable[[int], Array]  #: D of joint i, with f_i,a' = sum_b D_ab f_i,b
+
+    @property
+    def width(self) -> int:
+        """Number of terms K."""
+        return len(self.terms)
+
+    def initial(self, seed: int) -> Array:
+        """Random coefficients that decrease with the degree, (size,)."""
+        order = np.array([np.count_nonzero(term) for term in self.terms])
+        C = np.random.default_rng(seed).normal(size=(self.outputs, len(self.terms))) * 0.3**order
+        return C.ravel()
+
+    def embed(self, theta: Array, coarser: "ProductFamily") -> Array:
+        """Convert coefficients of a smaller basis to this one, (size,)."""
+        place = {term: k for k, term in enumerate(self.terms)}
+        wide = np.zeros((self.outputs, self.width))
+        wide[:, [place[term] for term in coarser.terms]] = theta.reshape(self.outputs, coarser.width)
+        return wide.ravel()
+
+    @cached_property
+    def derivatives(self) -> list[tuple[Array, NDArray[np.int_], NDArray[np.int_]]]:
+        """Entries of D_i with d (1, psi) / d q_i = D_i (1, psi): values, rows and columns for every joint."""
+        terms = ((0,) * self.space.n, *self.terms)
+        places = {term: k for k, term in enumerate(terms)}
+        found = []
+        for i in range(self.space.n):
+            D = self.one_joint_derivatives(i)
+            parts = [np.flatnonzero(row).tolist() for row in D]
+            entries = [
+                (k, places[(*term[:i], b, *term[i + 1 :])], D[term[i], b])
+                for k, term in enumerate(terms)
+                for b in parts[term[i]]
+            ]
+            rows, columns, values = np.array(entries, dtype=float).reshape(-1, 3).T
+            found.append((values, rows.astype(int), columns.astype(int)))
+        return found
+
+    def derivative_matrix(self, joint: int) -> Any:
+        """D_i as a sparse matrix, (1 + K, 1 + K)."""
+        values, rows, columns = self.derivatives[joint]
+        return scipy.sparse.csr_array((values, (rows, columns)), shape=(1 + self.width,) * 2)
+
+    def derivative_tables(self, theta: Array) -> Array:
+        """C_i with d xi / d q_i = C_i (1, psi), (n, r, 1 + K)."""
+        C = np.hstack([np.zeros((self.outputs, 1)), theta.reshape(self.outputs, self.width)])
+        tables = np.zeros((self.space.n, self.outputs, 1 + self.width))
+        for table, (values, rows, columns) in zip(tables, self.derivatives, strict=True):
+            np.add.at(table.T, columns, (C[:, rows] * values).T)
+        return tables
+
+
+def product_family(
+    space: JointSpace,
+    outputs: int,
+    terms: tuple[Term, ...],
+    one_joint_functions: Callable[[Any], list[Any]],
+    one_joint_derivatives: Callable[[int], Array],
+) -> ProductFamily:
+    """The family of the given terms.
+
+    Args:
+        space: the joints.
+        outputs: number of components.
+        terms: the terms. None is constant, and the terms of their derivatives are included.
+        one_joint_functions: f_1, f_2, ... of all joints at once, (n, N) each, for q (n, N).
+        one_joint_derivatives: D of joint i, with f_i,a' = sum_b D_ab f_i,b.
+    """
+
+    def basis(q: Any) -> Any:
+        return _products(terms, ca.vertcat(*one_joint_functions(q)))
+
+    return ProductFamily(space, outputs, basis, terms=terms, one_joint_derivatives=one_joint_derivatives)
+
+
+def _products(terms: tuple[Term, ...], factors: Any) -> Any:
+    """Values of terms, (K, N), from those of the one-joint functions f_1 of all joints, then f_2 and so on.
+
+    All terms with as many factors are one product of columns: to build them one by one takes CasADi ten times as long.
+    """
+    n = len(terms[0])
+    levels: list[Any] = []
+    rows: list[dict[Term, int]] = []  # of the terms in their levels
+    for level in by_factors(terms):
+        parts = [split(term) for term in level]
+        values = factors[[n * (index - 1) + joint for _, joint, index in parts], :]
+        levels.append(levels[-1][[rows[-1][rest] for rest, *_ in parts], :] * values if levels else values)
+        rows.append({term: k for k, term in enumerate(level)})
+    places = {term: k for k, term in enumerate(term for level in rows for term in level)}
+    return ca.vertcat(*levels)[[places[term] for term in terms], :]
+
+
+def by_factors(terms: Iterable[Term]) -> list[list[Term]]:
+    """Terms and what they are made of, by the number of factors; each level is sorted."""
+    levels: dict[int, list[Term]] = {}
+    for term in sorted(with_parts(terms)):
+        levels.setdefault(len(term) - term.count(0), []).append(term)
+    return [levels[k] for k in sorted(levels)]
+
+
+def with_parts(terms: Iterable[Term]) -> set[Term]:
+    """The terms, and what is left of each without its last factors."""
+    found: set[Term] = set()
+    waiting = list(terms)
+    while waiting:
+        term = waiting.pop()
+        if any(term) and term not in found:
+            found.add(term)
+            waiting.append(split(term)[0])
+    return found
+
+
+def split(term: Term) -> tuple[Term, int, int]:
+    """A term without its last factor, the joint of this factor, and the index of its function."""
+    joint = len(term) - 1
+    while not term[joint]:
+        joint -= 1
+    return (*term[:joint], 0, *term[joint + 1 :]), joint, term[joint]
+
+
+def reduced_terms(degrees: list[list[int]], total: int, linear: list[int]) -> tuple[Term, ...]:
+    """The terms of `terms_up_to` without those in the joints `linear`, then the term linear in each of these."""
+    kept = [[0] if k in linear else own for k, own in enumerate(degrees)]
+    return (*terms_up_to(kept, total), *(tuple(int(i == k) for i in range(len(degrees))) for k in linear))
+
+
+def terms_up_to(degrees: list[list[int]], total: int) -> Iterator[Term]:
+    """All non-constant choices of one function per joint whose degrees add up to at most `total`.
+
+    Args:
+        degrees: the degrees of the functions of every joint. The first is 0.
+        total: largest sum of degrees.
+    """
+
+    def extend(prefix: Term, left: int) -> Iterator[Term]:
+        if len(prefix) == len(degrees):
+            if any(prefix):
+                yield prefix
+            return
+        for k, degree in enumerate(degrees[len(prefix)]):
+            if degree <= left:
+                yield from extend((*prefix, k), left - degree)
+
+    return extend((), total)
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """Products of Legendre polynomials of total degree <= degree, orthonormal for the uniform density on the box.
+
+    Args:
+        degree: total degree, >= 1.
+        cyclic: joints that appear in one linear term each, by name, or "auto" for all cyclic joints of the problem.
+            Charts are then valid for all positions of these joints; see `orthocas.cyclic_joints`.
+
+    Example:
+        >>> import orthocas as oc
+        >>> polynomial = oc.Polynomial(degree=4)
+        >>> polynomial.label, polynomial.term_count(7)
+        ('polynomial:4', 329)
+        >>> oc.Polynomial(degree=4, cyclic=["A1"]).term_count(7)
+        210
+    """
+
+    degree: int
+    cyclic: Cyclic = ()
+    linear: ClassVar[bool] = True
+    closed_form: ClassVar[None] = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "degree", require_count("degree", self.degree))
+        object.__setattr__(self, "cyclic", cyclic_choice.checked_cyclic(self.cyclic))
+
+    @property
+    def label(self) -> str:
+        """'polynomial:DEGREE', with the cyclic joints if there are any."""
+        return f"polynomial:{self.degree}{cyclic_choice.suffix(self.cyclic)}"
+
+    def for_problem(self, problem: "Problem") -> "Polynomial":
+        """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
+        return Polynomial(self.degree, cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
+
+    def of_degree(self, degree: int) -> "Polynomial":
+        """The same parametrisation with another degree."""
+        return Polynomial(degree, self.cyclic)
+
+    def term_count(self, n: int) -> int:
+        """C(n + d, d) - 1, with n the number of joints that are not cyclic, plus one term for each that is."""
+        linear = min(n, cyclic_choice.count(self.cyclic))
+        return comb(n - linear + self.degree, self.degree) - 1 + linear
+
+    def family(self, space: JointSpace, outputs: int) -> ProductFamily:
+        """Polynomials in u_i = (q_i - centre_i) / half_width_i."""
+
+        def legendre(q: Any) -> list[Any]:
+            centre, half_width = (ca.repmat(ca.DM(v), 1, q.shape[1]) for v in (space.centre, space.half_width))
+            u = (q - centre) / half_width
+            P = [1 + 0 * u, u]
+            for k in range(2, self.degree + 1):
+                P.append(((2 * k - 1) * u * P[k - 1] - (k - 1) * P[k - 2]) / k)
+            return [sqrt(2 * k + 1) * P[k] for k in range(1, self.degree + 1)]
+
+        def derivatives(i: int) -> Array:
+            """P_a' = sum of (2 b + 1) P_b over b = a - 1, a - 3, ..., here for normalised polynomials."""
+            a, b = np.indices((self.degree + 1, self.degree + 1))
+            values: Array = np.sqrt((2 * a + 1) * (2 * b + 1)) * ((a > b) & ((a - b) % 2 == 1)) / space.half_width[i]
+            return values
+
+        degrees = [list(range(self.degree + 1))] * space.n
+        linear = cyclic_choice.indices(self.cyclic, space)
+        return product_family(space, outputs, reduced_terms(degrees, self.degree, linear), legendre, derivatives)
+
+
+@dataclass(frozen=True)
+class Fourier:
+    """Products of sqrt(2) cos(k q_i) and sqrt(2) sin(k q_i) of total degree <= degree, periodic in every joint.
+
+    Args:
+        degree: total degree, >= 1.
+        cyclic: joints that appear in one linear term each instead of sines and cosines, by name, or "auto" for all
+            cyclic joints of the problem; see `orthocas.cyclic_joints`.
+
+    Example:
+        >>> import orthocas as oc
+        >>> fourier = oc.Fourier(degree=2)
+        >>> fourier.label, fourier.term_count(3)
+        ('fourier:2', 24)
+    """
+
+    degree: int
+    cyclic: Cyclic = ()
+    linear: ClassVar[bool] = True
+    closed_form: ClassVar[None] = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "degree", require_count("degree", self.degree))
+        object.__setattr__(self, "cyclic", cyclic_choice.checked_cyclic(self.cyclic))
+
+    @property
+    def label(self) -> str:
+        """'fourier:DEGREE', with the cyclic joints if there are any."""
+        return f"fourier:{self.degree}{cyclic_choice.suffix(self.cyclic)}"
+
+    def for_problem(self, problem: "Problem") -> "Fourier":
+        """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
+        return Fourier(self.degree, cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
+
+    def of_degree(self, degree: int) -> "Fourier":
+        """The same parametrisation with another degree."""
+        return Fourier(degree, self.cyclic)
+
+    def term_count(self, n: int) -> int:
+        """Sum over j of C(n, j) C(d, j) 2^j, without the constant. Cyclic joints do not count in n, but add a term."""
+        linear = min(n, cyclic_choice.count(self.cyclic))
+        n, d = n - linear, self.degree
+        terms: int = sum(comb(n, j) * comb(d, j) * 2**j for j in range(1, min(n, d) + 1))
+        return terms + linear
+
+    def family(self, space: JointSpace, outputs: int) -> ProductFamily:
+        """Fourier terms of the joint angles.
+
+        Raises:
+            InvalidValueError: if a joint is prismatic. The message names it.
+        """
+        if any(space.prismatic):
+            name = space.joint_names[space.prismatic.index(True)]
+            raise InvalidValueError(
+                f"joint '{name}' of a Fourier basis", "prismatic", "a revolute joint; use polynomial instead"
+            )
+        linear = cyclic_choice.indices(self.cyclic, space)
+
+        def waves(q: Any) -> list[Any]:
+            out = [sqrt(2) * wave(k * q) for k in range(1, self.degree + 1) for wave in (ca.cos, ca.sin)]
+            rows = (q[i, :] - space.centre[i] if i in linear else out[0][i, :] for i in range(space.n))
+            return [ca.vertcat(*rows), *out[1:]]
+
+        def derivatives(i: int) -> Array:
+            """cos(k q)' = -k sin(k q), sin(k q)' = k cos(k q); a linear function has the derivative 1."""
+            if i in linear:
+                return np.array([[0.0, 0.0], [1.0, 0.0]])
+            D = np.zeros((2 * self.degree + 1,) * 2)
+            for k in range(1, self.degree + 1):
+                D[2 * k - 1, 2 * k], D[2 * k, 2 * k - 1] = -k, k
+            return D
+
+        degrees = [[0] + [k for k in range(1, self.degree + 1) for _ in range(2)]] * space.n
+        return product_family(space, outputs, reduced_terms(degrees, self.degree, linear), waves, derivatives)
+
+
+Normals = Literal["orthonormal", "paper"]
+
+
+@dataclass(frozen=True)
+class Linear:
+    """xi(q) = N^T (q - q0), which is exact only at the base q0 ([AS2023] eq. (21)).
+
+    Args:
+        base: q0, (n,) [rad] or [m]. Default: the centre of the domain.
+        normals: "orthonormal" for an orthonormal basis of the null space of J_x A^-1, or "paper" for (37) with n = 3,
+            m = 1 and (39) with n = 3, m = 2.
+    """
+
+    base: tuple[float, ...] | None = None
+    normals: Normals = "orthonormal"
+    linear: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        require_known("normals", self.normals, ("orthonormal", "paper"))
+        if self.base is not None:
+            object.__setattr__(self, "base", tuple(frozen_array("base", self.base, (None,)).tolist()))
+
+    @property
+    def label(self) -> str:
+        """'linear'."""
+        return "linear"
+
+    def for_problem(self, problem: Problem) -> "Linear":
+        """The object itself: it does not depend on the problem."""
+        return self
+
+    def closed_form(self, problem: Problem) -> ClosedForm:
+        """The normals at the base. The coordinates vanish at the base, and keep their unit normals.
+
+        Raises:
+            ShapeError: if the base does not have n entries.
+            InvalidValueError, SingularTaskError: if the task is singular at the base.
+        """
+        base = frozen_array("base", problem.domain.centre if self.base is None else self.base, (problem.n,))
+        J, A = task_jacobians(problem, base[None])[0], metric_matrices(problem.metric, base[None])[0]
+        if not (J**2).sum(axis=1).all():
+            raise InvalidValueError("base", base.tolist(), "a joint position where no task gradient vanishes")
+        theta = self.normal_vectors(np.linalg.solve(A, J.T).T).ravel()
+        return ClosedForm(theta, base, scaled=False)
+
+    def family(self, space: JointSpace, outputs: int) -> ProductFamily:
+        """Linear functions of q. The parameters are the normals, row by row."""
+        terms = tuple(tuple(int(i == k) for i in range(space.n)) for k in range(space.n))
+
+        def displacement(q: Any) -> list[Any]:
+            return [q - ca.repmat(ca.DM(space.centre), 1, q.shape[1])]
+
+        return product_family(space, outputs, terms, displacement, lambda i: np.array([[0.0, 0.0], [1.0, 0.0]]))
+
+    def normal_vectors(self, gradients: Array) -> Array:
+        """Rows n_j of unit length with n_j . grad_A h_i = 0, (r, n).
+
+        Args:
+            gradients: grad_A h_i at the base, (m, n).
+
+        Raises:
+            SingularTaskError: if the gradients are linearly dependent at the base.
+            InvalidValueError: if normals is "paper" and n is not 3.
+        """
+        m, n = gradients.shape
+        values, vectors = np.linalg.svd(gradients)[1:]
+        normals = vectors[m:]
+        if values[-1] <= 1e-9 * values[0]:
+            raise SingularTaskError("the task is singular at the base of linear coordinates, expected a regular base")
+        if self.normals == "orthonormal":
+            return normals
+        if n != 3:
+            raise InvalidValueError("n", n, "3 joints for the paper's normal vectors")
+        if m == 2:
+            normal = np.cross(gradients[0], gradients[1])  # (39)
+            return np.asarray(normal / np.linalg.norm(normal), dtype=float)[None, :]
+        v = gradients[0]
+        if np.hypot(v[0], v[1]) < 1e-9 * np.linalg.norm(v):
+            raise SingularTaskError("the paper's normals (37) need a task gradient with a component along joint 1 or 2")
+        n1 = np.array([v[1], -v[0], 0.0]) / np.hypot(v[0], v[1])  # (37a)
+        n2 = np.cross(n1, v)  # (37b)
+        return np.array([n1, n2 / np.linalg.norm(n2)])

@@ -1,0 +1,174 @@
+"""The registry of parametrisations: labels for the command line, plain data for chart files. Add your own here."""
+
+import json
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from typing import Any
+
+from orthocas.bases.circle import Circle
+from orthocas.bases.cyclic import Cyclic, parse_suffix
+from orthocas.bases.family import Parametrisation
+from orthocas.bases.given import Given
+from orthocas.bases.mlp import MLP
+from orthocas.bases.products import Fourier, Linear, Polynomial
+from orthocas.bases.sew import SEW
+from orthocas.errors import InvalidValueError, NotSavableWarning
+from orthocas.tools.checks import require_kind, require_known
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A parametrisation that chart files and the command line support."""
+
+    kind: type[Parametrisation]
+    parse: Callable[[str], Parametrisation] | None  #: parses the text after 'name:' on the command line
+
+
+_REGISTERED: dict[str, Registration] = {}
+
+
+def register(name: str, kind: type[Parametrisation], parse: Callable[[str], Parametrisation] | None = None) -> None:
+    """Register a parametrisation, so that its charts can be saved and loaded, and the command line accepts it.
+
+    A program that loads such a chart file must register the same name first.
+
+    Args:
+        name: unique name. Labels begin with it.
+        kind: a dataclass that is built from its fields. They are plain data: numbers, text, or tuples of them.
+        parse: converts the text after the colon in 'name:text' to a parametrisation. Without it, the command line does
+            not accept the name.
+
+    Raises:
+        InvalidValueError: if the name belongs to another class, or the class is not a dataclass.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> import orthocas as oc
+        >>> @dataclass(frozen=True)
+        ... class Cubic(oc.Polynomial):
+        ...     degree: int = 3
+        >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
+        >>> oc.parametrisations.parse_parametrisation("cubic")
+        Cubic(degree=3, cyclic=())
+    """
+    require_kind("name", name, str)
+    known = _REGISTERED.get(name)
+    if known is not None and known.kind is not kind:
+        raise InvalidValueError("name", repr(name), f"a name that {known.kind.__name__} does not use")
+    if not isinstance(kind, type) or not is_dataclass(kind):
+        raise InvalidValueError("kind", repr(kind), "a dataclass: chart files store its fields")
+    _REGISTERED[name] = Registration(kind, parse)
+
+
+def parametrisation_names() -> tuple[str, ...]:
+    """Names that the command line accepts."""
+    return tuple(name for name, known in _REGISTERED.items() if known.parse is not None)
+
+
+def require_savable(parametrisation: Parametrisation) -> None:
+    """Raise InvalidValueError, before a fit, unless charts of this parametrisation can be saved."""
+    parametrisation_to_data(parametrisation)
+
+
+def warn_unless_savable(parametrisation: Parametrisation) -> None:
+    """Issue a NotSavableWarning, before a fit, if its chart cannot be saved."""
+    try:
+        require_savable(parametrisation)
+    except InvalidValueError as error:
+        warnings.warn(f"charts of this fit cannot be saved: {error}", NotSavableWarning, stacklevel=3)
+
+
+def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
+    """Convert a parametrisation to plain data: kind and settings.
+
+    Raises:
+        InvalidValueError: if it is not registered, or its settings are not plain data.
+    """
+    kind = type(parametrisation)
+    if kind not in {known.kind for known in _REGISTERED.values()} or not is_dataclass(parametrisation):
+        raise InvalidValueError(
+            "parametrisation",
+            kind.__name__,
+            f"a registered one, so that it can be saved: orthocas.register_parametrisation('...', {kind.__name__})",
+        )
+    parts = {part.name: getattr(parametrisation, part.name) for part in fields(parametrisation)}
+    inner = {name: parametrisation_to_data(part) for name, part in parts.items() if isinstance(part, Parametrisation)}
+    settings = {**asdict(parametrisation), **inner}
+    try:
+        json.dumps(settings)
+    except (TypeError, ValueError) as error:
+        raise InvalidValueError(f"settings of {kind.__name__}", f"not plain data ({error})", "plain data") from None
+    return {"parametrisation": kind.__name__, "settings": settings}
+
+
+def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
+    """Convert the result of `parametrisation_to_data` back.
+
+    Raises:
+        UnknownNameError: if no such parametrisation is registered.
+    """
+    require_kind("data of a parametrisation", data, Mapping)
+    kinds = {known.kind.__name__: known.kind for known in _REGISTERED.values()}
+    name: str = data.get("parametrisation", "")
+    settings: Any = data.get("settings")
+    require_known("parametrisation", name, kinds)
+    kind = kinds[name]
+    require_kind("settings", settings, dict)
+    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    inner = {name: part for name, part in settings.items() if isinstance(part, dict) and "parametrisation" in part}
+    settings = settings | {name: parametrisation_from_data(part) for name, part in inner.items()}
+    if not settings.keys() <= known:
+        raise InvalidValueError(f"settings of {kind.__name__}", sorted(settings), f"some of {sorted(known)}")
+    return kind(**settings)
+
+
+def parse_parametrisation(label: str) -> Parametrisation:
+    """Parse a label: 'polynomial:4', 'fourier:2:cyclic', 'mlp:64x64:raw', 'circle:mlp:32x32', 'linear', or your own.
+
+    Raises:
+        UnknownNameError: if there is no such parametrisation.
+        InvalidValueError: if the text after the colon is invalid.
+    """
+    require_kind("parametrisation", label, str)
+    name, _, text = label.partition(":")
+    require_known("parametrisation", name, parametrisation_names())
+    parse = _REGISTERED[name].parse
+    assert parse is not None
+    return parse(text)
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise InvalidValueError(
+            "parametrisation", repr(text), "whole numbers, as in polynomial:4 or mlp:64x64"
+        ) from None
+
+
+def _degree_and_cyclic(text: str) -> tuple[int, Cyclic]:
+    degree, _, rest = text.partition(":")
+    return _whole(degree), parse_suffix(rest)
+
+
+def _mlp(text: str) -> MLP:
+    widths, colon, inputs = text.partition(":")
+    if colon and inputs != "raw":
+        raise InvalidValueError("parametrisation", repr(f"mlp:{text}")[:80], "nothing but ':raw' after the widths")
+    return MLP(tuple(_whole(width) for width in widths.split("x")), bool(colon))
+
+
+def _linear(text: str) -> Linear:
+    if text:
+        raise InvalidValueError("parametrisation", repr(f"linear:{text}"), "'linear' without a number")
+    return Linear()
+
+
+register("linear", Linear, _linear)
+register("polynomial", Polynomial, lambda text: Polynomial(*_degree_and_cyclic(text)))
+register("fourier", Fourier, lambda text: Fourier(*_degree_and_cyclic(text)))
+register("mlp", MLP, _mlp)
+register("sew", SEW, lambda text: SEW(text or "stereographic"))
+register("circle", Circle, lambda text: Circle(parse_parametrisation(text)))
+register("given", Given)

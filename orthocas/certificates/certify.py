@@ -1,0 +1,341 @@
+"""Certify charts: prove with rigorous arithmetic that they do not fold, and where they are one-to-one (ours)."""
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+
+import numpy as np
+
+from orthocas.certificates.chart_rows import ChartRows, chart_rows
+from orthocas.certificates.judges import RegularityJudge
+from orthocas.certificates.one_to_one import one_to_one_judge
+from orthocas.certificates.outside import judge_of
+from orthocas.certificates.search import Limits, Look, Search, distances, largest_first, nearest_first
+from orthocas.charts.certificate import METHOD, OPEN, Certificate, Subdivision
+from orthocas.charts.chart import Chart
+from orthocas.charts.chart_file import fingerprint
+from orthocas.errors import CertifyError, Interrupted, InvalidValueError
+from orthocas.tasks.domains import Box, Domain, SelfDrawing, contains, reach, sample_heavily, slack
+from orthocas.tools.checks import Array, as_number, require_at_least, require_executor, require_kind
+from orthocas.tools.progress import Monitor, Progress, silent
+
+_SAMPLES = 20_000  # points where folds are looked for before the proof
+_SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
+_FEW_BOXES = 300  # for one scale
+_MANY_BOXES = (500, 45_000)  # the least and the most; between them, three times what the proof without folds took
+_HELD_RANGE = 1.0  # half-width of a leading joint on which J does not depend, if its whole range is too wide
+_LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
+
+
+def certify(
+    chart: Chart,
+    bound: float = 0.0,
+    *,
+    time_limit: float | None = None,
+    executor: Executor | None = None,
+    monitor: Monitor = silent,
+    resume: Certificate | None = None,
+) -> Certificate:
+    """Prove that a chart does not fold: det J has one sign on its domain, and the conditioning is above a bound.
+
+    The domain is halved again and again, until J is proved nonsingular on each part: by Taylor models of degree 3 with
+    remainders that include all rounding, taken to the singular vectors of their centre, and elimination. The robot's
+    numbers and those of the chart are taken as they are in the file. Samples are no part of the proof; they only find
+    folds early. Also proved is a large box around the centre on which phi is one-to-one: the average of J between any
+    two of its points is nonsingular, see `orthocas.certificates.one_to_one`. It has the domain's proportions, but a
+    joint on which J does not depend keeps its whole range if it can.
+
+    In a `ClearBox`, parts need no proof that are proved, by the same arithmetic, to lie outside: the relative singular
+    value of the task is at most the bound there. They count as proved in the share of the box. So do parts of the box
+    of a `Corridor` that are farther from its path than the radius.
+
+    Args:
+        chart: a fitted chart.
+        bound: bound of the conditioning as in `evaluate`, from 0 (det J != 0 only) to below 1; Euclidean metric only.
+            The condition used is sufficient, and misses 4 to 14 % of the true conditioning.
+        time_limit: seconds after which the certificate holds the share proved so far.
+        executor: shares the work, for example `concurrent.futures.ProcessPoolExecutor`, or
+            `distributed.Client(...).get_executor()` of Dask. Default: this process.
+        monitor: called with progress.
+        resume: an unfinished certificate of the same chart and bound, to go on from.
+
+    Returns:
+        What is proved and what is not. `certificate.proved` tells whether it is everything.
+
+    Raises:
+        CertifyError: if the chart is grown, uses operations without proven bounds, or `resume` belongs to another one.
+        Interrupted: after Ctrl-C; `result` is the certificate so far.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> certificate = oc.certify(chart)
+        >>> certificate.proved, certificate.share
+        (True, 1.0)
+    """
+    start = time.monotonic()
+    limits = Limits(seconds=checked_options(chart, time_limit, executor))
+    bound = checked_bound(chart, bound)
+    rows = chart_rows(chart)
+    base = whole_domain(chart.problem.domain) if resume is None else _resumed(chart, bound, resume)
+    search = _regularity_search(chart, rows, bound, base, limits, executor)
+    injective: Subdivision | None = None
+
+    def so_far() -> Certificate:
+        return _certificate(chart, bound, search, injective, time.monotonic() - start, resume)
+
+    try:
+        search.visit(_suspects(chart))
+        search.run(_shown(monitor, "regular"))
+        left = limits.seconds - (time.monotonic() - start)
+        if search.finished and left > 0:
+            most = int(np.clip(3 * search.judged, *_MANY_BOXES))
+            injective = _one_to_one(chart, rows, base, Limits(left, boxes=most), executor, monitor)
+    except KeyboardInterrupt:
+        raise Interrupted(so_far()) from None
+    return so_far()
+
+
+def folds_nowhere(chart: Chart, time_limit: float) -> bool:
+    """Whether a processor time [s] is enough to prove that a chart does not fold. No one-to-one box is looked for."""
+    base, limits = whole_domain(chart.problem.domain), Limits(time_limit, time.thread_time)
+    search = _regularity_search(chart, chart_rows(chart), 0.0, base, limits, None)
+    search.visit(_suspects(chart))
+    search.run(lambda _: None)
+    return search.finished
+
+
+def _regularity_search(
+    chart: Chart, rows: ChartRows, bound: float, base: Subdivision, limits: Limits, executor: Executor | None
+) -> Search:
+    return Search(judge_of(chart, rows, bound), base, limits, largest_first(base), executor)
+
+
+def certified_box(
+    chart: Chart,
+    bound: float = 0.0,
+    *,
+    time_limit: float | None = None,
+    executor: Executor | None = None,
+    monitor: Monitor = silent,
+) -> Box:
+    """The largest box around the domain's centre, with its proportions, on which the chart is proved not to fold.
+
+    Largest up to what the bounds resolve: parts are halved down to 1/64 of the domain's widths.
+
+    Args:
+        chart: a fitted chart; it may fold elsewhere.
+        bound: bound of the conditioning, see `certify`.
+        time_limit: seconds after which the box proved so far is returned.
+        executor: shares the work, see `certify`.
+        monitor: called with progress.
+
+    Raises:
+        CertifyError: as `certify`, and if nothing is proved around the centre.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> bool((oc.certified_box(chart).half_width == chart.problem.domain.half_width).all())
+        True
+    """
+    limits = replace(_LARGEST_BOX, seconds=checked_options(chart, time_limit, executor))
+    judge = RegularityJudge(chart_rows(chart), checked_bound(chart, bound))
+    base = whole_domain(chart.problem.domain)
+    search = Search(judge, base, limits, nearest_first(base), executor)
+    search.run(_shown(monitor, "largest box"))
+    scale = proved_scale(search.subdivision())
+    if scale == 0:
+        raise CertifyError("nothing is proved around the centre of the domain, expected a chart that is regular there")
+    domain = chart.problem.domain
+    return Box(domain.centre, domain.half_width * (scale if scale == 1 else scale * (1 - 1e-9)))
+
+
+def checked_options(chart: Chart, time_limit: float | None, executor: Executor | None) -> float:
+    """Seconds of a time limit, inf for none. Chart and executor are checked as well."""
+    require_kind("chart", chart, Chart)
+    require_executor(executor)
+    if time_limit is None:
+        return float("inf")
+    require_at_least("time_limit", time_limit, 0)
+    return as_number("time_limit", time_limit)
+
+
+def checked_bound(chart: Chart, bound: float) -> float:
+    """A bound of the conditioning, checked."""
+    bound = as_number("bound", bound)
+    if not 0 <= bound < 1:
+        raise InvalidValueError("bound", bound, "a number from 0 to below 1")
+    if bound > 0 and not chart.problem.metric.is_identity:
+        metric = chart.problem.metric.name
+        raise CertifyError(
+            f"bound is {bound:g} with metric {metric}, expected 0: conditioning is proved for the Euclidean metric"
+        )
+    return bound
+
+
+def whole_domain(domain: Domain) -> Subdivision:
+    """The domain, with the slack of its borders, as a box in one part; unbounded joints have their half-width.
+
+    That of a full turn is pi, rounded down. With the slack, the box holds every angle.
+    """
+    half = reach(domain)
+    half = np.where(np.isfinite(half), half, domain.half_width + slack(domain))
+    low, high = domain.centre - half, domain.centre + half
+    return Subdivision.whole(np.nextafter(low, -np.inf), np.nextafter(high, np.inf))
+
+
+def require_same(chart: Chart, certificate: Certificate) -> None:
+    """Raise CertifyError unless a certificate is one of this chart and of this version's method."""
+    require_kind("certificate", certificate, Certificate)
+    if certificate.method != METHOD:
+        raise CertifyError(f"the certificate is of method {certificate.method}, expected {METHOD}: certify it again")
+    certificate.require_for(fingerprint(chart.problem, chart.coordinates))
+    if not certificate.digest:
+        raise CertifyError("the certificate has no digest, expected one made by `certify`")
+    left_out = getattr(chart.problem.domain, "least_singular_value", 0.0)
+    if certificate.least_singular_value != left_out:
+        raise CertifyError(
+            f"the certificate is void: it leaves out singular values up to {certificate.least_singular_value:g}, "
+            f"the domain {left_out:g}"
+        )
+    domain = whole_domain(chart.problem.domain)
+    if not (
+        np.array_equal(domain.low, certificate.regular.low) and np.array_equal(domain.high, certificate.regular.high)
+    ):
+        raise CertifyError("the certificate is void: it covers another domain")
+
+
+def _resumed(chart: Chart, bound: float, certificate: Certificate) -> Subdivision:
+    require_same(chart, certificate)
+    if certificate.bound != bound or certificate.fold:
+        raise CertifyError(
+            f"resume is a certificate for bound {certificate.bound:g}, expected one for {bound:g} without a fold"
+        )
+    return certificate.regular
+
+
+def _suspects(chart: Chart) -> Array:
+    """The centre, and the sample with the least sign(det J(centre)) det J: uniform, near faces, and near corners."""
+    domain = chart.problem.domain
+    rng = np.random.default_rng(0)
+    unit = rng.uniform(-1, 1, (_SAMPLES, chart.n))
+    powers = rng.choice([1.0, 0.5, 0.25], (_SAMPLES, 1))
+    points = np.vstack([domain.centre, domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers])
+    points = points[contains(domain, points)]
+    if isinstance(domain, SelfDrawing):
+        points = sample_heavily(domain, _SAMPLES, 0)
+    J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
+    volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
+    worst = int(np.argmin(volumes * np.sign(volumes[0])))
+    suspects: Array = points[[0, worst]]
+    return suspects
+
+
+def _one_to_one(
+    chart: Chart, rows: ChartRows, base: Subdivision, limits: Limits, executor: Executor | None, monitor: Monitor
+) -> Subdivision | None:
+    """The largest of some boxes around the centre with a proof, and its parts; None if there is no proof for any.
+
+    Leading joints on which J does not depend keep their whole range, or 1 rad. A few boxes are enough for most scales;
+    from there, larger ones are tried with more, until one of them would take too many.
+    """
+    end = time.monotonic() + limits.seconds
+    judge = one_to_one_judge(chart, rows, base)
+    best: Subdivision | None = None
+    if judge is None:
+        return None
+
+    def proved(share: Array, most: int) -> bool:
+        nonlocal best
+        part = _scaled(base, share)
+        middle, own = (part.low + part.high)[None] / 2, replace(judge, low=part.low, high=part.high)
+        if not own(middle, middle).proved.all():  # the middle of points that may be farthest apart
+            return False
+        left = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=most // 4)
+        search = Search(own, part, left, largest_first(part), executor)
+        search.run(_shown(monitor, "one-to-one"))
+        if search.finished:
+            best = search.subdivision()
+        return search.finished
+
+    joints = np.arange(chart.n)
+    idle = ~np.isin(joints, rows.active)  # coordinates themselves: their range does not matter
+    held, half = np.isin(joints, judge.still_joints), (base.high - base.low) / 2
+    for range_ in (np.inf, _HELD_RANGE) if held.any() else (np.inf,):
+        share = np.where(idle, 1.0, np.minimum(1.0, range_ / half))
+        _try_scales([np.where(idle | held, share, scale) for scale in _SCALES], proved, limits.boxes)
+        if best is not None:
+            break
+    return best
+
+
+def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool], most: int) -> None:
+    """Ask for proofs of boxes of increasing size: the largest one, then by bisection with few boxes, then with many."""
+    if proved(shares[-1], _FEW_BOXES):
+        return
+    low, high = 0, len(shares) - 1  # those before `low` are proved, those from `high` on are not with few boxes
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (middle + 1, high) if proved(shares[middle], _FEW_BOXES) else (low, middle)
+    if low == 0:
+        return
+    while low + 1 < len(shares) and proved(shares[low + 1], most):
+        low += 2
+    if low < len(shares):
+        proved(shares[low], most)
+
+
+def _scaled(base: Subdivision, share: Array) -> Subdivision:
+    """A box about the same centre, with so much of the width of each joint, (n,)."""
+    middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
+    whole = share == 1
+    low, high = np.where(whole, base.low, middle - share * half), np.where(whole, base.high, middle + share * half)
+    return Subdivision.whole(low, high)
+
+
+def proved_scale(parts: Subdivision) -> float:
+    """The scale of the largest copy of a box about its centre that no open part reaches into."""
+    low, high = parts.leaves(OPEN)
+    return float(distances(parts, low, high).min()) if len(low) else 1.0
+
+
+def _certificate(
+    chart: Chart,
+    bound: float,
+    search: Search,
+    injective: Subdivision | None,
+    seconds: float,
+    resume: Certificate | None,
+) -> Certificate:
+    fold = tuple(tuple(point.tolist()) for point in search.signs.values()) if search.folded else ()
+    before = (0, 0.0) if resume is None else (resume.boxes, resume.seconds)
+    known = (
+        search.conditioning
+        if resume is None or not resume.conditioning
+        else min(search.conditioning, resume.conditioning)
+    )
+    return Certificate(
+        fingerprint(chart.problem, chart.coordinates),
+        METHOD,
+        bound,
+        search.subdivision(),
+        known * (1 - 1e-9) if bound > 0 and np.isfinite(known) else 0.0,
+        injective,
+        fold,
+        before[0] + search.judged,
+        before[1] + seconds,
+        getattr(chart.problem.domain, "least_singular_value", 0.0),
+        search.dead,
+    ).sealed()
+
+
+def _shown(monitor: Monitor, stage: str) -> Look:
+    def show(search: Search) -> None:
+        detail = f"{search.judged} boxes, {100 * search.proved_volume:.2f} % proved"
+        monitor(Progress(stage, min(search.proved_volume, 1.0), detail))
+
+    return show

@@ -1,0 +1,225 @@
+"""Rows of the Jacobian of phi as Taylor models: polynomials, networks, and tasks (ours)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+
+from orthocas.bases.mlp import MLPFamily
+from orthocas.bases.products import ProductFamily
+from orthocas.certificates.functions import cosine, sine, square, tanh
+from orthocas.certificates.graph import DerivativeGraph, TaylorGraph
+from orthocas.certificates.product_rows import ProductRows
+from orthocas.certificates.task_rows import task_rows
+from orthocas.certificates.taylor import TINY, UNIT, TaylorModel, Variables, above, stacked
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
+from orthocas.errors import CertifyError
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.task import Task
+from orthocas.tools.batch import dense_function
+from orthocas.tools.checks import Array
+from orthocas.tools.expressions import gradient_dependences, to_tape
+
+MOST_VARIABLES = 20
+_MOST_STEPS = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkRows:
+    """J_xi of xi = W_out tanh(W_2 tanh(W_1 [sin q; cos q; q] + b_1) + b_2) on boxes."""
+
+    layers: tuple[tuple[Array, Array], ...]  #: weights (out, in) and biases (out,)
+    direct: tuple[bool, ...]  #: which joints enter as q itself
+
+    @classmethod
+    def of(cls, family: MLPFamily, theta: Array) -> "NetworkRows":
+        """The layers of a family with its parameters."""
+        layers, start = [], 0
+        for width, out in pairwise(family.widths):
+            end = start + out * width
+            layers.append((theta[start:end].reshape(width, out).T.copy(), theta[end : end + out]))
+            start = end + out
+        return cls(tuple(layers), family.direct)
+
+    def __call__(self, joints: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
+        """J_xi, (r, n, boxes), for models of the joints."""
+        turning = [q for q, slides in zip(joints, self.direct, strict=True) if not slides]
+        sliding = [q for q, slides in zip(joints, self.direct, strict=True) if slides]
+        sines, cosines = [sine(q) for q in turning], [cosine(q) for q in turning]
+        layer, slopes = stacked([*sines, *cosines, *sliding]), []
+        one = TaylorModel.constant(np.ones((1, 1)))
+        for W, b in self.layers[:-1]:
+            layer = tanh(_weighted(W, layer) + TaylorModel.constant(b[:, None]))
+            slopes.append(one - square(layer))
+        rows = []
+        for weights in self.layers[-1][0]:
+            gradient = TaylorModel.constant(weights[:, None])
+            for (W, _), slope in zip(self.layers[-2::-1], slopes[::-1], strict=True):
+                gradient = _weighted(W.T, gradient * slope)
+            rows.append(self._by_joint(gradient, sines, cosines))
+        return stacked(rows)
+
+    def _by_joint(self, gradient: TaylorModel, sines: list[TaylorModel], cosines: list[TaylorModel]) -> TaylorModel:
+        """Derivatives by the joints from those by the inputs [sin q; cos q; q]."""
+        turning, columns = len(sines), []
+        angle, slide = 0, 2 * turning
+        for slides in self.direct:
+            if slides:
+                columns.append(gradient[slide])
+                slide += 1
+            else:
+                by_sine, by_cosine = gradient[angle], gradient[turning + angle]
+                columns.append(by_sine * cosines[angle] - by_cosine * sines[angle])
+                angle += 1
+        return stacked(columns)
+
+
+def _weighted(W: Array, models: TaylorModel) -> TaylorModel:
+    """W times a column of models, (out, boxes)."""
+    size = np.abs(W)
+    rounding = 4 * UNIT * (W.shape[1] + 8) * np.abs(models.coefficients).sum(axis=0)
+    remainder = (size @ (models.remainder + rounding)) * above(W.shape[1]) + TINY
+    return TaylorModel(models.variables, W @ models.coefficients, remainder)
+
+
+CoordinateRows = Callable[[list[TaylorModel], Array, Variables], TaylorModel]
+
+
+@dataclass(frozen=True, eq=False)
+class ChartRows:
+    """J on boxes, without idle joints: their rows and columns are those of the identity.
+
+    The rows of the task may be rotated, and those of the coordinates lack their scale, so that det J keeps its sign.
+    """
+
+    n: int
+    m: int
+    active: Variables  #: joints that are not coordinates themselves: the columns
+    variables: Variables  #: joints that J depends on
+    task: "GraphRows"  #: of the active joints
+    coordinates: CoordinateRows | None
+    turns: Array  #: periods of the rows; 0 for those that have none
+
+    def __call__(self, low: Array, high: Array) -> TaylorModel:
+        """Models (active, active, boxes) for the boxes between corners (boxes, n)."""
+        joints, half_widths = joint_models(low, high, self.variables)
+        rows = [self.task(joints)]
+        if self.coordinates is not None:
+            active = list(self.active)
+            rows.append(self.coordinates([joints[i] for i in active], half_widths[active], self.active))
+        variables = tuple(sorted({v for part in rows for v in part.variables}))
+        rows = [part.over(variables) for part in rows]
+        return TaylorModel(
+            variables,
+            np.concatenate([part.coefficients for part in rows], axis=1),
+            np.concatenate([part.remainder for part in rows]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class GraphRows:
+    """A matrix of so many rows that a graph gives column by column."""
+
+    graph: TaylorGraph | DerivativeGraph
+    rows: int
+    allowance: float = 0.0  #: added to the remainders
+
+    def __call__(
+        self, joints: list[TaylorModel], half_widths: Array | None = None, variables: Variables = ()
+    ) -> TaylorModel:
+        """Models (rows, columns, boxes)."""
+        entries = self.graph(joints)
+        boxes = joints[0].remainder.shape
+        entries = [entry.on(boxes) for entry in entries]
+        flat = stacked([stacked(entries[k : k + self.rows]) for k in range(0, len(entries), self.rows)])
+        remainder = flat.remainder.swapaxes(0, 1) + self.allowance
+        return TaylorModel(flat.variables, flat.coefficients.swapaxes(1, 2), remainder)
+
+
+def chart_rows(chart: Chart) -> ChartRows:
+    """The rows of a fitted chart.
+
+    Raises:
+        CertifyError: if the chart is grown, or uses operations without proven bounds.
+    """
+    coordinates = chart.coordinates
+    if not isinstance(coordinates, Coordinates):
+        raise CertifyError(f"a chart with {coordinates.label} coordinates has no expression, expected a fitted chart")
+    if not np.all(coordinates.scale != 0):
+        raise CertifyError("a coordinate is scaled by 0, so it is constant, expected coordinates that vary")
+    active = tuple(coordinates.active)
+    task, moved_by = task_gradients(chart.problem.task, chart.problem.domain, active)
+    own, depends = _coordinate_rows(coordinates)
+    variables = tuple(sorted({*moved_by, *depends}))
+    if len(variables) > MOST_VARIABLES:
+        raise CertifyError(f"the chart depends on {len(variables)} joints, expected at most {MOST_VARIABLES}")
+    periods = coordinates.turns[: len(coordinates.offset)] / np.abs(coordinates.scale)
+    turns = np.concatenate([np.zeros(chart.m), periods])
+    return ChartRows(chart.n, chart.m, active, variables, task, own, turns)
+
+
+def task_gradients(task: Task, domain: Domain, joints: Sequence[int]) -> tuple[GraphRows, set[int]]:
+    """Columns of J_x, or of C(q) J_x from `task_rows`, and the joints that they depend on."""
+    rows, allowance = task_rows(task, domain)
+    if rows is task.jacobian_function:
+        return true_gradients(task, joints)
+    return closed_form_rows(rows, joints, allowance)
+
+
+def closed_form_rows(rows: ca.Function, joints: Sequence[int], allowance: float = 0.0) -> tuple[GraphRows, set[int]]:
+    """Columns of a matrix that a function of q gives as it is, and the joints that they depend on."""
+    q = ca.SX.sym("q", rows.size1_in(0))
+    J = ca.densify(rows(q)[:, list(joints)])
+    graph = TaylorGraph.of(dense_function("task_rows", [q], [J]), "the task")
+    return GraphRows(graph, J.shape[0], allowance), {k for k in range(q.shape[0]) if ca.depends_on(J, q[k])}
+
+
+def true_gradients(task: Task, joints: Sequence[int]) -> tuple[GraphRows, set[int]]:
+    """Columns of J_x itself, the derivative of h, and the joints that they depend on."""
+    return _derivatives(task.function, joints, "the task")
+
+
+def _derivatives(function: ca.Function, joints: Sequence[int], what: str) -> tuple[GraphRows, set[int]]:
+    """Columns of the Jacobian of a function of q, and the inputs that they depend on."""
+    graph = DerivativeGraph.of(function, joints, what)
+    known = gradient_dependences(to_tape(function))
+    return GraphRows(graph, graph.outputs), {k for row in known for j in joints for k in row.get(j, ())}
+
+
+def joint_models(low: Array, high: Array, variables: Variables) -> tuple[list[TaylorModel], Array]:
+    """Models of q_1, ..., q_n on boxes between corners (boxes, n), and the half-widths (n, boxes).
+
+    Joints that are no variables stand still at the middle of the box: J does not depend on them.
+    """
+    centre = (low + high) / 2
+    half = np.nextafter(np.maximum(high - centre, centre - low), np.inf) + TINY
+    models = []
+    for k in range(low.shape[1]):
+        if k in variables:
+            linear = np.stack([centre[:, k], half[:, k], *np.zeros((2, len(low)))])
+            models.append(TaylorModel((k,), linear, np.zeros(len(low))))
+        else:
+            models.append(TaylorModel.constant(np.ascontiguousarray(centre[:, k])))
+    return models, np.ascontiguousarray(half.T)
+
+
+def _coordinate_rows(coordinates: Coordinates) -> tuple[CoordinateRows | None, set[int]]:
+    """The fitted coordinates, and the joints they depend on."""
+    if not len(coordinates.offset):
+        return None, set()
+    family, active = coordinates.family, coordinates.active
+    if isinstance(family, ProductFamily):
+        rows = ProductRows.of(family, coordinates.theta)
+        return rows, {active[i] for i in rows.dependences()}
+    if isinstance(family, MLPFamily):
+        return NetworkRows.of(family, coordinates.theta), set(active)
+    own = ca.SX.sym("q", len(active))
+    xi = family.expression(own, ca.SX(ca.DM(coordinates.theta)))
+    function = dense_function("xi", [own], [xi])
+    if function.n_instructions() * len(active) > _MOST_STEPS:
+        raise CertifyError(f"{coordinates.label} coordinates take too many operations, expected at most {_MOST_STEPS}")
+    found, depends = _derivatives(function, range(len(active)), "the coordinates")
+    return found, {active[i] for i in depends}

@@ -1,0 +1,229 @@
+"""What a proof must know beyond the box: parts of a domain, endless joints (ours)."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.bases.family import Family, LinearFamily
+from orthocas.bases.mlp import MLPFamily
+from orthocas.certificates.chart_rows import (
+    ChartRows,
+    GraphRows,
+    closed_form_rows,
+    joint_models,
+    task_gradients,
+    true_gradients,
+)
+from orthocas.certificates.judges import (
+    Judge,
+    RegularityJudge,
+    Verdicts,
+    between,
+    is_orthogonal,
+    most_influential,
+    singular_vectors,
+)
+from orthocas.certificates.taylor import UP, TaylorModel, Variables
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
+from orthocas.errors import CertifyError
+from orthocas.tasks.clear_box import ClearBox
+from orthocas.tasks.corridor import Corridor
+from orthocas.tasks.domains import borders
+from orthocas.tools.batch import dense_function, one_blas_thread
+from orthocas.tools.checks import Array
+from orthocas.tools.expressions import Tape, gradient_dependences, periodic_joints, to_tape
+
+_ROUNDING = 1e-6  # of distances, far above that of floating-point numbers
+_LENGTHS = 1e-7  # of squares: far above what singular vectors miss that are orthogonal up to 1e-9, and roundings of D
+_GUARDS = 1e-12  # of |J|^2: elimination in floating-point numbers is exact to less, so guards agree
+
+
+def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
+    """Raise CertifyError unless a proof for the half-widths of unbounded joints is one for all their positions.
+
+    It is one for a joint that is not among the variables of the proof, and for a revolute joint whose half-width is at
+    least half a turn, if J is the same after a full turn of it. No word of the file is taken for that: the steps of h
+    and of xi are read. The joints of a torus are unbounded.
+    """
+    problem = chart.problem
+    endless = np.flatnonzero(np.isinf(borders(problem.domain)[1])).tolist()
+    asked = [joint for joint in endless if joint in variables]
+    if not asked:
+        return
+    alike = _same_after_turns(chart)
+    for joint in asked:
+        name = problem.robot.joint_names[joint]
+        if problem.robot.tree.prismatic[joint] or problem.domain.half_width[joint] < np.pi:
+            raise CertifyError(f"joint '{name}' is unbounded and J depends on it, expected bounds, or a full turn")
+        if joint not in alike:
+            raise CertifyError(
+                f"joint '{name}' is unbounded and J is not periodic in it, expected bounds, or a task and coordinates "
+                "that are (Fourier, networks of sines and cosines, or a linear term only)"
+            )
+
+
+def _same_after_turns(chart: Chart) -> set[int]:
+    """The joints whose full turns change neither J_x nor J_xi."""
+    coordinates = chart.coordinates
+    assert isinstance(coordinates, Coordinates)  # `chart_rows` has refused others
+    task = _alike(to_tape(chart.problem.task.function), chart.n)
+    if not len(coordinates.offset):
+        return task
+    own = _family_alike(coordinates.family, len(coordinates.active), coordinates)
+    return task & {*coordinates.idle, *(coordinates.active[i] for i in own)}
+
+
+def _family_alike(family: Family, n: int, coordinates: Coordinates) -> set[int]:
+    """The same for the coordinates of a family of n joints."""
+    if isinstance(family, MLPFamily):
+        return {i for i, direct in enumerate(family.direct) if not direct}
+    q = ca.SX.sym("q", n)
+    if isinstance(family, LinearFamily):
+        values = family.basis(q)
+    else:
+        values = family.expression(q, ca.SX(ca.DM(coordinates.theta)))
+    return _alike(to_tape(dense_function("values", [q], [values])), n)
+
+
+def _alike(tape: Tape, n: int) -> set[int]:
+    """The joints whose full turns do not change a gradient."""
+    needed = {k for row in gradient_dependences(tape) for joints in row.values() for k in joints}
+    return {k for k in range(n) if k not in needed} | periodic_joints(tape, n)
+
+
+@dataclass(frozen=True, eq=False)
+class OutsideJudge:
+    """Counts boxes as proved, without a sign, that lie outside a ClearBox: s(q) <= bound all over the box.
+
+    s(q) <= |v^T D^-1 J(q)| for all |v| >= 1, with the rows J that count in that ClearBox. Here v(q) is the singular
+    vector of the smallest singular value at the middle of the box, plus as much of the others, linear in q, as cancels
+    the change of v^T D^-1 J along them to first order. Another judge judges the other boxes, and their det J must have
+    the sign of the middle of the domain: a box with the other sign is halved until its parts lie outside, or a fold
+    shows.
+    """
+
+    inside: RegularityJudge
+    rows: GraphRows  #: J, the rows that judge, or C(q) J with orthogonal C if all entries of D are the same
+    domain: ClearBox
+    sign: float  #: of det J at the centre of the domain
+    variables: Variables
+
+    @property
+    def joints(self) -> Variables:
+        """The joints that J or the bound depends on."""
+        return tuple(sorted({*self.inside.joints, *self.variables}))
+
+    def __call__(self, low: Array, high: Array) -> Verdicts:
+        """Judge boxes between corners (boxes, n)."""
+        found = self.inside(low, high)
+        near = np.flatnonzero(~self.domain.is_clear((low + high) / 2))  # others do not lie outside
+        outside, widest = np.zeros(len(low), dtype=bool), found.widest.copy()
+        if near.size:
+            with one_blas_thread():
+                outside[near], widest[near] = self._lie_outside(low[near], high[near])
+        return Verdicts(
+            proved=(found.proved & (found.sign == self.sign)) | outside,
+            regular=found.regular & ~outside,
+            sign=np.where(outside, 0, found.sign),
+            conditioning=np.where(outside, np.inf, found.conditioning),
+            widest=widest,
+        )
+
+    def _lie_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """Whether boxes lie outside, and the joint to halve to find out."""
+        J = self.rows(joint_models(low, high, self.variables)[0]).times(1 / self.domain.scale[:, None, None])
+        left, right = singular_vectors(J)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            least = _least_row(between(left, J, right))
+            sizes = least.magnitude()
+            squared = (sizes**2).sum(axis=0) * UP
+            squared += _GUARDS * (J.magnitude() ** 2).sum(axis=(0, 1))
+            influences = (least.gains() * sizes).sum(axis=1)
+        small = squared <= self.domain.least_singular_value**2 * (1 - _LENGTHS)
+        outside: Array = small & is_orthogonal(left) & is_orthogonal(right)
+        return outside, most_influential(influences.T, least.variables)
+
+
+def _least_row(turned: TaylorModel) -> TaylorModel:
+    """v^T times a matrix in its singular basis, for v = (a_1, ..., a_m-1, 1) with a_j = -(linear part) / s_j."""
+    row = turned[-1]
+    linear = slice(1, 1 + len(turned.variables))
+    for j in range(len(turned.remainder) - 1):
+        share = np.zeros_like(turned.coefficients[:, -1, j])
+        share[linear] = -turned.coefficients[linear, -1, j] / turned.centre[j, j]
+        row = row + TaylorModel(turned.variables, share[:, None], np.zeros(share[:1].shape)) * turned[j]
+    return row
+
+
+@dataclass(frozen=True, eq=False)
+class CorridorJudge:
+    """Counts boxes as proved, without a sign, that are farther from the path than the radius.
+
+    A box is, if the distance of its middle is larger than the radius by more than half of its diagonal.
+
+    Another judge judges the other boxes, and their det J must have the sign of the first posture of the path.
+    """
+
+    inside: RegularityJudge
+    domain: Corridor
+    sign: float
+
+    @property
+    def joints(self) -> Variables:
+        """All joints: parts may lie outside in each of them."""
+        return tuple(range(len(self.domain.centre)))
+
+    def __call__(self, low: Array, high: Array) -> Verdicts:
+        """Judge boxes between corners (boxes, n)."""
+        middle, half = (low + high) / 2, (high - low) / 2
+        distance: Any = np.sqrt(self.domain.squared_distance(middle))
+        outside = distance > 1 + _ROUNDING + self.domain.lengths(half)
+        found = self.inside(low, high)
+        return Verdicts(
+            proved=(found.proved & (found.sign == self.sign)) | outside,
+            regular=found.regular & (distance <= 1),  # only these signs tell about the corridor
+            sign=np.where(outside, 0, found.sign),
+            conditioning=np.where(outside, np.inf, found.conditioning),
+            widest=found.widest,
+        )
+
+
+def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
+    """The judge of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
+
+    Raises:
+        CertifyError: if a joint is unbounded, and a proof for its half-width is none for all its positions. In a
+            corridor, an unbounded joint whose distance to the path counts is one of these.
+    """
+    require_all_positions(chart, rows.variables)
+    judge, domain = RegularityJudge(rows, bound), chart.problem.domain
+    if isinstance(domain, Corridor):
+        _require_uncounted(domain, chart.problem.robot.joint_names)
+        start = domain.postures[domain.contains(domain.postures)][:1]
+        return CorridorJudge(judge, domain, float(judge(start, start).sign[0]))
+    if not isinstance(domain, ClearBox):
+        return judge
+    own, variables = _judging_rows(chart, domain)
+    require_all_positions(chart, variables)
+    sign = float(judge(domain.centre[None], domain.centre[None]).sign[0])  # rows have other scales than the chart's
+    return OutsideJudge(judge, own, domain, sign, tuple(sorted(variables)))
+
+
+def _judging_rows(chart: Chart, domain: ClearBox) -> tuple[GraphRows, set[int]]:
+    """The rows that judge positions, just as `domain.is_clear` takes them, and the joints that they depend on."""
+    task, joints = chart.problem.task, range(chart.n)
+    if domain.jacobian_function is not task.jacobian_function:
+        return closed_form_rows(domain.jacobian_function, joints)
+    rotated = task.recipe["kind"] == "position:xyz" and bool((domain.scale == domain.scale[0]).all())
+    return task_gradients(task, domain, joints) if rotated else true_gradients(task, joints)
+
+
+def _require_uncounted(domain: Corridor, joint_names: Sequence[str]) -> None:
+    """Raise CertifyError if an unbounded joint counts: after a turn, what is far from the path may be near it."""
+    for joint in {*domain.unbounded} & {*domain.counted.tolist()}:
+        name = joint_names[joint]
+        raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")

@@ -1,0 +1,224 @@
+"""Branch and bound: judge boxes, and halve those on which nothing is proved, the largest first (ours)."""
+
+import heapq
+import time
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from orthocas.certificates.judges import UNKNOWN, Judge, Verdicts
+from orthocas.charts.certificate import MOST_BOXES, OPEN, PROVED, Subdivision, halfway
+from orthocas.tools.checks import Array
+
+BATCH = 512  #: most boxes of one task
+_SMALL = 128  # boxes; smaller tasks take longer for each
+_TASKS = 8  # that the waiting boxes are cut into if they are few
+_IN_FLIGHT = 64  # most tasks of an executor at a time
+Priority = Callable[[Array, Array], Array]  #: corners (boxes, n) -> numbers, smallest first
+Look = Callable[["Search"], None]  #: called after each batch
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a search ends before all is proved."""
+
+    seconds: float = np.inf
+    clock: Callable[[], float] = time.monotonic  #: of the seconds
+    boxes: int = MOST_BOXES // 4
+    smallest: float = 2.0**-12  #: share of the width of the whole below which a joint's interval is not halved
+    first_failure: bool = False  #: whether boxes that rank behind one that is too small to halve do not matter
+    folds: bool = True  #: whether a fold ends the search
+    hopeless: int = MOST_BOXES  #: boxes after which the search ends if the rest would take more than `boxes`
+
+
+@dataclass(eq=False)
+class Search:
+    """A search in progress: the tree of boxes, and those still to judge."""
+
+    judge: Judge
+    base: Subdivision  #: its open parts are searched
+    limits: Limits
+    priority: Priority
+    executor: Executor | None = None
+    judged: int = 0
+    proved_volume: float = 0.0  #: share of the whole
+    failed: float = np.inf  #: least rank of the boxes too small to halve
+    dead: int = 0  #: number of boxes too small to halve
+    conditioning: float = np.inf  #: least of the lower bounds on proved boxes
+    signs: dict[int, Array] = field(default_factory=dict)  #: sign of det J -> a point that has it
+    _codes: list[int] = field(default_factory=list)
+    _children: list[int] = field(default_factory=list)  #: place of the lower half; the upper half follows
+    _waiting: list[tuple[float, int, Array, Array]] = field(default_factory=list)  #: a heap
+
+    def __post_init__(self) -> None:
+        low, high = self.base.leaves(OPEN)
+        self.proved_volume = self.base.share
+        self._add(low, high)
+
+    @property
+    def folded(self) -> bool:
+        """Whether det J was found with both signs."""
+        return len(self.signs) == 2
+
+    @property
+    def finished(self) -> bool:
+        """Whether everything is proved."""
+        return OPEN not in self._codes and not self.folded
+
+    def run(self, look: Look) -> None:
+        """Search until all is proved, a fold is found, or a limit is reached. An interrupted search keeps its state."""
+        clock = self.limits.clock
+        end = clock() + self.limits.seconds
+        pending: dict[Future[Verdicts], list[tuple[float, int, Array, Array]]] = {}
+        try:
+            while self._waiting or pending:
+                if self._decided or clock() > end or self.judged >= self.limits.boxes or self._hopeless:
+                    break
+                self._step(pending)
+                look(self)
+        finally:
+            for future, batch in pending.items():
+                future.cancel()
+                self._return(batch)
+
+    @property
+    def _hopeless(self) -> bool:
+        """Whether all would take too many boxes, if it goes on as slowly as so far."""
+        late = self.judged > self.limits.hopeless
+        return late and self.judged > self.proved_volume * self.limits.boxes
+
+    @property
+    def _decided(self) -> bool:
+        """Whether the rest does not matter."""
+        behind = bool(self._waiting) and self._waiting[0][0] > self.failed
+        return (self.folded and self.limits.folds) or (behind and self.limits.first_failure)
+
+    def visit(self, points: Array) -> None:
+        """Note the signs of det J at points (k, n), where they are proved."""
+        found = self.judge(points, points)
+        for point, regular, sign in zip(points, found.regular, found.sign.tolist(), strict=True):
+            if regular and sign:
+                self.signs.setdefault(int(sign), point)
+
+    def subdivision(self) -> Subdivision:
+        """The tree so far."""
+        codes: list[int] = []
+        root = 0
+        for code in self.base.codes.tolist():
+            if code == OPEN:
+                codes += self._preorder(root)
+                root += 1
+            else:
+                codes.append(code)
+        return Subdivision(self.base.low, self.base.high, np.array(codes, dtype=np.uint8))
+
+    def _step(self, pending: dict[Future[Verdicts], list[tuple[float, int, Array, Array]]]) -> None:
+        """Judge one batch here, or give batches to the executor and take back those that are done."""
+        if self.executor is None:
+            batch = self._take()
+            try:
+                verdicts = self.judge(*_corners(batch))
+            except KeyboardInterrupt:
+                self._return(batch)
+                raise
+            self._apply(batch, verdicts)
+            return
+        while self._waiting and len(pending) < _IN_FLIGHT:
+            batch = self._take()
+            pending[self.executor.submit(self.judge, *_corners(batch))] = batch
+        done = wait(pending, return_when=FIRST_COMPLETED).done
+        for future in done:
+            verdicts = future.result()
+            self._apply(pending.pop(future), verdicts)
+
+    def _take(self) -> list[tuple[float, int, Array, Array]]:
+        return [heapq.heappop(self._waiting) for _ in range(self._batch_size())]
+
+    def _batch_size(self) -> int:
+        """As many boxes as there are, but enough tasks for all workers of an executor."""
+        waiting = len(self._waiting)
+        return min(BATCH, waiting if self.executor is None else max(waiting // _TASKS, min(_SMALL, waiting)))
+
+    def _return(self, batch: list[tuple[float, int, Array, Array]]) -> None:
+        for box in batch:
+            heapq.heappush(self._waiting, box)
+
+    def _apply(self, batch: list[tuple[float, int, Array, Array]], verdicts: Verdicts) -> None:
+        """Close the boxes that are proved, and halve the others."""
+        low, high = _corners(batch)
+        self.judged += len(batch)
+        self._look_for_folds((low + high) / 2, verdicts.sign)
+        proved = verdicts.proved
+        if proved.any():
+            self.conditioning = min(self.conditioning, float(verdicts.conditioning[proved].min()))
+            self.proved_volume += float(_shares(self.base, low[proved], high[proved]).sum())
+        for k, (rank, place, a, b) in enumerate(batch):
+            if proved[k]:
+                self._codes[place] = PROVED
+                continue
+            shares = (b - a) / (self.base.high - self.base.low)
+            joint = int(verdicts.widest[k])
+            if joint == UNKNOWN:  # the relatively widest one: any choice that stays the same may never help
+                joint = max(self.judge.joints, key=lambda i: float(shares[i]))
+            if shares[joint] > self.limits.smallest:
+                self._halve(place, a, b, joint)
+            else:
+                self.dead += 1
+                self.failed = min(self.failed, rank)
+
+    def _halve(self, place: int, low: Array, high: Array, joint: int) -> None:
+        middle = halfway(low[joint], high[joint])
+        top, bottom = high.copy(), low.copy()
+        top[joint] = bottom[joint] = middle
+        self._codes[place], self._children[place] = joint, len(self._codes)
+        self._add(np.array([low, bottom]), np.array([top, high]))
+
+    def _add(self, low: Array, high: Array) -> None:
+        for rank, a, b in zip(self.priority(low, high).tolist(), low, high, strict=True):
+            heapq.heappush(self._waiting, (rank, len(self._codes), a, b))
+            self._codes.append(OPEN)
+            self._children.append(0)
+
+    def _look_for_folds(self, points: Array, signs: Array) -> None:
+        """Visit a point for each sign that is new: signs at the middle of boxes without a proof are hints."""
+        for sign in {-1, 1} - set(self.signs):
+            there = np.flatnonzero(signs == sign)
+            if there.size:
+                self.visit(points[there[:1]])
+
+    def _preorder(self, root: int) -> list[int]:
+        codes, waiting = [], [root]
+        while waiting:
+            place = waiting.pop()
+            codes.append(self._codes[place])
+            if codes[-1] < PROVED:
+                waiting += [self._children[place] + 1, self._children[place]]
+        return codes
+
+
+def largest_first(base: Subdivision) -> Priority:
+    """Boxes of the largest volume first."""
+    return lambda low, high: -_shares(base, low, high)
+
+
+def nearest_first(base: Subdivision) -> Priority:
+    """Boxes that the smallest scaled copy of the whole touches first."""
+    return lambda low, high: distances(base, low, high)
+
+
+def distances(base: Subdivision, low: Array, high: Array) -> Array:
+    """The scale s at which a copy of the whole about its centre first touches each box, (boxes,)."""
+    middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
+    gaps: Array = np.maximum(np.maximum(low - middle, middle - high), 0) / half
+    return np.asarray(gaps.max(axis=1))
+
+
+def _shares(base: Subdivision, low: Array, high: Array) -> Array:
+    shares: Array = ((high - low) / (base.high - base.low)).prod(axis=1)
+    return shares
+
+
+def _corners(batch: list[tuple[float, int, Array, Array]]) -> tuple[Array, Array]:
+    return np.array([box[2] for box in batch]), np.array([box[3] for box in batch])

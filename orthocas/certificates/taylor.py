@@ -1,0 +1,255 @@
+"""Taylor models: polynomials with a remainder that covers truncation and rounding (ours)."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import combinations_with_replacement
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.tools.checks import Array
+
+UNIT = 2.0**-53  #: u: relative error of one operation
+UP = 1.0 + 2.0**-40  #: factor on bounds, for up to 4,000 roundings of non-negative numbers
+TINY = 1e-290  #: larger than all underflow of one operation on arrays of numbers up to 1e10
+DEGREE = 3
+_PRODUCTS = 8  # that add up to a coefficient of a product: a_S b_rest over the subsets S of three variables
+
+
+def sum_error(products: int) -> float:
+    """Error of a sum of so many products, relative to the sum of their absolute values; 8 roundings are to spare."""
+    return 1.01 * (products + 8) * UNIT  # k u / (1 - k u) < 1.01 k u for k below 10^13
+
+
+def above(products: int) -> float:
+    """The factor on bounds that are sums of so many products of non-negative numbers."""
+    return UP * (1 + sum_error(products))
+
+
+Variables = tuple[int, ...]  #: increasing numbers of variables
+Monomial = tuple[int, ...]  #: its variables in increasing order, repeated for powers
+Places = slice | NDArray[np.intp]  #: where coefficients go
+
+
+@cache
+def monomials(variables: Variables, degree: int = DEGREE) -> tuple[Monomial, ...]:
+    """All monomials up to the degree, in order of their degrees."""
+    degrees = range(degree + 1)
+    return tuple(m for d in degrees for m in combinations_with_replacement(variables, d))
+
+
+@cache
+def order_starts(count: int) -> tuple[int, ...]:
+    """Where the monomials of degree 0, 1, 2, 3 in so many variables start, and how many there are in all."""
+    linear, quadratic = 1 + count, (1 + count) * (2 + count) // 2
+    return 0, 1, linear, quadratic, quadratic * (3 + count) // 3
+
+
+@cache
+def places(part: Variables, whole: Variables) -> Places:
+    """Where the monomials of some of the variables stand among those of all."""
+    index = {monomial: k for k, monomial in enumerate(monomials(whole))}
+    return _compact([index[monomial] for monomial in monomials(part)])
+
+
+@dataclass(frozen=True, slots=True)
+class Product:
+    """How to multiply two polynomials a and b, cut off after degree 3."""
+
+    variables: Variables  #: of the product
+    size: int  #: number of coefficients of the product
+    left: Places  #: of a's monomials
+    right: Places  #: of b's monomials
+    by_linear: tuple[Places, ...]  #: of a's linear monomials times b's linear and quadratic ones
+    quadratic_by: tuple[Places, ...]  #: of a's quadratic monomials times b's linear ones
+
+
+@cache
+def product(left: Variables, right: Variables) -> Product:
+    """The table for polynomials in the given variables."""
+    both = tuple(sorted({*left, *right}))
+    index = {monomial: k for k, monomial in enumerate(monomials(both))}
+
+    def of(one: Monomial, others: tuple[Monomial, ...]) -> Places:
+        return _compact([index[tuple(sorted(one + other))] for other in others])
+
+    a, b = monomials(left), monomials(right)
+    starts = order_starts(len(left))
+    middle = b[1 : order_starts(len(right))[3]]
+    return Product(
+        both,
+        len(index),
+        places(left, both),
+        places(right, both),
+        tuple(of((i,), middle) for i in left),
+        tuple(of((j,), a[starts[2] : starts[3]]) for j in right),
+    )
+
+
+def _compact(indices: list[int]) -> Places:
+    """A slice where the indices follow each other."""
+    if indices and indices == list(range(indices[0], indices[-1] + 1)):
+        return slice(indices[0], indices[-1] + 1)
+    return np.array(indices, dtype=np.intp)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TaylorModel:
+    """Models of functions on boxes: any shape of functions first, boxes last."""
+
+    variables: Variables  #: the variables it depends on
+    coefficients: Array  #: (monomials, ..., boxes), in the order of `monomials`
+    remainder: Array  #: (..., boxes), >= 0
+
+    @classmethod
+    def constant(cls, values: Array, error: Array | float = 0.0) -> Self:
+        """Numbers (..., boxes) known up to an error."""
+        return cls((), values[None], np.broadcast_to(error, values.shape))
+
+    @property
+    def centre(self) -> Array:
+        """The constant coefficients, (..., boxes)."""
+        value: Array = self.coefficients[0]
+        return value
+
+    def sizes(self) -> Array:
+        """Sums of the absolute coefficients of each degree, (4, ..., boxes)."""
+        starts = order_starts(len(self.variables))[:4]
+        size = np.abs(self.coefficients)
+        if not self.variables:
+            return np.concatenate([size, np.zeros((3, *size.shape[1:]))])
+        sums: Array = np.add.reduceat(size, starts, axis=0)
+        return sums
+
+    def magnitude(self) -> Array:
+        """A bound of the absolute values, (..., boxes)."""
+        bound: Array = (np.abs(self.coefficients).sum(axis=0) + self.remainder) * UP
+        return bound
+
+    def __getitem__(self, part: object) -> "TaylorModel":
+        index = part if isinstance(part, tuple) else (part,)
+        return replace(self, coefficients=self.coefficients[(slice(None), *index)], remainder=self.remainder[index])
+
+    def over(self, variables: Variables) -> "TaylorModel":
+        """The same model with more variables."""
+        if variables == self.variables:
+            return self
+        wide = np.zeros((order_starts(len(variables))[4], *self.coefficients.shape[1:]))
+        wide[places(self.variables, variables)] = self.coefficients
+        return TaylorModel(variables, wide, self.remainder)
+
+    def on(self, shape: tuple[int, ...]) -> "TaylorModel":
+        """The same model for functions and boxes of another shape, to which its own is broadcast."""
+        wide = np.broadcast_to(self.coefficients, (len(self.coefficients), *shape))
+        return TaylorModel(self.variables, wide, np.broadcast_to(self.remainder, shape))
+
+    def __neg__(self) -> "TaylorModel":
+        return replace(self, coefficients=-self.coefficients)
+
+    def __add__(self, other: "TaylorModel") -> "TaylorModel":
+        variables = tuple(sorted({*self.variables, *other.variables}))
+        total = self.over(variables).coefficients + other.over(variables).coefficients
+        rounding = UNIT * np.abs(total).sum(axis=0)
+        return TaylorModel(variables, total, (self.remainder + other.remainder + rounding) * UP + TINY)
+
+    def __sub__(self, other: "TaylorModel") -> "TaylorModel":
+        return self + (-other)
+
+    def times(self, factor: Array | float) -> "TaylorModel":
+        """The product with exact numbers, (..., boxes)."""
+        scaled = self.coefficients * factor
+        rounding = UNIT * np.abs(scaled).sum(axis=0)
+        return TaylorModel(self.variables, scaled, (np.abs(factor) * self.remainder + rounding) * UP + TINY)
+
+    def __mul__(self, other: "TaylorModel") -> "TaylorModel":
+        if not self.variables:
+            return other._by_constant(self)
+        if not other.variables:
+            return self._by_constant(other)
+        table = product(self.variables, other.variables)
+        a, b = self.coefficients, other.coefficients
+        out = np.zeros((table.size, *np.broadcast_shapes(a.shape[1:], b.shape[1:])))
+        out[table.right] = a[0] * b
+        out[table.left] += b[0] * a
+        out[0] = a[0] * b[0]
+        starts, end = order_starts(len(self.variables)), order_starts(len(other.variables))[3]
+        for i, where in enumerate(table.by_linear, 1):
+            out[where] += a[i] * b[1:end]
+        for j, where in enumerate(table.quadratic_by, 1):
+            out[where] += b[j] * a[starts[2] : starts[3]]
+        return TaylorModel(table.variables, out, self._left_out(other))
+
+    def _by_constant(self, factor: "TaylorModel") -> "TaylorModel":
+        """The product with a model without variables."""
+        exact = self.times(factor.centre)
+        doubt = factor.remainder * (np.abs(self.coefficients).sum(axis=0) + self.remainder)
+        return _more_uncertain(exact, doubt)
+
+    def _left_out(self, other: "TaylorModel") -> Array:
+        """The remainder of a product: degrees above 3, the remainders of the factors, and rounding."""
+        a, b = self.sizes(), other.sizes()
+        all_a, all_b = a.sum(axis=0), b.sum(axis=0)
+        high = a[3] * (b[1] + b[2] + b[3]) + a[2] * (b[2] + b[3]) + a[1] * b[3]
+        carried = self.remainder * (all_b + other.remainder) + other.remainder * all_a
+        bound: Array = (high + carried + sum_error(_PRODUCTS) * (all_a * all_b)) * UP + TINY
+        return bound
+
+    def composed(self, series: "Series") -> "TaylorModel":
+        """The model of f(self), for the series of f about the centre."""
+        if not self.variables:
+            first = np.abs(series.values[1:]) + series.errors[1:]
+            e = self.remainder
+            doubt = series.errors[0] + series.tail + e * (first[0] + e * (first[1] + e * first[2]))
+            return TaylorModel.constant(series.values[0], doubt * UP)
+        away = TaylorModel(self.variables, self.coefficients.copy(), self.remainder)
+        away.coefficients[0] = 0
+        values = [TaylorModel.constant(series.values[k], series.errors[k]) for k in range(4)]
+        return _more_uncertain(((values[3] * away + values[2]) * away + values[1]) * away + values[0], series.tail)
+
+    def deviation(self) -> Array:
+        """A bound of the distance from the centre, (..., boxes)."""
+        bound: Array = (np.abs(self.coefficients[1:]).sum(axis=0) + self.remainder) * UP
+        return bound
+
+    def gains(self) -> Array:
+        """How much halving the interval of each variable takes from the bound of the values, (variables, ..., boxes).
+
+        A coefficient shrinks by 2^-power; the remainder is shared out like the cubic terms, which it is most like.
+        """
+        taken, size = _taken(self.variables).T, np.abs(self.coefficients)
+        cubic = order_starts(len(self.variables))[3]
+        flat, shape = size.reshape(len(size), -1), (len(taken), *size.shape[1:])
+        last = (taken[:, cubic:] @ flat[cubic:]).reshape(shape)
+        known = (taken[:, :cubic] @ flat[:cubic]).reshape(shape) + last
+        with np.errstate(invalid="ignore"):  # infinite remainders
+            gains: Array = known + last / (last.sum(axis=0) + TINY) * self.remainder
+        return gains
+
+
+@cache
+def _taken(variables: Variables) -> Array:
+    """1 - 2^-power of each variable in each monomial, (monomials, variables)."""
+    return np.array([[1 - 0.5 ** powers.count(v) for v in variables] for powers in monomials(variables)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """f(x + e) = sum_k values[k] e^k up to errors[k], and a rest of at most `tail` for the e in question."""
+
+    values: Array  #: (4, ..., boxes)
+    errors: Array  #: (4, ..., boxes)
+    tail: Array  #: (..., boxes)
+
+
+def stacked(models: list[TaylorModel]) -> TaylorModel:
+    """Models of the same shape as one, with a new first axis."""
+    variables = tuple(sorted({v for model in models for v in model.variables}))
+    shape = np.broadcast_shapes(*(model.remainder.shape for model in models))
+    parts = [model.on(shape).over(variables) for model in models]
+    coefficients = np.stack([part.coefficients for part in parts], axis=1)
+    return TaylorModel(variables, coefficients, np.stack([part.remainder for part in parts]))
+
+
+def _more_uncertain(model: TaylorModel, error: Array) -> TaylorModel:
+    return replace(model, remainder=(model.remainder + error) * UP)

@@ -1,0 +1,245 @@
+"""What a proof leaves behind in a chart file: the certificate, and the subdivision of the domain."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+
+from orthocas.errors import CertifyError, InvalidValueError
+from orthocas.tools.checks import Array, frozen_array, require_kind, require_shape, require_text
+from orthocas.tools.display import Shown, number_list
+
+OPEN, PROVED = 255, 254  #: codes of boxes that are not halved; others are the joint that is
+MOST_BOXES = 20_000_000
+_DEEPEST = 1000
+#: Of this version; certificates of other methods cannot be checked. The one-to-one part of taylor-3/1 was unsound.
+METHOD = "taylor-3/2"
+
+
+@dataclass(frozen=True, eq=False)
+class Subdivision:
+    """A box and its parts. Halves share the face between them exactly, so the parts cover the box.
+
+    Raises:
+        InvalidValueError: if the codes are no tree.
+    """
+
+    low: Array  #: corner of the box, (n,)
+    high: Array  #: opposite corner, (n,)
+    codes: Array  #: uint8, in preorder: the joint whose interval is halved (lower half first), PROVED or OPEN
+
+    def __post_init__(self) -> None:
+        low = frozen_array("low", self.low, (None,))
+        high = frozen_array("high", self.high, low.shape)
+        codes = np.array(self.codes)
+        if codes.dtype != np.uint8 or codes.ndim != 1 or not 0 < codes.size <= MOST_BOXES:
+            raise InvalidValueError("codes", f"{codes.dtype} of shape {codes.shape}", "bytes of a tree of boxes")
+        if not (low < high).all():
+            raise InvalidValueError("low", low.tolist(), "a corner below the opposite one")
+        _require_tree(codes, len(low))
+        codes.setflags(write=False)
+        for name, value in (("low", low), ("high", high), ("codes", codes)):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def whole(cls, low: Array, high: Array) -> Self:
+        """The box in one part, not proved."""
+        return cls(low, high, np.array([OPEN], dtype=np.uint8))
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.low)
+
+    @property
+    def proved_count(self) -> int:
+        """Number of parts that are proved."""
+        return int((self.codes == PROVED).sum())
+
+    @property
+    def open_count(self) -> int:
+        """Number of parts where nothing is proved."""
+        return int((self.codes == OPEN).sum())
+
+    @property
+    def complete(self) -> bool:
+        """Whether all parts are proved."""
+        return not (self.codes == OPEN).any()
+
+    @property
+    def share(self) -> float:
+        """Share of the volume that is proved: 1 only if all of it is."""
+        if self.complete:
+            return 1.0
+        depths = self._depths()[self.codes == PROVED]
+        return min(float((0.5**depths).sum()), 1 - 2**-53)
+
+    def leaves(self, code: int) -> tuple[Array, Array]:
+        """Corners (boxes, n) of the parts with a code."""
+        low, high = [], []
+        for found, a, b in self._walk():
+            if found == code:
+                low.append(a)
+                high.append(b)
+        return np.array(low).reshape(-1, self.n), np.array(high).reshape(-1, self.n)
+
+    def _depths(self) -> Array:
+        depths = np.zeros(self.codes.size)
+        waiting = [0]
+        for k, code in enumerate(self.codes.tolist()):
+            depths[k] = waiting.pop()
+            if code < PROVED:
+                waiting += [depths[k] + 1] * 2
+        return depths
+
+    def _walk(self) -> Iterator[tuple[int, Array, Array]]:
+        """Codes and corners of all parts, in preorder."""
+        waiting = [(np.array(self.low), np.array(self.high))]
+        for code in self.codes.tolist():
+            low, high = waiting.pop()
+            yield code, low, high
+            if code < PROVED:
+                middle = halfway(low[code], high[code])
+                top, bottom = low.copy(), high.copy()
+                top[code] = bottom[code] = middle
+                waiting += [(top, high), (low, bottom)]
+
+
+def halfway(low: float, high: float) -> float:
+    """The number between two corners where a box is halved."""
+    return (low + high) / 2
+
+
+def _require_tree(codes: Array, n: int) -> None:
+    require_shape("codes", codes.shape, (None,))
+    inner = codes < PROVED
+    if (codes[inner] >= n).any():
+        raise InvalidValueError("codes", int(codes[inner].max()), f"numbers of joints below {n}, {PROVED} or {OPEN}")
+    missing = 1 + np.cumsum(np.where(inner, 1, -1))
+    if missing[-1] != 0 or (missing[:-1] <= 0).any():
+        raise InvalidValueError("codes", f"{codes.size} bytes", "a tree of boxes")
+    if missing.max() > _DEEPEST:
+        raise InvalidValueError("codes", "a tree that is too deep", f"at most {_DEEPEST} open halves at once")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Certificate(Shown):
+    """A proof about the chart with this fingerprint; see `orthocas.certify`.
+
+    The parts of `regular` that are proved cover a share of the domain on which det J has one sign and, if `bound` is
+    above 0, the conditioning is at least `bound`. On the box `injective`, two different q never share phi. Certificates
+    of other methods have no such box: theirs is void.
+    """
+
+    fingerprint: str  #: of all that defines J
+    method: str
+    bound: float  #: of the conditioning; 0: det J != 0 only
+    regular: Subdivision  #: the domain and its parts
+    conditioning: float  #: proven lower bound of the conditioning on the proved share; 0 if none was asked for
+    injective: Subdivision | None = None  #: a box on which phi is one-to-one, and its parts
+    fold: tuple[tuple[float, ...], ...] = ()  #: two joint positions where det J differs in sign, the second in the fold
+    boxes: int = 0  #: judged to find the proof
+    seconds: float = field(default=0.0)
+    least_singular_value: float = 0.0  #: of a ClearBox; parts proved to lie outside it count as proved. 0: no ClearBox
+    dead: int = 0  #: number of unproved parts that are too small to halve: a longer search does not help there
+    digest: str = ""  #: of all of the above, see `sealed`
+
+    def __post_init__(self) -> None:
+        for name in ("fingerprint", "method"):
+            require_text(name, getattr(self, name))
+        require_kind("regular", self.regular, Subdivision)
+        if not 0 <= self.bound < 1 or not 0 <= self.conditioning <= 1:
+            raise InvalidValueError("bound and conditioning", (self.bound, self.conditioning), "numbers from 0 to 1")
+        if self.method != METHOD:
+            object.__setattr__(self, "injective", None)
+
+    def sealed(self) -> Self:
+        """The same certificate with the digest of its content, which shows accidental changes. It is no signature."""
+        return replace(self, digest=self._content_digest())
+
+    def _content_digest(self) -> str:
+        """SHA-256 of all numbers and texts but the digest."""
+        numbers = (self.bound, self.conditioning, self.boxes, self.seconds, self.least_singular_value, self.dead)
+        points = [[float(value) for value in point] for point in self.fold]
+        content = [self.fingerprint, self.method, [float(number) for number in numbers], points]
+        digest = hashlib.sha256(json.dumps(content).encode())
+        for tree in (self.regular, self.injective):
+            parts = () if tree is None else (tree.low, tree.high, tree.codes)
+            digest.update(b"".join(hashlib.sha256(part.tobytes()).digest() for part in parts) or b"none")
+        return digest.hexdigest()
+
+    def require_for(self, fingerprint: str) -> None:
+        """Raise CertifyError if the certificate is not that of the chart with this fingerprint, or has been changed."""
+        if self.digest and self.digest != self._content_digest():
+            raise CertifyError("the certificate is void: it has been changed since `certify` made it")
+        if self.fingerprint != fingerprint:
+            raise CertifyError("the certificate is void: it was made for another chart, or the chart has changed")
+
+    @property
+    def proved(self) -> bool:
+        """Whether the proof covers the whole domain."""
+        return self.regular.complete and not self.fold
+
+    @property
+    def share(self) -> float:
+        """Share of the domain's volume that is proved, of the whole box for a ClearBox."""
+        return 0.0 if self.fold else self.regular.share
+
+    @property
+    def unproved(self) -> tuple[Array, Array]:
+        """Corners (boxes, n) of the parts where nothing is proved."""
+        return self.regular.leaves(OPEN)
+
+    def facts(self) -> dict[str, str]:
+        """What is proved, of how many boxes, and what is not."""
+        facts = {"certificate": self._verdict()}
+        if self.conditioning > 0:
+            facts["conditioning"] = f"at least {self.conditioning:.3g} there"
+        if self.injective is not None:
+            half = (self.injective.high - self.injective.low) / 2
+            facts["one-to-one"] = f"on the box of half-width {number_list(half)} around the centre"
+        elif self.method != METHOD:
+            facts["one-to-one"] = f"void, of an older method ({self.method}): certify the chart again"
+        if self.least_singular_value > 0:
+            facts["left out"] = f"where the task's relative singular value is at most {self.least_singular_value:g}"
+        low, high = self.unproved
+        if len(low) and not self.fold:
+            largest = int(np.argmax((high - low).prod(axis=1)))
+            at = number_list((low[largest] + high[largest]) / 2)
+            facts["not proved"] = f"{len(low)} boxes, the largest at q = ({at})"
+        if self.dead and not self.fold:
+            facts["given up"] = (
+                f"{self.dead} boxes are too small to halve: J is nearly singular or folds there; more time is no help"
+            )
+        facts["boxes"] = f"{self.regular.proved_count} proved, {self.boxes} judged, {self.seconds:.3g} s"
+        facts["method"] = f"{self.method}, chart {self.fingerprint[:12]}"
+        return facts
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        one = self.injective
+        return {
+            "proved": self.proved,
+            "share": self.share,
+            "bound": self.bound,
+            "conditioning": self.conditioning,
+            "boxes": self.boxes,
+            "parts": self.regular.proved_count,
+            "unproved": self.regular.open_count,
+            "dead": self.dead,
+            "seconds": self.seconds,
+            "one_to_one_half_width": None if one is None else ((one.high - one.low) / 2).tolist(),
+            "fold": [list(point) for point in self.fold],
+            "method": self.method,
+            "fingerprint": self.fingerprint,
+        }
+
+    def _verdict(self) -> str:
+        if self.fold:
+            at = ", ".join(f"{value:.3f}" for value in self.fold[-1])
+            return f"refuted, the chart folds at q = ({at})"
+        where = "everywhere on the domain" if self.proved else f"on {100 * self.share:.4f} % of the domain"
+        return f"no fold {where}, conditioning >= {self.bound:g}" if self.bound else f"no fold {where}"

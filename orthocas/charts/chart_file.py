@@ -1,0 +1,252 @@
+"""Chart files: a chart, its problem and its certificate as a header and arrays, and back."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from orthocas.bases.cyclic import require_cyclic
+from orthocas.bases.family import CyclicParametrisation, JointSpace
+from orthocas.bases.mlp import MLP
+from orthocas.bases.products import Fourier, Linear, Polynomial
+from orthocas.bases.registry import parametrisation_from_data, parametrisation_to_data
+from orthocas.charts.certificate import Certificate, Subdivision
+from orthocas.charts.coordinates import CoordinateMap, Coordinates
+from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
+from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.leaves import leaf_from_arrays
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.problem_file import FOREIGN, problem_from_data, problem_to_data
+from orthocas.tools.archive import Kind, Stored, read_archive, to_npy, write_archive
+from orthocas.tools.checks import require_count, require_text
+from orthocas.tools.json import part
+
+_TREES = ("regular", "injective")
+_CORNERS = ("low", "high", "codes")
+CHART = Kind("chart", 1, ChartFileError)
+_PROBES = 8  # points of the domain where a chart that is read is evaluated
+_MODERATE = 1e50  # products of a few such numbers do not overflow
+_BOUNDED = (Polynomial, Fourier, Linear, MLP)  # finite wherever their parameters are
+_LEAF = "leaf_"  # prefix of the names of arrays that belong to a base leaf
+
+
+def certificate_to_data(certificate: Certificate) -> tuple[dict[str, Any], dict[str, Stored]]:
+    """A certificate as plain data and arrays."""
+    arrays: dict[str, Stored] = {}
+    for name in _TREES:
+        tree: Subdivision | None = getattr(certificate, name)
+        if tree is not None:
+            arrays |= {f"certificate_{name}_{corner}": getattr(tree, corner) for corner in _CORNERS}
+    header = {
+        "fingerprint": certificate.fingerprint,
+        "method": certificate.method,
+        "bound": certificate.bound,
+        "conditioning": certificate.conditioning,
+        "fold": [list(point) for point in certificate.fold],
+        "boxes": certificate.boxes,
+        "seconds": certificate.seconds,
+        **({"least_singular_value": certificate.least_singular_value} if certificate.least_singular_value else {}),
+        **({"dead": certificate.dead} if certificate.dead else {}),
+        **({"digest": certificate.digest} if certificate.digest else {}),
+    }
+    return header, arrays
+
+
+def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored], n: int) -> Certificate:
+    """The certificate of a chart of n joints.
+
+    Raises:
+        InvalidValueError: if something is missing or makes no sense. The message names it.
+    """
+    regular = _tree(arrays, "regular", n)
+    injective = _tree(arrays, "injective", n) if "certificate_injective_codes" in arrays else None
+    fold = part(data, "fold", list)
+    if len(fold) not in (0, 2) or any(not isinstance(point, list) or len(point) != n for point in fold):
+        raise InvalidValueError("fold of a certificate", repr(fold)[:80], f"no or two joint positions of {n} numbers")
+    return Certificate(
+        part(data, "fingerprint", str),
+        part(data, "method", str),
+        _number(data, "bound"),
+        regular,
+        _number(data, "conditioning"),
+        injective,
+        tuple(tuple(float(value) for value in point) for point in fold),
+        require_count("boxes of a certificate", int(_number(data, "boxes")), least=0),
+        _number(data, "seconds"),
+        _number(data, "least_singular_value") if "least_singular_value" in data else 0.0,
+        require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0) if "dead" in data else 0,
+        part(data, "digest", str) if "digest" in data else "",  # missing in older files
+    )
+
+
+def _tree(arrays: Mapping[str, Stored], name: str, n: int) -> Subdivision:
+    low, high, codes = (part(arrays, f"certificate_{name}_{corner}", np.ndarray) for corner in _CORNERS)
+    tree = Subdivision(low, high, codes)
+    if tree.n != n:
+        raise InvalidValueError(f"box of '{name}' in a certificate", f"one of {tree.n} joints", f"{n} joints")
+    return tree
+
+
+def _number(data: Mapping[str, Any], name: str) -> float:
+    value = data.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e300:
+        raise InvalidValueError(f"field '{name}' of a certificate", repr(value)[:80], "a number that is not negative")
+    return float(value)
+
+
+Notes = Mapping[str, str | float]
+
+
+def write_chart(
+    path: str | Path,
+    problem: Problem,
+    coordinates: CoordinateMap,
+    notes: Notes,
+    certificate: Certificate | None = None,
+    force: bool = False,
+) -> None:
+    """Write a chart. `orthocas.tools.archive` describes the container.
+
+    Raises:
+        ChartFileError: if the file cannot be written, or would replace something other than a chart without `force`.
+    """
+    header, arrays = _content(problem, coordinates)
+    header["notes"] = _checked_notes(notes)
+    if certificate is not None:
+        data, proof = certificate_to_data(certificate)
+        header["certificate"], arrays = {**data, "notes": _digest_of(header["notes"])}, {**arrays, **proof}
+    write_archive(path, CHART, header, arrays, force)
+
+
+def fingerprint(problem: Problem, coordinates: CoordinateMap) -> str:
+    """A digest of all that defines the chart: robot, task, metric, domain and coordinates, but no notes."""
+    header, arrays = _content(problem, coordinates)
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        digest.update(name.encode() + hashlib.sha256(to_npy(arrays[name])).digest())
+    return digest.hexdigest()
+
+
+def _content(problem: Problem, coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
+    """Header and arrays of a chart, without notes."""
+    header, arrays = problem_to_data(problem)
+    description, numbers = _coordinates_to_data(coordinates)
+    return {**header, "coordinates": description}, {**arrays, **numbers}
+
+
+def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certificate | None]:
+    """Read a chart back.
+
+    Raises:
+        ChartFileError: if the file is missing, truncated, edited, not a chart file, or from a newer version.
+    """
+    header, arrays = read_archive(path, CHART)
+    try:
+        problem = problem_from_data(header, arrays)
+        coordinates = _coordinates(problem, part(header, "coordinates", dict), arrays)
+        if coordinates.r != problem.r:
+            raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
+        _require_finite(problem, coordinates)
+        certificate = _certificate(problem, coordinates, header, arrays)
+        return problem, coordinates, _checked_notes(part(header, "notes", dict)), certificate
+    except ChartFileError:
+        raise
+    except OrthocasError as error:
+        raise ChartFileError(f"{path} is inconsistent: {error}") from None
+    except FOREIGN as error:
+        raise ChartFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
+
+
+def _certificate(
+    problem: Problem, coordinates: CoordinateMap, header: Mapping[str, Any], arrays: Mapping[str, Stored]
+) -> Certificate | None:
+    """The certificate of the file, if it has one, and only if it belongs to the chart."""
+    if "certificate" not in header:
+        return None
+    data = part(header, "certificate", dict)
+    certificate = certificate_from_data(data, arrays, problem.n)
+    certificate.require_for(fingerprint(problem, coordinates))
+    if "notes" in data and data["notes"] != _digest_of(header["notes"]):  # missing in older files
+        raise CertifyError("the notes have been changed since the file was written")
+    return certificate
+
+
+def _digest_of(notes: Mapping[str, Any]) -> str:
+    """SHA-256 of notes: they are no part of a proof, and a certified chart shows them beside it."""
+    return hashlib.sha256(json.dumps(notes, sort_keys=True).encode()).hexdigest()
+
+
+def _checked_notes(notes: Notes) -> dict[str, str | float]:
+    """Notes of texts and finite numbers.
+
+    Raises:
+        InvalidValueError: for anything else.
+    """
+    for name, value in notes.items():
+        require_text("name of a note", name)
+        if isinstance(value, float) and not np.isfinite(value):
+            raise InvalidValueError(f"note '{name}'", value, "a finite number")
+        if not isinstance(value, str | int | float):
+            raise InvalidValueError(f"note '{name}'", repr(value)[:80], "text or a number")
+    return dict(notes)
+
+
+def _require_finite(problem: Problem, coordinates: CoordinateMap) -> None:
+    """Look once at what will be evaluated. Singular points, also at the centre, are no reason to refuse a chart.
+
+    Raises:
+        InvalidValueError: if task, coordinates or their Jacobians are finite at none of a few points of the domain.
+    """
+    q = sample_uniform(problem.domain, _PROBES, 0)
+    values = {"the task": problem.task.batched(q)[0], "the Jacobian of the task": problem.task.batched_jacobian(q)[0]}
+    if isinstance(coordinates, Coordinates) and not _surely_finite(coordinates):  # grown ones may be NaN
+        values |= {"xi": coordinates.xi(q), "the Jacobian of xi": coordinates.jacobian(q)}
+    for what, numbers in values.items():
+        if not np.isfinite(numbers.reshape(_PROBES, -1)).all(axis=1).any():
+            raise InvalidValueError(what, f"not finite at any of {_PROBES} points of the domain", "finite numbers")
+
+
+def _surely_finite(coordinates: Coordinates) -> bool:
+    """Whether coordinates are finite on their domain because all their numbers are moderate. That is quick to tell."""
+    sizes = [np.abs(values) for values in (coordinates.theta, coordinates.offset, coordinates.scale)]
+    widths = coordinates.space.half_width
+    moderate = all((size < _MODERATE).all() for size in (*sizes, widths, 1 / widths))
+    return moderate and isinstance(coordinates.parametrisation, _BOUNDED)
+
+
+def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
+    """Coordinates as plain data and arrays."""
+    if isinstance(coordinates, GrownCoordinates):
+        arrays = {f"{_LEAF}{name}": array for name, array in coordinates.leaf.to_arrays().items()}
+        return {"leaf": coordinates.leaf.kind}, arrays
+    assert isinstance(coordinates, Coordinates)
+    data = {**parametrisation_to_data(coordinates.parametrisation), "idle": list(coordinates.idle)}
+    return data, {"theta": coordinates.theta, "offset": coordinates.offset, "scale": coordinates.scale}
+
+
+def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> CoordinateMap:
+    if "leaf" in data:
+        own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
+        return GrownCoordinates(problem, leaf_from_arrays(problem, part(data, "leaf", str), own))
+    parametrisation = parametrisation_from_data(data)
+    found = Coordinates(
+        parametrisation,
+        JointSpace.of(problem),
+        _idle(part(data, "idle", list), problem.n),
+        *(part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
+    )
+    if isinstance(parametrisation, CyclicParametrisation):
+        require_cyclic(problem, parametrisation.cyclic)
+    return found
+
+
+def _idle(joints: list[int], n: int) -> tuple[int, ...]:
+    """The idle joints, checked against the number of joints."""
+    idle = tuple(require_count("idle joint", k, least=0) for k in joints)
+    if len(set(idle)) != len(idle) or any(k >= n for k in idle):
+        raise InvalidValueError("idle joints", str(idle)[:80], f"different indices below {n}")
+    return idle

@@ -1,0 +1,362 @@
+"""Coordinates xi(q) of a chart: protocols, functions of one joint position, and fitted coordinates."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import casadi as ca
+import numpy as np
+
+from orthocas.bases.circle import TURN, CircleFamily
+from orthocas.bases.family import (
+    Expression,
+    Family,
+    GradedParametrisation,
+    JointSpace,
+    LinearFamily,
+    Parametrisation,
+    SelfDerivativeFamily,
+)
+from orthocas.tools.batch import Batched, dense_function, one_blas_thread
+from orthocas.tools.blas_graph import NumpyGraph
+from orthocas.tools.cached import BuiltOnUse, cached_property
+from orthocas.tools.checks import Array, frozen_array, require_shape
+from orthocas.tools.columns import COLUMNS, MANY, BlockedFunction, BlockFunction, ColumnFunction, fill
+from orthocas.tools.expressions import scalar_code
+
+_FEW = 8  # joint positions below which networks are evaluated one by one
+
+
+class CoordinateMap(Protocol):
+    """Coordinates xi(q), fitted or grown."""
+
+    @property
+    def r(self) -> int:
+        """Number of coordinates."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """Short name of the representation, for example 'polynomial:4'."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        ...
+
+    @property
+    def functions(self) -> dict[str, ca.Function]:
+        """CasADi functions of one joint position (n, 1), as graphs of shared parts.
+
+        They are xi (r, 1), jacobian (r, n), and second_derivative (r, 1) of q, v, w: (d/ds) J_xi(q + s v) w.
+        """
+        ...
+
+    def xi(self, points: Array) -> Array:
+        """Coordinates (N, r) at points (N, n)."""
+        ...
+
+    def jacobian(self, points: Array) -> Array:
+        """J_xi (N, r, n) at points (N, n)."""
+        ...
+
+
+@runtime_checkable
+class InvertibleMap(Protocol):
+    """Coordinates with their own inverse map."""
+
+    @property
+    def turn(self) -> float:
+        """Period of the coordinates: 2 pi on a circle, 0 if they are not periodic."""
+        ...
+
+    def inverse(self, phi: Array, q_start: Array) -> Array:
+        """Joint positions (N, n) with the given task values and coordinates phi (N, n); NaN where there are none."""
+        ...
+
+
+def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Function]:
+    """xi (r, 1) and jacobian (r, n) as functions of q (n, 1); second_derivative (r, 1) as a function of q, v, w.
+
+    second_derivative is d^2 xi(q)[v, w]. A basis is evaluated once, and a loop multiplies it with a table of
+    coefficients: written out, a polynomial of degree 4 on seven joints takes ten thousand operations.
+    """
+    if isinstance(family, SelfDerivativeFamily):
+        return _from_tables(family, theta, n)
+    if isinstance(family, LinearFamily):
+        return _from_basis(family, theta, n)
+    kind: Any = ca.MX if family.as_matrices else ca.SX
+    q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
+    parameters: Any = ca.DM(theta)  # constants, so that weights are not sliced and transposed at every call
+    xi = family.expression(q, parameters)
+    jacobian = ca.horzcat(*family.jacobian(q, parameters)).T
+    return _functions(xi, jacobian, second_derivative(xi, q, v, w), q, v, w)
+
+
+def second_derivative(values: Any, q: Any, v: Any, w: Any) -> Any:
+    """(d/ds) J(q + s v) w of an SX or MX expression."""
+    return ca.jtimes(ca.jtimes(values, q, w), q, v)
+
+
+def _from_basis(family: LinearFamily, theta: Array, n: int) -> dict[str, ca.Function]:
+    """xi = C psi, J = C dpsi/dq and C d^2 psi[v, w], with the coefficients C and the basis psi."""
+    x, a, b = (ca.SX.sym(name, n) for name in ("q", "v", "w"))
+    psi = family.basis(x)
+    basis = ca.Function("basis", [x], [psi])
+    slopes = ca.Function("basis_slopes", [x], [ca.densify(ca.jacobian(psi, x))])
+    bends = ca.Function("basis_bends", [x, a, b], [ca.densify(second_derivative(psi, x, a, b))])
+    C = ca.MX(ca.DM(theta.reshape(family.outputs, family.width)))
+    q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
+    return _functions(C @ basis(q), C @ slopes(q), C @ bends(q, v, w), q, v, w)
+
+
+def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str, ca.Function]:
+    """Functions of a family whose basis is closed under differentiation: d xi / d q_i = C_i psi', psi' part of psi.
+
+    For a polynomial of degree d, psi' holds the terms up to degree d - 1, and J is one table times psi'.
+    """
+    r = family.outputs
+    tables = family.derivative_tables(theta)
+    places = np.flatnonzero(tables.any(axis=(0, 1)))
+    x, u = ca.SX.sym("q", n), ca.SX.sym("v", n)
+    psi = family.basis(x)
+    smaller = ca.vertcat(1, psi)[places.tolist()]
+    basis = ca.Function("basis", [x], [psi])
+    smaller_basis = ca.Function("smaller_basis", [x], [smaller])
+    change = ca.Function("smaller_basis_change", [x, u], [ca.densify(ca.jtimes(smaller, x, u))])
+    values = ca.MX(ca.DM(theta.reshape(r, family.width)))
+    slopes = ca.MX(ca.DM(tables[:, :, places].reshape(n * r, len(places))))
+    q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
+    jacobian = ca.reshape(slopes @ smaller_basis(q), r, n)
+    second = ca.reshape(slopes @ change(q, v), r, n) @ w
+    return _functions(values @ basis(q), jacobian, second, q, v, w)
+
+
+def _functions(xi: Any, jacobian: Any, second: Any, q: Any, v: Any, w: Any) -> dict[str, ca.Function]:
+    return {
+        "xi": dense_function("xi", [q], [xi]),
+        "jacobian": dense_function("J_xi", [q], [jacobian]),
+        "second_derivative": dense_function("d2xi", [q, v, w], [second], ["q", "v", "w"]),
+    }
+
+
+Maker = Callable[[], BlockFunction]
+
+
+def block_function(coordinates: "Coordinates", name: str) -> Maker:
+    """What makes xi or the Jacobian of a self-derivative family on blocks, once for each thread.
+
+    They are functions of q (n, c) that return (r, c), or J_xi row by row, (r n, c).
+    """
+    family = coordinates.family
+    assert isinstance(family, SelfDerivativeFamily)
+    return (_values if name == "xi" else _slopes)(coordinates, family)
+
+
+def _values(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
+    """xi = scale (C psi - offset), and the idle joints."""
+    r, active, idle = family.outputs, coordinates.active, list(coordinates.idle)
+    C = coordinates.scale[:, None] * coordinates.theta.reshape(r, -1)
+    shift, centre = (coordinates.scale * coordinates.offset)[:, None], coordinates.space.centre[idle, None]
+    q = ca.SX.sym("q", len(active))
+    basis = ColumnFunction(ca.Function("basis", [q], [ca.densify(family.basis(q))]))
+
+    def make() -> BlockFunction:
+        psi, xi = basis.on_one_block(), np.empty((coordinates.r, COLUMNS))
+
+        def on_one_block(columns: Array) -> Array:
+            np.matmul(C, psi(columns[active])[0], out=xi[:r])
+            xi[:r] -= shift
+            xi[r:] = columns[idle] - centre
+            return xi
+
+        return on_one_block
+
+    return make
+
+
+def _slopes(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
+    """J_xi = scale C_i psi', where psi' holds the basis functions that occur in derivatives, and 1 for idle joints."""
+    n, r, active = coordinates.space.n, family.outputs, coordinates.active
+    by_joint = family.derivative_tables(coordinates.theta)  # (active, r, 1 + K)
+    places = np.flatnonzero(by_joint.any(axis=(0, 1)))
+    table = np.zeros((r, n, len(places)))
+    table[:, active] = coordinates.scale[:, None, None] * by_joint[:, :, places].transpose(1, 0, 2)
+    flat = table.reshape(r * n, len(places))
+    of_idle = np.eye(n)[list(coordinates.idle)].reshape(-1, 1)
+    q = ca.SX.sym("q", len(active))
+    smaller = ca.vertcat(1, family.basis(q))[places.tolist()]
+    basis = ColumnFunction(ca.Function("smaller_basis", [q], [ca.densify(smaller)]))
+
+    def make() -> BlockFunction:
+        psi, J = basis.on_one_block(), np.empty((coordinates.r * n, COLUMNS))
+        J[r * n :] = of_idle
+
+        def on_one_block(columns: Array) -> Array:
+            np.matmul(flat, psi(columns[active])[0], out=J[: r * n])
+            return J
+
+        return on_one_block
+
+    return make
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """xi(q) = [scale (family(q_active) - offset); q_idle - centre_idle], (r, 1).
+
+    Offset and scale are chosen so that xi(centre) = 0, and the mean gradient length of each coordinate over the domain
+    is 1. They do not change any angles.
+    """
+
+    parametrisation: Parametrisation
+    space: JointSpace = field(repr=False)  #: all joints of the robot
+    idle: tuple[int, ...]  #: joints that are coordinates themselves; they come last
+    theta: Array = field(repr=False)  #: parameters of the family, (size,)
+    offset: Array = field(repr=False)  #: (r - idle,)
+    scale: Array = field(repr=False)  #: (r - idle,)
+
+    def __post_init__(self) -> None:
+        fitted = len(self.offset)
+        if isinstance(self.parametrisation, GradedParametrisation):  # before a basis is built that may be enormous
+            terms = self.parametrisation.term_count(len(self.active)) if fitted else 0
+            require_shape("theta", np.shape(self.theta), (fitted * terms,))
+        size = self.family.size if fitted else 0
+        object.__setattr__(self, "theta", frozen_array("theta", self.theta, (size,)))
+        object.__setattr__(self, "offset", frozen_array("offset", self.offset, (fitted,)))
+        object.__setattr__(self, "scale", frozen_array("scale", self.scale, (fitted,)))
+
+    @property
+    def r(self) -> int:
+        """Number of coordinates."""
+        return len(self.offset) + len(self.idle)
+
+    @property
+    def label(self) -> str:
+        """Short name of the parametrisation, or 'joints' if all coordinates are idle joints."""
+        return self.parametrisation.label if len(self.offset) else "joints"
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.theta.size
+
+    @property
+    def active(self) -> list[int]:
+        """Joints that the fitted family depends on."""
+        return [i for i in range(self.space.n) if i not in self.idle]
+
+    @property
+    def turns(self) -> Array:
+        """Periods of the coordinates, (r,): 2 pi scale for circle-valued ones, 0 for others."""
+        fitted = len(self.offset)
+        own = TURN * np.abs(self.scale) if fitted and isinstance(self.family, CircleFamily) else np.zeros(fitted)
+        return np.concatenate([own, np.zeros(len(self.idle))])
+
+    @property
+    def as_matrices(self) -> bool:
+        """Whether the graphs consist of dense matrix products, as for networks."""
+        return bool(len(self.offset)) and self.family.as_matrices
+
+    @cached_property
+    def family(self) -> Family:
+        """The fitted family on the active joints."""
+        return self.parametrisation.family(self.space.restricted_to(self.active), len(self.offset))
+
+    def expression(self, q: Expression) -> Expression:
+        """xi(q), (r, N), for joint positions as columns (n, N)."""
+        columns = q.shape[1]
+        rows: list[Expression] = []
+        if len(self.offset):
+            theta = type(q)(ca.DM(self.theta))
+            fitted = self.family.expression(q[self.active, :], theta)
+            rows.append((fitted - _columns(self.offset, columns)) * _columns(self.scale, columns))
+        if self.idle:
+            rows.append(q[list(self.idle), :] - _columns(self.space.centre[list(self.idle)], columns))
+        return ca.vertcat(*rows)
+
+    def xi(self, points: Array) -> Array:
+        """Coordinates (N, r) at points (N, n)."""
+        return self.into("xi", np.empty((len(points), self.r)), points)
+
+    def jacobian(self, points: Array) -> Array:
+        """J_xi (N, r, n) at points (N, n)."""
+        return self.into("jacobian", np.empty((len(points), self.r, self.space.n)), points)
+
+    def once(self, name: str, points: Array) -> Array:
+        """Values of `xi` or `jacobian`, without building what makes later calls fast."""
+        if self.as_matrices:
+            return self.xi(points) if name == "xi" else self.jacobian(points)
+        return Batched(self.functions[name])(points)[0]
+
+    def into(self, name: str, results: Array, points: Array) -> Array:
+        """Write xi or the Jacobian at points (N, n) to `results`, which may be part of a larger array; return it."""
+        if not self._has_blocks or len(points) < (_FEW if self.as_matrices else MANY):
+            self._point_by_point[name].into(results, points)
+        else:
+            with one_blas_thread():
+                fill(results, points, self._on_blocks[name])
+        return results
+
+    @cached_property
+    def functions(self) -> dict[str, ca.Function]:
+        """Functions of one joint position: xi (r, 1), jacobian (r, n), and second_derivative of q, v, w (r, 1)."""
+        n, idle, active = self.space.n, list(self.idle), self.active
+        q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
+        unit = np.eye(n)
+        xi, J, second = [], [], []
+        if len(self.offset):
+            parts, scale = point_functions(self.family, self.theta, len(active)), ca.DM(self.scale)
+            xi.append((parts["xi"](q[active]) - ca.DM(self.offset)) * scale)
+            J_active = parts["jacobian"](q[active]) * ca.repmat(scale, 1, len(active))
+            J.append(J_active @ ca.DM(unit[active]) if idle else J_active)
+            second.append(parts["second_derivative"](q[active], v[active], w[active]) * scale)
+        if idle:
+            xi.append(q[idle] - ca.DM(self.space.centre[idle]))
+            J.append(ca.MX(ca.DM(unit[idle])))
+            second.append(ca.MX(len(idle), 1))
+        return {
+            "xi": dense_function("xi", [q], [ca.vertcat(*xi)]),
+            "jacobian": dense_function("J_xi", [q], [ca.vertcat(*J)]),
+            "second_derivative": dense_function("d2xi", [q, v, w], [ca.vertcat(*second)], ["q", "v", "w"]),
+        }
+
+    @cached_property
+    def _point_by_point(self) -> BuiltOnUse[BlockedFunction]:
+        fast = (lambda graph: graph) if self.as_matrices else scalar_code
+        return BuiltOnUse(lambda name: BlockedFunction(fast(self.functions[name])))
+
+    @property
+    def _has_blocks(self) -> bool:
+        """Whether products of matrices make the family fast on blocks of joint positions."""
+        return self.as_matrices or (len(self.offset) > 0 and isinstance(self.family, SelfDerivativeFamily))
+
+    @cached_property
+    def _on_blocks(self) -> BuiltOnUse[Maker]:
+        """What makes functions of many joint positions side by side."""
+        if self.as_matrices:
+            return BuiltOnUse(lambda name: self._column_graphs[name].on_one_block)
+        return BuiltOnUse(lambda name: block_function(self, name))
+
+    @cached_property
+    def _column_graphs(self) -> dict[str, NumpyGraph]:
+        """Functions xi and vec(J_xi^T) of many joint positions side by side, where dense products are fast."""
+        q = ca.MX.sym("q", self.space.n, COLUMNS)
+        J_xi = ca.vertcat(*self._gradients(q))
+        return {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}
+
+    def _gradients(self, q: ca.MX) -> list[ca.MX]:
+        """Gradients of all coordinates, r matrices (n, N), for joint positions as columns (n, N)."""
+        N = q.shape[1]
+        unit = np.eye(self.space.n)
+        gradients: list[ca.MX] = []
+        if len(self.offset):
+            own = self.family.jacobian(q[self.active, :], ca.MX(ca.DM(self.theta)))
+            spread = ca.DM(unit[:, self.active])
+            gradients += [spread @ gradient * scale for gradient, scale in zip(own, self.scale, strict=True)]
+        return gradients + [ca.MX(_columns(unit[k], N)) for k in self.idle]
+
+
+def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:
+    return ca.DM(np.repeat(np.asarray(values, dtype=float)[:, None], columns, axis=1))

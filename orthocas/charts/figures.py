@@ -1,0 +1,132 @@
+"""Figures of charts: histograms of their quality, and the arm along each coordinate."""
+
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from orthocas.charts.quality import AngleStatistics, LeakStatistics
+from orthocas.charts.self_motion import fan_along
+from orthocas.errors import InvalidValueError
+from orthocas.tools.checks import Array, require_at_least, require_count
+from orthocas.tools.picture import Picture
+
+if TYPE_CHECKING:
+    from orthocas.charts.chart import Chart
+    from orthocas.charts.quality import Report
+
+_MOST_POSTURES = 1000
+_TASK, _EXTRA, _LEAK = "#1f5fa8", "#d95f02", "#5a9e6f"
+
+
+def quality_figure(report: "Report") -> Figure:
+    """Histograms of task and mutual angles [deg], as in [AS2023] Figs. 20 and 27, and of leaks (ours)."""
+    _require("report", report, "task_angle", "a Report")
+    figure = Picture(figsize=(12.0, 3.4), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    _draw_angles(left, report.task_angle, _TASK, r"task angle $\angle(\mathrm{d}\xi_j, \nabla_A h_i)$")
+    _draw_angles(middle, report.mutual_angle, _EXTRA, r"mutual angle $\angle(\mathrm{d}\xi_i, \mathrm{d}\xi_j)$")
+    _draw_leaks(right, report.leak)
+    left.set_ylabel("share of angles per degree")
+    figure.suptitle(f"{report.samples:,} held-out samples, conditioning mean {report.conditioning.mean:.2f}")
+    return figure
+
+
+def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 0.4) -> Figure:
+    """The self-motions of the arm: each panel sweeps one coordinate and holds the task and the others.
+
+    Args:
+        chart: the chart; the sweep starts at the centre of its domain.
+        postures: number of postures per panel.
+        reach: largest value of the swept coordinate. None: as far as it reaches on either side.
+
+    Raises:
+        InverseError: if a posture of the sweep cannot be reached.
+    """
+    _require("chart", chart, "xi_range", "a Chart")
+    require_count("postures", postures, most=_MOST_POSTURES)
+    if reach is not None:
+        require_at_least("reach", reach, 0)
+    figure = Picture(figsize=(3.0 * chart.r, 3.5), layout=ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1))
+    sweeps = [_sweep(chart, j, postures, reach) for j in range(chart.r)]
+    everything = chart.problem.robot.joint_points(np.concatenate(sweeps)).reshape(-1, 3)
+    colours = mpl.colormaps["viridis"](np.linspace(0.1, 0.9, postures))
+    for j, sweep in enumerate(sweeps):
+        panel = figure.add_subplot(1, chart.r, j + 1, projection="3d")
+        for points, colour in zip(chart.problem.robot.joint_points(sweep), colours, strict=True):
+            panel.plot(*points.T, "-o", color=colour, markersize=2.5, linewidth=1.5)
+        moved = np.abs(chart.task(sweep) - chart.task(chart.problem.domain.centre)).max()
+        low, high = chart.xi(sweep[[0, -1]])[:, j]
+        panel.set_title(rf"$\xi_{j + 1}$ from {low:.3g} to {high:.3g}" + f"\ntask moves {_bound(moved)}", fontsize=10)
+        _equal_axes(panel, everything)
+    return figure
+
+
+def _draw_angles(axes: Axes, angles: AngleStatistics, colour: str, label: str) -> None:
+    first = 3  # groups of five bins, so that 90 degrees lies in the middle of its group
+    counts = angles.histogram[first:-3].reshape(-1, 5).sum(axis=1)
+    edges = (first - 0.5) / 10 + 0.5 * np.arange(len(counts) + 1)
+    axes.stairs(counts / max(counts.sum(), 1) / 0.5, edges, fill=True, color=colour, alpha=0.85)
+    width = max(6.0, 5 * (0.0 if np.isnan(angles.std) else angles.std))
+    axes.set_xlim(90 - width, 90 + width)
+    axes.set_xlabel(f"{label} [deg]")
+    axes.set_title(f"mean {angles.mean:.2f}°, std {angles.std:.2f}°", fontsize=10)
+    axes.grid(alpha=0.3)
+
+
+def _draw_leaks(axes: Axes, leak: LeakStatistics) -> None:
+    counts = leak.histogram[:900].reshape(-1, 5).sum(axis=1)
+    axes.stairs(counts / max(counts.sum(), 1) / 0.5, 0.5 * np.arange(len(counts) + 1) - 0.05, fill=True, color=_LEAK)
+    axes.set_xlim(0, max(6.0, 3 * leak.rms))
+    axes.set_xlabel(r"leak, in the metric [deg]")
+    axes.set_title(f"rms {leak.rms:.2f}°, largest {leak.max:.1f}°", fontsize=10)
+    axes.grid(alpha=0.3)
+
+
+def _sweep(chart: "Chart", j: int, postures: int, reach: float | None) -> Array:
+    """Joint positions along xi_j with all else held. Each is solved from its neighbour, from the middle outwards."""
+    centre = chart.problem.domain.centre
+    base = chart.phi(centre)
+    if reach is None:
+        fan = fan_along(chart, centre, j)
+        shown: Array = fan.q[np.abs(fan.arc_length[:, None] - fan.places(postures)).argmin(axis=0)]
+        return shown
+    values = np.linspace(-float(reach), float(reach), postures)
+    found = np.empty((len(values), chart.n))
+    middle = int(np.argmin(np.abs(values)))
+    for order in (range(middle, len(values)), range(middle - 1, -1, -1)):
+        q = centre
+        for k in order:
+            target = base.copy()
+            target[chart.m + j] = values[k]
+            q = chart.inverse(target, q, outside=True)  # as far as was asked
+            found[k] = q
+    return found
+
+
+def _equal_axes(axes: Any, points: Array) -> None:
+    """Use the same scale on all three axes, around the points. A planar arm is drawn from above."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = (high - low).max() / 2 * 1.05
+    for name, middle in zip("xyz", (low + high) / 2, strict=True):
+        getattr(axes, f"set_{name}lim")(middle - half, middle + half)
+        getattr(axes, f"set_{name}label")(f"{name} [m]", fontsize=8)
+        getattr(axes, f"{name}axis").labelpad = -3
+    axes.tick_params(labelsize=7, pad=0)
+    axes.locator_params(nbins=4)
+    axes.set_box_aspect((1, 1, 1), zoom=0.85)
+    flat = (high - low)[2] < 1e-9
+    axes.view_init(elev=90 if flat else 22, azim=-90 if flat else -60)
+
+
+def _bound(length: float) -> str:
+    return f"< 1e{int(np.ceil(np.log10(max(length, 1e-16)))):d} m"
+
+
+def _require(name: str, value: object, part: str, wanted: str) -> None:
+    """Raise InvalidValueError unless the value has the part that is drawn; its class imports this module."""
+    if not hasattr(value, part):
+        raise InvalidValueError(name, repr(value)[:80], wanted)

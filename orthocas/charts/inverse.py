@@ -1,0 +1,221 @@
+"""The inverse map q(x, xi): restarts where needed, and how each row ended."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.charts.in_domain import InDomain
+from orthocas.charts.inside import Inside
+from orthocas.charts.newton import Attempt, LocalSolver, Starts
+from orthocas.charts.phi import PhiMap, largest
+from orthocas.charts.solutions import InverseStatus, Solutions
+from orthocas.robots.tree import KinematicTree
+from orthocas.tasks.domains import Conditioned, borders
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array, Indices
+
+_ROUNDING = 1e-9  # of L: task values next to the limit may be rounded
+_ROWS = 16_384  # solved at once
+_FIRST = 2  # restarts from points of the table, and the centre, before all of the domain is searched
+_RESTARTS = 8  # from points of the table, where nothing leads to any solution
+_UNSOLVED = (InverseStatus.NOT_FOUND, InverseStatus.OUT_OF_REACH)
+_MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, *_UNSOLVED)
+_SNAP = 1e-9  # of the half-widths: solutions so close to the border are moved onto it
+_SLACK = 1e-9  # of the half-widths: joint limits are decimal numbers, see `require_within_limits`
+
+
+def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
+    """Which task values (N, m) no joint position within the limits has, because the arm is too short, (N,).
+
+    Never for tasks without a position of the tip, nor for arms with an unlimited prismatic joint.
+    """
+    columns = [k for k, label in enumerate(task.labels) if label in ("x", "y", "z") and task.units[k] == "m"]
+    if task.recipe["kind"] == "custom" or not columns:
+        return np.zeros(len(x), dtype=bool)
+    origin, length = _origin_and_length(task.robot.tree)
+    away = x[:, columns] - origin[["xyz".index(task.labels[k]) for k in columns]]
+    return np.asarray(np.linalg.norm(away, axis=1) > (1 + _ROUNDING) * length)
+
+
+def _origin_and_length(tree: KinematicTree) -> tuple[Array, float]:
+    """Place of the first joint that moves the tip, (3,), and the largest distance of the tip from it [m]."""
+    chain = _chain(tree)
+    offsets = [*tree.translations[chain], tree.tip_translation]
+    strokes = np.maximum(np.abs(tree.lower[chain]), np.abs(tree.upper[chain]))[np.array(tree.prismatic)[chain]]
+    return offsets[0], float(sum(np.linalg.norm(offset) for offset in offsets[1:]) + strokes.sum())
+
+
+def _chain(tree: KinematicTree) -> list[int]:
+    """Joints that move the tip, from the base on."""
+    found, body = [], tree.tip_parent
+    while body >= 0:
+        found.append(body)
+        body = tree.parents[body]
+    return found[::-1]
+
+
+@dataclass(eq=False)
+class Found:
+    """The best points so far."""
+
+    q: Array  #: (N, n), finite
+    residual: Array  #: (phi - phi(q)) / scale, (N, n)
+    iterations: Indices  #: (N,)
+    status: Indices  #: (N,)
+
+    def improve(self, rows: Indices, other: "Found") -> None:
+        """Take over what another search found in some rows, where it is better."""
+        better = other.status < self.status[rows]
+        same = other.status == self.status[rows]
+        better |= same & (other.status == InverseStatus.NOT_FOUND) & (other.error < self.error[rows])
+        into = rows[better]
+        for name in ("q", "residual", "iterations", "status"):
+            getattr(self, name)[into] = getattr(other, name)[better]
+
+    @property
+    def error(self) -> Array:
+        """Largest entries of the residuals, (N,)."""
+        return largest(self.residual)
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """Solves phi(q) = phi, and tells for each row how the search ended."""
+
+    problem: Problem
+    phi_map: PhiMap
+    local: LocalSolver
+    starts: Starts
+    in_domain: InDomain | None = None  #: searches all of the domain; for fitted coordinates
+    inside: Inside | None = None  #: finds points inside that keep the task; for fitted coordinates
+
+    def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
+        """Solutions for targets (N, n), from starts (N, n) or our own. Rows that are not finite fail."""
+        good = np.isfinite(targets).all(axis=1)
+        if starts is not None:
+            good &= np.isfinite(starts).all(axis=1)
+        q = np.full(targets.shape, np.nan)
+        error, distance = np.full((2, len(q)), np.nan)
+        status, iterations = np.full(len(q), int(InverseStatus.BAD_INPUT)), np.zeros(len(q), dtype=np.int64)
+        for rows in np.array_split(np.flatnonzero(good), -(-int(good.sum()) // _ROWS) or 1):
+            if rows.size:
+                found = self._searched(targets[rows], None if starts is None else starts[rows], tolerance, inside)
+                q[rows], status[rows], iterations[rows] = found.q, found.status, found.iterations
+                error[rows], distance[rows] = found.error, self._distance(targets[rows], found.residual)
+                kept = found.status == InverseStatus.NEAREST
+                error[rows[kept]] = largest(found.residual[kept, : self.problem.m])
+        return Solutions(q, status, iterations, error, distance, tolerance)
+
+    def _searched(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
+        """What the search finds from given starts, or from the rough inverse and, where that fails, in the domain."""
+        best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance)
+        self._tell_beyond(targets, best)
+        if inside and self.inside is not None:
+            self._search_inside(self.inside, targets, best, tolerance)
+        elif starts is None:
+            self._restart(targets, best, self._open(best), _FIRST, InverseStatus.FOUND, tolerance)
+            self._search_domain(targets, best, self._open(best), tolerance)
+            rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
+            self._restart(targets, best, rows, _RESTARTS, InverseStatus.SINGULAR, tolerance)
+        return best
+
+    def _tell_beyond(self, targets: Array, best: Found) -> None:
+        """Say of rows without a solution whether the arm is too short."""
+        rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
+        beyond = beyond_reach(self.problem.task, targets[rows, : self.problem.m])
+        best.status[rows[beyond]] = InverseStatus.OUT_OF_REACH
+
+    def _open(self, best: Found) -> Indices:
+        """Rows that may have another solution, inside the domain."""
+        return np.flatnonzero(~np.isin(best.status, (InverseStatus.FOUND, InverseStatus.OUT_OF_REACH)))
+
+    def _search_domain(self, targets: Array, best: Found, rows: Indices, tolerance: float) -> None:
+        """Search all of the domain in some rows."""
+        if rows.size and self.in_domain is not None:
+            q, _ = self.in_domain.search(targets[rows], tolerance)
+            attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
+            best.improve(rows, self._judged(attempt, tolerance))
+        if isinstance(self.problem.domain, Conditioned):  # it may be a small part of its box
+            self._restart(targets, best, rows, _RESTARTS, InverseStatus.FOUND, tolerance)
+
+    def _restart(
+        self, targets: Array, best: Found, rows: Indices, count: int, worst: InverseStatus, tolerance: float
+    ) -> None:
+        """Search some rows again from points of the table and the centre, until their status is `worst` or better."""
+        for start in self._other_starts(targets[rows], count):
+            left = best.status[rows] > worst
+            if not left.any():
+                break
+            best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
+
+    def _search_inside(self, inside: Inside, targets: Array, best: Found, tolerance: float) -> None:
+        """Replace what is not found by other solutions, or the nearest coordinates, inside the domain."""
+        self._search_domain(targets, best, self._open(best), tolerance)
+        rows = np.flatnonzero(best.status != InverseStatus.FOUND)
+        q, in_reach = inside.with_task(targets[rows], best.q[rows])
+        self._replace(targets, best, rows[~in_reach], q[~in_reach], tolerance)
+        rows, q = rows[in_reach], q[in_reach]
+        moved = np.isin(best.status[rows], _MOVED)
+        self._replace(targets, best, rows[moved], inside.nearest(targets[rows[moved]], q[moved]), tolerance)
+
+    def _replace(self, targets: Array, best: Found, rows: Indices, q: Array, tolerance: float) -> None:
+        """Put points of the box into some rows, with their status; singular solutions stay."""
+        moved = np.isin(best.status[rows], _MOVED)
+        rows, q = rows[moved], q[moved]
+        residual = self.phi_map.residual(targets[rows], q)
+        kept = (largest(residual[:, : self.problem.m]) <= tolerance) & self.problem.domain.contains(q)
+        whole = kept & (largest(residual) <= tolerance)
+        best.q[rows], best.residual[rows] = q, residual
+        beyond = best.status[rows] == InverseStatus.OUT_OF_REACH
+        missed = np.where(beyond, InverseStatus.OUT_OF_REACH, InverseStatus.NOT_FOUND)
+        best.status[rows] = np.where(whole, InverseStatus.FOUND, np.where(kept, InverseStatus.NEAREST, missed))
+
+    def _other_starts(self, targets: Array, count: int) -> Iterator[Array]:
+        """Points of the table near the targets, nearest first, and the centre of the domain, (N, n) each."""
+        if len(targets):
+            yield from self.starts.nearest(targets, count, self.problem.n)
+            yield np.broadcast_to(self.problem.domain.centre, targets.shape)
+
+    def _attempt(self, targets: Array, starts: Array, tolerance: float) -> Found:
+        """One search from starts (N, n), judged."""
+        return self._judged(self._snapped(targets, self.local(targets, starts), tolerance), tolerance)
+
+    def _judged(self, attempt: Attempt, tolerance: float) -> Found:
+        """Where a search ended, with a status."""
+        solved = largest(attempt.residual) <= tolerance
+        status = np.full(len(attempt.q), int(InverseStatus.NOT_FOUND))
+        status[solved] = self._status(attempt.q[solved])
+        doubtful = np.flatnonzero(solved & attempt.suspicious)
+        if doubtful.size:
+            status[doubtful[self.phi_map.is_singular(attempt.q[doubtful])]] = InverseStatus.SINGULAR
+        return Found(attempt.q, attempt.residual, attempt.iterations, status)
+
+    def _status(self, q: Array) -> Indices:
+        """Where solutions (N, n) lie."""
+        robot, domain = self.problem.robot, self.problem.domain
+        slack = _SLACK * domain.half_width
+        allowed = ((q >= robot.lower - slack) & (q <= robot.upper + slack)).all(axis=1)
+        beyond = np.where(allowed, InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT)
+        return np.where(domain.contains(q), InverseStatus.FOUND, beyond).astype(np.int64)
+
+    def _snapped(self, targets: Array, attempt: Attempt, tolerance: float) -> Attempt:
+        """The same points, but on the border where they are solutions that miss it by rounding."""
+        low, high = borders(self.problem.domain)
+        moved = np.clip(attempt.q, low, high)
+        off = np.abs(moved - attempt.q)
+        rows = np.flatnonzero((off > 0).any(axis=1) & (off <= _SNAP * self.problem.domain.half_width).all(axis=1))
+        if not rows.size:
+            return attempt
+        residual = self.phi_map.residual(targets[rows], moved[rows])
+        good = largest(residual) <= tolerance
+        attempt.q[rows[good]], attempt.residual[rows[good]] = moved[rows[good]], residual[good]
+        return attempt
+
+    def _distance(self, targets: Array, residual: Array) -> Array:
+        """|xi(q) - xi|, (N,): infinite where xi(q) is undefined."""
+        difference = (residual * self.phi_map.scale(targets))[:, self.problem.m :]
+        distance = np.sqrt((difference**2).sum(axis=1))
+        return np.where(np.isfinite(distance), distance, np.inf)

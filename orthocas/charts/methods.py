@@ -1,0 +1,276 @@
+"""Methods of charts around the inverse map q(phi), and the CasADi functions of a chart, the inverse among them."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.charts.coordinates import Coordinates, InvertibleMap
+from orthocas.charts.in_domain import BoxedPhi, Cells, InDomain
+from orthocas.charts.inside import Inside, Nearest
+from orthocas.charts.inverse import Inverse
+from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, PointFunctions, Starts, inverse_function
+from orthocas.charts.phi import PhiFunctions, PhiMap
+from orthocas.charts.solutions import Solutions, Tracker
+from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, SingularTaskError
+from orthocas.tasks.domains import Conditioned, borders
+from orthocas.tasks.problem import task_sizes
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import (
+    Array,
+    Indices,
+    as_float_array,
+    as_point,
+    as_point_set,
+    require_at_least,
+    require_kind,
+    require_known,
+)
+
+FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "inverse")
+
+
+class InverseMethods(PhiFunctions):
+    """What a chart has on top of phi: its inverse in batches, for streams, and as a CasADi function."""
+
+    def inverse(
+        self, phi: ArrayLike, q_start: ArrayLike | None = None, *, outside: bool = False, tolerance: float = 1e-9
+    ) -> Array:
+        """Solve phi(q) = phi for q: fitted charts by Newton's method with line search, grown ones along the flow.
+
+        Several q may have the same phi, inside the domain too. With `q_start`, q is the one that is reached from there.
+        Without it, q is the first that the search of `solve` finds inside. `solutions` has all.
+
+        Args:
+            phi: target values, (n,) or (N, n).
+            q_start: initial guess (n,), or (N, n) with one guess per row of phi. For grown coordinates it selects the
+                number of full turns and the sheet of a linear leaf.
+            outside: accept solutions outside the domain, where the chart is not known to be good, and beyond joint
+                limits.
+            tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
+
+        Returns:
+            q, (n,) or (N, n), inside the domain unless `outside`.
+
+        Raises:
+            InverseError: if no solution is found, J is singular there, or it lies outside the domain. The message names
+                the rows. If solutions lie outside, `error.nearest` has q, (n,) or (N, n), inside the domain: solutions
+                where there are any, otherwise the same x with the nearest xi that is found (see `solve` with
+                `inside=True`); None for grown coordinates.
+
+        Example:
+            >>> import orthocas as oc
+            >>> from orthocas import problems
+            >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+            >>> start = [0.6, 0.8, 0.8]
+            >>> try:
+            ...     chart.inverse(chart.phi(start) + [0.0, 0.0, 2.0], start)
+            ... except oc.errors.InverseError as error:
+            ...     bool(oc.contains(chart.problem.domain, error.nearest))
+            True
+        """
+        targets, single = as_point_set("phi", phi, self.n)
+        if q_start is not None:
+            as_point_set("q_start", q_start, self.n)
+        require_kind("outside", outside, bool)
+        found = self.solve(targets, q_start, tolerance=tolerance).require(inside=False)
+        beyond = np.flatnonzero(~found.found)
+        if beyond.size and not outside:
+            raise self._outside_error(targets, q_start, found, beyond, single)
+        return found.q[0] if single else found.q
+
+    def solve(
+        self,
+        phi: ArrayLike,
+        q_start: ArrayLike | None = None,
+        *,
+        tolerance: float = 1e-9,
+        inside: bool = False,
+        local: LocalSolver | None = None,
+    ) -> Solutions:
+        """Solve phi(q) = phi for q, with a status for each row: a row that fails does not disturb the others.
+
+        Several q may have the same phi, inside the domain too. With `q_start`, Newton's method searches from there
+        only, and q is the solution that it reaches, inside the domain or not. Otherwise it starts at a rough inverse of
+        phi, a polynomial fitted to points of the domain, then at stored points of the domain whose phi is nearest. Rows
+        that still have no solution inside are searched for in all cells of the domain that may hold one. q is the first
+        solution inside that is found; `solutions` has all.
+
+        Args:
+            phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
+            q_start: initial guess (n,), or (N, n) with one guess per row of phi.
+            tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
+            inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
+                other starts, get the q inside with the same x and the nearest xi that is found, a local minimum, with
+                the status NEAREST, or NOT_FOUND if none with that x is found. Not for grown coordinates.
+            local: another solver of phi(q) = phi near given starts; `orthocas.compile_inverse` has one.
+
+        Returns:
+            `Solutions` with q (N, n), status, iterations, error and distance (N,); N = 1 for one phi.
+
+        Raises:
+            ShapeError: if a row has another number of entries, or q_start another number of rows.
+            NoExpressionError: if `inside` is asked of grown coordinates.
+
+        Source:
+            ours: docs/inverse.md.
+        """
+        require_at_least("tolerance", tolerance, 0)
+        targets = self._rows("phi", phi)
+        starts = None if q_start is None else self._rows("q_start", q_start)
+        if starts is None and isinstance(self.coordinates, InvertibleMap):
+            starts = self.problem.domain.centre[None]
+        if starts is not None:
+            if len(starts) not in (1, len(targets)):
+                raise ShapeError("q_start", starts.shape, targets.shape)
+            starts = np.broadcast_to(starts, targets.shape)
+        require_kind("inside", inside, bool)
+        if local is not None and not callable(local):
+            raise InvalidValueError("local", repr(local)[:80], "a function of targets and starts")
+        if inside:
+            self._require_expression("inside=True")
+        inverse = self._inverse if local is None else replace(self._inverse, local=local)
+        return inverse.solve(targets, starts, float(tolerance), inside)
+
+    def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
+        """All q inside the domain with phi(q) = phi that a search of the whole domain finds.
+
+        A chart without a fold may have several: det J != 0 makes phi one-to-one near each point only. On the box of a
+        certificate's proof "one-to-one", there is at most one. The search starts in all cells of the domain that may
+        hold a solution. It is no proof that there are no others; docs/inverse.md has what it misses.
+
+        Args:
+            phi: target values, (n,).
+            tolerance: as in `solve`.
+
+        Returns:
+            Different solutions, the one nearest to the centre of the domain first, (k, n).
+
+        Raises:
+            NoExpressionError: if the coordinates are grown.
+
+        Example:
+            >>> import numpy as np
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[1.0, 1.0])
+            >>> problem = oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Box([0.5, 0.5], 1.0))
+            >>> chart = oc.fit(problem, oc.Linear()).chart  # it folds
+            >>> len(chart.solutions(chart.phi([0.4, 0.3])))
+            2
+        """
+        require_at_least("tolerance", tolerance, 0)
+        self._require_expression("a search for all solutions")
+        in_domain = self._inverse.in_domain
+        assert in_domain is not None
+        return in_domain.all_solutions(as_point("phi", phi, self.n), float(tolerance))
+
+    def tracker(self, q0: ArrayLike, largest_step: ArrayLike | None = None) -> Tracker:
+        """A tracker that follows a stream of phi from q0; see `Tracker`.
+
+        Args:
+            q0: a joint position inside the domain, (n,).
+            largest_step: largest change of each joint in a call, (n,) or one number [rad] or [m]; default: a tenth of
+                the half-widths of the domain.
+
+        Raises:
+            NoExpressionError: if the coordinates are grown.
+            InvalidValueError: if q0 lies outside the domain, or J is singular there.
+        """
+        self._require_expression("a tracker")
+        return Tracker(self._point_functions, self.problem.domain, q0, largest_step)
+
+    def function(self, name: str) -> ca.Function:
+        """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.
+
+        The input q is a column (n, 1). second_derivative takes q, v, w (n, 1) and returns d^2 phi(q)[v, w] =
+        (d/ds) J(q + s v) w, (n, 1). For v = dq this is dJ/dt w. inverse takes phi and q_start (n, 1), and returns q
+        (n, 1) with phi(q) = phi, or NaN where Newton's method finds none. Its derivatives are those of the implicit
+        function theorem, of any order; so it can be part of an optimal control problem.
+
+        Raises:
+            UnknownNameError: if there is no such function.
+            NoExpressionError: if the coordinates are grown. `orthocas.distil` fits an expression to them.
+        """
+        require_known("chart function", name, FUNCTIONS)
+        return self._inverse_function if name == "inverse" else self._graph(name)
+
+    @cached_property
+    def phi_sizes(self) -> Array:
+        """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
+        return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
+
+    @property
+    def turns(self) -> Array:
+        """Periods of the components of phi, (n,): 2 pi for circle-valued coordinates, 0 where there is none."""
+        own = self.coordinates
+        periods = own.turns if isinstance(own, Coordinates) else np.full(self.r, getattr(own, "turn", 0.0))
+        return np.concatenate([np.zeros(self.m), periods])
+
+    @cached_property
+    def phi_map(self) -> PhiMap:
+        """phi and J for solvers of phi(q) = phi."""
+        return PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes, self.turns)
+
+    @cached_property
+    def _inverse(self) -> Inverse:
+        phi_map, domain = self.phi_map, self.problem.domain
+        starts = Starts(phi_map, domain)
+        if isinstance(self.coordinates, InvertibleMap):
+            return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map), starts)
+        boxed = BoxedPhi(self.problem.task, domain, phi_map)
+        local = FewRows(phi_map, self._point_functions, Newton(phi_map))
+        by_ipopt = Nearest(domain, self.m, self.function("phi"), phi_map)
+        in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts, by_ipopt)
+        return Inverse(self.problem, phi_map, local, starts, in_domain, inside)
+
+    @cached_property
+    def _inverse_function(self) -> ca.Function:
+        return inverse_function(self.function("phi"), self.phi_sizes, self.turns)
+
+    @cached_property
+    def _point_functions(self) -> PointFunctions:
+        return PointFunctions.of(self.function("phi"), self.function("jacobian"), self.phi_sizes, self.turns)
+
+    def _outside_error(
+        self, targets: Array, q_start: ArrayLike | None, found: Solutions, beyond: Indices, single: bool
+    ) -> InverseError:
+        """What to raise for solutions (N, n) of which some rows lie outside the domain."""
+        nearest = None
+        if not isinstance(self.coordinates, InvertibleMap):
+            nearest = found.q.copy()
+            starts = None if q_start is None else np.broadcast_to(self._rows("q_start", q_start), targets.shape)[beyond]
+            inside = self.solve(targets[beyond], starts, tolerance=found.tolerance, inside=True)
+            nearest[beyond] = inside.q
+        q, domain = found.q[beyond[0]], self.problem.domain
+        low, high = borders(domain)
+        j = int(np.argmax(np.maximum(low - q, q - high) / domain.half_width))
+        reason = (
+            f"joint '{self.problem.robot.joint_names[j]}' at {q[j]:.4g}, expected within [{low[j]:.4g}, {high[j]:.4g}]"
+        )
+        if isinstance(domain, Conditioned) and low[j] <= q[j] <= high[j]:
+            reason = domain.told(q)
+        return InverseError(
+            f"q with phi(q) = phi lies outside the domain for {found.named(beyond)}: {reason}. "
+            "`error.nearest` has joint positions inside; outside=True accepts those outside",
+            None if nearest is None else nearest[0] if single else nearest,
+        )
+
+    def _jacobian_or_nan(self, points: Array) -> Array:
+        """J at points (N, n), with NaN where the task has no finite Jacobian."""
+        try:
+            return self.jacobian(points)
+        except SingularTaskError:
+            J_x = self.problem.task.batched_jacobian(points)[0].reshape(-1, self.m, self.n)
+            return np.concatenate([J_x, self.coordinates.jacobian(points)], axis=1)
+
+    def _require_expression(self, what: str) -> None:
+        """Raise NoExpressionError if the coordinates are grown."""
+        if isinstance(self.coordinates, InvertibleMap):
+            raise NoExpressionError(f"{what} needs coordinates with a CasADi expression; received grown coordinates")
+
+    def _rows(self, name: str, value: ArrayLike) -> Array:
+        """One point or a set, as `as_point_set` takes them, but finite or not, (N, n)."""
+        array = as_float_array(name, value)
+        as_point_set(name, np.zeros_like(array), self.n)
+        return array.reshape(-1, self.n)

@@ -1,0 +1,218 @@
+"""The map phi(q) = [h(q); xi(q)] as functions, its angles, and the scale of its errors."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar, overload
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocas.charts.coordinates import CoordinateMap, Coordinates
+from orthocas.errors import InvalidValueError
+from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, as_point_set, require_shape
+from orthocas.tools.expressions import fast_form
+
+ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
+_SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
+
+
+def shortest(difference: Any, turns: Array) -> Any:
+    """Differences of phi without whole turns of its periodic components.
+
+    Args:
+        difference: NumPy rows (N, k) or (k,), or a CasADi column (k, 1).
+        turns: periods of the components, (k,); 0 for those that have none.
+    """
+    if not turns.any():
+        return difference
+    periods = np.where(turns > 0, turns, 1.0)
+    if isinstance(difference, ca.SX | ca.MX | ca.DM):
+        whole: Any = ca.floor(difference / ca.DM(periods) + 0.5)
+        return difference - ca.DM(turns) * whole
+    return difference - turns * np.round(difference / periods)
+
+
+def counted_on(rows: Array, turns: Array) -> Array:
+    """Rows (N, k) of values along a curve; periodic ones go on by the shorter way from row to row."""
+    if not turns.any():
+        return rows
+    steps = shortest(np.diff(rows, axis=0), turns)
+    return np.asarray(rows[0] + np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(steps, axis=0)]))
+
+
+def require_no_turns(labels: tuple[str, ...], turns: Array, purpose: str) -> None:
+    """Raise InvalidValueError if a component of phi is periodic, for what cannot deal with that yet."""
+    circles = [label for label, turn in zip(labels, turns, strict=True) if turn > 0]
+    if circles:
+        raise InvalidValueError(
+            "chart", f"one with circle-valued coordinates ({', '.join(circles)})", f"real-valued ones for {purpose}"
+        )
+
+
+@dataclass(frozen=True)
+class PhiMap:
+    """phi at many points. Points are finite, values need not be."""
+
+    phi: Callable[[Array], Array]  #: (N, n) -> (N, n)
+    jacobian: Callable[[Array], Array]  #: (N, n) -> (N, n, n)
+    sizes: Array  #: sizes of the components, (n,)
+    turns: Array  #: periods of the components, (n,); 0 for those that have none
+
+    def scale(self, targets: Array) -> Array:
+        """Scale of errors (N, n): the sizes of the components, and more where rounding of phi exceeds them."""
+        scale: Array = self.sizes + ROUNDING * np.abs(targets)
+        return scale
+
+    def residual(self, targets: Array, q: Array) -> Array:
+        """(phi - phi(q)) / scale, (N, n), by the shorter way around for periodic components."""
+        residual: Array = self.difference(targets, self.phi(q)) / self.scale(targets)
+        return residual
+
+    def difference(self, targets: Array, values: Array) -> Array:
+        """Targets - values, (N, n), without whole turns of periodic components."""
+        difference: Array = shortest(targets - values, self.turns)
+        return difference
+
+    def is_singular(self, q: Array) -> NDArray[np.bool_]:
+        """Whether J is singular or undefined at points (N, n), (N,)."""
+        J = self.jacobian(q) / self.sizes[:, None]
+        known = np.asarray(np.isfinite(J).all(axis=(1, 2)))
+        J[~known] = 0.0
+        values = np.linalg.svd(J, compute_uv=False)
+        return np.asarray(~known | (values[:, -1] <= _SINGULAR * values[:, 0]))
+
+
+def largest(residual: Array) -> Array:
+    """The largest entries of residuals (N, n), (N,): infinite where phi is undefined."""
+    error = np.abs(residual).max(axis=1)
+    return np.where(np.isfinite(error), error, np.inf)
+
+
+Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
+
+
+class PhiFunctions:
+    """The functions of a chart: numbers for joint positions, expressions for CasADi columns."""
+
+    problem: Problem
+    coordinates: CoordinateMap
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.problem.n
+
+    @property
+    def m(self) -> int:
+        """Number of task components."""
+        return self.problem.m
+
+    @property
+    def r(self) -> int:
+        """Number of extra coordinates."""
+        return self.problem.r
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the components of phi: those of the task, then xi1, xi2, ..."""
+        return (*self.problem.task.labels, *(f"xi{k + 1}" for k in range(self.r)))
+
+    def runnable(self, graph: ca.Function) -> ca.Function:
+        """The fast form of a graph of this chart's functions: scalar code, or the graph itself for networks.
+
+        It is also the graph itself for robots with more than 10 joints.
+        """
+        matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.as_matrices
+        return graph if matrices else fast_form(graph, self.n)
+
+    @overload
+    def xi(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def xi(self, q: ArrayLike) -> Array: ...
+    def xi(self, q: Any) -> Any:
+        """Extra coordinates, (r,) or (N, r)."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("xi", q)
+        points, single = as_point_set("q", q, self.n)
+        values = self.coordinates.xi(points)
+        return values[0] if single else values
+
+    @overload
+    def task(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def task(self, q: ArrayLike) -> Array: ...
+    def task(self, q: Any) -> Any:
+        """Task values x = h(q), (m,) or (N, m)."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("task", q)
+        points, single = as_point_set("q", q, self.n)
+        values = self.problem.task.batched(points)[0]
+        return values[0] if single else values
+
+    @overload
+    def phi(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def phi(self, q: ArrayLike) -> Array: ...
+    def phi(self, q: Any) -> Any:
+        """Task values and extra coordinates stacked, (n,) or (N, n)."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("phi", q)
+        points, single = as_point_set("q", q, self.n)
+        phi = np.empty((len(points), self.n))
+        self.problem.task.batched.into(phi[:, : self.m], points)
+        self._coordinates_into("xi", phi[:, self.m :], points)
+        return phi[0] if single else phi
+
+    @overload
+    def jacobian(self, q: Symbolic) -> Symbolic: ...
+    @overload
+    def jacobian(self, q: ArrayLike) -> Array: ...
+    def jacobian(self, q: Any) -> Any:
+        """J = dphi/dq, (n, n) or (N, n, n); task rows first."""
+        if isinstance(q, ca.SX | ca.MX):
+            return self._expression("jacobian", q)
+        points, single = as_point_set("q", q, self.n)
+        J = np.empty((len(points), self.n, self.n))
+        task_jacobians(self.problem, points, J[:, : self.m])
+        self._coordinates_into("jacobian", J[:, self.m :], points)
+        return J[0] if single else J
+
+    def _graph(self, name: str) -> ca.Function:
+        """The CasADi function of that name, but the inverse."""
+        if name == "task":
+            return self.problem.task.function
+        return self.problem.task.jacobian_function if name == "task_jacobian" else self._functions[name]
+
+    def _expression(self, name: str, q: Any) -> Any:
+        """Evaluate a function at a CasADi column (n, 1)."""
+        require_shape("q", q.shape, (self.n, 1))
+        return self._graph(name)(q)
+
+    def _coordinates_into(self, name: str, results: Array, points: Array) -> None:
+        """Write xi or its Jacobian at points (N, n) to part of an array."""
+        if isinstance(self.coordinates, Coordinates):
+            self.coordinates.into(name, results, points)
+        else:
+            results[...] = getattr(self.coordinates, name)(points)
+
+    @cached_property
+    def _functions(self) -> dict[str, ca.Function]:
+        q = ca.MX.sym("q", self.n)
+        task, coordinates = self.problem.task, self.coordinates.functions
+        x, J_x = task.function(q), task.jacobian_function(q)
+        xi, J_xi = coordinates["xi"](q), coordinates["jacobian"](q)
+        outputs = {
+            "xi": xi,
+            "phi": ca.vertcat(x, xi),
+            "jacobian": ca.vertcat(J_x, J_xi),
+        }
+        functions = {name: ca.Function(name, [q], [ca.densify(out)], ["q"], [name]) for name, out in outputs.items()}
+        v, w = ca.MX.sym("v", self.n), ca.MX.sym("w", self.n)
+        second = ca.vertcat(task.second_derivative_function(q, v, w), coordinates["second_derivative"](q, v, w))
+        functions["second_derivative"] = ca.Function(
+            "second_derivative", [q, v, w], [ca.densify(second)], ["q", "v", "w"], ["second_derivative"]
+        )
+        return functions

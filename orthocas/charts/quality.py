@@ -1,0 +1,434 @@
+"""The quality of a chart on its domain: angles and conditioning ([AS2023] Figs. 20 and 27), leaks and folds (ours)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocas.charts.angles import pairs
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.point_quality import Judged
+from orthocas.charts.worst_points import WorstPoints, worst_points
+from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.tasks.domains import Torus, sample_uniform
+from orthocas.tasks.samples import idle_joints, samples_at
+from orthocas.tools.batch import in_threads
+from orthocas.tools.checks import Array, Indices, as_point_set, require_count, require_kind, require_memory
+from orthocas.tools.display import Shown, listed
+from orthocas.tools.json import plain
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_BIN = 0.1  # [deg]; the middle angle lies in the middle of its bin
+_PIECE = 2**13  # samples that a thread takes at once
+DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
+SAMPLES, SEED = 100_000, 1  #: of an evaluation by default
+_TELLING = 200  # samples that tell idle joints from others
+_ALONE = 1e-10  # share of a gradient that counts as zero
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """Sums over the samples of some angles in degrees, each angle a column."""
+
+    count: int  #: of samples
+    middle: float  #: 90 or 0
+    first: Array  #: sum of deviations from the middle, (k,)
+    second: Array  #: sum of their squares, (k,)
+    largest: Array  #: largest absolute deviation, (k,)
+    counts: Array  #: in bins around 0.0, 0.1, ... degrees, (k, bins)
+
+    @classmethod
+    def of(cls, inverse: Callable[[Array], Array], values: Array, middle: float, most: int) -> Self:
+        """Of inverse(values), for values (N, k); angles are at most `most` degrees."""
+        N, k = values.shape
+        bins = round(most / _BIN) + 1
+        first_bins = bins * np.arange(k)[:, None]
+
+        def one_piece(start: int) -> tuple[Array, Array, Array, Indices]:
+            angles = np.degrees(inverse(np.ascontiguousarray(values[start : start + _PIECE].T)))
+            places = (angles / _BIN + 0.5).astype(np.intp) + first_bins
+            counts = np.bincount(places.ravel(), minlength=k * bins).reshape(k, bins)
+            angles -= middle
+            return angles.sum(axis=1), (angles * angles).sum(axis=1), np.abs(angles).max(axis=1), counts
+
+        first, second, largest, counts = np.zeros(k), np.zeros(k), np.zeros(k), np.zeros((k, bins))
+        for part in in_threads(one_piece, range(0, N, _PIECE) if k else ()):
+            first, second, counts = first + part[0], second + part[1], counts + part[3]
+            largest = np.maximum(largest, part[2])
+        return cls(N, middle, first, second, largest, counts)
+
+    def __getitem__(self, columns: Sequence[int]) -> "_Sums":
+        """Those of some of the angles."""
+        chosen = list(columns)
+        parts = (self.first[chosen], self.second[chosen], self.largest[chosen], self.counts[chosen])
+        return _Sums(self.count, self.middle, *parts)
+
+    @property
+    def empty(self) -> bool:
+        """Whether there are no angles."""
+        return self.count * len(self.first) == 0
+
+    @property
+    def mean(self) -> float:
+        """Mean deviation."""
+        return float(self.first.sum() / (self.count * len(self.first)))
+
+    @property
+    def mean_square(self) -> float:
+        """Mean squared deviation."""
+        return float(self.second.sum() / (self.count * len(self.first)))
+
+
+def _sums_of_cosines(cosines: Array) -> _Sums:
+    """Of arccos(cosines), for cosines (N, k)."""
+    return _Sums.of(np.arccos, np.clip(cosines, -1.0, 1.0), 90.0, 180)
+
+
+@dataclass(frozen=True, eq=False)
+class AngleStatistics:
+    """Angles between gradients over all samples and pairs, in degrees. 90 is perfect; NaN if there are no pairs."""
+
+    mean: float
+    std: float
+    max: float  #: largest deviation from 90 degrees
+    histogram: Array = field(repr=False)  #: counts in bins of 0.1 degree, centred at 0.0, 0.1, ..., 180.0
+
+    @classmethod
+    def of_cosines(cls, cosines: Array) -> Self:
+        """Statistics of the angles arccos(cosines), in degrees."""
+        return cls.of_sums(_sums_of_cosines(cosines.reshape(-1, 1)))
+
+    @classmethod
+    def of_sums(cls, sums: _Sums) -> Self:
+        """Statistics of all angles of some sums."""
+        counts = sums.counts.sum(axis=0)
+        if sums.empty:
+            return cls(np.nan, np.nan, np.nan, counts)
+        spread = np.sqrt(max(sums.mean_square - sums.mean**2, 0.0))
+        return cls(sums.middle + sums.mean, float(spread), float(sums.largest.max()), counts)
+
+    def as_dict(self) -> dict[str, float]:
+        """Mean, standard deviation and largest deviation [deg]."""
+        return {"mean": self.mean, "std": self.std, "max": self.max}
+
+
+@dataclass(frozen=True, eq=False)
+class LeakStatistics:
+    """Leaks of coordinates over all samples, in degrees. 0 is perfect; NaN if there are no coordinates.
+
+    The leak of a coordinate is the angle in the metric between its gradient and the space orthogonal to the task:
+    sin(leak_j) = |Pi_x grad_A xi_j|_A / |grad_A xi_j|_A with the A-orthogonal projector Pi_x on the task gradients. It
+    does not depend on the choice of task coordinates.
+
+    Source:
+        ours, docs/angles.md.
+    """
+
+    mean: float
+    rms: float
+    max: float
+    rms_of_each: tuple[float, ...]  #: root mean square of each coordinate
+    histogram: Array = field(repr=False)  #: counts in bins of 0.1 degree, centred at 0.0, 0.1, ..., 90.0
+
+    @classmethod
+    def of_sums(cls, sums: _Sums) -> Self:
+        """Statistics of the leaks of some coordinates, each a column of the sums."""
+        counts = sums.counts.sum(axis=0)
+        if sums.empty:
+            return cls(np.nan, np.nan, np.nan, (), counts)
+        each = tuple(np.sqrt(sums.second / sums.count).tolist())
+        return cls(sums.mean, float(np.sqrt(sums.mean_square)), float(sums.largest.max()), each, counts)
+
+    def as_dict(self) -> dict[str, object]:
+        """Mean, root mean square and largest leak, and the root mean square of each coordinate [deg]."""
+        return {"mean": self.mean, "rms": self.rms, "max": self.max, "rms_of_each": list(self.rms_of_each)}
+
+
+@dataclass(frozen=True, eq=False)
+class Angles:
+    """Angles of some coordinates: those of [AS2023] eq. (24), with Euclidean norms, and ours, in the metric."""
+
+    task_angle: AngleStatistics  #: between each dxi_j and grad_A h_i, in the paper's cosines
+    mutual_angle: AngleStatistics  #: between two coordinates, in the paper's cosines
+    leak: LeakStatistics  #: in the metric
+    metric_mutual_angle: AngleStatistics  #: between two coordinates, in the metric
+
+    @classmethod
+    def of(cls, judged: Judged, chosen: Sequence[Sequence[int]]) -> "list[Angles]":
+        """The angles of each of some sets of coordinates of `judged`."""
+        N, m, r = judged.task_cosines.shape
+        task = _sums_of_cosines(judged.task_cosines.reshape(N, m * r))
+        mutual = _sums_of_cosines(judged.mutual_cosines)
+        same = judged.metric_mutual_cosines is judged.mutual_cosines
+        in_metric = mutual if same else _sums_of_cosines(judged.metric_mutual_cosines)
+        leak = _Sums.of(np.arcsin, np.clip(judged.leak_sines, 0.0, 1.0), 0.0, 90)
+        found = []
+        for some in chosen:
+            together = [k for k, pair in enumerate(pairs(r)) if set(pair) <= set(some)]
+            found.append(
+                cls(
+                    AngleStatistics.of_sums(task[[i * r + j for i in range(m) for j in some]]),
+                    AngleStatistics.of_sums(mutual[together]),
+                    LeakStatistics.of_sums(leak[some]),
+                    AngleStatistics.of_sums(in_metric[together]),
+                )
+            )
+        return found
+
+    def as_dict(self) -> dict[str, dict[str, object]]:
+        """Plain data: the four angles in degrees."""
+        return {
+            "task_angle_deg": dict(self.task_angle.as_dict()),
+            "mutual_angle_deg": dict(self.mutual_angle.as_dict()),
+            "leak_deg": self.leak.as_dict(),
+            "metric_mutual_angle_deg": dict(self.metric_mutual_angle.as_dict()),
+        }
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """Smallest singular value of [A-orthonormal task basis; unit coordinate gradients]: 1 is perfect, 0 degenerate."""
+
+    min: float  #: of samples and of the search for the worst points; 0 if the search finds folds
+    p01: float  #: 1 % quantile
+    mean: float
+
+    @classmethod
+    def of(cls, values: Array, worst: WorstPoints | None) -> "Conditioning":
+        """Statistics of the values at all samples, (N,), and of the worst points of a search."""
+        least = values.min() if worst is None else max(0.0, min(values.min(), worst.least))
+        return cls(float(least), float(np.quantile(values, 0.01)), float(values.mean()))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Report(Shown):
+    """Quality of a chart on uniform samples of its domain, or at given joint positions."""
+
+    n: int
+    m: int
+    r: int
+    samples: int
+    seed: int | None  #: None for given joint positions
+    metric: str
+    task_angle: AngleStatistics  #: the paper's, with Euclidean norms
+    mutual_angle: AngleStatistics  #: the paper's, with Euclidean norms
+    leak: LeakStatistics  #: in the metric: what couples the inertias of task and coordinates
+    metric_mutual_angle: AngleStatistics  #: between two coordinates, in the metric
+    conditioning: Conditioning
+    worst_point: tuple[float, ...]  #: the joint position with the smallest conditioning, of samples and search
+    worst: WorstPoints | None  #: found by a search; None on a torus, at given joint positions, and for grown charts
+    singular_samples: int  #: samples left out: a gradient vanishes, or a grown coordinate has no value
+    length_ratio: float  #: 99 % over 1 % quantile of the gradient length, for the worst coordinate
+    folded_samples: int  #: samples where det J has the opposite sign of most samples: the chart folds over
+    idle_joints: tuple[str, ...]  #: names of joints that are exact coordinates themselves
+    without_idle: Angles | None  #: angles of the other coordinates; None if no joint, or every coordinate, is idle
+
+    @property
+    def degenerate(self) -> bool:
+        """Whether coordinates are nearly parallel to each other or to the task gradients on over 1 % of the domain."""
+        return self.conditioning.p01 < DEGENERATE
+
+    def plot(self) -> "Figure":
+        """Histograms of angles and leaks, as a matplotlib figure; see `orthocas.plotting.quality_figure`."""
+        from orthocas.charts.figures import quality_figure  # with matplotlib, which takes long to import
+
+        return quality_figure(self)
+
+    def facts(self) -> dict[str, str]:
+        """Angles, conditioning, lengths, and the faults of the chart if there are any."""
+        values = self.conditioning
+        return {
+            "problem": f"n = {self.n} joints, m = {self.m} task, r = {self.r} extra, metric {self.metric}",
+            **self._angles(),
+            "conditioning": f"mean {values.mean:.3f}, 1 % quantile {values.p01:.3f}, min {values.min:.3g}",
+            **({} if self.worst is None else {"searched": f"least conditioning {self.worst.told}"}),
+            **self._faults(),
+            "lengths": f"of gradients differ by a factor of {self.length_ratio:.3g} (99 % to 1 % quantile)",
+            "samples": f"{self.samples} given" if self.seed is None else f"{self.samples} held out, seed {self.seed}",
+        }
+
+    def _angles(self) -> dict[str, str]:
+        """The paper's angles and ours, by name."""
+        leak, others = self.leak, self.without_idle
+
+        def paper(angles: AngleStatistics) -> str:
+            spread = f"mean {angles.mean:.2f}, std {angles.std:.2f}, largest sampled deviation {angles.max:.1f} deg"
+            return f"{spread} (the paper's cosines)"
+
+        found = {
+            "task angle": paper(self.task_angle),
+            "mutual angle": paper(self.mutual_angle),
+            "leak": f"rms {leak.rms:.2f}, mean {leak.mean:.2f}, largest sampled {leak.max:.1f} deg (in the metric)",
+        }
+        if self.r == 1:
+            found["mutual angle"] = "none, r = 1"
+        if others is not None:
+            several = f", mutual std {others.mutual_angle.std:.2f}" if len(others.leak.rms_of_each) > 1 else ""
+            found["without idle"] = (
+                f"task std {others.task_angle.std:.2f}{several}, leak rms {others.leak.rms:.2f} deg: "
+                f"{listed(self.idle_joints)} is exact and flatters the mean"
+            )
+        return found
+
+    def _faults(self) -> dict[str, str]:
+        faults = {}
+        if self.folded_samples:
+            at = ", ".join(f"{value:.2f}" for value in self.worst_point)
+            share = self.folded_samples / self.samples
+            faults["folded"] = (
+                f"{share:.3%} of the {self._where}, where det J changes sign; conditioning worst at q = ({at})"
+            )
+        if self.singular_samples:
+            share = self.singular_samples / self.samples
+            faults["left out"] = f"{share:.3%} of the {self._where}: singular, or without a value"
+        if self.degenerate:
+            advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
+            faults["DEGENERATE"] = f"coordinates are nearly parallel to each other or to the task: {advice}"
+        return faults
+
+    @property
+    def _where(self) -> str:
+        return "given points" if self.seed is None else "domain"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON. NaN becomes None."""
+        angles = Angles(self.task_angle, self.mutual_angle, self.leak, self.metric_mutual_angle)
+        data = {
+            "n": self.n,
+            "m": self.m,
+            "r": self.r,
+            "samples": self.samples,
+            "seed": self.seed,
+            "metric": self.metric,
+            **angles.as_dict(),
+            "idle_joints": list(self.idle_joints),
+            "without_idle": None if self.without_idle is None else self.without_idle.as_dict(),
+            "conditioning": asdict(self.conditioning),
+            "worst_point": list(self.worst_point),
+            "least_conditioning_searched": None if self.worst is None else self.worst.least,
+            "singular_samples": self.singular_samples,
+            "folded_samples": self.folded_samples,
+            "length_ratio": self.length_ratio,
+            "degenerate": self.degenerate,
+        }
+        return dict(plain(data))
+
+
+def evaluate(
+    chart: Chart, samples: int | None = None, seed: int | None = None, *, points: ArrayLike | None = None
+) -> Report:
+    """Measure the quality of a chart on uniform samples of its domain. Use another seed than that of the fit.
+
+    Uniform samples miss folds, so the least conditioning is searched near faces and corners too, and by descent.
+
+    The task and mutual angles are those of [AS2023] eq. (24): between each dxi_j and grad_A h_i, over all m r pairs,
+    and between the coordinates, over all r (r - 1) / 2 pairs. Their norms are Euclidean, so for A = M they hide how far
+    a coordinate leans into the task. The leak, the angle in the metric, shows it; see `LeakStatistics`. The
+    conditioning is computed in coordinates where A is the identity, so it does not depend on the task's own
+    conditioning or units.
+
+    Args:
+        chart: the chart.
+        samples: number of samples N. Default: 100,000.
+        seed: seed of the samples. Default: 1.
+        points: joint positions (N, n) or (n,) [rad] or [m] in place of samples, for example those of a path.
+
+    Raises:
+        SingularTaskError: if a gradient vanishes, or a coordinate has no value, everywhere.
+        InvalidValueError, ShapeError: if an argument is invalid, or both points and samples or a seed are given.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> report = oc.evaluate(chart, samples=2000)
+        >>> 85 < report.task_angle.mean < 95, report.folded_samples
+        (True, 0)
+        >>> oc.evaluate(chart, points=[[0.6, 0.8, 0.8], [0.7, 0.8, 0.8]]).samples
+        2
+    """
+    require_kind("chart", chart, Chart)
+    if points is None:
+        count, drawn = _count(chart, SAMPLES if samples is None else samples), SEED if seed is None else seed
+        drawn = require_count("seed", drawn, least=0)
+        searched = isinstance(chart.coordinates, Coordinates) and not isinstance(chart.problem.domain, Torus)
+        problem, found = chart.problem, chart.coordinates
+        worst = worst_points(problem, found, drawn, thorough=True) if searched else None
+        return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst)
+    if samples is not None or seed is not None:
+        raise InvalidValueError("points", "given with samples or a seed", "points alone")
+    given = as_point_set("points", points, chart.n)[0]
+    _count(chart, len(given))
+    return _report(chart, given, None, None)
+
+
+def _count(chart: Chart, samples: int) -> int:
+    """The number of samples, if there is memory for them."""
+    count = require_count("samples", samples)
+    require_memory(f"evaluating {count} samples", 8.0 * count * chart.n * (2 * chart.n + 4))
+    return count
+
+
+def _report(chart: Chart, points: Array, seed: int | None, worst: WorstPoints | None) -> Report:
+    judged = Judged.at(chart.problem, chart.coordinates, points)
+    if len(judged.points) == 0:
+        where = "given points" if seed is None else "samples of the domain"
+        raise SingularTaskError(f"a gradient vanishes, or a coordinate has no value, at all {len(points)} {where}")
+    idle = _idle_coordinates(chart, judged)
+    others = [j for j in range(chart.r) if j not in idle]
+    angles, without_idle = Angles.of(judged, [range(chart.r), others])
+    short, long = np.quantile(_lengths(judged.jacobian), [0.01, 0.99], axis=0)
+    return Report(
+        n=chart.n,
+        m=chart.m,
+        r=chart.r,
+        samples=len(points),
+        seed=seed,
+        metric=chart.problem.metric.name,
+        task_angle=angles.task_angle,
+        mutual_angle=angles.mutual_angle,
+        leak=angles.leak,
+        metric_mutual_angle=angles.metric_mutual_angle,
+        conditioning=Conditioning.of(judged.conditioning, worst),
+        worst_point=tuple(_worst_point(judged, worst).tolist()),
+        worst=worst,
+        singular_samples=len(points) - len(judged.points),
+        length_ratio=float((long / short).max()),
+        folded_samples=int(min((judged.signs > 0).sum(), (judged.signs <= 0).sum())),
+        idle_joints=tuple(idle.values()),
+        without_idle=without_idle if idle and others else None,
+    )
+
+
+def _worst_point(judged: Judged, worst: WorstPoints | None) -> Array:
+    """The point of least conditioning, (n,)."""
+    k = int(np.argmin(judged.conditioning))
+    point: Array = judged.points[k]
+    return point if worst is None or worst.least > judged.conditioning[k] else worst.points[0]
+
+
+def _idle_coordinates(chart: Chart, judged: Judged) -> dict[int, str]:
+    """Coordinates that are functions of one idle joint alone, with the names of these joints."""
+    first = samples_at(chart.problem, sample_uniform(chart.problem.domain, _TELLING, 0))
+    found: dict[int, str] = {}
+    for joint in idle_joints(chart.problem, first):
+        likely = _functions_of(joint, judged.jacobian[:_TELLING])
+        sure = likely[_functions_of(joint, judged.jacobian[:, likely])]
+        found |= {int(j): chart.problem.robot.joint_names[joint] for j in sure}
+    return found
+
+
+def _functions_of(joint: int, J: Array) -> NDArray[np.int_]:
+    """Coordinates whose gradients, rows of J (N, r, n), have entries for one joint only."""
+    others = np.abs(np.delete(J, joint, axis=2)).max(axis=2, initial=0.0) <= _ALONE * _lengths(J)
+    return np.flatnonzero(others.all(axis=0))
+
+
+def _lengths(J: Array) -> Array:
+    """Norms of the rows of J (N, r, n), (N, r)."""
+    return np.asarray(np.sqrt(np.einsum("sij,sij->si", J, J)))

@@ -1,0 +1,127 @@
+"""Ready charts of known arms: the catalogue, and a card for each."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib.resources import as_file, files
+from typing import Any, Self
+
+from orthocas.charts.chart import Chart
+from orthocas.tools.checks import require_known
+from orthocas.tools.display import Shown, listed, number_list
+
+_DATA = files(__package__) / "data"
+_CARD = ".json"
+
+
+@dataclass(frozen=True)
+class Model:
+    """Where the numbers of a robot come from. A chart file includes them, so their licence travels with it."""
+
+    robot: str  #: maker and type
+    file: str  #: the robot file
+    package: str  #: what the file was taken from, with its version
+    upstream: str  #: where that has it from
+    licence: str  #: its SPDX identifier; the text is in orthocas/charts/licences
+    holder: str  #: who holds the copyright
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Card(Shown):
+    """What is known of a ready chart. Angles are in degrees, joint positions in rad or m."""
+
+    name: str
+    model: Model
+    task: str
+    coordinates: str  #: the parametrisation
+    joints: tuple[str, ...]
+    cyclic_joints: tuple[str, ...]  #: joints whose positions all belong to the domain
+    centre: tuple[float, ...]
+    half_width: tuple[float, ...]
+    quality: Mapping[str, Any]  #: as printed by `orthocas evaluate --json`
+    proved_parts: int  #: parts of the domain in the proof that the chart does not fold
+    fingerprint: str  #: of the chart
+    commands: tuple[str, ...]  #: that made the chart
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Read what `to_json` wrote."""
+        data = json.loads(text)
+        lists = {name: tuple(value) for name, value in data.items() if isinstance(value, list)}
+        return cls(**data | lists | {"model": Model(**data["model"])})
+
+    def to_json(self) -> str:
+        """The card as text."""
+        return json.dumps(asdict(self), indent=1, ensure_ascii=False) + "\n"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return asdict(self)
+
+    @property
+    def licence_text(self) -> str:
+        """The licence of the robot's model."""
+        return (files(__package__) / "licences" / f"{self.model.licence}.txt").read_text(encoding="utf-8")
+
+    def facts(self) -> dict[str, str]:
+        """Quality, domain, proof, and where the chart comes from."""
+        quality, model = self.quality, self.model
+        extra = "1 extra coordinate" if quality["r"] == 1 else f"{quality['r']} extra coordinates"
+        cyclic = {"cyclic": f"holds at all positions of {listed(self.cyclic_joints)}"} if self.cyclic_joints else {}
+        angles, leak, conditioning = quality["task_angle_deg"], quality["leak_deg"], quality["conditioning"]
+        return {
+            "card": f"{self.name}, {model.robot}, {quality['n']} joints, {extra}",
+            "leak": f"rms {leak['rms']:.2f}, largest sampled {leak['max']:.1f} deg (angle in the metric)",
+            "task angle": f"{_spread(angles)} (the paper's cosines)",
+            "mutual angle": "none, r = 1" if quality["r"] == 1 else _spread(quality["mutual_angle_deg"]),
+            "conditioning": f"mean {conditioning['mean']:.3f}, least {conditioning['min']:.3f}",
+            "domain": f"half-width {number_list(self.half_width)} around {number_list(self.centre)}",
+            **cyclic,
+            "proof": f"no fold anywhere on the domain, {self.proved_parts} parts",
+            "model": f"{model.file} of {model.package}; {model.licence}, {model.holder}",
+            "samples": f"{quality['samples']} held out, seed {quality['seed']}",
+            "coordinates": self.coordinates,
+        }
+
+
+def _spread(angles: Mapping[str, float]) -> str:
+    return f"mean {angles['mean']:.2f}, std {angles['std']:.2f} deg"
+
+
+def names() -> tuple[str, ...]:
+    """Names of all ready charts, such as 'panda-position'."""
+    return tuple(sorted(entry.name.removesuffix(_CARD) for entry in _DATA.iterdir() if entry.name.endswith(_CARD)))
+
+
+def load(name: str) -> Chart:
+    """A ready chart. It includes the robot's model, and a proof that the chart does not fold.
+
+    Raises:
+        UnknownNameError: if there is no chart of that name.
+
+    Example:
+        >>> import orthocas as oc
+        >>> chart = oc.charts.load("panda-position")
+        >>> chart.labels
+        ('x', 'y', 'z', 'xi1', 'xi2', 'xi3', 'xi4')
+        >>> chart.certificate.proved
+        True
+    """
+    require_known("ready chart", name, names())
+    with as_file(_DATA / f"{name}.orthocas") as path:
+        return Chart.load(path)
+
+
+def card(name: str) -> Card:
+    """The card of a ready chart: quality, domain, model with its licence, and the commands that made it.
+
+    Raises:
+        UnknownNameError: if there is no chart of that name.
+
+    Example:
+        >>> import orthocas as oc
+        >>> oc.charts.card("panda-position").model.licence
+        'Apache-2.0'
+    """
+    require_known("ready chart", name, names())
+    return Card.from_json((_DATA / f"{name}{_CARD}").read_text(encoding="utf-8"))

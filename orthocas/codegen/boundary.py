@@ -1,0 +1,140 @@
+"""What C is written from, and the condition of the domain's boundary in C."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+
+from orthocas.charts.chart import Chart
+from orthocas.codegen.description import numbers
+from orthocas.codegen.precision import Precision
+from orthocas.control.controller import Controller
+from orthocas.control.safety import Safety
+from orthocas.tasks.clear_box import ClearBox
+from orthocas.tasks.corridor import Corridor
+from orthocas.tasks.domains import Conditioned, Domain
+from orthocas.tools.checks import Array
+from orthocas.tools.expressions import scalar_code
+
+
+class Source(Protocol):
+    """A chart or several ones, as templates see them."""
+
+    @property
+    def chart(self) -> Chart:
+        """The chart that kernels and sizes are taken from."""
+        ...
+
+    @property
+    def own_code(self) -> Mapping[str, str]:
+        """C bodies by name of the functions that are written by hand; the number of the chart is `mem`."""
+        ...
+
+    @property
+    def condition(self) -> Conditioned | None:
+        """The condition of the domain beside its box, if there is one."""
+        ...
+
+    @property
+    def somewhere(self) -> Array:
+        """A position of the domain at which the library checks itself, (n,)."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """What kind of coordinates."""
+        ...
+
+    def law(self, controller: Controller) -> Controller:
+        """The law on `chart`, for one of the charts; raises InvalidValueError for a law of another chart."""
+        ...
+
+    def safety(self, controller: Controller) -> Safety:
+        """The default settings of the supervised law."""
+        ...
+
+    def law_values(self, controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
+        """Values of the placeholders in the templates of laws that depend on the border or on the chart."""
+        ...
+
+    def graph(self, graph: ca.Function) -> ca.Function:
+        """The graph of a law, less the border of a domain that C code looks after."""
+        ...
+
+    def stack_bytes(self, size: int) -> int:
+        """Additional use of the stack by functions of the domain and the charts, with numbers of a size [bytes]."""
+        ...
+
+    def values(self, known: Mapping[str, str], precision: Precision) -> dict[str, str]:
+        """Values of the placeholders that describe domain and charts, and of the code that belongs to them.
+
+        Args:
+            known: values of the other placeholders.
+            precision: the number type.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class BorderCondition:
+    """What the supervised law has to know of a condition."""
+
+    template: str  #: code with `clearance(q)`: 0 at the border, 1 as far inside as the middle
+    meaning: str  #: of that number, for the header
+    values: dict[str, str]  #: of the placeholders in the template
+    kernels: tuple[ca.Function, ...] = ()
+    inwards: str = ""  #: code that brings `inner` inside, before the borders of the box do
+
+
+def border_condition(source: Source, controller: Controller) -> BorderCondition | None:
+    """The condition of the law's domain as a part of its border, if it has one."""
+    condition: Any = source.condition
+    make = _MADE.get(type(condition))
+    return None if controller.chart is None or make is None else make(condition)
+
+
+def border_units(domain: Domain) -> Any:
+    """What distances to the borders of the box count in, (n,): half-widths, or the radius of a corridor if smaller.
+
+    A path of a corridor ends one radius before the border of its box, which may be many radii wide.
+    """
+    return np.minimum(domain.half_width, domain.radius) if isinstance(domain, Corridor) else domain.half_width
+
+
+def _clear(clear: ClearBox) -> BorderCondition:
+    span = float(clear.singular_values(clear.centre)) - clear.least_singular_value
+    return BorderCondition(
+        "clear_border.c",
+        "The bound on the relative singular value of the task is a part of the border; its\n"
+        " * distance counts in shares of that from the centre.",
+        {"clear_bound": repr(clear.least_singular_value), "clear_span": repr(span)},
+        (scalar_code(ca.Function("gram", [q := ca.MX.sym("q", len(clear.centre))], [clear.gram(q)])),),
+    )
+
+
+def _near_path(corridor: Corridor) -> BorderCondition:
+    starts, axes, squares = corridor.lines
+    values = {
+        "lines": str(len(squares)),
+        "counted": str(len(corridor.counted)),
+        "counted_joints": ", ".join(map(str, corridor.counted)),
+        "path_radii": numbers(corridor.radius[corridor.counted]),
+        "path_starts": _rows(starts),
+        "path_axes": _rows(axes),
+        "path_lengths": numbers(np.sqrt(squares)),
+    }
+    return BorderCondition(
+        "corridor_border.c",
+        "The distance to the path of postures is a part of the border; it counts in radii.",
+        values,
+        inwards="  towards_path(fmax(share, DEEP), inner);\n",
+    )
+
+
+def _rows(values: Any) -> str:
+    return ",\n  ".join(f"{{{numbers(row)}}}" for row in values)
+
+
+_MADE: dict[type, Callable[[Any], BorderCondition]] = {ClearBox: _clear, Corridor: _near_path}

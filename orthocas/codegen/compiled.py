@@ -1,0 +1,254 @@
+"""CasADi functions and integrators compiled for this process; libraries are kept for equal code."""
+
+import ctypes
+import hashlib
+import os
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import scipy
+
+from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.library import compilers
+from orthocas.errors import CompileError, SimulationError
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, as_path
+from orthocas.tools.files import draft_folder, made_folder, published
+from orthocas.tools.interrupts import deferred
+
+_FLAGS = ("-O2",)  # -O3 takes twice as long, and gains little
+_PREFIX = "kernel"
+_ENTRY = """int {name}(const double **arg, double **res, int *iw, double *w) {{
+  return {prefix}_{name}(arg, res, iw, w, 0);
+}}"""
+_STAGES = 12  # as in templates/runner.c.in
+
+
+def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], folder: str | Path | None = None) -> Path:
+    """The shared library of C sources, compiled now or earlier: its name is a digest of sources, compiler and flags.
+
+    Args:
+        kind: begins the name of the library.
+        sources: contents of the files by name.
+        flags: of the compiler.
+        folder: where libraries are kept; default `orthocas` in $XDG_CACHE_HOME or ~/.cache.
+
+    Raises:
+        CompileError: if there is no C compiler, or it fails.
+        InvalidValueError: if the folder cannot be written.
+    """
+    compiler, options = compilers()[0], ("-std=c99", "-fPIC", "-shared", *flags)
+    content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
+    name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
+    library = made_folder("folder", _cache() if folder is None else as_path("folder", folder)).resolve() / name
+    if not library.exists():
+        with draft_folder() as place, published(library.parent) as drafts:
+            for file, text in sources.items():
+                (place / file).write_text(text, encoding="utf-8")
+            code = [str(place / file) for file in sources if file.endswith(".c")]
+            _compile([compiler, *options, "-o", str(drafts / name), *code, "-lm"])
+    return library
+
+
+def loaded(library: Path) -> ctypes.CDLL:
+    """Load a library that was kept.
+
+    Raises:
+        CompileError: if it is damaged.
+    """
+    try:
+        return ctypes.CDLL(str(library))
+    except OSError as error:
+        raise CompileError(f"cannot load {library}: {error}; delete it and compile again") from None
+
+
+def template(name: str) -> str:
+    """A file of `templates/`."""
+    return (files(__package__) / "templates" / name).read_text()
+
+
+def _compile(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise CompileError(f"{' '.join(command)} failed: {done.stderr[:500]}")
+
+
+def _cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "orthocas"
+
+
+class Kernel(ctypes.Structure):
+    """`kernel` of templates/runner.c.in: a function with its own work arrays, for one thread."""
+
+    _fields_ = (
+        ("run", ctypes.c_void_p),
+        ("arg", ctypes.c_void_p),
+        ("res", ctypes.c_void_p),
+        ("iw", ctypes.c_void_p),
+        ("w", ctypes.c_void_p),
+    )
+    _alive: tuple[Any, ...]  # what the pointers point to
+
+
+@dataclass(frozen=True, eq=False)
+class _Function:
+    """Sizes of a compiled function."""
+
+    work: tuple[int, int, int, int]  #: lengths of arg, res, iw and w
+    outputs: tuple[int, ...]
+
+
+class CompiledFunctions:
+    """Dense functions of columns in one shared library. Threads may share it.
+
+    Args:
+        functions: functions with different names. Inputs and outputs are columns.
+        folder: where compiled libraries are kept; default as in `orthocas.compile_inverse`.
+
+    Raises:
+        CompileError: if there is no C compiler.
+    """
+
+    def __init__(self, functions: Sequence[ca.Function], folder: Path | None = None) -> None:
+        kernels = generate_kernels(list(functions), _PREFIX)
+        sizes = {f.name(): tuple(f.nnz_out(i) for i in range(f.n_out())) for f in functions}
+        self._functions = {name: _Function(kernels.work[name], outputs) for name, outputs in sizes.items()}
+        entries = [_ENTRY.format(name=name, prefix=_PREFIX) for name in sizes]
+        code = "\n\n".join(["#include <math.h>\n#include <string.h>", kernels.code, *entries, ""])
+        self.library = kept_library("functions", {"functions.c": code}, _FLAGS, folder)
+
+    def kernel(self, name: str, constants: Sequence[Array | None] = ()) -> Kernel:
+        """A function for compiled code.
+
+        Args:
+            name: of the function.
+            constants: inputs that stay; None for those that the caller sets.
+        """
+        arg, res, iw, w = (max(1, size) for size in self._functions[name].work)
+        arguments, results = (ctypes.c_void_p * arg)(), (ctypes.c_void_p * res)()
+        integers, doubles = np.zeros(iw, dtype=np.intc), np.zeros(w)
+        kept = [None if value is None else np.ascontiguousarray(value, dtype=float) for value in constants]
+        for i, value in enumerate(kept):
+            arguments[i] = None if value is None else value.ctypes.data
+        run = ctypes.cast(getattr(self._c, name), ctypes.c_void_p)
+        found = Kernel(
+            run, ctypes.addressof(arguments), ctypes.addressof(results), integers.ctypes.data, doubles.ctypes.data
+        )
+        found._alive = (arguments, results, integers, doubles, kept)
+        return found
+
+    def rows(self, name: str, *arguments: Array) -> list[Array]:
+        """Evaluate a function for N rows of each argument, (N, size) or, where all rows are equal, (size,)."""
+        N = max(len(argument) for argument in arguments if argument.ndim == 2)
+        kernel = self.kernel(name, [None] * len(arguments))
+        inputs = [np.ascontiguousarray(argument, dtype=float) for argument in arguments]
+        outputs = [np.empty((N, size)) for size in self._functions[name].outputs]
+        places = [_pointers(arrays) for arrays in (inputs, outputs)]
+        strides = [
+            (ctypes.c_long * len(arrays))(*(array.shape[1] if array.ndim == 2 else 0 for array in arrays))
+            for arrays in (inputs, outputs)
+        ]
+        counts = [ctypes.c_int(len(arrays)) for arrays in (inputs, outputs)]
+        rows = runner("rows")
+        rows(ctypes.byref(kernel), ctypes.c_long(N), counts[0], places[0], strides[0], counts[1], places[1], strides[1])
+        return outputs
+
+    @cached_property
+    def _c(self) -> ctypes.CDLL:
+        return loaded(self.library)
+
+
+@cache
+def runner(name: str) -> Any:
+    """A function of templates/runner.c.in, which calls kernels."""
+    method = scipy.integrate.DOP853
+    tables = {"a": method.A, "b": method.B, "c": method.C, "e3": method.E3[:-1], "e5": method.E5[:-1]}
+    values = {key: ", ".join(repr(float(x)) for x in table.ravel()) for key, table in tables.items()}
+    source = Template(template("runner.c.in")).substitute(values)
+    return getattr(loaded(kept_library("runner", {"runner.c": source}, ("-O3",))), f"orthocas_{name}")
+
+
+def _pointers(arrays: Sequence[Array]) -> Any:
+    return (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays))
+
+
+class _State(ctypes.Structure):
+    """`loop` of templates/runner.c.in."""
+
+    _fields_ = (
+        *((name, Kernel) for name in ("law", "plant", "profile")),
+        *((name, ctypes.c_int) for name in ("n", "k", "size", "load_size")),
+        *((name, ctypes.c_double) for name in ("tolerance", "step")),
+        ("work", ctypes.c_void_p),
+    )
+
+
+class Integrator:
+    """Dormand and Prince's method of order 8 for a closed loop, for one thread. It remembers the length of its steps.
+
+    Args:
+        kernels: law, plant and profile of the reference.
+        sizes: numbers of joints, quantities, of a state, and of a load.
+        tolerance: of a step, relative and absolute.
+        step: to try first [s].
+    """
+
+    def __init__(
+        self, kernels: tuple[Kernel, Kernel, Kernel], sizes: tuple[int, int, int, int], tolerance: float, step: float
+    ) -> None:
+        n, k, size, _ = sizes
+        self._alive = kernels, np.zeros((_STAGES + 2) * size + 2 * n + 3 * k + 1)
+        self._state = _State(*kernels, *sizes, tolerance, step, self._alive[1].ctypes.data)
+
+    def continuous(
+        self, parts: int, span: tuple[float, float], since: float, parameters: Array, load: Array, start: Array
+    ) -> Array:
+        """States at the ends of equal parts of a time span, (parts, s).
+
+        Args:
+            parts: number of parts.
+            span: begin and end [s].
+            since: when the segment of the reference began [s].
+            parameters: of the segment.
+            load: a row of the loads.
+            start: state at the begin, (s,).
+
+        Raises:
+            SimulationError: if the steps become too short.
+        """
+        states = np.empty((parts, len(start)))
+        times = [ctypes.c_double(t) for t in (*span, since)]
+        given = [np.ascontiguousarray(array) for array in (parameters, load)]
+        self._run("continuous", *times, *given, ctypes.c_long(parts), np.ascontiguousarray(start), states)
+        return states
+
+    def ticks(self, period: float, start: Array, *columns: Array) -> tuple[Array, Array, Array]:
+        """States after ticks (N, s), commands (N, n) and status (N, 1).
+
+        Args:
+            period: length of a tick [s].
+            start: state at the begin, (s,).
+            columns: references with derivatives (N, 3 k), noise (N, s) and loads.
+
+        Raises:
+            SimulationError: if the steps become too short.
+        """
+        N, given = len(columns[0]), [np.ascontiguousarray(column) for column in columns]
+        found = np.empty((N, len(start))), np.empty((N, self._state.n)), np.empty((N, 1))
+        self._run("ticks", ctypes.c_double(period), ctypes.c_long(N), np.ascontiguousarray(start), *given, *found)
+        return found
+
+    def _run(self, name: str, *arguments: Any) -> None:
+        pointers = [ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else a for a in arguments]
+        with deferred():
+            failed = runner(name)(ctypes.byref(self._state), *pointers)
+        if failed:
+            raise SimulationError("the integrator gave up: its steps became too short, or too many")

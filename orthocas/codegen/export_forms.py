@@ -1,0 +1,276 @@
+"""Coordinates as lines of NumPy, PyTorch or JAX: tables of products, networks, or tapes."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Self
+
+import casadi as ca
+import numpy as np
+
+from orthocas.bases.mlp import MLPFamily
+from orthocas.bases.products import ProductFamily, Term, split, with_parts
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
+from orthocas.tools.batch import dense_function
+from orthocas.tools.checks import Array
+from orthocas.tools.expressions import ARITHMETIC, Tape, to_tape
+
+_OPERATORS = {
+    **ARITHMETIC,
+    "pow": "{0} ** {1}",
+    "constpow": "{0} ** {1}",
+}
+_CONDITIONS = {
+    "not": "{0} == 0",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "eq": "{0} == {1}",
+    "ne": "{0} != {1}",
+    "and": "({0} != 0) & ({1} != 0)",
+    "or": "({0} != 0) | ({1} != 0)",
+}
+
+_FUNCTIONS = {
+    name: name
+    for name in (
+        *("exp", "log", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh", "floor", "ceil", "log1p", "expm1"),
+        *("sign", "hypot", "fmod", "copysign", "fmin", "fmax"),
+    )
+} | {
+    "asin": "arcsin",
+    "acos": "arccos",
+    "atan": "arctan",
+    "asinh": "arcsinh",
+    "acosh": "arccosh",
+    "atanh": "arctanh",
+    "atan2": "arctan2",
+    "fabs": "abs",
+}  # names in NumPy, which PyTorch and JAX share
+
+
+def function_code(name: str, summary: str, function: ca.Function) -> str:
+    """A Python function of columns q (n, N) with the entries of a dense SX function's output, row by row, (k, N)."""
+    q = ca.SX.sym("q", function.size_in(0)[0])
+    rows = ca.vec(ca.densify(function(q)).T)
+    lines = tape_lines(to_tape(ca.Function("rows", [q], [ca.cse(rows)])))
+    body = "\n".join(f"    {line}" for line in lines)
+    return f'def {name}(q):\n    """{summary}"""\n{body}\n'
+
+
+def tape_lines(tape: Tape) -> list[str]:
+    """The lines that compute a tape's output from columns q (n, N), and return it as (k, N)."""
+    lines: list[str] = []
+    known: dict[int, str] = {}  # words for the constants in work slots
+    results: dict[int, str] = {}
+    for name, into, *of in tape["steps"]:
+        if name == "const":
+            known[into] = _literal(float(of[0]))
+        elif name == "output":
+            results[into] = f"y{into}"
+            lines.append(f"y{into} = {_array(of[0], known)}")
+        else:
+            text = f"q[{of[0]}]" if name == "input" else _operation(name, of, known)
+            known.pop(into, None)
+            lines.append(f"w{into} = {text}")
+    return [*lines, f"return np.stack([{', '.join(results[k] for k in range(len(results)))}])"]
+
+
+def _operation(name: str, of: list[Any], known: dict[int, str]) -> str:
+    """One operation on work slots."""
+    if name in _OPERATORS:
+        return _OPERATORS[name].format(*(known.get(slot, f"w{slot}") for slot in of))
+    words = [_array(slot, known) for slot in of]
+    if name in _CONDITIONS:
+        return f"({_CONDITIONS[name].format(*words)}) * np.ones_like(q[0])"
+    if name == "if_else_zero":
+        return f"np.where({words[0]} != 0, {words[1]}, np.zeros_like(q[0]))"
+    return f"_erf({words[0]})" if name == "erf" else f"np.{_FUNCTIONS[name]}({', '.join(words)})"
+
+
+def _array(slot: int, known: dict[int, str]) -> str:
+    """The value in a work slot as an array, for functions that take nothing else."""
+    return f"np.full_like(q[0], {known[slot]})" if slot in known else f"w{slot}"
+
+
+def _literal(value: float) -> str:
+    """The number in Python, exactly; in brackets where an operator beside it would take its sign."""
+    if value in (float("inf"), float("-inf")):
+        return f'float("{value}")'
+    return repr(value) if value >= 0 else f"({value!r})"
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """The functions `_xi` and `_xi_jacobian` of columns q (n, N): a template, and what it uses."""
+
+    template: str  #: name of a file in templates/
+    values: Mapping[str, str]  #: of its placeholders
+    functions: str  #: further functions
+    tables: Mapping[str, Array]
+    indices: Mapping[str, Sequence[int]]
+
+
+def idle_part(coordinates: Coordinates) -> tuple[Array, Array]:
+    """A (r, n) and c (r, 1) with A q + c = q - centre for the idle joints, and 0 for the other coordinates."""
+    r, n, idle = coordinates.r, coordinates.space.n, list(coordinates.idle)
+    A, c = np.zeros((r, n)), np.zeros((r, 1))
+    A[r - len(idle) :] = np.eye(n)[idle]
+    c[r - len(idle) :, 0] = -coordinates.space.centre[idle]
+    return A, c
+
+
+def network_form(coordinates: Coordinates) -> Form | None:
+    """xi = W_out tanh(... tanh(W_0 u + b_0) ...) + A q + c; None if the coordinates are no network."""
+    family = coordinates.family if len(coordinates.offset) else None
+    if not isinstance(family, MLPFamily):
+        return None
+    scale, fitted, depth = coordinates.scale[:, None], len(coordinates.offset), len(family.hidden)
+    layers = _layers(family, coordinates.theta)
+    A, c = idle_part(coordinates)
+    W_out = np.zeros((coordinates.r, family.hidden[-1]))
+    W_out[:fitted] = scale * layers[depth][0]
+    c[:fitted] = scale * (layers[depth][1] - coordinates.offset[:, None])
+    active, slides = np.array(coordinates.active, dtype=int), np.array(family.direct, dtype=bool)
+    turning, sliding, idle = active[~slides], active[slides], np.array(coordinates.idle, dtype=int)
+    indices = {"turning": turning, "sliding": sliding, "idle": idle}
+    indices["order"] = np.argsort(np.concatenate(list(indices.values())))
+    tables = {"W_out": W_out, "A": A, "c": c}
+    for k, (W, b) in enumerate(layers[:depth]):
+        tables |= {f"W_{k}": W, f"b_{k}": b}
+    plain = {name: [int(k) for k in of] for name, of in indices.items()}
+    return Form("network", {"depth": str(depth)}, "", tables, plain)
+
+
+def _layers(family: MLPFamily, theta: Array) -> list[tuple[Array, Array]]:
+    """Weights (out, width) and biases (out, 1) of all layers."""
+    layers, start = [], 0
+    for width, out in pairwise(family.widths):
+        middle, end = start + out * width, start + out * (width + 1)
+        layers.append((theta[start:middle].reshape(width, out).T, theta[middle:end, None]))
+        start = end
+    return layers
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Terms by number of factors. Each is a term of the level before times its last factor.
+
+    In every level, the terms that derivatives need come first.
+    """
+
+    levels: list[list[Term]]
+    lower: set[Term]  #: what derivatives need
+
+    @classmethod
+    def of(cls, terms: Iterable[Term], of_derivatives: Iterable[Term]) -> Self:
+        """The plan for these terms, with what they are made of."""
+        every, lower = with_parts(terms), with_parts(of_derivatives)
+        every |= {_split(term)[1] for term in every}
+        lower = lower or {min(term for term in every if np.count_nonzero(term) == 1)}
+        ordered = sorted(every, key=lambda term: (term not in lower, term))
+        most = max(np.count_nonzero(term) for term in every)
+        return cls([[term for term in ordered if np.count_nonzero(term) == k + 1] for k in range(most)], lower)
+
+    @property
+    def terms(self) -> list[Term]:
+        """All terms in the order of the code."""
+        return [term for level in self.levels for term in level]
+
+    @property
+    def counts(self) -> dict[str, str]:
+        """How many terms each level has, and how many of them derivatives need, as Python."""
+        lower = [sum(term in self.lower for term in level) for level in self.levels]
+        return {"all": _tuple(map(len, self.levels)), "lower": _tuple(count for count in lower if count)}
+
+    @property
+    def indices(self) -> dict[str, list[int]]:
+        """For the terms of each level, rows of the level before and rows of one-joint functions."""
+        found: dict[str, list[int]] = {}
+        functions = {term: k for k, term in enumerate(self.levels[0])}
+        for k, (before, level) in enumerate(pairwise(self.levels), start=1):
+            rows = {term: row for row, term in enumerate(before)}
+            split = [_split(term) for term in level]
+            found[f"parents_{k}"] = [rows[rest] for rest, _ in split]
+            found[f"factors_{k}"] = [functions[alone] for _, alone in split]
+        return found
+
+
+def product_form(coordinates: Coordinates) -> Form | None:
+    """xi = C psi + A q + c and J_xi = T psi' + D; None if the coordinates are no such products."""
+    family = coordinates.family if len(coordinates.offset) else None
+    if not isinstance(family, ProductFamily):
+        return None
+    slopes = coordinates.scale[:, None, None] * family.derivative_tables(coordinates.theta).transpose(1, 0, 2)
+    used = np.flatnonzero(slopes[:, :, 1:].any(axis=(0, 1)))
+    plan = Plan.of(family.terms, [family.terms[k] for k in used])
+    rows = {term: k for k, term in enumerate(family.terms)}
+    if not set(plan.levels[0]) <= set(rows):  # then the family has no term for a function that its terms contain
+        return None
+    q = ca.SX.sym("q", coordinates.space.n)
+    functions = family.basis(q[coordinates.active])[[rows[term] for term in plan.levels[0]]]
+    code = function_code("_one_joint", "Functions of one joint each, (k, N).", dense_function("f", [q], [functions]))
+    tables = _coefficients(coordinates, plan, rows) | _slopes(coordinates, slopes, plan, rows)
+    return Form("products", plan.counts, code, tables, plan.indices)
+
+
+def _coefficients(coordinates: Coordinates, plan: Plan, rows: dict[Term, int]) -> dict[str, Array]:
+    """C (r, terms), A (r, n) and c (r, 1)."""
+    fitted, scale = len(coordinates.offset), coordinates.scale[:, None]
+    A, c = idle_part(coordinates)
+    C = np.zeros((coordinates.r, len(plan.terms)))
+    theta = coordinates.theta.reshape(fitted, -1)
+    for k, term in enumerate(plan.terms):
+        if term in rows:
+            C[:fitted, k] = coordinates.scale * theta[:, rows[term]]
+    c[:fitted] = -scale * coordinates.offset[:, None]
+    return {"C": C, "A": A, "c": c}
+
+
+def _slopes(coordinates: Coordinates, slopes: Array, plan: Plan, rows: dict[Term, int]) -> dict[str, Array]:
+    """T (r n, terms of derivatives) and D (r, n, 1), from the slopes (fitted, active, 1 + K)."""
+    r, n, fitted, active = coordinates.r, coordinates.space.n, len(coordinates.offset), coordinates.active
+    lower = [term for term in plan.terms if term in plan.lower]
+    T, D = np.zeros((r, n, len(lower))), idle_part(coordinates)[0]
+    for k, term in enumerate(lower):
+        if term in rows:
+            T[:fitted, active, k] = slopes[:, :, 1 + rows[term]]
+    D[:fitted, active] = slopes[:, :, 0]
+    return {"T": T.reshape(r * n, -1), "D": D[:, :, None]}
+
+
+def _split(term: Term) -> tuple[Term, Term]:
+    """A term without its last factor, and that factor alone."""
+    rest, joint, index = split(term)
+    return rest, tuple(index if k == joint else 0 for k in range(len(term)))
+
+
+def _tuple(values: Iterable[int]) -> str:
+    return f"({', '.join(map(str, values))},)"
+
+
+_SPECIAL = (product_form, network_form)  # what `expression_form` would write as many thousand lines
+
+
+def form_of(chart: Chart) -> Form:
+    """The coordinates of a chart in the first form that fits.
+
+    Raises:
+        NoExpressionError: if the chart is grown.
+    """
+    if isinstance(chart.coordinates, Coordinates):
+        for form in _SPECIAL:
+            if (found := form(chart.coordinates)) is not None:
+                return found
+    return expression_form(chart)
+
+
+def expression_form(chart: Chart) -> Form:
+    """xi and its Jacobian, operation by operation."""
+    q = ca.SX.sym("q", chart.n)
+    slopes = dense_function("J_xi", [q], [chart.function("jacobian")(q)[chart.m :, :]])
+    code = [
+        function_code("_xi", "Coordinates, (r, N), of columns q (n, N).", chart.function("xi")),
+        function_code("_xi_slopes", "The entries of their Jacobian row by row, (r n, N).", slopes),
+    ]
+    return Form("expression", {}, "\n\n".join(code), {}, {})

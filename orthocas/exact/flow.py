@@ -1,0 +1,313 @@
+"""Flows along the task gradients: Dormand-Prince for many points at once, SUNDIALS for the dynamics of one."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from orthocas.errors import GrowError
+from orthocas.tasks.metric import metric_matrices
+from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.samples import Samples
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
+from orthocas.tools.columns import ColumnFunction, blocked, by_sample
+
+_STAGES = 12
+_FEW = 64  # up to this many trajectories, a block of columns does not pay off
+_FIRST = 0.25  # first step
+_SMALLEST = 1e-9  # smaller steps mean that the field is singular, so the trajectory stops
+_SHRINK, _GROW, _SAFETY = 0.2, 10.0, 0.9
+TOLERANCE = 1e-10  #: default local error of a step [rad] or [m]; end points are then accurate to about 1e-8
+_LOOSER = 100.0  # factor on the tolerance of tangent vectors, which need fewer digits than points
+CHANGE = 1e-6  #: the paper's stopping rule: change of q between two steps [rad] or [m]
+_STEPS = 2000  # largest number of steps of the gradient flow
+_ON_LEAF = (
+    1e-4  # largest |h - x0|, relative to the start, of a trajectory that stopped on the leaf and not in a singularity
+)
+_NEARLY_SINGULAR = 1e-6  # J A^-1 J^T, relative to its mean over the batch, below which the flow is slowed down
+
+
+@dataclass(frozen=True, eq=False)
+class BatchedFlow:
+    """Integrates dy/ds = f(y, p) from s = 0 to 1 for many y and p, by the 8th-order method of Dormand and Prince.
+
+    Coefficients and error estimate are those of `scipy.integrate.DOP853` ([HNW1993] Sec. II.10); the batching is ours.
+
+    Args:
+        field: f, (k, 1) x (l, 1) -> (k, 1).
+        scale: factor on the tolerance of each state, (k,).
+    """
+
+    field: ca.Function
+    scale: Array
+
+    def end_points(self, starts: Array, parameters: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
+        """States at s = 1, (N, k), and which trajectories reached s = 1, (N,).
+
+        The other trajectories stopped where the step size fell below 1e-9 or the field was not finite. Their rows hold
+        the last state.
+
+        Args:
+            starts: (N, k).
+            parameters: (N, l).
+            tolerance: tolerance of the local error of a step.
+        """
+        y, s, step = starts.copy(), np.zeros(len(starts)), np.full(len(starts), _FIRST)
+        running = np.arange(len(starts))
+        while running.size:
+            tried = np.minimum(step[running], 1 - s[running])
+            moved, error = self._moved(y[running], tried[:, None], parameters[running])
+            ratio = np.nan_to_num(error[:, 0] / tolerance, nan=np.inf)
+            good = ratio <= 1
+            y[running[good]] = moved[good]
+            s[running[good]] += tried[good]
+            step[running] = tried * np.clip(_SAFETY * np.maximum(ratio, 1e-16) ** (-1 / 8), _SHRINK, _GROW)
+            running = running[(s[running] < 1) & (step[running] > _SMALLEST)]
+        return y, s >= 1
+
+    def _moved(self, *arguments: Array) -> list[Array]:
+        """One step of some trajectories: y (N, k), step sizes (N, 1), p (N, l) -> y (N, k), errors (N, 1)."""
+        N = len(arguments[0])
+        if N <= _FEW:
+            return self._few(*arguments)
+        outputs = self._many(*map(blocked, arguments))
+        return [by_sample(out[:, None], N)[:, :, 0] for out in outputs]
+
+    @cached_property
+    def _few(self) -> Batched:
+        return Batched(self._step)
+
+    @cached_property
+    def _many(self) -> ColumnFunction:
+        return ColumnFunction(self._step)
+
+    @cached_property
+    def _step(self) -> ca.Function:
+        """One step: y, step size, p -> new y and its estimated error in units of the tolerance."""
+        k = self.field.size1_in(0)
+        y, step, p = ca.SX.sym("y", k), ca.SX.sym("step"), ca.SX.sym("p", self.field.size1_in(1))
+        method, slopes = scipy.integrate.DOP853, list[Any]()
+        for i in range(_STAGES):
+            slopes.append(self.field(y + step * _combined(method.A[i, :i], slopes), p) if i else self.field(y, p))
+        moved = y + step * _combined(method.B, slopes)
+        scale = ca.DM(self.scale)
+        fifth = ca.sumsqr(_combined(method.E5[:_STAGES], slopes) / scale)
+        third = ca.sumsqr(_combined(method.E3[:_STAGES], slopes) / scale)
+        error = step * fifth / ca.sqrt(fifth + 0.01 * third + 1e-300)
+        return dense_function("step", [y, step, p], [moved, error])
+
+
+def _combined(weights: Array, slopes: list[Any]) -> Any:
+    """Weighted sum, without the terms whose weight is zero."""
+    return sum(float(w) * slope for w, slope in zip(weights, slopes, strict=True) if w != 0)
+
+
+class Arrival(IntEnum):
+    """How a trajectory ended."""
+
+    REACHED = 0  #: reached the desired task value
+    SINGULAR = 1  #: stopped on the way, where the task gradients vanish or become dependent
+    OUTSIDE = 2  #: reached the desired task value, but outside the chart of the base leaf
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """End points of trajectories."""
+
+    points: Array  #: (N, n); for SINGULAR, the last point before the singularity
+    status: NDArray[np.int_]  #: `Arrival` of each trajectory, (N,), int
+
+    @property
+    def reached(self) -> NDArray[np.bool_]:
+        """Which trajectories reached the desired task value, (N,)."""
+        return np.asarray(self.status == Arrival.REACHED)
+
+
+@dataclass(frozen=True, eq=False)
+class TaskFlow:
+    """The flow dq/ds = J_x^#A dx, s in [0, 1], which changes task values by exactly dx, A-orthogonally to the leaves.
+
+    For m = 1 it is dq/ds = dx grad_A h / (dh(grad_A h)), the curve of [AS2023] eq. (23) with the task value as its
+    parameter. It ends on the desired leaf without a stopping rule (ours, docs/derivations.md#growing). For m >= 2 it
+    follows the straight line in task coordinates; other paths end elsewhere unless the distribution is involutive.
+    """
+
+    problem: Problem
+
+    def move(self, points: Array, dx: Array, tolerance: float = TOLERANCE) -> Moved:
+        """Change the task values of points (N, n) by dx (N, m).
+
+        Args:
+            points: joint positions.
+            dx: desired changes of the task values.
+            tolerance: local error of a step [rad] or [m].
+        """
+        ends, arrived = self._positions.end_points(points, dx, tolerance)
+        return Moved(ends, np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
+
+    def pull(self, points: Array, level: Array, tolerance: float = TOLERANCE) -> Moved:
+        """Pull points (N, n) to the leaf h(q) = level (m,)."""
+        return self.move(points, level - self.problem.task.batched(points)[0], tolerance)
+
+    def pull_with_derivative(self, points: Array, level: Array, tolerance: float = TOLERANCE) -> tuple[Moved, Array]:
+        """Do the same as `pull`, and return d q_hat / dq, (N, n, n), by forward sensitivities.
+
+        The flow maps leaves to leaves, so r vectors v that start tangent to the leaf of q stay tangent to leaves, with
+        dv/ds = (df/dq) v. The code stores each v as a direction and the logarithm of its length. Where flow lines
+        converge, lengths fall by many orders of magnitude, and rounding would destroy the directions of v itself. Since
+        q_hat is constant along the flow, the derivative is [v_1 ... v_r] Z^T A, where Z is an A-orthonormal basis of
+        ker J_x(q).
+        """
+        n, r = self.problem.n, self.problem.r
+        A = metric_matrices(self.problem.metric, points)
+        inverse = np.asarray(np.linalg.inv(A), dtype=float)
+        samples = Samples(points, task_jacobians(self.problem, points), inverse)
+        Z = samples.null_basis
+        lengths = np.linalg.norm(Z, axis=1)
+        directions = (Z / lengths[:, None, :]).transpose(0, 2, 1).reshape(-1, r * n)
+        starts = np.concatenate([points, directions, np.log(lengths)], axis=1)
+        dx = level - self.problem.task.batched(points)[0]
+        ends, arrived = self._with_tangents.end_points(starts, dx, tolerance)
+        tangents = ends[:, n : n + r * n].reshape(-1, r, n) * np.exp(ends[:, n + r * n :])[:, :, None]
+        moved = Moved(ends[:, :n], np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
+        return moved, tangents.transpose(0, 2, 1) @ Z.transpose(0, 2, 1) @ A
+
+    @cached_property
+    def field(self) -> ca.Function:
+        """q (n, 1), dx (m, 1) -> J_x^#A dx (n, 1)."""
+        q, dx = ca.SX.sym("q", self.problem.n), ca.SX.sym("dx", self.problem.m)
+        gradients = self.gradients(q)
+        J = self.problem.task.jacobian_function(q)
+        return dense_function("field", [q, dx], [gradients @ _spd_solve(J @ gradients, dx)])
+
+    def gradients(self, q: ca.SX) -> ca.SX:
+        """Gradients of the task in the metric, A^-1 J_x^T (n, m), for a symbol q ([AS2023] eq. (16))."""
+        J = self.problem.task.jacobian_function(q)
+        return J.T if self.problem.metric.is_identity else _spd_solve(self.problem.metric.function(q), J.T)
+
+    @cached_property
+    def _positions(self) -> BatchedFlow:
+        return BatchedFlow(self.field, np.ones(self.problem.n))
+
+    @cached_property
+    def _with_tangents(self) -> BatchedFlow:
+        """The flow with r tangent vectors, stored as directions u with |u| = 1 and logarithms of lengths."""
+        n, m, r = self.problem.n, self.problem.m, self.problem.r
+        y, dx = ca.SX.sym("y", n + r * (n + 1)), ca.SX.sym("dx", m)
+        q, directions = y[:n], ca.reshape(y[n : n + r * n], n, r)
+        dq = self.field(q, dx)
+        turning = ca.jacobian(dq, q) @ directions
+        stretching = ca.sum1(directions * turning) / ca.sum1(directions**2)
+        rates = turning - directions * ca.repmat(stretching, n, 1)
+        field = dense_function("field_with_tangents", [y, dx], [ca.vertcat(dq, ca.vec(rates), stretching.T)])
+        return BatchedFlow(field, np.r_[np.ones(n), np.full(r * (n + 1), _LOOSER)])
+
+
+def _spd_solve(A: ca.SX, B: ca.SX) -> ca.SX:
+    """A^-1 B for symmetric positive definite A, with half the operations of `ca.solve`."""
+    return ca.ldl_solve(B, *ca.ldl(A))
+
+
+@dataclass(frozen=True, eq=False)
+class SundialsFlow:
+    """Batched flows of a problem with m = 1 to a leaf h(q) = x0, by CVODES (Adams, functional iteration).
+
+    Args:
+        problem: a problem with m = 1.
+        tolerance: relative and absolute tolerance of CVODES.
+
+    Raises:
+        GrowError: if m > 1.
+    """
+
+    problem: Problem
+    tolerance: float = 1e-10
+
+    def __post_init__(self) -> None:
+        if self.problem.m != 1:
+            raise GrowError(f"the task has m = {self.problem.m} components, expected m = 1 for this flow")
+
+    def gradient_flow(self, points: Array, level: float, change: float = CHANGE) -> Moved:
+        """Follow dq/dt = (x0 - h(q)) grad_A h(q), [AS2023] eq. (23), until q changes by less than `change` in a step.
+
+        A step lasts 1 / (mean J A^-1 J^T), about the time in which the distance to the leaf falls by a factor of e. A
+        trajectory that comes to rest away from the leaf has run into a singularity.
+
+        Args:
+            points: (N, n).
+            level: x0.
+            change: stopping rule [rad] or [m].
+        """
+        q, status = points.copy(), np.full(len(points), Arrival.SINGULAR)
+        duration = 1.0 / float(self._strength(points)[0].mean())
+        way = np.abs(level - self.problem.task.batched(points)[0][:, 0])
+        running = np.arange(len(points))
+        for _ in range(_STEPS):
+            if not running.size:
+                break
+            parameters = np.tile([level, duration], (len(running), 1))
+            moved = self._gradient_step(q[running], parameters)[0]
+            rested = np.abs(moved - q[running]).max(axis=1) < change
+            q[running] = moved
+            running = running[~rested]
+        left = np.abs(level - self.problem.task.batched(q)[0][:, 0])
+        status[left <= _ON_LEAF * np.maximum(way, 1e-3)] = Arrival.REACHED
+        return Moved(q, status)
+
+    def pull(self, points: Array, level: float) -> Moved:
+        """Follow dq/ds = (x0 - h(q_1)) grad_A h / (dh(grad_A h)), s in [0, 1].
+
+        Near singularities a lower bound keeps the denominator from vanishing, so that CVODES continues. Such a
+        trajectory ends off the leaf, with status SINGULAR.
+
+        Args:
+            points: (N, n).
+            level: x0.
+        """
+        dx = level - self.problem.task.batched(points)[0]
+        floor = _NEARLY_SINGULAR * float(self._strength(points)[0].mean())
+        ends = self._task_step(points, np.concatenate([dx, np.full_like(dx, floor)], axis=1))[0]
+        left = np.abs(level - self.problem.task.batched(ends)[0][:, 0])
+        reached = left <= 1e3 * self.tolerance * (1 + np.abs(dx[:, 0]))
+        return Moved(ends, np.where(reached, Arrival.REACHED, Arrival.SINGULAR))
+
+    @cached_property
+    def _strength(self) -> Batched:
+        """J_x A^-1 J_x^T, (1, 1)."""
+        q = ca.SX.sym("q", self.problem.n)
+        J = self.problem.task.jacobian_function(q)
+        return Batched(dense_function("strength", [q], [J @ TaskFlow(self.problem).gradients(q)]))
+
+    @cached_property
+    def _gradient_step(self) -> Batched:
+        q, p = ca.SX.sym("q", self.problem.n), ca.SX.sym("p", 2)
+        gradient = TaskFlow(self.problem).gradients(q)
+        return self._integrator(q, p, p[1] * (p[0] - self.problem.task.function(q)) * gradient)
+
+    @cached_property
+    def _task_step(self) -> Batched:
+        q, p = ca.SX.sym("q", self.problem.n), ca.SX.sym("p", 2)
+        gradient = TaskFlow(self.problem).gradients(q)
+        strength = self.problem.task.jacobian_function(q) @ gradient
+        return self._integrator(q, p, p[0] * gradient / ca.fmax(strength, p[1]))
+
+    def _integrator(self, q: ca.SX, p: ca.SX, rate: ca.SX) -> Batched:
+        """start, p -> end after a unit of time."""
+        options: dict[str, Any] = {
+            "linear_multistep_method": "adams",
+            "nonlinear_solver_iteration": "functional",
+            "abstol": self.tolerance,
+            "reltol": self.tolerance,
+            "max_num_steps": 1_000_000,
+            "disable_internal_warnings": True,
+        }
+        solver = ca.integrator("flow", "cvodes", {"x": q, "p": p, "ode": ca.densify(rate)}, 0.0, 1.0, options)
+        start, parameters = ca.MX.sym("start", q.shape[0]), ca.MX.sym("p", p.shape[0])
+        end = solver(x0=start, p=parameters)["xf"]
+        return Batched(dense_function("flow", [start, parameters], [end]))

@@ -1,0 +1,257 @@
+"""Level surfaces of a task as meshes, and harmonic maps of them ([AS2023] App. B)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import skimage
+from numpy.typing import ArrayLike, NDArray
+
+from orthocas.errors import FoldedMapError, InvalidValueError
+from orthocas.exact import libigl as igl
+from orthocas.exact.mesh import TriangleMesh, cotangents, flip_to_delaunay, require_disk, steps_to_neighbours
+from orthocas.tools.checks import Array, Indices, frozen_array, require_count, require_finite, require_shape
+
+_ON_LEVEL = 2e-13  # |h - level| of a vertex, relative to the larger of 1 and the largest |h|
+_ROUNDS = 4  # rounds of flips and smoothing
+_NEWTON_STEPS = 20
+_BISECTIONS = 60
+_CLEARANCE = 0.1  # smallest distance of marching cubes vertices from grid points, as a share of a cell's edge
+_TINY = 1e-300
+_CHUNK = 500_000  # grid points per call of h
+
+__all__ = ["TriangleMesh", "level_surface", "require_disk"]
+
+Mask = NDArray[np.bool_]
+Function = Callable[[Array], Array]  # (N, 3) -> (N,), or (N, 3) for a gradient
+
+
+def level_surface(
+    h: Function, gradient: Function, level: float, low: ArrayLike, high: ArrayLike, cells: int
+) -> TriangleMesh:
+    """The surface {q : low <= q <= high, h(q) = level}.
+
+    Marching cubes finds the topology, Newton steps along the gradient move every vertex onto the surface, and edge
+    flips with tangential smoothing make the triangles round and Delaunay. Vertices on faces of the box stay there.
+
+    Args:
+        h: function (N, 3) -> (N,).
+        gradient: dh/dq, (N, 3) -> (N, 3).
+        level: the value of h on the surface.
+        low: (3,) lower corner of the box [rad] or [m].
+        high: (3,) upper corner of the box, > low.
+        cells: number of grid cells along the longest edge of the box, >= 2.
+
+    Returns:
+        A mesh with normals along the gradient and |h - level| <= 1e-12 at its vertices, relative to the largest |h| if
+        that exceeds 1. Components smaller than a cell may be missed.
+
+    Raises:
+        ShapeError: if low, high, or a value of h or its gradient has the wrong shape.
+        InvalidValueError: if h does not take the value in the box, is not finite, or jumps across the value.
+
+    Source:
+        Marching cubes: [AS2023] Sec. 5.2. Exact vertices and the improvement of the triangles are ours:
+        docs/derivations.md#disk-chart.
+    """
+    frozen_array("level", level, ())
+    corners = np.stack([frozen_array("low", low, (3,)), frozen_array("high", high, (3,))])
+    if not np.all(corners[0] < corners[1]):
+        raise InvalidValueError("low", corners[0].tolist(), f"less than high = {corners[1].tolist()}")
+    axes = _grid_axes(corners, require_count("cells", cells, least=2))
+    gap, largest = _sampled_gap(h, level, axes)
+    points, faces, free, ends = _march(gap, axes)
+    sheet = _Sheet(h, gradient, level, corners, free, _ON_LEVEL * max(1.0, largest), float(axes[0][1] - axes[0][0]))
+    points = sheet.start(points, ends)
+    for _ in range(_ROUNDS):
+        faces = flip_to_delaunay(points, faces)
+        points = sheet.slide(points, steps_to_neighbours(points, faces))
+    return TriangleMesh(points, flip_to_delaunay(points, faces))
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """The surface and the box; vertices of the mesh move on both."""
+
+    h: Function
+    gradient: Function
+    level: float
+    corners: Array  # (2, 3)
+    free: Mask  # (V, 3): whether a vertex may move along an axis; false across the faces of the box that it lies on
+    tolerance: float  # of h
+    cell: float  # edge length of a grid cell
+
+    def start(self, points: Array, ends: Array) -> Array:
+        """Move marching cubes vertices onto the surface, by bisection between ends (2, V, 3) where Newton fails."""
+        moved, failed = self._newton(points)
+        if failed.any():
+            moved[failed] = self._bisect(ends[:, failed])
+        return moved
+
+    def slide(self, points: Array, steps: Array) -> Array:
+        """Move vertices by the part of their steps along surface and box; a vertex stays in place if Newton fails."""
+        normal = _values(self.gradient, points, "gradient", (3,)) * self.free
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), _TINY)
+        along = steps * self.free
+        moved, failed = self._newton(points + along - normal * np.sum(normal * along, axis=1, keepdims=True))
+        moved[failed] = points[failed]
+        return moved
+
+    def _newton(self, start: Array) -> tuple[Array, Mask]:
+        """Take Newton steps along the free part of the gradient; tell which vertices fail or move more than a cell."""
+        points, moving = start.copy(), np.arange(len(start))
+        for _ in range(_NEWTON_STEPS):
+            gap = self._gap(points[moving])
+            moving, gap = moving[np.abs(gap) > self.tolerance], gap[np.abs(gap) > self.tolerance]
+            if not len(moving):
+                break
+            slope = _values(self.gradient, points[moving], "gradient", (3,)) * self.free[moving]
+            step = slope * (gap / np.maximum(np.sum(slope**2, axis=1), _TINY))[:, None]
+            length = np.linalg.norm(step, axis=1, keepdims=True)
+            step *= self.cell / np.maximum(length, self.cell)
+            points[moving] = np.clip(points[moving] - step, *self.corners)
+        failed = np.linalg.norm(points - start, axis=1) > self.cell
+        failed[moving] = True
+        return points, failed
+
+    def _bisect(self, ends: Array) -> Array:
+        """A point of the surface between each pair of ends (2, K, 3)."""
+        a, b = ends
+        below = self._gap(a) < 0
+        for _ in range(_BISECTIONS):
+            middle = (a + b) / 2
+            same = ((self._gap(middle) < 0) == below)[:, None]
+            a, b = np.where(same, middle, a), np.where(same, b, middle)
+        points: Array = np.where((np.abs(self._gap(a)) < np.abs(self._gap(b)))[:, None], a, b)
+        off = np.flatnonzero(np.abs(self._gap(points)) > self.tolerance)
+        if len(off):
+            place = np.round(points[off[0]], 4).tolist()
+            raise InvalidValueError("level", self.level, f"a value that h does not jump across, as near {place}")
+        return points
+
+    def _gap(self, points: Array) -> Array:
+        """Checked values of h - level."""
+        return _values(self.h, points, "h", ()) - self.level
+
+
+def _grid_axes(corners: Array, cells: int) -> list[Array]:
+    """Grid coordinates along each axis: nearly cubic cells, `cells` of them along the longest edge."""
+    width = corners[1] - corners[0]
+    counts = np.maximum(1, np.ceil(cells * width / width.max() - 1e-9)).astype(int) + 1
+    return [np.linspace(corners[0, i], corners[1, i], counts[i]) for i in range(3)]
+
+
+def _sampled_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[np.float32], float]:
+    """h - level on the grid in single precision with the signs preserved, and the largest |h|."""
+    shape = tuple(len(axis) for axis in axes)
+    gap = np.empty(shape, dtype=np.float32)
+    slab = max(1, _CHUNK // (shape[1] * shape[2]))
+    lowest, highest = np.inf, -np.inf
+    for start in range(0, shape[0], slab):
+        grid = np.stack(np.meshgrid(axes[0][start : start + slab], *axes[1:], indexing="ij"), axis=-1)
+        values = _values(h, grid.reshape(-1, 3), "h", ())
+        lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
+        gap[start : start + slab] = (values - level).reshape(grid.shape[:3])
+    if not lowest < level < highest:
+        raise InvalidValueError("level", level, f"a value of h in the box, found {lowest:.6g} to {highest:.6g}")
+    return gap, max(abs(lowest), abs(highest))
+
+
+def _march(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, Indices, Mask, Array]:
+    """Marching cubes: vertices (V, 3), faces (F, 3), free axes (V, 3), and the ends of their grid edges (2, V, 3)."""
+    _push_from_zero(gap)
+    index, faces, _, _ = skimage.measure.marching_cubes(gap, 0.0, gradient_direction="descent")
+    corners = np.stack([np.floor(index), np.ceil(index)]).astype(int)
+    ends = np.stack([axis[corners[:, :, i]] for i, axis in enumerate(axes)], axis=2)
+    points = ends[0] + (index - corners[0]) * (ends[1] - ends[0])
+    return points, faces.astype(np.int64), (index > 0) & (index < np.array(gap.shape) - 1), ends
+
+
+def _push_from_zero(gap: NDArray[np.float32]) -> None:
+    """Keep the surface away from grid points, where marching cubes triangles shrink to zero size.
+
+    In place, |h - level| becomes at least _CLEARANCE times the largest change to a neighbour. Zeros become positive.
+    """
+    change = np.zeros_like(gap)
+    for axis in range(3):
+        step = np.abs(np.diff(gap, axis=axis))
+        for side in (slice(None, -1), slice(1, None)):
+            part = change[tuple(side if i == axis else slice(None) for i in range(3))]
+            np.maximum(part, step, out=part)
+    change *= _CLEARANCE
+    np.copyto(gap, np.where(gap < 0, -change, change), where=np.abs(gap) < change)
+
+
+def _values(function: Function, points: Array, name: str, shape: tuple[int, ...]) -> Array:
+    """Checked values of h or its gradient."""
+    values = np.asarray(function(points), dtype=float)
+    require_shape(f"{name}(q)", values.shape, (len(points), *shape))
+    require_finite(f"{name}(q)", values)
+    return values
+
+
+def harmonic_disk(mesh: TriangleMesh) -> Array:
+    """One-to-one harmonic map of a mesh onto the unit disk.
+
+    Boundary vertices lie on the unit circle, spaced by arc length; the one with the lowest index has angle 0. Every
+    inner vertex is the mean of its neighbours, weighted by cot(alpha) + cot(beta) with the angles opposite the edge. If
+    no weight is negative (a Delaunay mesh), the map is one-to-one. The result is always checked for folds.
+
+    Args:
+        mesh: a topological disk.
+
+    Returns:
+        Images of the vertices, (V, 2); all triangles are counterclockwise.
+
+    Raises:
+        NotADiskError: if the mesh is not a disk.
+        InvalidValueError: if a triangle has no area.
+        FoldedMapError: if the map inverts triangles.
+
+    Source:
+        [AS2023] eqs. (40)-(43), by libigl. The check is ours: docs/derivations.md#disk-chart.
+    """
+    loop = require_disk(mesh)
+    disk = solve_dirichlet(mesh, loop, igl.map_vertices_to_circle(mesh.vertices, loop))
+    areas = signed_areas(disk, mesh.faces)
+    folded = int(np.sum(~(areas > 0)))
+    if folded:
+        raise FoldedMapError(folded, len(areas))
+    return disk
+
+
+def solve_dirichlet(mesh: TriangleMesh, fixed: Indices, values: Array) -> Array:
+    """Discrete harmonic functions with given values at some vertices.
+
+    sum_j w_ij (u_j - u_i) = 0 at every other vertex i, with w_ij = cot(alpha_ij) + cot(beta_ij).
+
+    Args:
+        mesh: triangles with areas > 0.
+        fixed: indices of vertices (B,), at least one in each component of the mesh.
+        values: values at these vertices, (B, k).
+
+    Returns:
+        Values at all vertices, (V, k).
+
+    Raises:
+        ShapeError: if the values do not match the fixed vertices.
+        InvalidValueError: if a triangle has no area, or the equations are singular.
+
+    Source:
+        [AS2023] eqs. (40), (41), (43), by libigl.
+    """
+    require_shape("values", values.shape, (len(fixed), None))
+    require_finite("cotangent", cotangents(mesh.vertices, mesh.faces))
+    try:
+        result: Array = igl.harmonic(mesh.vertices, mesh.faces, fixed, values, 1)
+    except RuntimeError:
+        wanted = "at least one in each component of a mesh without nearly flat triangles"
+        raise InvalidValueError("fixed", f"{len(fixed)} vertices", wanted) from None
+    return result
+
+
+def signed_areas(points: Array, faces: Indices) -> Array:
+    """Signed areas of triangles in the plane, (F,), positive if counterclockwise."""
+    a, b = points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
+    areas: Array = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
+    return areas

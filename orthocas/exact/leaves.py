@@ -1,0 +1,274 @@
+"""Base leaves that are lines or closed curves, and how a leaf is read from a file."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from orthocas.errors import GrowError, InvalidValueError
+from orthocas.exact.disk_leaf import DiskLeaf
+from orthocas.exact.leaf import LeafChart, LeafValues, require_on_leaf, turning_joints, without_turns
+from orthocas.tasks.metric import metric_matrices
+from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.samples import samples_at
+from orthocas.tools.cached import building, cached_property
+from orthocas.tools.checks import Array, frozen_array, require_known
+from orthocas.tools.interrupts import deferred
+
+_STAGES = 8  # intermediate points on the way to the desired coordinates
+_ITERATIONS = 10  # Newton steps at each point
+_SOLVED = 1e-12
+SAMPLES = 2000  #: points on the curve; the spline through them is accurate to about 1e-12
+_ON_CURVE = 1e-5  # distance [rad] beyond which a point belongs to another component of the leaf
+_PIECE, _STEPS = 1.0, 100  # arc length and number of outputs per call of the integrator
+_LONGEST = 200.0  # longest curve [rad]
+_SINGULAR = 0.01  # smallest singular value of J_x on the curve, relative to the largest
+_FEWEST = 20  # smallest number of samples of a curve
+_CLOSINGS = 3  # number of corrections of the length
+_PROJECTIONS = 4  # Gauss-Newton steps from the nearest sample to the nearest point of the curve
+
+
+@dataclass(frozen=True, eq=False)
+class LinearLeaf:
+    """xi0(q) = N^T (q - q0) for q on the leaf of q0, as in [AS2023] eq. (21).
+
+    It is a chart where the leaf is a graph over its tangent space at q0. Its values are defined everywhere on the leaf.
+    Where the leaf folds over, the Jacobian of the grown chart loses rank, which `evaluate` shows.
+    """
+
+    problem: Problem = field(repr=False)
+    level: Array  #: x0 = h(q0), (m,)
+    centre: Array  #: q0, (n,)
+    normals: Array = field(repr=False)  #: N, (n, r), unit columns with J_x(q0) A^-1(q0) N = 0
+    kind = "linear"
+    turn = 0.0
+    periodic = False
+
+    def __post_init__(self) -> None:
+        n, m, r = self.problem.n, self.problem.m, self.problem.r
+        for name, shape in (("level", (m,)), ("centre", (n,)), ("normals", (n, r))):
+            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+        require_on_leaf(self.problem, self.level, self.centre[None])
+        if np.abs(np.linalg.norm(self.normals, axis=0) - 1).max() > 1e-9:
+            raise InvalidValueError("normals", self.normals.tolist(), "columns of length 1")
+
+    def values(self, points: Array) -> LeafValues:
+        """Coordinates of points on the leaf, (N, n)."""
+        gradients = np.broadcast_to(self.normals.T, (len(points), *self.normals.T.shape))
+        return LeafValues((points - self.centre) @ self.normals, gradients, np.ones(len(points), dtype=bool))
+
+    def points(self, xi: Array, near: Array | None = None) -> Array:
+        """Points of the leaf (N, n) with coordinates xi (N, r); NaN where no such point exists.
+
+        Newton's method follows the straight line from the coordinates of `near`, or of q0, to xi, and so stays on one
+        sheet.
+        """
+        q = np.broadcast_to(self.centre, (len(xi), len(self.centre)))
+        q = q if near is None else np.where(np.isfinite(near), near, q)
+        start = (q - self.centre) @ self.normals
+        N = np.broadcast_to(self.normals.T, (len(xi), *self.normals.T.shape))
+        for share in np.linspace(0.0, 1.0, _STAGES + 1)[1:]:
+            for _ in range(_ITERATIONS):
+                residual = self._residual(q, start + share * (xi - start))
+                if np.abs(residual).max(initial=0.0) < _SOLVED:
+                    break
+                J = np.concatenate([task_jacobians(self.problem, q) / self._scale, N], axis=1)
+                q = q - (np.linalg.pinv(J) @ residual[:, :, None])[:, :, 0]
+        solved = np.abs(self._residual(q, xi)).max(axis=1) < 1e3 * _SOLVED
+        return np.where(solved[:, None], q, np.nan)
+
+    def to_arrays(self) -> Mapping[str, Array]:
+        """All arrays, for chart files."""
+        return {"level": self.level, "centre": self.centre, "normals": self.normals}
+
+    def _residual(self, q: Array, xi: Array) -> Array:
+        x = self.problem.task.batched(q)[0]
+        return np.concatenate([(x - self.level) / self._scale, (q - self.centre) @ self.normals - xi], axis=1)
+
+    @cached_property
+    def _scale(self) -> float:
+        """Size of J_x at q0, which makes the units of the task irrelevant."""
+        return float(np.linalg.norm(task_jacobians(self.problem, self.centre[None])))
+
+
+def linear_leaf(problem: Problem, centre: Array) -> LinearLeaf:
+    """The leaf through a joint position (n,), with coordinates along its tangent space there."""
+    points = centre[None]
+    normals = (metric_matrices(problem.metric, points) @ samples_at(problem, points).null_basis)[0]
+    level = problem.task.batched(points)[0][0]
+    return LinearLeaf(problem, level, centre, normals / np.linalg.norm(normals, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class CircleLeaf:
+    """xi0 = 2 pi l / L in (-pi, pi] on a closed curve of length L, where l is the arc length from the first sample.
+
+    The cut is the point opposite the first sample, because a circle has no coordinate that is smooth everywhere.
+    """
+
+    problem: Problem = field(repr=False)
+    level: Array  #: x0, (m,)
+    curve: Array = field(repr=False)  #: samples at equal arc lengths, (K + 1, n); the last equals the first up to turns
+    length: Array  #: L, (1,)
+    kind = "circle"
+    turn = 2 * np.pi
+    periodic = True
+
+    def __post_init__(self) -> None:
+        for name, shape in (("level", (self.problem.m,)), ("curve", (None, self.problem.n)), ("length", (1,))):
+            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+        if len(self.curve) < _FEWEST or not self.length[0] > 0:
+            raise InvalidValueError("curve", f"{len(self.curve)} samples of length {self.length[0]}", "a closed curve")
+        require_on_leaf(self.problem, self.level, self.curve)
+
+    @property
+    def cut(self) -> Array:
+        """The point of the leaf where xi0 jumps from pi to -pi, (n,)."""
+        return np.asarray(self._spline(self.length[0] / 2) + self._drift / 2)
+
+    def values(self, points: Array) -> LeafValues:
+        """Coordinates of points on the leaf, (N, n)."""
+        nearest = self._tree.query(self._embedded(points))[1]
+        L = self.length[0]
+        samples = self.curve[nearest]
+        near = samples + without_turns(self.problem, points - samples)
+        along = nearest * L / (len(self.curve) - 1)
+        for _ in range(_PROJECTIONS):
+            tangent = self._spline(along, 1) + self._drift / L
+            away = near - self._at(along)
+            along = along + (tangent * away).sum(axis=1) / (tangent**2).sum(axis=1)
+        tangent = self._spline(along, 1) + self._drift / L
+        inside = np.linalg.norm(near - self._at(along), axis=1) < _ON_CURVE
+        xi = np.pi - (np.pi - 2 * np.pi * along / L) % (2 * np.pi)
+        gradients = 2 * np.pi / L * tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
+        return LeafValues(xi[:, None], gradients[:, None, :], inside)
+
+    def points(self, xi: Array, near: Array | None = None) -> Array:
+        """Points of the leaf with coordinates xi (N, 1) in [-pi, pi]; both ends are at the cut. NaN for other xi."""
+        along = xi[:, 0] * self.length[0] / (2 * np.pi)
+        return np.where(np.abs(xi) <= np.pi + 1e-9, self._at(along), np.nan)
+
+    def to_arrays(self) -> Mapping[str, Array]:
+        """All arrays, for chart files."""
+        return {"level": self.level, "curve": self.curve, "length": self.length}
+
+    @cached_property
+    def _drift(self) -> Array:
+        """Whole turns of the joints along the curve, (n,) [rad]."""
+        return np.asarray(self.curve[-1] - self.curve[0])
+
+    @cached_property
+    def _spline(self) -> Any:
+        """A spline of the curve without its drift, periodic in the arc length."""
+        share = np.linspace(0.0, 1.0, len(self.curve))[:, None]
+        periodic = self.curve - share * self._drift
+        periodic[-1] = periodic[0]
+        return scipy.interpolate.CubicSpline(share[:, 0] * self.length[0], periodic, bc_type="periodic")
+
+    def _at(self, along: Array) -> Array:
+        return np.asarray(self._spline(along) + along[:, None] / self.length[0] * self._drift)
+
+    @cached_property
+    def _tree(self) -> Any:
+        return scipy.spatial.cKDTree(self._embedded(self.curve[:-1]))
+
+    def _embedded(self, points: Array) -> Array:
+        """Angles as points on circles, so that whole turns do not matter."""
+        turning = turning_joints(self.problem)
+        angles = points[:, turning]
+        return np.concatenate([np.cos(angles), np.sin(angles), points[:, ~turning]], axis=1)
+
+
+def circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAMPLES) -> CircleLeaf:
+    """Trace the leaf from one of its points until it closes.
+
+    Args:
+        problem: a problem with r = 1.
+        level: x0, (m,).
+        start: a point of the leaf, where xi0 = 0, (n,).
+        samples: number of samples to keep.
+
+    Raises:
+        GrowError: if the leaf does not close within 200 rad, or runs into a singularity.
+    """
+    trace = _tracer(problem, level, _STEPS)
+    q, travelled, step = start, 0.0, _PIECE / _STEPS
+    while travelled < _LONGEST:
+        piece = trace(q, _PIECE)
+        away = without_turns(problem, piece[1:] - start)
+        left = -(np.diff(piece, axis=0) * away).sum(axis=1) / step  # arc length to the start, along the curve
+        back = np.flatnonzero((np.linalg.norm(away, axis=1) < 2 * step) & (left >= 0))
+        if back.size:
+            k = int(back[-1])
+            return _closed(problem, level, start, travelled + (k + 1) * step + left[k], samples)
+        q, travelled = piece[-1], travelled + _PIECE
+    raise GrowError(f"the base leaf h(q) = {level.tolist()} does not close within {_LONGEST:g} rad of arc length")
+
+
+def _closed(problem: Problem, level: Array, start: Array, length: float, samples: int) -> CircleLeaf:
+    """Trace the leaf once around, with corrections of its length."""
+    trace = _tracer(problem, level, samples)
+    for _ in range(_CLOSINGS):
+        curve = trace(start, length)
+        last = curve[-1] - curve[-2]
+        length -= float(last @ without_turns(problem, curve[-1] - start)) / float(np.linalg.norm(last))
+    curve = trace(start, length)
+    sizes = np.linalg.svd(task_jacobians(problem, curve), compute_uv=False)
+    if sizes[:, -1].min() < _SINGULAR * sizes[:, 0].max():  # the integrator may step across a singular point
+        raise _singular(level)
+    return CircleLeaf(problem, level, curve, np.array([length]))
+
+
+def _singular(level: Array) -> GrowError:
+    return GrowError(f"the base leaf h(q) = {level.tolist()} runs into a singularity of the task")
+
+
+def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, float], Array]:
+    """A map (point, length) -> points at equal arc lengths (steps + 1, n) along the leaf, integrated by SUNDIALS.
+
+    The curve follows the unit vector orthogonal to all task gradients; the term -J_x^# (h - x0) keeps it on the leaf.
+    """
+    q, length = ca.SX.sym("q", problem.n), ca.SX.sym("length")
+    J = problem.task.jacobian_function(q)
+    others = [[k for k in range(problem.n) if k != i] for i in range(problem.n)]
+    across = ca.vertcat(*((-1) ** (i + 1) * ca.det(J[:, columns]) for i, columns in enumerate(others)))
+    home = J.T @ ca.solve(J @ J.T, problem.task.function(q) - level)
+    rate = length * (across / ca.norm_2(across) - home)
+    grid = np.linspace(0.0, 1.0, steps + 1)
+    options = {"abstol": 1e-12, "reltol": 1e-12, "max_num_steps": 100_000, "disable_internal_warnings": True}
+    with building:
+        integrator = ca.integrator(
+            "trace", "cvodes", {"x": q, "p": length, "ode": rate}, 0.0, grid[1:].tolist(), options
+        )
+
+    def trace(start: Array, span: float) -> Array:
+        try:
+            with deferred():
+                points = np.asarray(integrator(x0=start, p=span)["xf"]).T
+        except RuntimeError:
+            points = np.full((steps, problem.n), np.nan)
+        if not np.isfinite(points).all():
+            raise _singular(level)
+        return np.vstack([start, points])
+
+    return trace
+
+
+LEAVES: dict[str, type[LinearLeaf] | type[CircleLeaf] | type[DiskLeaf]] = {
+    kind.kind: kind for kind in (LinearLeaf, CircleLeaf, DiskLeaf)
+}
+
+
+def leaf_from_arrays(problem: Problem, kind: str, arrays: Mapping[str, NDArray[Any]]) -> LeafChart:
+    """Build the chart of a leaf from its arrays.
+
+    Raises:
+        UnknownNameError: if no kind has that name.
+        ShapeError: if an array has the wrong shape.
+    """
+    require_known("leaf", kind, LEAVES)
+    return LEAVES[kind](problem, **arrays)

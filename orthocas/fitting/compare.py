@@ -1,0 +1,196 @@
+"""`compare`: a grid of parametrisations, solvers and seeds, fitted and evaluated side by side."""
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+from orthocas.bases.family import Parametrisation
+from orthocas.bases.registry import require_savable
+from orthocas.charts.chart import Chart
+from orthocas.charts.chart_file import CHART
+from orthocas.codegen.ticks import control_tick
+from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
+from orthocas.fitting.comparison import Comparison
+from orthocas.fitting.grid import Cell, CellResult, run_cells
+from orthocas.fitting.settings import PRECISIONS, default_solver
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
+from orthocas.solvers.gauss_newton import GaussNewton
+from orthocas.solvers.protocol import Solver
+from orthocas.tasks.problem import Problem
+from orthocas.tools.archive import require_free
+from orthocas.tools.checks import as_path, require_count, require_kind, require_known
+from orthocas.tools.files import require_writable
+from orthocas.tools.interrupts import deferred
+from orthocas.tools.progress import Monitor, Progress, silent
+
+
+def with_control_ticks(results: Sequence[CellResult], cells: Sequence[Cell], monitor: Monitor) -> list[CellResult]:
+    """Add `control_tick_us` to the results. Ticks are measured one at a time, so that they do not disturb each other.
+
+    It is NaN if there is no chart file, no C compiler, or the controller does not support the chart.
+    """
+    files = {
+        cell.parametrisation.label: cell.chart_file for cell in cells if cell.chart_file and cell.chart_file.exists()
+    }
+    ticks = {}
+    for done, (label, file) in enumerate(files.items()):
+        monitor(Progress("timing control ticks", done / len(files), label))
+        ticks[label] = _control_tick(file)
+    return [
+        result if result.failed else replace(result, control_tick_us=ticks.get(result.parametrisation, math.nan))
+        for result in results
+    ]
+
+
+def _control_tick(file: Path) -> float:
+    try:
+        with deferred():  # CasADi may make a RuntimeError of Ctrl-C while it builds functions
+            chart = Chart.load(file)
+        return control_tick(chart)
+    except (OrthocasError, OSError, RuntimeError, MemoryError):  # never lose the fits because of a failed measurement
+        return math.nan
+
+
+def compare(
+    problem: Problem,
+    parametrisations: Sequence[Parametrisation],
+    solvers: Sequence[Solver] | None = None,
+    *,
+    seeds: int = 1,
+    weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
+    samples: int | None = None,
+    precision: str = PRECISIONS[0],
+    held_out: int = 100_000,
+    executor: Executor | None = None,
+    jobs: int | None = None,
+    charts: str | Path | None = None,
+    control_ticks: bool = False,
+    monitor: Monitor = silent,
+    force: bool = False,
+) -> Comparison:
+    """Fit every parametrisation with every solver and seed, and evaluate all on the same held-out samples.
+
+    If a fit fails, the result says so and the others continue. Coordinates in closed form need no solver and no seed,
+    so they are evaluated once.
+
+    In scripts, call it under `if __name__ == "__main__"`: it starts processes.
+
+    Args:
+        problem: robot, task, metric and domain.
+        parametrisations: the parametrisations to fit.
+        solvers: the solvers to use. Default: for each parametrisation the default of `fit`.
+        seeds: number of seeds 0, 1, ... of samples and random starts.
+        weights: weights of the loss; see `fit`.
+        samples: number of training samples. Default: grows with the number of parameters.
+        precision: 'double' or 'single', as in `orthocas.fit`.
+        held_out: number of held-out samples.
+        executor: any `concurrent.futures.Executor` (processes, threads, Dask, MPI, ...). Default: processes on this
+            machine with one thread each, so that seconds are those of one core.
+        jobs: number of these processes. Default: one for each core.
+        charts: folder to save charts in.
+        control_ticks: measure after all fits how long a control tick takes with each parametrisation. The tick is
+            decoupled PD+ as generated C, on a saved chart. NaN if there is no C compiler.
+        monitor: called with progress.
+        force: replace files in the folder for charts that are no charts.
+
+    Raises:
+        InvalidValueError: if the grid is empty, or two of its parametrisations or solvers have the same name.
+        ChartFileError: if the folder for charts cannot be written, or has another file with the name of a chart.
+        Interrupted: after Ctrl-C; its `result` is the comparison of the finished fits.
+
+    Example:
+        >>> from concurrent.futures import ThreadPoolExecutor
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> with ThreadPoolExecutor(1) as executor:
+        ...     comparison = oc.compare(
+        ...         problems.get("planar_3r_xy"),
+        ...         [oc.Linear(), oc.Polynomial(degree=2)],
+        ...         samples=200,
+        ...         held_out=1000,
+        ...         executor=executor,
+        ...     )
+        >>> [result.parametrisation for result in comparison.results]
+        ['linear', 'polynomial:2']
+    """
+    require_kind("problem", problem, Problem)
+    count, loss = require_count("seeds", seeds), Weights.of(weights)
+    jobs = None if jobs is None else require_count("jobs", jobs)
+    held_out = require_count("held_out", held_out)
+    require_known("precision", precision, PRECISIONS)
+    _require_grid(parametrisations, solvers)
+    folder = None if charts is None else as_path("charts", charts)
+    if folder is not None:
+        require_writable(folder / "chart", ChartFileError)
+        for parametrisation in parametrisations:
+            require_savable(parametrisation.for_problem(problem))
+    elif control_ticks:
+        raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
+    cells = [
+        Cell(problem, parametrisation, solver, seed, loss, samples, precision, held_out, file, force)
+        for parametrisation, solver, seed, file in _fits(problem, parametrisations, solvers, count, folder)
+    ]
+    for cell in cells:
+        if cell.chart_file is not None:
+            require_free(cell.chart_file, CHART, force)
+    return _run_grid(cells, executor, jobs, control_ticks, monitor)
+
+
+def _fits(
+    problem: Problem,
+    parametrisations: Sequence[Parametrisation],
+    solvers: Sequence[Solver] | None,
+    seeds: int,
+    folder: Path | None,
+) -> Iterator[tuple[Parametrisation, Solver, int, Path | None]]:
+    """Parametrisation, solver, seed and chart file of every fit of a grid."""
+    for parametrisation in parametrisations:
+        closed = parametrisation.closed_form is not None
+        fitting = [default_solver(parametrisation, problem)] if closed or solvers is None else solvers
+        for solver, seed in product(fitting, range(1 if closed else seeds)):
+            name = re.sub(r"[^\w.-]", "-", f"{parametrisation.label}_{solver.name}_{seed}.orthocas")
+            yield parametrisation, solver, seed, None if folder is None else folder / name
+
+
+def _run_grid(
+    cells: Sequence[Cell], executor: Executor | None, jobs: int | None, control_ticks: bool, monitor: Monitor
+) -> Comparison:
+    """All fits in the order of the grid. After Ctrl-C, the finished ones."""
+    order = {(cell.parametrisation.label, cell.solver_name, cell.seed): k for k, cell in enumerate(cells)}
+    results: list[CellResult] = []
+    interrupted = False
+    try:
+        results.extend(run_cells(cells, executor, jobs, monitor))
+        if control_ticks:
+            results = with_control_ticks(results, cells, monitor)
+    except KeyboardInterrupt:
+        interrupted = True
+    results.sort(key=lambda result: order[result.parametrisation, result.solver, result.seed])
+    found = Comparison(tuple(results), interrupted)
+    if interrupted:
+        raise Interrupted(found)
+    return found
+
+
+def _require_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence[Solver] | None) -> None:
+    """Refuse grids that are empty, contain other objects, or have two entries of the same name."""
+    for name, members, kinds, example in (
+        ("parametrisations", parametrisations, Parametrisation, "Polynomial(degree=4)"),
+        ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
+    ):
+        require_kind(name, members, Sequence)
+        if not members:
+            raise InvalidValueError(name, "empty", f"at least one, such as [{example}]")
+        for member in members:
+            if not isinstance(member, kinds):
+                raise InvalidValueError(name, repr(member), f"objects such as {example}")
+        labels = [getattr(member, "label", getattr(member, "name", "")) for member in members]
+        twice = [label for label in labels if labels.count(label) > 1]
+        if twice:
+            raise InvalidValueError(
+                name, f"a list with two called '{twice[0]}'", "different names; compare these in two grids"
+            )

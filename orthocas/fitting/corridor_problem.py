@@ -1,0 +1,82 @@
+"""The problem of one chart for a whole path of postures (ours)."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.bases.cyclic import cyclic_joints, over_cyclic_joints
+from orthocas.errors import DomainError, InvalidValueError
+from orthocas.tasks.corridor import Corridor
+from orthocas.tasks.domains import Box
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.regular_box import joint_range
+from orthocas.tasks.samples import idle_joints, sample_problem
+from orthocas.tools.checks import Array, as_number, as_point_set, require_kind
+
+_THINNED = 0.5  # of the radius, between postures that are kept
+_PRISMATIC = 0.25  # [m] that count like 1 rad
+_SAMPLES, _SEED = 200, 0
+RADIUS = 0.2  #: [rad]
+
+
+def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADIUS, margin_deg: float = 0.0) -> Problem:
+    """The same robot, task and metric near a path of postures: a problem whose domain is a `Corridor`.
+
+    Fit it with `Polynomial(3, "auto")`. Joints that the task does not see, and joints that only turn the whole task,
+    may take all positions between their limits. The others, taken together, stay within the radius of the path.
+
+    Args:
+        problem: robot, task and metric; its domain does not matter.
+        postures: the path in steps that are small against the radius, (N, n) [rad] or [m].
+        radius: largest distance from the path [rad]; prismatic joints count as if a quarter of it [m] were as much.
+        margin_deg: distance to the joint limits [deg].
+
+    Raises:
+        ShapeError, InvalidValueError, DomainError: if the postures have another shape, or none is within the limits.
+
+    Example:
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> postures = np.linspace([0.0, 0.6, 0.8], [0.8, 1.6, 0.8], 20)
+        >>> problem = oc.corridor_problem(problems.get("planar_3r_xy"), postures)
+        >>> chart = oc.fit(problem, oc.Polynomial(3), samples=500).chart
+        >>> bool(oc.evaluate(chart, samples=500).conditioning.min > 0.5)
+        True
+    """
+    require_kind("problem", problem, Problem)
+    path = as_point_set("postures", postures, problem.n)[0]
+    size = as_number("radius", radius)
+    if not 0 < size < np.pi:
+        raise InvalidValueError("radius", radius, "a positive number below pi")
+    prismatic = np.array(problem.robot.tree.prismatic)
+    sizes = np.where(prismatic, _PRISMATIC * size, size)
+    whole = joint_range(problem.robot, margin_deg)
+    path = path[_thinned(path / sizes)]
+    narrow = Problem(problem.robot, problem.task, problem.metric, _around(whole, path, sizes), problem.name)
+    names = problem.robot.joint_names
+    cyclic = cyclic_joints(narrow)
+    idle = idle_joints(narrow, sample_problem(narrow, _SAMPLES, _SEED))
+    for k in {*idle, *map(names.index, cyclic)}:
+        sizes[k] = np.inf
+    free = Problem(problem.robot, problem.task, problem.metric, _around(whole, path, sizes), problem.name)
+    return over_cyclic_joints(free, cyclic)
+
+
+def _thinned(z: Array) -> list[int]:
+    """Rows of a path (N, n) that are at least so far apart, and the last one."""
+    kept = [0]
+    for k in range(1, len(z)):
+        if np.linalg.norm(z[k] - z[kept[-1]]) >= _THINNED:
+            kept.append(k)
+    return kept if kept[-1] == len(z) - 1 else [*kept, len(z) - 1]
+
+
+def _around(whole: Box, path: Array, sizes: Array) -> Corridor:
+    """The corridor in its bounding box; joints with an infinite size have their whole range."""
+    low = np.maximum(path.min(axis=0) - sizes, whole.centre - whole.half_width)
+    high = np.minimum(path.max(axis=0) + sizes, whole.centre + whole.half_width)
+    empty = np.flatnonzero(low >= high)
+    if empty.size:
+        raise DomainError(f"the path leaves the range of joint {empty[0] + 1}, expected postures within the limits")
+    unbounded = [i for i in whole.unbounded if np.isinf(sizes[i])]
+    return Corridor(Box((low + high) / 2, (high - low) / 2, unbounded), path, sizes)

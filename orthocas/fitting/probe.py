@@ -1,0 +1,202 @@
+"""Quick fits on trial boxes: the leak and the conditioning that a chart would have there (ours)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from orthocas.bases.family import JointSpace, LinearFamily
+from orthocas.bases.products import Polynomial
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.point_quality import in_the_metric
+from orthocas.fitting.basis_gradients import gradients_of
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.starts import spectral_start
+from orthocas.fitting.terms import DEFAULT_WEIGHTS
+from orthocas.solvers.gauss_newton import GaussNewton
+from orthocas.solvers.protocol import Status
+from orthocas.tasks.domains import Box, sample_evenly, sample_heavily
+from orthocas.tasks.problem import (
+    NEAR_HALF_A_TURN,
+    NEAR_SINGULAR,
+    Problem,
+    distance_from_half_a_turn,
+    relative_singular_values,
+)
+from orthocas.tasks.samples import Samples, samples_at
+from orthocas.tools.batch import one_blas_thread
+from orthocas.tools.checks import Array
+from orthocas.tools.interrupts import deferred
+
+_DEGREE = 2  # its conditioning is that of degree 4, its leak about a fifth larger
+_TRAINING, _HEAVY, _JUDGES = 700, 300, 3000  # numbers of samples: even, near faces and corners, and of a verdict
+_MANY, _AGAIN = 6, 4  # coordinates from which a fit starts from that of another box, and its steps then
+_SEED = 0
+_TINY = 1e-4
+
+
+Miss = Literal["leak", "conditioning", "singularity", "half a turn"]  #: bounds that a box may miss
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What is asked of coordinates on a box."""
+
+    leak_deg: float  #: largest leak [deg]
+    conditioning: float  #: smallest conditioning
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Quality of coordinates on a box."""
+
+    leak_deg: float  #: root mean square over uniform samples and coordinates [deg]
+    conditioning: float  #: the smallest at any sample; negative if det J changes its sign, because the chart folds over
+    worst_point: Array  #: where, (n,)
+    task_value: float  #: smallest relative singular value of the task, see `orthocas.ClearBox`
+    turn_value: float  #: cos(angle / 2) of the tool's largest turn from the reference; 1 for tasks without one
+
+    def excess(self, bounds: Bounds) -> dict[Miss, float]:
+        """How much each value misses its bound, as a ratio of at most 1 where it keeps it, the largest first.
+
+        "singularity" and "half a turn" are the bounds `NEAR_SINGULAR` and `NEAR_HALF_A_TURN` on the task itself, which
+        the conditioning does not see.
+        """
+        ratios: dict[Miss, float] = {
+            "leak": self.leak_deg / bounds.leak_deg,
+            "conditioning": bounds.conditioning / max(self.conditioning, _TINY),
+            "singularity": NEAR_SINGULAR / max(self.task_value, _TINY),
+            "half a turn": NEAR_HALF_A_TURN / max(self.turn_value, _TINY),
+        }
+        return dict(sorted(ratios.items(), key=lambda pair: -pair[1]))
+
+    def told(self, miss: Miss, bounds: Bounds) -> str:
+        """The value that misses a bound, and the bound, in words."""
+        trial, most, least = "a trial chart has a", bounds.leak_deg, bounds.conditioning
+        words: dict[Miss, str] = {
+            "leak": f"{trial} leak of {self.leak_deg:.3g} deg, expected at most {most:.3g}",
+            "conditioning": f"{trial} conditioning of {self.conditioning:.3g}, expected at least {least:.3g}",
+            "singularity": f"the task's relative singular value is {self.task_value:.3g}, expected {NEAR_SINGULAR:g}",
+            "half a turn": "the tool turns by half a turn from the reference, expected less",
+        }
+        return words[miss]
+
+
+@dataclass(eq=False)
+class Prober:
+    """Fits quadratic coordinates of the active joints on trial boxes.
+
+    Many coordinates take a second, so they start from those of an earlier box, which are nearly the best already.
+    """
+
+    problem: Problem  #: robot, task and metric; trial boxes replace its domain
+    active: list[int]  #: joints that are not coordinates themselves
+    cyclic: tuple[str, ...] = ()  #: joints that enter linearly
+    _objective: BasisObjective | None = None  #: of the last box; others only move it
+    _start: Array | None = None  #: parameters of the last box without folds, on its cube; None: a spectral start
+
+    @property
+    def outputs(self) -> int:
+        """Number of coordinates to fit."""
+        return len(self.active) - self.problem.m
+
+    def verdict(self, box: Box) -> Verdict:
+        """Fit and judge on a box.
+
+        Raises:
+            KeyboardInterrupt: after Ctrl-C.
+        """
+        if self.outputs == 0:
+            return Verdict(0.0, 1.0, box.centre, 1.0, 1.0)
+        problem = Problem(self.problem.robot, self.problem.task, self.problem.metric, box)
+        space = JointSpace.of(problem).restricted_to(self.active)
+        family = Polynomial(_DEGREE, self.cyclic).family(space, self.outputs)
+        with one_blas_thread():
+            theta = self._fitted(problem, family)
+            C = theta.reshape(self.outputs, family.width)
+
+            def jacobian(points: Array) -> Array:
+                basis = gradients_of(family, len(self.active))
+                G = basis.dense(basis.at(points[:, self.active]), len(points))
+                J: Array = (G @ C.T).transpose(0, 2, 1)
+                return J
+
+            found = judged(problem, sample_heavily(box, _JUDGES, _SEED), jacobian, self.active)
+        if self.outputs >= _MANY and found.conditioning > 0:
+            self._start = theta
+        return found
+
+    def _fitted(self, problem: Problem, family: LinearFamily) -> Array:
+        """Parameters, (size,)."""
+        even = sample_evenly(problem.domain, _TRAINING, _SEED)
+        heavy = sample_heavily(problem.domain, _HEAVY, _SEED + 1)
+        samples = samples_at(problem, np.vstack([even, heavy])).restricted_to(self.active)
+        solver = GaussNewton().coarser()
+        with deferred():
+            if self._start is None:
+                start = spectral_start(family, samples[: len(even)])
+            else:
+                start, solver = self._start, replace(solver, max_iterations=_AGAIN)
+            objective = self._loss(problem, family, samples, start)
+        result = solver.minimise(objective, start)
+        if result.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        theta: Array = result.theta
+        return theta
+
+    def _loss(self, problem: Problem, family: LinearFamily, samples: Samples, start: Array) -> BasisObjective:
+        """The loss of the fit that confirms the box: with the weights for its metric."""
+        known = self._objective
+        if known is None:
+            weights = DEFAULT_WEIGHTS.for_metric(problem.metric)
+            self._objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
+        else:
+            self._objective = known.moved(gradients_of(family, len(self.active)), samples, start)
+        return self._objective
+
+
+def judged_chart(chart: Chart, samples: int, seed: int) -> Verdict:
+    """Quality of a fitted chart, without its idle joints, on samples of its domain, many near faces and corners."""
+    coordinates = chart.coordinates
+    assert isinstance(coordinates, Coordinates)
+    fitted, active = len(coordinates.offset), coordinates.active
+
+    def jacobian(points: Array) -> Array:
+        J: Array = coordinates.jacobian(points)[:, :fitted, active]
+        return J
+
+    return judged(chart.problem, sample_heavily(chart.problem.domain, samples, seed), jacobian, active)
+
+
+def judged(problem: Problem, points: Array, jacobian: Callable[[Array], Array], active: list[int]) -> Verdict:
+    """Quality at the result of `sample_heavily`.
+
+    Args:
+        problem: robot, task and metric.
+        points: all samples (N, n).
+        jacobian: gradients of the fitted coordinates in the active joints, (N, r, n), at points of all joints.
+        active: the active joints.
+    """
+    samples = samples_at(problem, points)
+    J, own = jacobian(samples.points), samples.restricted_to(active)
+    uniform = len(samples) - 2 * (len(samples) // 3)
+    leaks, conditioning = leak_and_conditioning(own, J)
+    worst = int(np.argmin(conditioning))
+    leak = float(np.degrees(np.sqrt(np.mean(leaks[:uniform] ** 2))))
+    task_value = float(relative_singular_values(problem, points).min())
+    turn_value = float(distance_from_half_a_turn(problem, points).min())
+    return Verdict(leak, float(conditioning[worst]), samples.points[worst], task_value, turn_value)
+
+
+def leak_and_conditioning(samples: Samples, J: Array) -> tuple[Array, Array]:
+    """Leaks (N, r) [rad] and signed conditioning (N,) of coordinates with gradients J (N, r, n).
+
+    The leak of a coordinate is the angle, in the metric, between its gradient and the space orthogonal to the task. The
+    conditioning is the smallest singular value of [A-orthonormal task basis; unit coordinate gradients]. It is negative
+    where det J has the opposite sign of most samples.
+    """
+    sines, conditioning, signs = in_the_metric(samples, J)
+    usual = 1.0 if signs.sum() >= 0 else -1.0
+    return np.arcsin(np.minimum(sines, 1.0)), conditioning * np.where(signs == -usual, -1.0, 1.0)

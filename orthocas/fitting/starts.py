@@ -1,0 +1,221 @@
+"""Where fits begin: the spectral start of bases, and a second start from the mirrored gradients."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, permutations, product
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.bases.family import JointSpace, LinearFamily
+from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
+from orthocas.fitting.residuals import Pairs, coordinates_of
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import Samples, samples_at
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
+
+_MUTUAL_WEIGHT = 1.0
+_MIXING_ANGLE = np.radians(10)
+_RIDGE = 1e-10  # relative; keeps the pencil definite if basis functions coincide on the samples
+_TOLERANCE = 1e-6  # robot files give angles with ten decimals; a symmetry broken by less costs nothing
+_MOST_JOINTS = 12  # 4,096 choices of the joints that turn round
+_POINTS = 16
+_MOST_CHOICES = 8
+_SEED = 0
+
+
+def spectral_start(
+    family: LinearFamily,
+    samples: Samples,
+    kept: NDArray[np.bool_] | None = None,
+    gradients: BasisGradients | None = None,
+) -> Array:
+    """Coefficients (r K,) of coordinates, found one after the other from generalised eigenproblems.
+
+    Each coordinate minimises E |Pi_x grad xi|^2 subject to E |grad xi|^2 = 1, with the A-orthogonal projector Pi_x on
+    the task gradients. A function of a coordinate xi_j that is already found would be a minimiser too, so each xi_j
+    adds the term E (grad xi_j . grad xi)^2 / |grad xi_j|^2. All products are taken in the metric A^-1.
+
+    Args:
+        family: the coordinates.
+        samples: samples of the family's joints.
+        kept: the coefficients (r, K) that may differ from zero. Default: all.
+        gradients: gradients of the basis, if there are some already. Default: those of the family.
+
+    Source:
+        ours, docs/derivations.md#spectral-start.
+    """
+    basis = gradients_of(family, samples.points.shape[1]) if gradients is None else gradients
+    G = basis.dense(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)
+    N, _, K = G.shape
+    along_task = (samples.task_basis @ G).reshape(-1, K)  # e_i^T d psi, the components along the task gradients
+    S = along_task.T @ along_task / N
+    raised = G if samples.metric_inverse is None else samples.metric_inverse @ G
+    T = G.reshape(-1, K).T @ raised.reshape(-1, K) / N
+    T += _RIDGE * np.trace(T) / K * np.eye(K)
+    allowed = np.ones((family.outputs, K), dtype=bool) if kept is None else kept
+    C, left = np.zeros(allowed.shape), list(range(family.outputs))
+    while left:
+        classes = {
+            allowed[j].tobytes(): j for j in reversed(left)
+        }.values()  # one coordinate for all that allow the same
+        j, c = min(((j, _smallest(S, T, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
+        left.remove(j)
+        C[j] = c
+        gradient = raised @ c  # (N, n)
+        length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))
+        along = np.einsum("sn,snk->sk", gradient / length[:, None], G)
+        S = S + _MUTUAL_WEIGHT * along.T @ along / N
+    return _mixed(C, G, allowed).ravel()
+
+
+def _smallest(S: Array, T: Array, free: NDArray[np.bool_]) -> Array:
+    """The c with c^T T c = 1 and the smallest c^T S c, zero where it is not free, (K,)."""
+    block = np.ix_(free, free)
+    whitening = np.linalg.inv(np.linalg.cholesky(T[block])).T  # W^T T W = I
+    c = np.zeros(len(free))
+    c[free] = whitening @ np.linalg.eigh(whitening.T @ S[block] @ whitening)[1][:, 0]
+    return c
+
+
+def _mixed(C: Array, G: Array, allowed: NDArray[np.bool_]) -> Array:
+    """Scale coordinates to a mean gradient length of 1, and mix neighbours slightly that allow the same coefficients.
+
+    The spectral solution inherits the symmetries of the problem, and a symmetric point is often a saddle of the loss.
+    """
+    C = C / np.linalg.norm(G @ C.T, axis=1).mean(axis=0)[:, None]
+    c, s = np.cos(_MIXING_ANGLE), np.sin(_MIXING_ANGLE)
+    for j in np.flatnonzero((allowed[1:] == allowed[:-1]).all(axis=1)):
+        C[j], C[j + 1] = c * C[j] + s * C[j + 1], c * C[j + 1] - s * C[j]
+    return C
+
+
+@dataclass(frozen=True, eq=False)
+class Mirror:
+    """A reflection S = diag(s) of the joints about the centre of the domain that keeps task directions and metric.
+
+    The projector on the task gradients fulfils Pi(S q) = S Pi(q) S, and A(S q) = S A(q) S, with q from the centre. So
+    coordinates with xi_j(S q) = p_j xi_j(q), p_j = +1 or -1, have the same angles at q and at S q. So have coordinates
+    of which two change places, xi_i(S q) = xi_j(q): then (xi_i + xi_j) / sqrt 2 is even and (xi_i - xi_j) / sqrt 2 odd.
+    In both cases the coordinates come from even and odd components, each with half of the coefficients.
+    """
+
+    space: JointSpace
+    signs: Array  #: s, (n,), +1 or -1
+    parities: Array  #: p of the components, (r,): as many +1 and -1 as the null space has on the mirror, where S q = q
+    exchanged: Pairs = ()  #: pairs of an odd and an even component, from which two coordinates are made
+
+    def choices(self) -> list["Mirror"]:
+        """Mirrors with the same reflection and all choices of what changes places, up to a number of them."""
+        odd, even = (np.flatnonzero(self.parities == sign).tolist() for sign in (-1, 1))
+        most = min(len(odd), len(even))
+        pairs = [
+            tuple(zip(some, others, strict=True))
+            for count in range(most + 1)
+            for some in combinations(odd, count)
+            for others in permutations(even, count)
+        ]
+        return [replace(self, exchanged=chosen) for chosen in pairs[:_MOST_CHOICES]]
+
+    def coordinates(self, theta: Array) -> Array:
+        """Coefficients of the coordinates, (r K,), from those of the components."""
+        rows = theta.reshape(len(self.parities), -1)
+        return np.concatenate(coordinates_of(list(rows), self.exchanged))
+
+    def components(self, theta: Array) -> Array:
+        """Coefficients of the components, (r K,), from those of the coordinates."""
+        rows = theta.reshape(len(self.parities), -1)
+        back = tuple((j, i) for i, j in self.exchanged)
+        return np.concatenate(coordinates_of(list(rows), back))
+
+    def kept(self, family: LinearFamily) -> NDArray[np.bool_] | None:
+        """The coefficients (r, K) that the components may have; None if a basis function is neither even nor odd."""
+        if family not in self._kept:
+            self._kept[family] = self._allowed(family)
+        return self._kept[family]
+
+    @cached_property
+    def _kept(self) -> dict[LinearFamily, NDArray[np.bool_] | None]:
+        """Results of `kept` so far."""
+        return {}
+
+    def _allowed(self, family: LinearFamily) -> NDArray[np.bool_] | None:
+        q = ca.SX.sym("q", self.space.n)
+        basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
+        u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (self.space.n, _POINTS))
+        here, there = (
+            np.array(basis(self.space.centre[:, None] + self.space.half_width[:, None] * side))
+            for side in (u, self.signs[:, None] * u)
+        )
+        size = np.abs(here).max(axis=1)
+        even, odd = (np.abs(there - sign * here).max(axis=1) <= _TOLERANCE * size for sign in (1, -1))
+        allowed: NDArray[np.bool_] = np.where(even, 1, -1) == self.parities[:, None]
+        return allowed if (even | odd).all() else None
+
+
+def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
+    """The first mirror symmetry of a problem in its active joints, or None."""
+    space = JointSpace.of(problem).restricted_to(active)
+    if space.n > _MOST_JOINTS:
+        return None
+    u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (_POINTS, space.n))
+    left = [np.array(signs) for signs in product((1.0, -1.0), repeat=space.n)][1:]
+    for points in (u[:1], u[1:]):
+        left = _symmetric(problem, active, points, left)
+    for signs in left:
+        parities = _parities(problem, active, signs, u)
+        if parities is not None:
+            return Mirror(space, signs, parities)
+    return None
+
+
+def _symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[Array]) -> list[Array]:
+    """The choices of signs for which task directions and metric at S u are the mirror images of those at u."""
+    images = np.concatenate([u, *(signs * u for signs in choices)])
+    tensors = _tensors(problem, active, images)
+    if tensors is None:
+        return []
+    here, *there = tensors.reshape(1 + len(choices), len(u), *tensors.shape[1:])
+    return [
+        signs
+        for signs, image in zip(choices, there, strict=True)
+        if np.abs(image - signs[:, None] * here * signs).max() <= _TOLERANCE
+    ]
+
+
+def _tensors(problem: Problem, active: list[int], u: Array) -> Array | None:
+    """A^-1 and the projector on the task gradients with its second index raised, both of size 1, (N, 2, n, n)."""
+    q = np.repeat(problem.domain.centre[None, :], len(u), axis=0)
+    q[:, active] += problem.domain.half_width[active] * u
+    samples = samples_at(problem, q).restricted_to(active)
+    if len(samples) < len(u):
+        return None
+    basis = samples.task_basis
+    projector = basis.transpose(0, 2, 1) @ basis
+    inverse = np.broadcast_to(np.eye(len(active)), projector.shape)
+    if samples.metric_inverse is not None:
+        inverse = samples.metric_inverse
+    both = np.stack([inverse, projector], axis=1)
+    scaled: Array = both / np.abs(both).max()
+    return scaled
+
+
+def _parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Array | None:
+    """Parities of r coordinates, odd ones first; None if the null space has other parities elsewhere on the mirror.
+
+    The null space of J_x is mapped to itself where S q = q, and trace(S) on it is the number of even coordinates less
+    that of odd ones.
+    """
+    tensors = _tensors(problem, active, np.where(signs > 0, u, 0.0))
+    if tensors is None:
+        return None
+    inverse, projector = tensors[:, 0], tensors[:, 1]
+    along_task = np.einsum("sii,i->s", np.linalg.solve(inverse, projector.transpose(0, 2, 1)), signs)
+    differences = signs.sum() - along_task
+    r = len(active) - problem.m
+    even = np.round((r + differences.mean()) / 2)
+    if np.abs(2 * even - r - differences).max() > 0.01 or not 0 <= even <= r:
+        return None
+    return np.where(np.arange(r) < r - even, -1.0, 1.0)

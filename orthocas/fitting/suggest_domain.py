@@ -1,0 +1,423 @@
+"""`suggest_domain`: the widest box around a posture on which a chart has the quality that is asked (ours)."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.bases.cyclic import cyclic_joints
+from orthocas.bases.family import Parametrisation
+from orthocas.errors import DomainError, InvalidValueError
+from orthocas.fitting.fit import Fit, fit
+from orthocas.fitting.probe import Bounds, Miss, Prober, Verdict, judged_chart
+from orthocas.fitting.settings import default_parametrisation, require_parametrisation
+from orthocas.robots.robot import Robot
+from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
+from orthocas.tasks.domains import Box, Domain
+from orthocas.tasks.metric import Metric, MetricSpec
+from orthocas.tasks.problem import Problem, check
+from orthocas.tasks.regular_box import home_posture
+from orthocas.tasks.samples import idle_joints, sample_problem
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array, as_number, require_count, require_kind
+from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.progress import Monitor, Progress, silent
+
+JUDGES = 30_000  #: samples that judge the fit
+_START, _STEP = 0.5, 1.6  # first scale of the box, and factor to the next while the border is unknown
+_CLOSE = 1.06  # the border is found within this factor
+_SMALLEST = 1e-3  # scale of a box that is too small to be of use
+_ROUNDS = 2  # exchanges of width between joints
+_WIDER = 1.2  # factor by which one joint alone is widened
+_LARGEST_EXCHANGE = np.log(1.5)
+_STAGE = "suggest a domain"
+_PROBES, _PROBES_OF_A_JOINT = 15, 3  # about as many as a search needs
+#: what helps if no box keeps the bounds
+REMEDIES = (
+    "another home (home=..., --centre or --home), another metric (metric=..., --metric), a larger leak_deg "
+    "(--leak-deg) or a smaller conditioning (--conditioning) may help"
+)
+LEAK_DEG, CONDITIONING = 8.0, 0.2  #: what is asked by default
+_MARGIN = 1.25  # trial charts keep a higher conditioning, since a fit is judged at more points
+_FARTHEST = np.pi  # largest half-width of a revolute joint [rad]: a full turn
+_LONGEST = 1.0  # largest half-width of a prismatic joint without limits [m]
+_CHECKED = 200  # samples that tell whether the task can be regular at all, and which joints are idle
+_SHRINK, _TRIES = 0.92, 8  # after a fit that misses a bound
+
+Reason = Literal["joint limit", "unlimited", "idle", "cyclic", "leak", "conditioning", "singularity", "half a turn"]
+_WORDS: dict[Reason, str] = {
+    "joint limit": "to the joint limit",
+    "unlimited": "as far as tried",
+    "idle": "idle, whole range",
+    "cyclic": "cyclic, whole range",
+    "leak": "ended by the leak",
+    "conditioning": "ended by conditioning",
+    "singularity": "ended by singularity",
+    "half a turn": "ended by half a turn",
+}
+
+
+@dataclass(frozen=True)
+class JointWidth:
+    """How wide a suggested box is in one joint, and what ends it.
+
+    The reasons "leak", "conditioning", "singularity" and "half a turn" (of the tool, from the reference) name the bound
+    that breaks first if this joint alone moves a fifth further. A joint is "unlimited" if it reaches a full turn, or
+    1 m, without breaking a bound.
+    """
+
+    joint: str
+    half_width: float  #: [rad] or [m]
+    reason: Reason
+
+    @property
+    def explanation(self) -> str:
+        """The reason in words."""
+        return _WORDS[self.reason]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class DomainSuggestion(Shown):
+    """A domain with the quality that was asked for, and the fit that confirms it; see `suggest_domain`."""
+
+    fit: Fit  #: the fit on the suggested domain
+    home: Array  #: the posture, (n,) [rad] or [m]
+    home_source: str  #: where it comes from, in words
+    joints: tuple[JointWidth, ...]  #: one per joint
+    asked: Bounds
+    leak_deg: float  #: of the fit, root mean square over the domain [deg]
+    conditioning: float  #: of the fit: the smallest at samples, of which two thirds lie near faces and corners
+    worst_point: tuple[float, ...]  #: where the conditioning is smallest [rad] or [m]
+    seconds: float
+
+    @property
+    def problem(self) -> Problem:
+        """Robot, task, metric and suggested domain."""
+        return self.fit.chart.problem
+
+    @property
+    def domain(self) -> Domain:
+        """The suggested domain."""
+        return self.problem.domain
+
+    def facts(self) -> dict[str, str]:
+        """The box, what limits it, and the quality of the fit."""
+        reasons = dict.fromkeys(joint.reason for joint in self.joints)
+        ends = {_WORDS[why]: listed(joint.joint for joint in self.joints if joint.reason == why) for why in reasons}
+        label = self.fit.chart.coordinates.label
+        worst = f"{self.conditioning:.3g} at {JUDGES} samples, most near faces and corners"
+        return {
+            "suggestion": f"half-width {number_list(self.domain.half_width)}, {self.seconds:.3g} s",
+            "home": f"{number_list(self.home)} ({self.home_source})",
+            **ends,
+            "leak": f"{self.leak_deg:.3g} deg with {label}, asked <= {self.asked.leak_deg:g}",
+            "conditioning": f"at least {worst}, asked >= {self.asked.conditioning:g}",
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "home": self.home.tolist(),
+            "home_source": self.home_source,
+            "joints": [asdict(joint) for joint in self.joints],
+            "leak_deg": self.leak_deg,
+            "conditioning": self.conditioning,
+            "worst_point": list(self.worst_point),
+            "asked": asdict(self.asked),
+            "seconds": self.seconds,
+        }
+
+
+@dataclass(eq=False)
+class WidestBox:
+    """Search for the half-widths with the largest product that keep the bounds.
+
+    From a common scale, rounds of exchange follow: joints whose widening costs little become wider, the others
+    narrower, and the scale returns to the border of the bounds. At the optimum all joints that are free cost the same.
+
+    Args:
+        prober: fits and judges trial boxes.
+        home: centre of the boxes, (n,).
+        room: largest half-widths, (n,).
+        free: joints to widen. The others have their full room.
+        bounds: what is asked.
+        monitor: called with progress.
+    """
+
+    prober: Prober
+    home: Array
+    room: Array
+    free: list[int]
+    bounds: Bounds
+    monitor: Monitor
+    probes: int = 0
+
+    def found(self, unit: Array) -> tuple[Array, dict[int, list[Miss]]]:
+        """Half-widths (n,), and for every free joint the bounds that break if it alone becomes a fifth wider.
+
+        The list of a joint is empty if no bound breaks because the joint has no room.
+
+        Args:
+            unit: half-widths to start from, (n,); only their proportions count.
+
+        Raises:
+            DomainError: if no box around the home keeps the bounds.
+        """
+        if not self.free:
+            return self.room.copy(), {}
+        widths = self._to_border(unit, _START)
+        for _ in range(_ROUNDS):
+            trial = self._to_border(widths * np.exp(-self._exchange(widths)), 1.0)
+            if np.log(trial[self.free]).sum() <= np.log(widths[self.free]).sum():
+                break
+            widths = trial
+        return self._grown(widths)
+
+    def verdict(self, widths: Array) -> Verdict:
+        """Fit and judge the box of the given half-widths."""
+        self.probes += 1
+        detail = f"trial {self.probes}: mean half-width {widths[self.free].mean():.3g}"
+        expected = _PROBES + _PROBES_OF_A_JOINT * len(self.free)
+        self.monitor(Progress(_STAGE, min(0.99, self.probes / expected), detail))
+        return self.prober.verdict(Box(self.home, widths))
+
+    def _clipped(self, widths: Array) -> Array:
+        clipped = self.room.copy()
+        clipped[self.free] = np.minimum(widths, self.room)[self.free]
+        return clipped
+
+    def _excess(self, widths: Array) -> float:
+        return max(self.verdict(widths).excess(self.bounds).values())
+
+    def _refusal(self, widths: Array) -> DomainError:
+        """Which bound breaks even on a box of these half-widths (n,), and what may help."""
+        found = self.verdict(widths)
+        miss = next(iter(found.excess(self.bounds)))
+        return DomainError(
+            f"no box around the home {np.round(self.home, 4).tolist()} keeps the bounds: with half-widths of "
+            f"{widths[self.free].max():.1g} {found.told(miss, self.bounds)}; {REMEDIES}"
+        )
+
+    def _to_border(self, unit: Array, scale: float) -> Array:
+        """The widest multiple of half-widths that keeps the bounds."""
+        low, high = 0.0, np.inf
+        while high > _CLOSE * low:
+            widths = self._clipped(scale * unit)
+            if self._excess(widths) <= 1:
+                low = scale
+                if np.array_equal(widths, self.room):
+                    break
+            else:
+                high = scale
+            if high < _SMALLEST:
+                raise self._refusal(widths)
+            scale = low * _STEP if np.isinf(high) else high / _STEP**2 if low == 0 else float(np.sqrt(low * high))
+        return self._clipped(low * unit)
+
+    def _exchange(self, widths: Array) -> Array:
+        """How much narrower each joint becomes, as logarithms of factors, (n,): its cost above the mean cost."""
+        costs, here = np.zeros(len(widths)), self._excess(widths)
+        open_joints = [k for k in self.free if widths[k] < self.room[k]]
+        for k in open_joints:
+            costs[k] = np.log(self._excess(self._widened(widths, k)) / here) / np.log(_WIDER)
+        if open_joints:
+            costs[open_joints] -= costs[open_joints].mean()
+        return np.clip(costs, -_LARGEST_EXCHANGE, _LARGEST_EXCHANGE)
+
+    def _grown(self, widths: Array) -> tuple[Array, dict[int, list[Miss]]]:
+        """Widen each joint alone while the bounds are kept, and say what breaks then."""
+        broken: dict[int, list[Miss]] = {k: [] for k in self.free}
+        for k in self.free:
+            factor = _WIDER
+            while widths[k] < self.room[k]:
+                wider = self._widened(widths, k, factor)
+                misses = [name for name, ratio in self.verdict(wider).excess(self.bounds).items() if ratio > 1]
+                if misses and factor == _WIDER:
+                    broken[k] = misses
+                    break
+                widths = widths if misses else wider
+                factor = _WIDER if misses else factor**2
+        return widths, broken
+
+    def _widened(self, widths: Array, k: int, factor: float = _WIDER) -> Array:
+        wider = widths.copy()
+        wider[k] = min(factor * widths[k], self.room[k])
+        return wider
+
+
+def suggest_domain(
+    robot: Robot,
+    task: Task,
+    home: ArrayLike | str | None = None,
+    metric: Metric | MetricSpec = "euclidean",
+    *,
+    leak_deg: float = LEAK_DEG,
+    conditioning: float = CONDITIONING,
+    parametrisation: Parametrisation | None = None,
+    seed: int = 0,
+    monitor: Monitor = silent,
+) -> DomainSuggestion:
+    """The widest box around a posture, inside the joint limits, on which a chart has the quality that is asked.
+
+    Quadratic charts on trial boxes tell leak and conditioning in a fraction of a second. A search over the half-widths
+    of the joints takes the box with the largest volume that keeps both bounds, and a fit confirms it: if the fit misses
+    a bound, the box shrinks by 8 %. Idle and cyclic joints take their whole range. The result is deterministic.
+
+    Args:
+        robot: the robot.
+        task: a task of that robot. A missing reference orientation is taken at the home.
+        home: centre of the box, (n,) [rad] or [m], or the name of a posture of the robot's files. Default: the first
+            named posture that is regular and away from the limits, otherwise the most regular bent posture.
+        metric: as in `Problem`.
+        leak_deg: largest leak: the root mean square angle, in the metric, between the gradients of the fitted
+            coordinates and the space orthogonal to the task [deg]. 8 degrees couple accelerations by sin 8 = 14 %.
+        conditioning: smallest conditioning, at samples of which two thirds lie near faces and corners; 0 to 1.
+        parametrisation: the family of the fit. Default: Polynomial(degree=4), of degree 3 for more than 8 joints.
+        seed: seed of the fit.
+        monitor: called with progress.
+
+    Raises:
+        DomainError: if the home lies at a joint limit, or no box around it keeps the bounds. The message says which
+            bound breaks, and what may help.
+        SingularTaskError: if the task is singular everywhere.
+        UnknownNameError: if there is no posture of that name.
+        InvalidValueError, NotRedundantError: if an argument is invalid.
+        KeyboardInterrupt: after Ctrl-C; `Interrupted` with the fit on the box found, if it comes during a fit.
+
+    Source:
+        ours, docs/domains.md.
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+        >>> found = oc.suggest_domain(robot, oc.Task.position(robot, "xy"), [0.6, 0.8, 0.8])
+        >>> [joint.reason for joint in found.joints][0]
+        'cyclic'
+        >>> found.leak_deg < 8.0, found.conditioning > 0.2
+        (True, True)
+    """
+    start = time.perf_counter()
+    bounds = _checked(robot, task, leak_deg, conditioning, seed)
+    if parametrisation is not None:
+        require_parametrisation(parametrisation)
+    posture = home_posture(robot, task, home)
+    room = np.minimum(_room(robot, posture.q), _farthest(robot))
+    problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_unit(robot), room)))
+    check(problem, _CHECKED)
+    joints = _Joints.of(problem)
+    prober = Prober(problem, joints.active, joints.cyclic)
+    stricter = replace(bounds, conditioning=min(1.0, _MARGIN * bounds.conditioning))
+    widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).found(_unit(robot))
+    wanted = default_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
+    found, verdict = _confirmed(problem, wanted, joints, widths, bounds, seed, monitor)
+    return DomainSuggestion(
+        fit=found,
+        home=posture.q,
+        home_source=posture.source,
+        joints=joints.described(found.chart.problem, broken),
+        asked=bounds,
+        leak_deg=verdict.leak_deg,
+        conditioning=verdict.conditioning,
+        worst_point=tuple(verdict.worst_point.tolist()),
+        seconds=time.perf_counter() - start,
+    )
+
+
+@dataclass(frozen=True)
+class _Joints:
+    """The roles of the joints: idle and cyclic ones take their whole range, the others are free."""
+
+    names: tuple[str, ...]
+    idle: tuple[int, ...]
+    cyclic: tuple[str, ...]
+
+    @classmethod
+    def of(cls, problem: Problem) -> "_Joints":
+        idle = idle_joints(problem, sample_problem(problem, _CHECKED, 0))[-problem.r :]
+        return cls(problem.robot.joint_names, tuple(idle), cyclic_joints(problem))
+
+    @property
+    def active(self) -> list[int]:
+        """Joints that coordinates are fitted in."""
+        return [k for k in range(len(self.names)) if k not in self.idle]
+
+    @property
+    def free(self) -> list[int]:
+        """Joints whose half-widths are searched."""
+        return [k for k in self.active if self.names[k] not in self.cyclic]
+
+    def described(self, problem: Problem, broken: Mapping[int, list[Miss]]) -> tuple[JointWidth, ...]:
+        """Half-widths of the problem's domain, with what ends them.
+
+        Args:
+            problem: the problem on the suggested domain.
+            broken: the bounds that break if a joint moves further; none for joints that have no room.
+        """
+        robot, domain = problem.robot, problem.domain
+        limited = _room(robot, domain.centre) <= _farthest(robot)
+        found = []
+        for k, name in enumerate(self.names):
+            reason: Reason = "joint limit" if limited[k] else "unlimited"
+            if broken.get(k):
+                reason = broken[k][0]
+            if k not in self.free:
+                reason = "idle" if k in self.idle else "cyclic"
+            found.append(JointWidth(name, float(domain.half_width[k]), reason))
+        return tuple(found)
+
+
+def _checked(robot: Robot, task: Task, leak_deg: float, conditioning: float, seed: int) -> Bounds:
+    require_kind("robot", robot, Robot)
+    require_kind("task", task, Task)
+    require_count("seed", seed, least=0)
+    if not 0 < as_number("leak_deg", leak_deg) < 90:
+        raise InvalidValueError("leak_deg", leak_deg, "an angle between 0 and 90 degrees")
+    if not 0 < as_number("conditioning", conditioning) < 1:
+        raise InvalidValueError("conditioning", conditioning, "a number between 0 and 1")
+    return Bounds(float(leak_deg), float(conditioning))
+
+
+def _unit(robot: Robot) -> Array:
+    """Half-widths whose proportions a search starts from, (n,)."""
+    return np.where(robot.tree.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
+
+
+def _room(robot: Robot, q: Array) -> Array:
+    """Distances of a posture from the nearest joint limits, (n,)."""
+    room: Array = np.minimum(q - robot.lower, robot.upper - q)
+    return room
+
+
+def _farthest(robot: Robot) -> Array:
+    """Largest half-widths that a search tries, (n,): a full turn, the joint's own range, or 1 m."""
+    endless = np.isinf(robot.lower) | np.isinf(robot.upper)
+    return np.where(robot.tree.prismatic, np.where(endless, _LONGEST, np.inf), _FARTHEST)
+
+
+def _confirmed(
+    problem: Problem,
+    parametrisation: Parametrisation,
+    joints: _Joints,
+    widths: Array,
+    bounds: Bounds,
+    seed: int,
+    monitor: Monitor,
+) -> tuple[Fit, Verdict]:
+    """A fit that keeps the bounds, and its quality. The box shrinks until there is one."""
+    robot = problem.robot
+    unbounded = [k for k in joints.idle if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
+    factors = np.where(np.isin(np.arange(robot.n), joints.free), _SHRINK, 1.0)
+    for shrinkings in range(_TRIES):
+        box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
+        trial = Problem(robot, problem.task, problem.metric, box, problem.name)
+        found = fit(trial, parametrisation, seed=seed, monitor=monitor)
+        verdict = judged_chart(found.chart, JUDGES, seed + 1)
+        if max(verdict.excess(bounds).values()) <= 1:
+            return found, verdict
+    raise DomainError(
+        f"fits of {parametrisation.label} miss the bounds on {_TRIES} ever smaller boxes around the home: the last one "
+        f"has a leak of {verdict.leak_deg:.3g} deg and a conditioning of {verdict.conditioning:.3g}; {REMEDIES}"
+    )

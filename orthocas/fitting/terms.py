@@ -1,0 +1,425 @@
+"""The terms of the loss: cosines between gradients ([AS2023] eq. (24)), angles in the metric, regularity, length."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
+
+import casadi as ca
+
+from orthocas.charts.angles import pairs
+from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.tasks.metric import Metric
+from orthocas.tools.checks import as_float_array, as_number, require_kind, require_known, require_shape
+
+REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
+LEAST_CONDITIONING = 0.2  #: that fits aim at on the whole domain
+_FOLD_VOLUME = 1.6 * LEAST_CONDITIONING  # enough for it: det D <= sqrt(e) times the conditioning
+ANGLES = ("paper", "metric")  #: kinds of angles in the loss
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a problem, for the loss of one sample."""
+
+    n: int  #: joints
+    m: int  #: task components
+    r: int  #: coordinates
+    identity_metric: bool  #: whether A = I; then products with A^-1 are omitted
+
+
+Data = Mapping[str, ca.SX]  #: data of a sample by name; there is no 'metric_inverse' for A = I
+
+SAMPLE_DATA: dict[str, Callable[[Sizes], tuple[int, int]]] = {  #: shapes of the properties of `Samples` a term may need
+    "unit_task_gradients": lambda s: (s.m, s.n),
+    "task_basis": lambda s: (s.m, s.n),
+    "task_jacobian": lambda s: (s.m, s.n),
+    "metric_inverse": lambda s: (s.n, s.n),
+    "null_basis": lambda s: (s.n, s.r),
+    "points": lambda s: (s.n, 1),
+}
+
+
+@runtime_checkable
+class LossTerm(Protocol):
+    """A sum of squared residuals of the coordinate gradients at a sample. `Weights` holds its weight."""
+
+    @property
+    def name(self) -> str:
+        """Short name, as used in `Weights`."""
+        ...
+
+    @property
+    def data(self) -> tuple[str, ...]:
+        """Sample data that the term needs: names in `SAMPLE_DATA`."""
+        ...
+
+    @property
+    def hinge(self) -> bool:
+        """Whether the term is zero at most samples of a good fit, and couples all coordinates elsewhere."""
+        ...
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """J_xi (r, n) -> rho (k, 1), where k may be 0. The term adds weight |rho|^2 / 2 to the loss of a sample."""
+        ...
+
+
+def require_sample_data(name: str) -> None:
+    """Raise UnknownNameError unless samples have this data."""
+    require_known("data of a sample", name, SAMPLE_DATA)
+
+
+def task_cosines(unit_task_gradients: ca.SX, coordinate_jacobian: ca.SX) -> ca.SX:
+    """Cosines between task gradients and coordinate gradients, (m, r).
+
+    c_ij = v_x,i^T A^-1 v_xi,j / (|A^-1 v_x,i| |v_xi,j|), Euclidean norms.
+
+    Args:
+        unit_task_gradients: rows A^-1 v_x,i / |A^-1 v_x,i|, (m, n).
+        coordinate_jacobian: J_xi with rows v_xi,j, (r, n).
+
+    Returns:
+        Cosines in [-1, 1]; NaN where a coordinate gradient vanishes.
+
+    Source:
+        [AS2023] eq. (24), first sum.
+    """
+    n = unit_task_gradients.shape[1]
+    require_shape("coordinate_jacobian", coordinate_jacobian.shape, (None, n))
+    lengths = ca.sqrt(ca.sum2(coordinate_jacobian**2))
+    products: ca.SX = unit_task_gradients @ coordinate_jacobian.T
+    return products / ca.repmat(lengths.T, unit_task_gradients.shape[0], 1)
+
+
+def mutual_cosines(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
+    """Cosines between the gradients of two coordinates, one per pair i > j of `pairs(r)`, (r (r - 1) / 2, 1).
+
+    c_ij = v_xi,i^T A^-1 v_xi,j / (|A^-1 v_xi,i| |v_xi,j|), Euclidean norms.
+
+    Args:
+        coordinate_jacobian: J_xi, (r, n).
+        metric_inverse: A^-1, (n, n); None for the identity.
+
+    Source:
+        [AS2023] eq. (24), second sum.
+    """
+    J = coordinate_jacobian
+    raised = J if metric_inverse is None else J @ metric_inverse
+    lengths, raised_lengths = ca.sqrt(ca.sum2(J**2)), ca.sqrt(ca.sum2(raised**2))
+    cosines = [ca.dot(raised[i, :], J[j, :]) / (raised_lengths[i] * lengths[j]) for i, j in pairs(J.shape[0])]
+    return ca.vertcat(*cosines) if cosines else ca.SX(0, 1)
+
+
+@dataclass(frozen=True)
+class TaskTerm:
+    """Mean over task components and coordinates of the squared `task_cosines`."""
+
+    name: str = "task"
+    data: tuple[str, ...] = ("unit_task_gradients",)
+    hinge: bool = False
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """Cosines, coordinate by coordinate, over sqrt(m r), (m r, 1)."""
+        cosines = ca.vec(task_cosines(data["unit_task_gradients"], coordinate_jacobian))
+        rho: ca.SX = (1 / (sizes.m * sizes.r)) ** 0.5 * cosines
+        return rho
+
+
+@dataclass(frozen=True)
+class MutualTerm:
+    """Mean over pairs of coordinates of the squared `mutual_cosines`. It is empty for r = 1."""
+
+    name: str = "mutual"
+    data: tuple[str, ...] = ("metric_inverse",)
+    hinge: bool = False
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """Cosines over the square root of the number of pairs, (r (r - 1) / 2, 1)."""
+        count = max(1, len(pairs(sizes.r)))
+        rho: ca.SX = (1 / count) ** 0.5 * mutual_cosines(coordinate_jacobian, data.get("metric_inverse"))
+        return rho
+
+
+def log_lengths(coordinate_jacobian: ca.SX) -> ca.SX:
+    """Logarithms of the lengths of the coordinate gradients, (r, 1).
+
+    Angles do not fix how fast a coordinate grows along itself: xi^7 is as orthogonal as xi, but flat at 0.
+
+    Source:
+        ours, docs/derivations.md#lengths.
+    """
+    return ca.log(ca.sum2(coordinate_jacobian**2)) / 2
+
+
+@dataclass(frozen=True)
+class LengthTerm:
+    """Mean over coordinates of the squared `log_lengths`."""
+
+    name: str = "length"
+    data: tuple[str, ...] = ()
+    hinge: bool = False
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """Logarithms over sqrt(r), (r, 1)."""
+        rho: ca.SX = (1 / sizes.r) ** 0.5 * log_lengths(coordinate_jacobian)
+        return rho
+
+
+def leak_sines(task_basis: ca.SX, coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
+    """Components of the unit coordinate gradients along an orthonormal basis of the task gradients, (m, r).
+
+    s_aj = e_a . v_xi,j / |v_xi,j|_A^-1. The squares of column j add up to sin^2 of the leak of coordinate j, which
+    depends neither on the basis nor on the task coordinates.
+
+    Args:
+        task_basis: rows e_1..e_m, an A-orthonormal basis of span{grad_A h_i}, (m, n).
+        coordinate_jacobian: J_xi with rows v_xi,j, (r, n).
+        metric_inverse: A^-1, (n, n); None for the identity.
+
+    Returns:
+        Components in [-1, 1]; NaN where a coordinate gradient vanishes.
+
+    Source:
+        ours, docs/angles.md.
+    """
+    J = coordinate_jacobian
+    require_shape("coordinate_jacobian", J.shape, (None, task_basis.shape[1]))
+    lengths = metric_lengths(J, metric_inverse)
+    products: ca.SX = task_basis @ J.T
+    return products / ca.repmat(lengths.T, task_basis.shape[0], 1)
+
+
+def metric_mutual_cosines(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
+    """Cosines in the metric between the gradients of two coordinates, in the order of `pairs(r)`, (r (r - 1) / 2, 1).
+
+    c_ij = v_xi,i^T A^-1 v_xi,j / (|v_xi,i|_A^-1 |v_xi,j|_A^-1).
+
+    Args:
+        coordinate_jacobian: J_xi, (r, n).
+        metric_inverse: A^-1, (n, n); None for the identity.
+
+    Source:
+        ours, docs/angles.md.
+    """
+    J = coordinate_jacobian
+    raised = J if metric_inverse is None else J @ metric_inverse
+    lengths = metric_lengths(J, metric_inverse)
+    cosines = [ca.dot(raised[i, :], J[j, :]) / (lengths[i] * lengths[j]) for i, j in pairs(J.shape[0])]
+    return ca.vertcat(*cosines) if cosines else ca.SX(0, 1)
+
+
+def metric_lengths(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
+    """Lengths |v_xi,j|_A^-1 of the coordinate gradients in the metric, (r, 1)."""
+    raised = coordinate_jacobian if metric_inverse is None else coordinate_jacobian @ metric_inverse
+    lengths: ca.SX = ca.sqrt(ca.sum2(raised * coordinate_jacobian))
+    return lengths
+
+
+@dataclass(frozen=True)
+class MetricTaskTerm:
+    """Mean over basis vectors and coordinates of the squared `leak_sines`."""
+
+    name: str = "metric task"
+    data: tuple[str, ...] = ("metric_inverse", "task_basis")
+    hinge: bool = False
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """Sines, coordinate by coordinate, over sqrt(m r), (m r, 1)."""
+        sines = ca.vec(leak_sines(data["task_basis"], coordinate_jacobian, data.get("metric_inverse")))
+        rho: ca.SX = (1 / (sizes.m * sizes.r)) ** 0.5 * sines
+        return rho
+
+
+@dataclass(frozen=True)
+class MetricMutualTerm:
+    """Mean over pairs of coordinates of the squared `metric_mutual_cosines`. It is empty for r = 1."""
+
+    name: str = "metric mutual"
+    data: tuple[str, ...] = ("metric_inverse",)
+    hinge: bool = False
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """Cosines over the square root of the number of pairs, (r (r - 1) / 2, 1)."""
+        count = max(1, len(pairs(sizes.r)))
+        rho: ca.SX = (1 / count) ** 0.5 * metric_mutual_cosines(coordinate_jacobian, data.get("metric_inverse"))
+        return rho
+
+
+def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
+    """Signed volume of the coordinate gradients across the task, det(D) with D_jk = v_xi,j . z_k / |v_xi,j|_A^-1.
+
+    The z_k are an A-orthonormal basis of ker J_x, so D holds the components of the unit gradients that do not change
+    the task. |det D| is 1 for perfect coordinates, and the chart phi is regular exactly where det D is not 0.
+
+    Args:
+        coordinate_jacobian: J_xi, (r, n).
+        null_basis: columns z_1..z_r, (n, r), oriented continuously over the domain.
+        metric_inverse: A^-1, (n, n); None for the identity.
+
+    Source:
+        ours, docs/derivations.md#regularity.
+    """
+    J = coordinate_jacobian
+    raised = J if metric_inverse is None else J @ metric_inverse
+    lengths = ca.sqrt(ca.sum2(raised * J))
+    return ca.det((J @ null_basis) / ca.repmat(lengths, 1, J.shape[0]))
+
+
+@dataclass(frozen=True)
+class RegularityTerm:
+    """max(bound - det D, 0)^2, where det D is the `gradient_volume`."""
+
+    name: str = "regularity"
+    bound: float = REGULAR_VOLUME
+    data: tuple[str, ...] = ("metric_inverse", "null_basis")
+    hinge: bool = True
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """One residual, (1, 1)."""
+        volume = gradient_volume(coordinate_jacobian, data["null_basis"], data.get("metric_inverse"))
+        hinge: ca.SX = ca.fmax(self.bound - volume, 0)
+        return hinge
+
+
+FOLD_TERM = RegularityTerm("folds", _FOLD_VOLUME)  #: for the worst points of the domain only
+
+_TERMS: dict[str, LossTerm] = {}
+
+
+def register(term: LossTerm) -> None:
+    """Register a loss term. `Weights(extra={name: weight})` then adds it to the loss.
+
+    Raises:
+        UnknownNameError: if the term needs data that samples do not have.
+        InvalidValueError: if the name belongs to another term.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> @dataclass(frozen=True)
+        ... class FirstJoint:  # coordinates should depend little on joint 1
+        ...     name: str = "first joint"
+        ...     data: tuple[str, ...] = ()
+        ...     hinge: bool = False
+        ...
+        ...     def residuals(self, coordinate_jacobian, data, sizes):
+        ...         return coordinate_jacobian[:, 0]
+        >>> oc.register_loss_term(FirstJoint())
+        >>> weights = oc.Weights(extra={"first joint": 100.0})
+        >>> fit = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), weights=weights, samples=300)
+        >>> fit.status.value
+        'converged'
+    """
+    if isinstance(term, type) or not isinstance(term, LossTerm):
+        raise InvalidValueError("term", f"a {type(term).__name__}", "an object with the members of LossTerm")
+    for name in term.data:
+        require_sample_data(name)
+    if _TERMS.get(term.name, term) != term:
+        raise InvalidValueError("name", repr(term.name), "a name that no other term uses")
+    _TERMS[term.name] = term
+
+
+def term_of(name: str) -> LossTerm:
+    """The term with this name.
+
+    Raises:
+        UnknownNameError: if there is no such term.
+    """
+    require_known("loss term", name, _TERMS)
+    return _TERMS[name]
+
+
+_OURS = (MetricTaskTerm(), MetricMutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM)
+for _term in (TaskTerm(), MutualTerm(), *_OURS):
+    register(_term)
+
+WeightNumbers = Sequence[float]  #: two to five numbers: task, mutual, regularity, length, folds
+
+
+@dataclass(frozen=True)
+class Weights:
+    """lambda1 (task) and lambda2 (mutual) of [AS2023] eq. (24); the others are ours.
+
+    The ratio of the first two selects a point on the Pareto front of task angles and mutual angles. At the paper's
+    1000 : 1 the optimum can lose rank. The regularity term prevents the gradients of the coordinates from collapsing
+    anywhere. The length term keeps their lengths even, which helps controllers. The fold term acts at the worst points
+    of the domain, which a search finds between the stages of a fit, and keeps the conditioning above 0.2 there.
+
+    Args:
+        task: lambda1 > 0.
+        mutual: lambda2 >= 0.
+        regularity: lambda3 >= 0.
+        length: lambda4 >= 0.
+        folds: lambda5 >= 0. With 0 there is no search.
+        extra: weights >= 0 of registered terms, by name; see `orthocas.register_loss_term`.
+        angles: what the task and mutual terms measure: 'paper', the cosines of [AS2023] eq. (24) with Euclidean norms;
+            'metric', cosines in the metric with an orthonormal basis of the task gradients, which do not depend on the
+            choice of task coordinates. Default: 'metric' for A = M, where closed loops are better with it, and 'paper'
+            otherwise; see docs/angles.md.
+
+    Raises:
+        InvalidValueError: if a weight is negative or not finite, or all weights are zero.
+        UnknownNameError: if there are no such angles.
+
+    Example:
+        >>> import orthocas as oc
+        >>> oc.Weights(mutual=300.0).by_name
+        {'task': 1000.0, 'mutual': 300.0, 'regularity': 150.0, 'length': 0.0}
+        >>> oc.Weights.of([1000.0, 1.0]).regularity
+        0.0
+    """
+
+    task: float = 1000.0
+    mutual: float = 30.0
+    regularity: float = 150.0
+    length: float = 0.0
+    folds: float = 1000.0
+    extra: Mapping[str, float] = field(default_factory=dict, hash=False)
+    angles: str | None = None
+
+    def __post_init__(self) -> None:
+        for k, name in enumerate(("task", "mutual", "regularity", "length", "folds")):
+            object.__setattr__(self, name, _weight(f"lambda{k + 1}", getattr(self, name)))
+        require_kind("extra", self.extra, Mapping)
+        if self.angles is not None:
+            require_known("angles", self.angles, ANGLES)
+        extra = {name: _weight(f"weight of {name}", value) for name, value in self.extra.items()}
+        object.__setattr__(self, "extra", extra)
+        if not any(self.by_name.values()):
+            raise InvalidValueError("weights", "all zero", "at least one positive number")
+
+    @classmethod
+    def of(cls, weights: "Weights | WeightNumbers") -> "Weights":
+        """Convert two to five numbers in the order of the fields; missing ones are 0. Weights stay as they are.
+
+        Raises:
+            ShapeError, InvalidValueError: if the numbers are invalid, or the task weight is not positive.
+        """
+        if not isinstance(weights, Weights):
+            values = as_float_array("weights", weights)
+            if values.shape not in ((2,), (3,), (4,), (5,)):
+                raise ShapeError("weights", values.shape, (5,))
+            weights = cls(*values.tolist(), *[0.0] * (5 - len(values)))
+        if weights.task == 0:
+            raise InvalidValueError("lambda1", weights.task, "a positive number")
+        return weights
+
+    def for_metric(self, metric: Metric) -> "Weights":
+        """The same weights with the default angles of a metric, unless angles are given."""
+        return replace(self, angles="metric" if metric.is_inertia else "paper") if self.angles is None else self
+
+    @property
+    def by_name(self) -> dict[str, float]:
+        """The weights by the names of their terms, without the fold term; without angles, those of the paper."""
+        kind = "metric " if self.angles == "metric" else ""
+        angles = {f"{kind}task": self.task, f"{kind}mutual": self.mutual}
+        return angles | {"regularity": self.regularity, "length": self.length} | dict(self.extra)
+
+
+def _weight(name: str, value: float) -> float:
+    if not 0 <= as_number(name, value) < float("inf"):
+        raise InvalidValueError(name, value, "a finite number >= 0")
+    return float(value)
+
+
+DEFAULT_WEIGHTS = Weights()  #: weights of a fit by default

@@ -1,0 +1,128 @@
+"""The result of `orthocas.follow`: joint positions, velocities and accelerations on time stamps."""
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from orthocas.errors import PathFileError
+from orthocas.tools.checks import Array, as_path, frozen_array
+from orthocas.tools.display import Shown, listed
+from orthocas.tools.files import published, require_replaceable, require_writable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_HEAD = "time_s"  # first column of our files
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How far a motion stays from its limits, at its time stamps."""
+
+    border: float  #: smallest distance of a joint to the border of the domain, in half-widths
+    border_joint: str  #: the joint that comes closest, or ""
+    velocity: float  #: largest share of a velocity limit that is used, at most 1
+    acceleration: float  #: largest share of an acceleration limit that is used, at most 1
+    singular_value: float  #: smallest relative singular value of the task, see `orthocas.ClearBox`
+    distance: float  #: smallest distance of a link to an obstacle [m]; inf without obstacles
+    distance_pair: str  #: which link and obstacle, or ""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JointMotion(Shown):
+    """A motion from rest to rest: N time stamps, n joints."""
+
+    labels: tuple[str, ...]  #: names of the components of phi
+    joint_names: tuple[str, ...]
+    times: Array  #: (N,) [s], evenly spaced
+    q: Array  #: (N, n) [rad] or [m]
+    dq: Array  #: (N, n)
+    ddq: Array  #: (N, n)
+    x: Array  #: (N, m) task values
+    xi: Array  #: (N, r)
+    s: Array  #: (N,) parameter of the path, from 0 to 1
+    closed: bool  #: whether the last joint position is the first one
+    margins: Margins
+
+    def __post_init__(self) -> None:
+        N, n, m = len(self.times), len(self.joint_names), self.x.shape[1]
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("q", "dq", "ddq"), (N, n))
+        for name, shape in {**shapes, "times": (N,), "s": (N,), "x": (N, m), "xi": (N, n - m)}.items():
+            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+        return float(self.times[-1])
+
+    @property
+    def period(self) -> float:
+        """Distance of the time stamps [s]."""
+        return float(self.times[1])
+
+    def facts(self) -> dict[str, str]:
+        """Length, what moves, and what is left to the limits."""
+        kept, r = self.margins, self.xi.shape[1]
+        ranges = zip(self.labels[-r:], self.xi.min(axis=0), self.xi.max(axis=0), strict=True)
+        kind = "closed" if self.closed else "open"
+        near = f" (joint '{kept.border_joint}')" if kept.border_joint else ""
+        return {
+            "motion": f"{self.duration:.4g} s in {len(self.times)} time stamps, {kind} path",
+            "coordinates": listed(f"{label} from {low:.4g} to {high:.4g}" for label, low, high in ranges),
+            "border": f"{kept.border:.3g} half-widths away{near}",
+            "speed": f"{100 * kept.velocity:.3g} % of the limits, acceleration {100 * kept.acceleration:.3g} %",
+            "task": f"relative singular value at least {kept.singular_value:.3g}",
+            **({"obstacles": f"{kept.distance:.3g} m away: {kept.distance_pair}"} if kept.distance_pair else {}),
+        }
+
+    def plot(self) -> "Figure":
+        """Joints, speeds, task values and coordinates over time, as a matplotlib figure."""
+        from orthocas.paths.figure import motion_figure  # with matplotlib, which takes long to import
+
+        return motion_figure(self)
+
+    def save_csv(self, path: str | Path, force: bool = False) -> None:
+        """Write a CSV file: time_s, then q, dq and ddq of each joint, task values, and coordinates.
+
+        The file appears whole or not at all. It replaces a file that this method wrote, and with `force` any file.
+
+        Raises:
+            PathFileError: if the folder is missing or not writable, or there is another file, or a symbolic link.
+        """
+        target = as_path("path", path)
+        require_place(target, force)
+        with published(target.parent) as drafts:
+            (drafts / target.name).write_text(self._text(), encoding="utf-8", newline="")
+
+    def _text(self) -> str:
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        names = self.joint_names
+        rates = [f"{order}_{name}" for order in ("d", "dd") for name in names]
+        writer.writerow([_HEAD, *names, *rates, *self.labels])
+        table = np.column_stack([self.times, self.q, self.dq, self.ddq, self.x, self.xi])
+        writer.writerows([repr(float(value)) for value in row] for row in table)
+        return text.getvalue()
+
+
+def require_place(path: Path, force: bool) -> None:
+    """Check, before long work, that `JointMotion.save_csv` can write there.
+
+    Raises:
+        PathFileError: if the folder is missing or not writable, or there is a file of others, or a symbolic link.
+    """
+    require_writable(path, PathFileError)
+    require_replaceable(path, _is_ours(path), force, PathFileError)
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file begins like those of `save_csv`."""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(_HEAD) + 1) == f"{_HEAD},".encode()
+    except OSError:
+        return False

@@ -1,0 +1,161 @@
+"""Plans of tool paths: splines through waypoints, and files of paths."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from orthocas.charts.chart import Chart
+from orthocas.charts.phi import counted_on
+from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.tools.checks import Array, as_float_array, frozen_array
+from orthocas.tools.csv_table import LONGEST, column_places, read_table
+
+_SAMPLES = 501  # of a path that is given as a function
+_SAME = 1e-9  # relative distance of the ends of closed paths
+MOST_WAYPOINTS = 100_000
+
+
+def sampled(name: str, given: Any, size: int, labels: tuple[str, ...]) -> Array:
+    """The points (N, size) of a path: an array, or 501 values of a function of s in [0, 1].
+
+    Raises:
+        InvalidValueError, ShapeError: for anything else. The message names the first bad entry.
+    """
+    if callable(given):
+        return np.array([_value(name, given, s, size) for s in np.linspace(0, 1, _SAMPLES)])
+    points = as_float_array(name, given)
+    if points.ndim != 2 or points.shape[1] != size:
+        raise ShapeError(f"{name} ({', '.join(labels)})", points.shape, (None, size))
+    if not 2 <= len(points) <= MOST_WAYPOINTS:
+        raise InvalidValueError(f"number of rows of {name}", len(points), f"from 2 to {MOST_WAYPOINTS}")
+    bad = np.argwhere(~np.isfinite(points))
+    if bad.size:
+        row, column = (int(k) for k in bad[0])
+        raise InvalidValueError(f"{labels[column]} of {name}[{row}]", points[row, column], "a finite number")
+    return points
+
+
+def same_ends(points: Array, sizes: Array) -> bool:
+    """Whether a path returns to its first point."""
+    return bool((np.abs(points[-1] - points[0]) <= _SAME * sizes).all()) and len(points) > 2
+
+
+def places(points: Array, sizes: Array) -> Array:
+    """Parameters s (N,) of points (N, k) from 0 to 1, in proportion to the lengths of the chords.
+
+    Raises:
+        InvalidValueError: if a point repeats the one before it.
+    """
+    chords = np.linalg.norm(np.diff(points / sizes, axis=0), axis=1)
+    repeated = np.flatnonzero(chords <= 1e-12)
+    if repeated.size:
+        k = int(repeated[0]) + 1
+        raise InvalidValueError(f"waypoint {k}", "the same as the one before it", "a path that moves")
+    s = np.concatenate([[0.0], np.cumsum(chords)])
+    return np.asarray(s / s[-1])
+
+
+def spline(s: Array, points: Array, closed: bool) -> CubicSpline:
+    """The spline through points (N, k) at parameters s (N,)."""
+    if closed:
+        points = np.vstack([points[:-1], points[:1]])
+    return CubicSpline(s, points, bc_type="periodic" if closed else "not-a-knot")
+
+
+def _value(name: str, function: Callable[[float], Any], s: float, size: int) -> Array:
+    try:
+        value = function(float(s))
+    except Exception as error:
+        raise InvalidValueError(f"{name}({s:g})", f"{type(error).__name__}: {error}", "a value") from None
+    return frozen_array(f"{name}({s:g})", value, (size,))
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A path of the tool, and one of the extra coordinates."""
+
+    x: CubicSpline  #: s -> (m,)
+    xi: CubicSpline  #: s -> (r,)
+    s: Array  #: (N,) parameters of the waypoints
+    waypoints: Array  #: (N, m)
+    is_function: bool  #: whether the path was given as a function, so that waypoints are samples of it
+    closed: bool
+
+    @classmethod
+    def held(cls, chart: "Chart", tool_path: Any, xi: Array) -> "Plan":
+        """A tool path with constant coordinates (r,)."""
+        return cls._through(chart, tool_path, np.tile(xi, (2, 1)), np.array([0.0, 1.0]))
+
+    @classmethod
+    def scheduled(cls, chart: "Chart", tool_path: Any, xi: Any) -> "Plan":
+        """A tool path with a schedule: coordinates at the waypoints (N, r), or a function of s."""
+        values = counted_on(sampled("xi", xi, chart.r, chart.labels[chart.m :]), chart.turns[chart.m :])
+        if callable(xi) or callable(tool_path):
+            return cls._through(chart, tool_path, values, np.linspace(0.0, 1.0, len(values)))
+        return cls._through(chart, tool_path, values, None)
+
+    @classmethod
+    def _through(cls, chart: "Chart", tool_path: Any, xi: Array, s_xi: Array | None) -> "Plan":
+        """Splines; the coordinates are at parameters of their own, or at those of the waypoints (None)."""
+        x = sampled("tool_path", tool_path, chart.m, chart.labels[: chart.m])
+        if s_xi is None and len(xi) != len(x):
+            raise InvalidValueError("number of rows of xi", len(xi), f"{len(x)}, as of tool_path")
+        sizes = chart.phi_sizes[: chart.m]
+        closed = same_ends(x, sizes) and bool(np.abs(xi[-1] - xi[0]).max() < 1e-9)
+        if callable(tool_path):
+            s = np.linspace(0.0, 1.0, len(x))
+        elif s_xi is None:
+            s = places(np.hstack([x, xi]), chart.phi_sizes)
+        else:
+            s = places(x, sizes)
+        places_of_xi = s if s_xi is None else s_xi
+        curve = spline(places_of_xi, xi, closed and len(xi) > 2)
+        return cls(spline(s, x, closed), curve, s, x, callable(tool_path), closed)
+
+    def with_xi(self, xi: CubicSpline) -> "Plan":
+        """The same tool path with other coordinates."""
+        return replace(self, xi=xi)
+
+    def phi(self, s: Array, order: int = 0) -> Array:
+        """phi or a derivative of it at parameters (N,), (N, n); at one number (n,)."""
+        return np.concatenate([self.x(s, order), self.xi(s, order)], axis=-1)
+
+    def checked(self) -> Array:
+        """Parameters (P,) at which the path is checked: the waypoints, and between them."""
+        return np.union1d(self.s, np.linspace(0.0, 1.0, 1001))
+
+    def told(self, s: float, labels: tuple[str, ...]) -> str:
+        """A place on the path in words."""
+        x = ", ".join(f"{label} = {value:.4g}" for label, value in zip(labels, self.x(s), strict=False))
+        if self.is_function:
+            return f"at s = {s:.4g} ({x})"
+        k = int(np.searchsorted(self.s, s - 1e-12))
+        last = len(self.s) - 1
+        if abs(self.s[min(k, last)] - s) < 1e-9:
+            return f"at waypoint {k} of 0 to {last} ({x})"
+        return f"between waypoints {k - 1} and {k} of 0 to {last} ({x})"
+
+
+def read_path(path: str | Path, chart: Chart) -> tuple[Array, Array | None]:
+    """Waypoints (N, m), and their coordinates (N, r) if the file has columns for them.
+
+    Raises:
+        PathFileError: names the file, the line, and what is wrong there.
+    """
+    values = read_table(path, "path file", "waypoints", MOST_WAYPOINTS, lambda names: _columns(names, chart))
+    return values[:, : chart.m], values[:, chart.m :] if values.shape[1] > chart.m else None
+
+
+def _columns(names: Sequence[str], chart: Chart) -> list[int]:
+    """The columns in the order of the chart's labels, without those of the coordinates if there are none."""
+    task, extra = chart.labels[: chart.m], chart.labels[chart.m :]
+    wanted = (*task, *extra) if set(extra) & set(names) else task
+    for name in names:
+        if name not in chart.labels:
+            known = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
+            raise ValueError(f"line 1: unknown column {name[:LONGEST]!r}, expected {known}")
+    return column_places(names, wanted)

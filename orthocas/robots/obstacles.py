@@ -1,0 +1,270 @@
+"""Obstacles: spheres, capsules and half-spaces, and their distances to the links of a robot."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.errors import InvalidValueError
+from orthocas.robots.kinematics import joint_points
+from orthocas.robots.robot import Robot
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, as_float_array, as_number, as_point_set, frozen_array, require_kind
+
+_TINY = 1e-18  # [m^2], keeps square roots differentiable
+_FARTHEST = 1e6  # [m]
+_POSTURES, _MOVES = 20, 1e-9  # postures that tell which links move, and how far they do [m]
+
+
+@runtime_checkable
+class Obstacle(Protocol):
+    """A solid in the world."""
+
+    @property
+    def heading(self) -> str:
+        """The obstacle in a few words."""
+        ...
+
+    def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
+        """Distance of the segment between two points (3, 1) from the solid [m], a scalar; negative inside it."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """A ball.
+
+    Args:
+        centre: (3,) in the world [m].
+        radius: > 0 [m].
+
+    Example:
+        >>> import orthocas as oc
+        >>> oc.obstacles.Sphere([0.5, 0.0, 0.3], 0.1).heading
+        'sphere of radius 0.1 at (0.5, 0, 0.3)'
+    """
+
+    centre: Array
+    radius: float
+
+    def __init__(self, centre: ArrayLike, radius: float) -> None:
+        object.__setattr__(self, "centre", frozen_array("centre", centre, (3,)))
+        object.__setattr__(self, "radius", _size("radius", radius))
+
+    @property
+    def heading(self) -> str:
+        """Radius and centre."""
+        return f"sphere of radius {self.radius:.4g} at {_point(self.centre)}"
+
+    def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
+        """Distance of a segment from the ball."""
+        return ca.sqrt(_square_to_segment(ca.SX(ca.DM(self.centre)), start, end) + _TINY) - self.radius
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule:
+    """All points within a radius of a segment.
+
+    Args:
+        start: one end of the segment, (3,) in the world [m].
+        end: the other end.
+        radius: > 0 [m].
+    """
+
+    start: Array
+    end: Array
+    radius: float
+
+    def __init__(self, start: ArrayLike, end: ArrayLike, radius: float) -> None:
+        object.__setattr__(self, "start", frozen_array("start", start, (3,)))
+        object.__setattr__(self, "end", frozen_array("end", end, (3,)))
+        object.__setattr__(self, "radius", _size("radius", radius))
+
+    @property
+    def heading(self) -> str:
+        """Radius and ends."""
+        return f"capsule of radius {self.radius:.4g} from {_point(self.start)} to {_point(self.end)}"
+
+    def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
+        """Distance of a segment from the capsule."""
+        a, b = ca.SX(ca.DM(self.start)), ca.SX(ca.DM(self.end))
+        return ca.sqrt(_square_of_segments(start, end, a, b) + _TINY) - self.radius
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A half-space: a floor, a wall, a table. The robot is on the side to which the normal points.
+
+    Args:
+        normal: (3,) in the world, of any length > 0.
+        point: a point of the surface, (3,) [m].
+    """
+
+    normal: Array
+    point: Array
+
+    def __init__(self, normal: ArrayLike, point: ArrayLike) -> None:
+        given = frozen_array("normal", normal, (3,))
+        length = float(np.linalg.norm(given))
+        if not 1e-9 < length < np.inf:
+            raise InvalidValueError("normal", given.tolist(), "a direction, of a length above 1e-9")
+        object.__setattr__(self, "normal", frozen_array("normal", given / length, (3,)))
+        object.__setattr__(self, "point", frozen_array("point", point, (3,)))
+
+    @property
+    def heading(self) -> str:
+        """Point and normal."""
+        return f"plane through {_point(self.point)} with normal {_point(self.normal)}"
+
+    def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
+        """Distance of a segment from the half-space: that of its nearer end."""
+        normal, offset = ca.SX(ca.DM(self.normal)), float(self.normal @ self.point)
+        return ca.fmin(ca.dot(normal, start), ca.dot(normal, end)) - offset
+
+
+def _square_to_segment(point: ca.SX, start: ca.SX, end: ca.SX) -> ca.SX:
+    """Squared distance of a point from a segment, which may have no length."""
+    along = end - start
+    share = _within(ca.dot(point - start, along) / (ca.dot(along, along) + _TINY))
+    gap = point - start - share * along
+    return ca.dot(gap, gap)
+
+
+def _square_of_segments(a0: ca.SX, a1: ca.SX, b0: ca.SX, b1: ca.SX) -> ca.SX:
+    """Squared distance of two segments: the least of five candidates, of which one has an end or none at its place."""
+    a, b, between = a1 - a0, b1 - b0, a0 - b0
+    aa, ab, bb = ca.dot(a, a), ca.dot(a, b), ca.dot(b, b)
+    share = _within((ab * ca.dot(b, between) - bb * ca.dot(a, between)) / (aa * bb - ab**2 + _TINY))
+    squares = [_square_to_segment(a0 + share * a, b0, b1)]
+    squares += [_square_to_segment(point, b0, b1) for point in (a0, a1)]
+    squares += [_square_to_segment(point, a0, a1) for point in (b0, b1)]
+    least = squares[0]
+    for square in squares[1:]:
+        least = ca.fmin(least, square)
+    return least
+
+
+def _within(share: ca.SX) -> ca.SX:
+    return ca.fmin(ca.fmax(share, 0), 1)
+
+
+def _size(name: str, value: float) -> float:
+    size = as_number(name, value)
+    if not 0 < size < 1e6:
+        raise InvalidValueError(name, value, "a length above 0 [m], at most 1e6")
+    return size
+
+
+def _point(point: Array) -> str:
+    return f"({', '.join(f'{value:.4g}' for value in point)})"
+
+
+@dataclass(frozen=True, eq=False)
+class LinkDistances:
+    """Distances of the links on the way to the tip from obstacles, as functions of q.
+
+    A link is a capsule from the origin of its joint to that of the next joint, or to the tip; the true shape of links
+    is not known. Links that no joint moves are left out.
+
+    Args:
+        robot: the robot.
+        obstacles: the obstacles.
+        radius: of the capsules: one for all, or one for each joint of the robot, (n,), >= 0 [m].
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[1.0, 1.0])
+        >>> ball = oc.obstacles.Sphere([0.5, 1.0, 0.0], 0.2)
+        >>> distances = oc.obstacles.LinkDistances(robot, [ball], 0.1)
+        >>> distances.pairs
+        ("link of joint 'q1' and obstacle 0", "link of joint 'q2' and obstacle 0")
+        >>> distances([0.0, 0.0]).round(3).tolist()  # the arm is stretched along x
+        [0.7, 0.818]
+    """
+
+    robot: Robot
+    obstacles: tuple[Obstacle, ...]
+    radii: tuple[float, ...]
+
+    def __init__(self, robot: Robot, obstacles: Sequence[Obstacle], radius: ArrayLike = 0.0) -> None:
+        require_kind("robot", robot, Robot)
+        require_kind("obstacles", obstacles, Sequence)
+        for k, obstacle in enumerate(obstacles):
+            if isinstance(obstacle, type) or not isinstance(obstacle, Obstacle):
+                raise InvalidValueError(f"obstacles[{k}]", f"a {type(obstacle).__name__}", "a Sphere, Capsule or Plane")
+        given = as_float_array("radius", radius)
+        if given.shape not in ((), (robot.n,)):
+            raise InvalidValueError("radius", f"an array of shape {given.shape}", f"one number, or {robot.n}")
+        radii = np.broadcast_to(given, (robot.n,))
+        if not ((radii >= 0) & (radii < _FARTHEST)).all():
+            raise InvalidValueError("radius", given.tolist(), "lengths >= 0 [m]")
+        object.__setattr__(self, "robot", robot)
+        object.__setattr__(self, "obstacles", tuple(obstacles))
+        object.__setattr__(self, "radii", tuple(radii.tolist()))
+
+    def __call__(self, q: ArrayLike) -> Array:
+        """Distances [m] at q (n,) or (N, n), (K,) or (N, K): for each link, those from all obstacles."""
+        points, single = as_point_set("q", q, self.robot.n)
+        values: Array = self._batched(points)[0]
+        return values[0] if single else values
+
+    def with_gradients(self, points: Array) -> tuple[Array, Array]:
+        """Distances (N, K) and their gradients (N, K, n) at points (N, n)."""
+        values, gradients = self._batched_gradients(points)
+        return values, gradients.reshape(len(points), -1, self.robot.n)
+
+    @cached_property
+    def pairs(self) -> tuple[str, ...]:
+        """Which link and obstacle each distance belongs to, (K,)."""
+        return tuple(
+            f"link of joint '{self.robot.joint_names[joint]}' and obstacle {k}"
+            for joint, _, _ in self._links
+            for k in range(len(self.obstacles))
+        )
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """q (n, 1) -> distances (K, 1)."""
+        return dense_function("distances", [self._q], [self._expression])
+
+    @cached_property
+    def _q(self) -> ca.SX:
+        return ca.SX.sym("q", self.robot.n)
+
+    @cached_property
+    def _links(self) -> list[tuple[int, ca.SX, ca.SX]]:
+        """Joint, and both ends of its link, for links that move."""
+        tree = self.robot.tree
+        points = joint_points(tree, self._q)
+        seen = self.robot.joint_points(np.random.default_rng(0).uniform(-1, 1, (_POSTURES, tree.n)))
+        moves = np.ptp(seen, axis=0).max(axis=1) > _MOVES
+        chain: list[int] = []
+        i = tree.tip_parent
+        while i >= 0:
+            chain.insert(0, i)
+            i = tree.parents[i]
+        joints = [chain[0] if chain else 0, *chain]
+        moving = np.flatnonzero(moves[:-1] | moves[1:])
+        return [(joints[k], points[:, int(k)], points[:, int(k) + 1]) for k in moving]
+
+    @cached_property
+    def _expression(self) -> ca.SX:
+        distances = [
+            obstacle.distance(start, end) - self.radii[joint]
+            for joint, start, end in self._links
+            for obstacle in self.obstacles
+        ]
+        return ca.vertcat(*distances) if distances else ca.SX(0, 1)
+
+    @cached_property
+    def _batched(self) -> Batched:
+        return Batched(self.function)
+
+    @cached_property
+    def _batched_gradients(self) -> Batched:
+        both = ca.cse([self._expression, ca.densify(ca.jacobian(self._expression, self._q))])
+        return Batched(dense_function("distances", [self._q], both))

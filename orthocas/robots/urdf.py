@@ -1,0 +1,220 @@
+"""URDF files: checks for errors that Pinocchio's parser accepts, reading, and locked joints."""
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+
+from orthocas.errors import InvalidValueError, RobotError
+from orthocas.robots.pinocchio_model import frame_index, joint_axis, leader_of, remedy
+from orthocas.robots.xml import MOST_LINKS, Attributes, read_xml
+from orthocas.tools.checks import Array, require_known
+
+_WITH_AXIS = ("revolute", "continuous", "prismatic")
+WORLD = "universe"  #: Pinocchio's name for what does not move
+
+
+def check_urdf(path: str | Path, root: ElementTree.Element) -> None:
+    """Refuse zero axes, negative limits of effort and velocity, loops of joints, and more links than any robot has.
+
+    Pinocchio's parser checks lengths of vectors, numbers and limits.
+
+    Raises:
+        RobotError: if a check fails. The message names the file and the joint.
+    """
+    links = len(root.findall("link"))
+    if links > MOST_LINKS:
+        raise RobotError(f"{path} has {links} links, expected at most {MOST_LINKS}")
+    for joint in root.findall("joint"):
+        axis = joint.find("axis")
+        if axis is not None and joint.get("type") in _WITH_AXIS:
+            Attributes(str(path), f"<axis> of joint '{joint.get('name')}'", axis.attrib).direction("xyz")
+        _require_limits(path, joint)
+    _require_tree(path, root)
+
+
+def _require_limits(path: str | Path, joint: ElementTree.Element) -> None:
+    """Limits of effort and velocity are not negative; Pinocchio's parser refuses some, and names no joint."""
+    limit = joint.find("limit")
+    label = f"<limit> of joint '{joint.get('name')}'"
+    for what in ("effort", "velocity"):
+        text = "" if limit is None else limit.get(what, "")
+        if _is_negative(text):
+            raise RobotError(f"{path}: {what} of {label} is '{text[:80]}', expected a number >= 0 (0: unlimited)")
+
+
+def _is_negative(text: str) -> bool:
+    """Whether a text is a number below 0; whether it is a number at all is left to Pinocchio's parser."""
+    try:
+        return float(text) < 0
+    except ValueError:
+        return False
+
+
+def _require_tree(path: str | Path, root: ElementTree.Element) -> None:
+    """Every joint hangs on a link that no joint carries; Pinocchio's parser leaves out loops without a word."""
+    joints = [(joint, _link(joint, "parent"), _link(joint, "child")) for joint in root.findall("joint")]
+    children: dict[str, list[str]] = {}
+    for _, parent, child in joints:
+        children.setdefault(parent, []).append(child)
+    carried = {child for _, _, child in joints if child}
+    waiting = [link.get("name", "") for link in root.findall("link") if link.get("name", "") not in carried]
+    reached = set(waiting)
+    while waiting:
+        found = [child for child in children.get(waiting.pop(), ()) if child not in reached]
+        reached.update(found)
+        waiting += found
+    for joint, parent, child in joints:
+        if parent in carried and parent not in reached:
+            raise RobotError(
+                f"{path}: joint '{joint.get('name')}' hangs from link '{parent}' to link '{child}' "
+                "in a loop of joints, expected a tree of links"
+            )
+
+
+def _link(joint: ElementTree.Element, end: str) -> str:
+    """The link at one end of a joint; whether it is there is left to Pinocchio's parser."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
+def read_urdf(path: str | Path) -> pin.Model:
+    """Read a URDF file. Mimic joints are kept, so that they can be refused or locked later.
+
+    Raises:
+        RobotError: if the file is missing or not a URDF model, or a joint has a zero axis.
+    """
+    check_urdf(path, read_xml(path, "URDF", "robot"))
+    with _captured_stderr() as notes:
+        try:
+            model = pin.buildModelFromUrdf(str(path), mimic=True)
+        except (ValueError, RuntimeError) as error:
+            raise RobotError(f"{path} is not a usable URDF model: {_text(notes) or error}") from None
+        complaints = _text(notes)
+    if "Error:" in complaints:  # the parser skips what it cannot read, for example a mass
+        raise RobotError(f"{path} is not a usable URDF model: {complaints}")
+    return model
+
+
+def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
+    """Lock joints at the given positions [rad] or [m]. Joints that mimic a locked joint follow it.
+
+    A joint with several degrees of freedom (floating, spherical, planar) is locked at its neutral position, given as 0.
+
+    Raises:
+        UnknownNameError: if there is no such joint.
+        InvalidValueError: if a position is not finite.
+        RobotError: if the joint mimics another one, or has several degrees of freedom and a position other than 0.
+    """
+    if not isinstance(locked, Mapping):
+        raise InvalidValueError("locked", locked, "a mapping from joint names to positions")
+    names = list(model.names)[1:]
+    position = pin.neutral(model)
+    ids = []
+    for name, value in locked.items():
+        require_known("joint", name, names)
+        if not isinstance(value, int | float | np.number) or not np.isfinite(value):
+            raise InvalidValueError(f"locked position of joint '{name}'", repr(value), "a finite number")
+        ids.append(model.getJointId(name))
+        _set_position(model, ids[-1], float(value), position)
+    ids += [i for i in model.mimicking_joints if leader_of(model, i) in ids]
+    return _without_joints(model, ids, position) if ids else model
+
+
+def lock_off_chain(model: pin.Model, tip: str) -> pin.Model:
+    """Lock every joint that does not move the tip, of any type, at neutral or at the limit closest to zero.
+
+    Raises:
+        UnknownNameError: if there is no frame named `tip`.
+        RobotError: if a joint that moves the tip is not revolute, continuous or prismatic. The message names it.
+    """
+    chain = [i for i in model.supports[model.frames[frame_index(model, tip)].parentJoint] if i > 0]
+    for i in chain:
+        joint_axis(model, i)
+    ids = [i for i in range(1, model.njoints) if i not in chain]
+    position, mimics = pin.neutral(model), set(model.mimicking_joints)
+    for i in ids:
+        joint = model.joints[i]
+        if joint.nq == joint.nv == 1 and i not in mimics:
+            limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+            position[joint.idx_q] = np.clip(0.0, *limits)
+    return _without_joints(model, ids, position) if ids else model
+
+
+def default_tip(model: pin.Model) -> str:
+    """The last frame of a robot with a single chain.
+
+    Raises:
+        RobotError: if the robot branches. The message lists the frames to choose from.
+    """
+    carriers = {model.parents[i] for i in range(1, model.njoints)}
+    leaves = [i for i in range(1, model.njoints) if i not in carriers]
+    last: dict[int, str] = {i: [frame.name for frame in model.frames if frame.parentJoint == i][-1] for i in leaves}
+    if len(leaves) != 1:
+        raise RobotError(f"the robot has {len(leaves)} chains, name the tip frame: {', '.join(last.values())}")
+    return last[leaves[0]]
+
+
+@contextmanager
+def _captured_stderr() -> Iterator[IO[bytes]]:
+    """Capture what the C++ parser writes to standard error. It belongs in our message, not on the user's terminal."""
+    saved = os.dup(2)
+    with tempfile.TemporaryFile() as sink:
+        os.dup2(sink.fileno(), 2)
+        try:
+            yield sink
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+
+
+def _text(notes: IO[bytes]) -> str:
+    """The captured text, on one line of at most 300 characters."""
+    notes.seek(0)
+    return " ".join(notes.read().decode(errors="replace").split())[:300]
+
+
+def _without_joints(model: pin.Model, ids: list[int], position: Array) -> pin.Model:
+    """The model with joints fixed at a position.
+
+    Pinocchio finds joints by name among all frames, so others get names of their own meanwhile: bodies, sites and
+    joints may share one.
+
+    Raises:
+        RobotError: if a joint has the name of Pinocchio's world.
+    """
+    if WORLD in list(model.names)[1:]:
+        raise RobotError(
+            f"a joint is called '{WORLD}', which no joint can be called while joints are locked: rename it"
+        )
+    renamed, names = model.copy(), {}
+    for i, frame in enumerate(renamed.frames):
+        if i > 0 and frame.type != pin.FrameType.JOINT:
+            unique = f"{i}\n{frame.name}"
+            names[unique], frame.name = frame.name, unique
+    reduced = pin.buildReducedModel(renamed, ids, position)
+    for frame in reduced.frames:
+        frame.name = names.get(frame.name, frame.name)
+    return reduced
+
+
+def _set_position(model: pin.Model, i: int, value: float, position: Array) -> None:
+    """Write a joint position into a configuration. Pinocchio stores cos and sin of a continuous joint."""
+    joint, name = model.joints[i], model.names[i]
+    if i in set(model.mimicking_joints):
+        leader = model.names[leader_of(model, i)]
+        raise RobotError(f"joint '{name}' mimics joint '{leader}', expected an independent joint: {remedy(leader)}")
+    if joint.nv != 1:
+        if value != 0:
+            raise RobotError(
+                f"locked position of joint '{name}' is {value:g}, expected 0: "
+                f"a joint with {joint.nv} degrees of freedom can only be locked at its neutral position"
+            )
+        return
+    position[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(value), np.sin(value)) if joint.nq == 2 else value

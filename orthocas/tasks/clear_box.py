@@ -1,0 +1,218 @@
+"""The part of a box that stays clear of near-singular positions of a task (ours)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocas.errors import DomainError, InvalidValueError, SingularTaskError
+from orthocas.tasks.domains import Box, Domain, sample_evenly, sample_uniform
+from orthocas.tasks.task import Task
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, as_number, as_point_set, frozen_array, require_kind, require_known
+
+CLEAR_BOX = "clear box"  #: name of the kind
+ROWS = ("frame", "x")  #: Jacobians by which a position is judged
+_SAMPLES, _SEED = 256, 0  # of the box, for the scale of the rows
+_SHARE_SAMPLES = 20_000
+
+
+def row_scale(J: Array, units: tuple[str, ...]) -> Array:
+    """Root mean square length of the rows of each unit, (m,). It does not depend on how axes are turned; 1 if zero.
+
+    Args:
+        J: task Jacobians at samples, (N, m, n).
+        units: units of the task components; rows with the same unit share one scale, rows of unknown unit have their
+            own.
+    """
+    squares = (J**2).sum(axis=2).mean(axis=0)
+    groups = [unit or f"own {i}" for i, unit in enumerate(units)]
+    means = [
+        np.mean([square for square, other in zip(squares, groups, strict=True) if other == mine]) for mine in groups
+    ]
+    return np.sqrt([mean if mean > 0 else 1.0 for mean in means])
+
+
+@dataclass(frozen=True, eq=False, init=False, kw_only=True)
+class ClearBox(Box):
+    """All q of a box at which the relative singular value of a task is above a bound (ours).
+
+    The relative singular value s(q) is the smallest singular value of D^-1 J(q), without units. For orientation, pose
+    and axis tasks, J is the frame Jacobian: velocity and angular velocity of the tip in its own axes. So s(q) belongs
+    to the robot, and does not depend on a reference orientation. For other tasks, J is J_x. D is diagonal: rows with
+    the same unit are divided by their root mean square length over the box, so s = 1 is as regular as the task usually
+    is, and s = 0 is singular. Prismatic joints count 1 m like 1 rad. s(q) > bound holds just where
+    D^-1 J J^T D^-1 - bound^2 I is positive definite, so guards test the m pivots of its elimination.
+
+    Half a turn of the tool from the reference, x itself ends although the robot may be clear, and J_x loses rank. Laws
+    report SINGULAR close to it; rows="x" keeps a domain away from it.
+
+    `Problem(..., least_singular_value=bound)` builds it.
+
+    Args:
+        box: the borders.
+        task: the task.
+        least_singular_value: the bound, > 0.
+        scale: the diagonal of D, (m,) > 0, in m and rad per rad. Default: from 256 samples of the box.
+        rows: the rows J: "frame" as above; "x" for J_x of all tasks, as older chart files mean it, which also leaves
+            out what is near half a turn from the reference.
+
+    Raises:
+        DomainError: if the centre of the box is not clear.
+        UnknownNameError: for other rows.
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+        >>> clear = oc.ClearBox(oc.Box([0.6, 0.8, 0.8], 0.8), oc.Task.position(robot, "xy"), 0.1)
+        >>> clear.contains([[0.6, 0.8, 0.8], [0.6, 0.05, 0.05]]).tolist()  # the arm is bent, and nearly straight
+        [True, False]
+    """
+
+    task: Task
+    least_singular_value: float
+    scale: Array
+    rows: str
+
+    def __init__(
+        self,
+        box: Box,
+        task: Task,
+        least_singular_value: float,
+        scale: ArrayLike | None = None,
+        rows: str = "frame",
+    ) -> None:
+        require_kind("box", box, Box)
+        require_kind("task", task, Task)
+        require_known("rows", rows, ROWS)
+        super().__init__(box.centre, box.half_width, box.unbounded)
+        task = task.with_reference_at(box.centre)
+        object.__setattr__(self, "task", task)
+        object.__setattr__(self, "rows", rows)
+        sizes = self._row_sizes() if scale is None else frozen_array("scale", scale, (task.m,))
+        bound = as_number("least_singular_value", least_singular_value)
+        for name, value in (("least_singular_value", bound), ("scale", sizes.min())):
+            if not 0 < value < np.inf:
+                raise InvalidValueError(name, value, "positive and finite")
+        for field, value in (("name", CLEAR_BOX), ("least_singular_value", bound), ("scale", sizes)):
+            object.__setattr__(self, field, value)
+        if not self.is_clear(self.centre[None])[0]:
+            raise DomainError(f"the centre of the domain {self._value_told(self.centre)}")
+
+    @property
+    def heading(self) -> str:
+        """The condition in one line, with the lengths by which rows are divided."""
+        rows = "J_x" if self.jacobian_function is self.task.jacobian_function else "the frame Jacobian"
+        sizes = f"(rows of {rows} over {_lengths(self.scale, self.task.units)})"
+        return f"relative singular value of the task above {self.least_singular_value:g} {sizes}"
+
+    @property
+    def jacobian_function(self) -> ca.Function:
+        """q (n, 1) -> J (m, n), the rows that count."""
+        return self.task.jacobian_function if self.rows == "x" else self.task.frame_jacobian_function
+
+    def told(self, q: Array) -> str:
+        """What is wrong with a position (n,) that is not clear."""
+        return f"the task {self._value_told(q)}"
+
+    def _value_told(self, q: Array) -> str:
+        bound = f"expected one above least_singular_value = {self.least_singular_value:g}"
+        return f"has a relative singular value of {self.singular_values(q):.3g}, {bound}"
+
+    def within(self, box: Box) -> "ClearBox":
+        """The same condition on another box."""
+        return ClearBox(box, self.task, self.least_singular_value, self.scale, self.rows)
+
+    def contains(self, q: ArrayLike) -> Any:
+        """Whether points (n,) or (N, n) lie in the box and are clear of singular positions: a bool, or (N,)."""
+        points, single = as_point_set("q", q, len(self.centre))
+        inside = np.array(super().contains(points))
+        inside[inside] = self.is_clear(points[inside])
+        return inside[0] if single else inside
+
+    def is_clear(self, points: Array) -> NDArray[np.bool_]:
+        """Whether s(q) > bound at points (N, n), also outside the box, (N,)."""
+        return np.asarray((self._batched_pivots(points)[0] > 0).all(axis=1))
+
+    def singular_values(self, q: ArrayLike) -> Any:
+        """s(q) at points (n,) or (N, n): a number, or (N,); NaN where the task has no finite Jacobian."""
+        points, single = as_point_set("q", q, len(self.centre))
+        J = self._jacobians(points) / self.scale[:, None]
+        known = np.isfinite(J).all(axis=(1, 2))
+        values = np.full(len(points), np.nan)
+        values[known] = np.linalg.svd(J[known], compute_uv=False)[:, -1]
+        return values[0] if single else values
+
+    @cached_property
+    def share(self) -> float:
+        """Share of the box that is clear, from 20,000 samples."""
+        return float(self.is_clear(sample_evenly(_borders(self), _SHARE_SAMPLES, _SEED)).mean())
+
+    @cached_property
+    def gram(self) -> ca.Function:
+        """q (n, 1) -> D^-1 J J^T D^-1 (m, m), whose smallest eigenvalue is s(q)^2."""
+        q = ca.SX.sym("q", len(self.centre))
+        J = self.jacobian_function(q) / ca.repmat(ca.DM(self.scale), 1, len(self.centre))
+        return dense_function("gram", [q], [J @ J.T])
+
+    @cached_property
+    def pivots(self) -> ca.Function:
+        """q (n, 1) -> the pivots (m, 1) of D^-1 J J^T D^-1 - bound^2 I; all are > 0 just where q is clear."""
+        q = ca.SX.sym("q", len(self.centre))
+        square = self.least_singular_value * self.least_singular_value  # ** raises OverflowError for bounds of a file
+        left = self.gram(q) - square * ca.SX.eye(self.task.m)
+        found = []
+        for _ in range(self.task.m):
+            found.append(left[0, 0])
+            left = left[1:, 1:] - left[1:, 0] @ left[0, 1:] / left[0, 0]
+        return dense_function("pivots", [q], [ca.vertcat(*found)])
+
+    @cached_property
+    def _batched_pivots(self) -> Batched:
+        return Batched(self.pivots)
+
+    def _jacobians(self, points: Array) -> Array:
+        """J at points (N, n), (N, m, n)."""
+        batched = self.task.batched_jacobian if self.rows == "x" else self.task.batched_frame_jacobian
+        J: Array = batched(points)[0].reshape(len(points), self.task.m, len(self.centre))
+        return J
+
+    def _row_sizes(self) -> Array:
+        """The scale of the rows at samples of the box, without those where they are not finite, (m,)."""
+        J = self._jacobians(sample_uniform(_borders(self), _SAMPLES, _SEED))
+        known = np.isfinite(J).all(axis=(1, 2))
+        if not known.any():
+            raise SingularTaskError(
+                f"the Jacobian of task '{self.task.name}' is not finite at any of {_SAMPLES} samples"
+            )
+        return row_scale(J[known], self.task.units)
+
+
+def clear_domain(domain: Domain, task: Task, least_singular_value: float | None) -> Domain:
+    """The part of a domain where a task is clear of singular positions: a ClearBox of this task, if a bound is given.
+
+    Raises:
+        InvalidValueError: for a bound with a torus.
+        DomainError: if the centre is not clear.
+    """
+    if least_singular_value is not None:
+        if not isinstance(domain, Box) or domain.name not in ("box", CLEAR_BOX):
+            raise InvalidValueError("least_singular_value", least_singular_value, f"none with a {domain.name}")
+        return ClearBox(domain, task, least_singular_value)
+    if isinstance(domain, ClearBox) and domain.task is not task:
+        return ClearBox(domain, task, domain.least_singular_value, rows=domain.rows)
+    return domain
+
+
+def _borders(box: Box) -> Box:
+    """The whole box, also of a ClearBox."""
+    return Box(box.centre, box.half_width)
+
+
+def _lengths(scale: Array, units: tuple[str, ...]) -> str:
+    """For example '0.41 m, 1.53 rad'; one number for each row if units are unknown or their numbers differ."""
+    told = [f"{size:.3g} {unit}".strip() for size, unit in zip(scale, units, strict=True)]
+    return ", ".join(dict.fromkeys(told) if all(units) else told)

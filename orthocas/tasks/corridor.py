@@ -1,0 +1,159 @@
+"""The surroundings of a path of postures: the domain of one chart for a long motion (ours)."""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.tasks.domains import Box
+from orthocas.tools.batch import dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, as_float_array, as_point_set, frozen_array, require_kind
+from orthocas.tools.display import number_list
+
+CORRIDOR = "corridor"  #: name of the kind
+_MOST_POSTURES = 2000
+
+
+@dataclass(frozen=True, eq=False, init=False, kw_only=True)
+class Corridor(Box):
+    """All q of a box near a path of postures (ours): sum_i ((q_i - p_i) / radius_i)^2 <= 1 for a point p of the path.
+
+    The path consists of the straight lines between successive postures. A joint with an infinite radius does not count.
+    `corridor_problem` finds out which joints need not count, and builds the box.
+
+    A chart of a corridor has one xi, so it closes every loop inside. Its leak grows with the radius, hardly with the
+    length of the path.
+
+    Args:
+        box: a box; the corridor is that part of it.
+        postures: the path, (N, n) [rad] or [m].
+        radius: one number, or one for each joint (n,), > 0 [rad] or [m].
+
+    Raises:
+        ShapeError, InvalidValueError: for arguments of the wrong shape or value.
+
+    Example:
+        >>> import orthocas as oc
+        >>> corridor = oc.Corridor(oc.Box([0.5, 0.5], 0.7), [[0.0, 0.0], [1.0, 1.0]], 0.2)
+        >>> corridor.contains([[0.5, 0.6], [0.9, 0.1]]).tolist()
+        [True, False]
+    """
+
+    postures: Array
+    radius: Array
+
+    def __init__(self, box: Box, postures: ArrayLike, radius: ArrayLike) -> None:
+        require_kind("box", box, Box)
+        super().__init__(box.centre, box.half_width, box.unbounded)
+        n = len(box.centre)
+        path = frozen_array("postures", postures, (None, n))
+        if not 1 <= len(path) <= _MOST_POSTURES:
+            raise InvalidValueError("number of postures", len(path), f"from 1 to {_MOST_POSTURES}")
+        sizes = as_float_array("radius", radius)
+        if sizes.shape not in ((), (n,)):
+            raise ShapeError("radius", sizes.shape, (n,))
+        if not (sizes > 0).all() or np.isinf(sizes).all():
+            raise InvalidValueError("radius", sizes.tolist(), "positive numbers, at least one of them finite")
+        sizes = np.array(np.broadcast_to(sizes, (n,)))
+        sizes.setflags(write=False)
+        for field, value in (("name", CORRIDOR), ("postures", path), ("radius", sizes)):
+            object.__setattr__(self, field, value)
+        if not self.contains(path).any():
+            raise InvalidValueError("postures", "outside the box", "postures of which at least one lies in the box")
+
+    @property
+    def heading(self) -> str:
+        """The condition in one line."""
+        sizes = number_list(self.radius[self.counted])
+        return f"distance to a path of {len(self.postures)} postures at most 1 in units of {sizes}"
+
+    def within(self, box: Box) -> Self:
+        """The same condition on another box. Joints that have more room there do not count."""
+        wider = box.half_width > self.half_width * (1 + 1e-9)
+        return type(self)(box, self.postures, np.where(wider, np.inf, self.radius))
+
+    def told(self, q: Array) -> str:
+        """What is wrong with a position (n,) that is too far from the path."""
+        distance = float(np.sqrt(1 - float(self.pivots(q))))
+        return f"the position is {distance:.3g} radii away from the path of the corridor, expected at most 1"
+
+    def contains(self, q: ArrayLike) -> Any:
+        """Whether points (n,) or (N, n) lie in the corridor: a bool, or (N,)."""
+        points, single = as_point_set("q", q, len(self.centre))
+        inside = np.array(super().contains(points))
+        inside[inside] = self.squared_distance(points[inside]) <= 1
+        return inside[0] if single else inside
+
+    @cached_property
+    def pivots(self) -> ca.Function:
+        """q (n, 1) -> 1 - (distance to the path)^2, positive inside."""
+        q = ca.SX.sym("q", len(self.centre))
+        z = q[self.counted.tolist()] / ca.DM(self.radius[self.counted])
+        squares = []
+        for start, axis, square in zip(*self.lines, strict=True):
+            apart, length = z - ca.DM(start), float(np.sqrt(square))
+            along = ca.fmin(ca.fmax(ca.dot(apart, ca.DM(axis)), 0), length)
+            squares.append(ca.sumsqr(apart - along * ca.DM(axis)))
+        return dense_function("pivots", [q], [1 - ca.mmin(ca.vertcat(*squares))])
+
+    def draw(self, rng: np.random.Generator, count: int, power: float) -> Array:
+        """At most `count` points (M, n): uniform for power 1, nearer to the border for smaller powers.
+
+        Points are drawn in cylinders around lines, in proportion to their volumes. Those in the corridor are kept with
+        probability 1 / k if k cylinders hold them.
+        """
+        u = rng.uniform(-1.0, 1.0, (count, len(self.centre)))
+        q = self.centre + self.half_width * np.sign(u) * np.abs(u) ** power
+        q[:, self.counted] = self._in_cylinders(rng, count, power) * self.radius[self.counted]
+        q = q[self.contains(q)]
+        along, across = self._parts(q)
+        length = np.sqrt(self.lines[2])
+        held = (across <= 1) & (along * length >= -1) & ((along - 1) * length <= 1)
+        return np.asarray(q[rng.uniform(size=len(q)) * held.sum(axis=1) < 1])
+
+    def _in_cylinders(self, rng: np.random.Generator, count: int, power: float) -> Array:
+        """Points of cylinders of radius 1 around the lines, which are longer by 1 at both ends."""
+        starts, axes, squares = self.lines
+        length, d = np.sqrt(squares), starts.shape[1]
+        k = rng.choice(len(length), size=count, p=(length + 2) / (length + 2).sum())
+        direction = rng.normal(size=(count, d))
+        direction -= (direction * axes[k]).sum(axis=1, keepdims=True) * axes[k]
+        direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-300)
+        distance = rng.uniform(size=(count, 1)) ** (power / max(d - 1, 1)) if d > 1 else 0.0
+        along = rng.uniform(-1.0, length[k] + 1)[:, None]
+        return np.asarray(starts[k] + along * axes[k] + distance * direction)
+
+    def squared_distance(self, points: Array) -> Array:
+        """Squared distance of points (N, n) from the path in radii, (N,)."""
+        along, across = self._parts(points)
+        beyond = along - np.clip(along, 0.0, 1.0)
+        return np.asarray((across + beyond**2 * self.lines[2]).min(axis=1))
+
+    def lengths(self, steps: Array) -> Array:
+        """Lengths of steps (N, n) in radii, (N,)."""
+        return np.asarray(np.linalg.norm(steps / self.radius, axis=1))
+
+    def _parts(self, points: Array) -> tuple[Array, Array]:
+        """Place of points (N, n) along every line, from 0 to 1 on it, and squared distance from it, (N, lines) each."""
+        starts, axes, squares = self.lines
+        z = points[:, self.counted] / self.radius[self.counted]
+        along = z @ axes.T - (starts * axes).sum(axis=1)
+        total = (z**2).sum(axis=1)[:, None] - 2 * z @ starts.T + (starts**2).sum(axis=1)
+        return along / np.sqrt(squares), total - along**2
+
+    @cached_property
+    def counted(self) -> Any:
+        """The joints whose distance to the path counts, ascending."""
+        return np.flatnonzero(np.isfinite(self.radius))
+
+    @cached_property
+    def lines(self) -> tuple[Array, Array, Array]:
+        """Start, unit direction and squared length of every line, in joints that count and units of the radius."""
+        z = (self.postures / self.radius)[:, self.counted]
+        starts, steps = (z[:-1], np.diff(z, axis=0)) if len(z) > 1 else (z, np.zeros_like(z))
+        squares = np.maximum((steps**2).sum(axis=1), 1e-24)
+        return starts, steps / np.sqrt(squares)[:, None], squares

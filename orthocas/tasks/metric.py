@@ -1,0 +1,149 @@
+"""Metrics A(q) on joint space. They define what "orthogonal" means."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.errors import MetricError, ShapeError
+from orthocas.robots.pinocchio_model import remedy
+from orthocas.robots.robot import Robot
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, frozen_array, require_kind, require_known, require_text
+from orthocas.tools.expressions import expression_of
+
+METRIC_KINDS = ("euclidean", "inertia")
+MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` accepts
+_SINGULAR = 1e-12  # eigenvalue, relative to the largest entry, that counts as zero
+
+
+@dataclass(frozen=True, eq=False)
+class Metric:
+    """A symmetric positive definite A(q), (n, n). Use `from_spec` or `custom` to build one."""
+
+    name: str  #: euclidean, inertia, constant, custom, or a name of your own
+    function: ca.Function  #: q (n, 1) -> A (n, n), dense, SX
+    recipe: dict[str, Any] = field(repr=False)  #: plain data for chart files
+
+    @classmethod
+    def from_spec(cls, robot: Robot, spec: MetricSpec) -> Self:
+        """Build from "euclidean", "inertia", a constant matrix (n, n), or a map q -> A(q) on SX.
+
+        Raises:
+            UnknownNameError: if the name is unknown.
+            ShapeError: if A is not (n, n).
+            MetricError: if a constant A is not symmetric positive definite, or M(q) is singular everywhere. The message
+                names the joint.
+        """
+        require_kind("robot", robot, Robot)
+        q = ca.SX.sym("q", robot.n)
+        if isinstance(spec, str):
+            require_known("metric", spec, METRIC_KINDS)
+            if spec == "inertia":
+                _require_mass(robot)
+            A = robot.function("mass_matrix")(q) if spec == "inertia" else ca.SX.eye(robot.n)
+            return cls(spec, dense_function("metric", [q], [A]), {"kind": spec})
+        if callable(spec):
+            return cls.custom(robot, "custom", spec)
+        matrix = frozen_array("metric", spec, (robot.n, robot.n))
+        require_spd(matrix[None], np.zeros((1, robot.n)))
+        return cls(
+            "constant",
+            dense_function("metric", [q], [ca.SX(ca.DM(matrix))]),
+            {"kind": "constant", "matrix": matrix.tolist()},
+        )
+
+    @classmethod
+    def custom(cls, robot: Robot, name: str, function: Callable[[ca.SX], ca.SX] | ca.Function) -> Self:
+        """A metric of your own, as a CasADi expression.
+
+        Args:
+            robot: the robot.
+            name: a name for reports.
+            function: maps an SX column q (n, 1) to a symmetric positive definite A (n, n).
+
+        Raises:
+            ShapeError: if A is not (n, n).
+
+        Example:
+            >>> import casadi as ca
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+            >>> metric = oc.Metric.custom(robot, "stiff elbow", lambda q: ca.diag(ca.vertcat(1, 2 + ca.cos(q[1]))))
+            >>> oc.Problem(robot, oc.Task.position(robot, "x"), metric).metric.name
+            'stiff elbow'
+        """
+        require_text("name of a metric", str(name))
+        require_kind("robot", robot, Robot)
+        q = ca.SX.sym("q", robot.n)
+        A = expression_of("metric", function, q)
+        if A.shape != (robot.n, robot.n):
+            raise ShapeError("metric", A.shape, (robot.n, robot.n))
+        return cls(str(name), dense_function("metric", [q], [A]), {"kind": "custom", "name": str(name)})
+
+    @cached_property
+    def batched(self) -> Batched:
+        """Evaluates A at many points."""
+        return Batched(self.function)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether A = I everywhere."""
+        return bool(self.recipe["kind"] == "euclidean")
+
+    @property
+    def is_inertia(self) -> bool:
+        """Whether A = M, the mass matrix."""
+        return bool(self.recipe["kind"] == "inertia")
+
+
+def metric_matrices(metric: Metric, points: Array) -> Array:
+    """A at points (N, n), as an array (N, n, n). Each matrix is checked to be symmetric positive definite."""
+    n = points.shape[1]
+    if metric.is_identity:
+        return np.broadcast_to(np.eye(n), (len(points), n, n))
+    A = metric.batched(points)[0].reshape(-1, n, n)
+    require_spd(A, points)
+    return A
+
+
+def require_spd(matrices: Array, points: Array) -> None:
+    """Raise MetricError, with the worst point, unless all matrices (N, n, n) are symmetric positive definite."""
+    if not len(matrices):
+        return
+    size = np.abs(matrices).max(axis=(1, 2))
+    if not np.isfinite(size).all():
+        at = points[np.flatnonzero(~np.isfinite(size))[0]]
+        raise MetricError(
+            f"metric is not finite at q = {np.round(at, 4).tolist()}, expected symmetric positive definite"
+        )
+    asymmetry = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2))
+    worst = int(np.argmax(asymmetry - 1e-9 * size))
+    if asymmetry[worst] > 1e-9 * size[worst]:
+        raise MetricError(
+            f"metric is not symmetric at q = {np.round(points[worst], 4).tolist()} "
+            f"(difference {asymmetry[worst]:.3g}), expected symmetric positive definite"
+        )
+    smallest = np.linalg.eigvalsh(matrices)[:, 0]
+    worst = int(np.argmin(smallest - _SINGULAR * size))
+    if smallest[worst] <= _SINGULAR * size[worst]:
+        raise MetricError(
+            f"metric has eigenvalue {smallest[worst]:.3g} at q = {np.round(points[worst], 4).tolist()}, "
+            "expected symmetric positive definite"
+        )
+
+
+def _require_mass(robot: Robot) -> None:
+    """Raise MetricError, with the name of the joint, if M(q) is singular at several postures."""
+    M = robot.mass_matrix(np.random.default_rng(0).uniform(-1, 1, (4, robot.n)))
+    values, vectors = np.linalg.eigh(M)
+    if np.all(values[:, 0] <= _SINGULAR * np.abs(M).max(axis=(1, 2))):
+        joint = robot.joint_names[int(np.argmax(np.abs(vectors[0, :, 0])))]
+        raise MetricError(
+            f"joint '{joint}' moves no mass, so M(q) is singular, expected mass or armature for the inertia metric: "
+            f"give the joint's link a mass in the robot file, or {remedy(joint)}"
+        )

@@ -1,0 +1,242 @@
+"""A problem: a robot, a task, a metric and a domain that fit together."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
+from orthocas.robots.robot import Robot
+from orthocas.tasks.clear_box import ClearBox, clear_domain, row_scale
+from orthocas.tasks.corridor import Corridor
+from orthocas.tasks.domains import Domain, require_within_limits, sample_uniform
+from orthocas.tasks.metric import Metric, MetricSpec, metric_matrices
+from orthocas.tasks.regular_box import regular_box
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array, require_kind, require_shape, require_text
+from orthocas.tools.display import Shown, listed, number_list
+
+NEAR_SINGULAR = 0.01  #: smallest relative singular value of the task below which a sample counts as singular
+NEAR_HALF_A_TURN = 0.01  #: cos(angle / 2) of turns that count as half a turn: those above 178.9 deg
+_RANK_LOST = 1e-9
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Problem(Shown):
+    """Find r = n - m coordinates xi(q) with J_x A^-1 J_xi^T = 0 on a domain ([AS2023] eq. (5)).
+
+    Args:
+        robot: the robot.
+        task: a task of that robot, m < n. If it lacks a reference orientation, the one at the domain's centre is used.
+        metric: "euclidean", "inertia", a constant SPD matrix (n, n), a map q -> A(q) on SX, or a Metric.
+        domain: Box or Torus inside the joint limits. Default: `regular_box(robot, task)`, away from singular postures.
+        name: for reports.
+        least_singular_value: leaves out of the domain, a Box, all positions where the relative singular value of the
+            task is smaller; see `orthocas.ClearBox`. Default: no bound.
+
+    Raises:
+        NotRedundantError: if m >= n.
+        DomainError: if the domain leaves the joint limits, or its centre is nearer to a singular position than allowed.
+        MetricError: if a constant metric is not SPD, or a joint moves no mass under "inertia". Metrics that depend on q
+            are checked by `check`, and later at every sample.
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+        >>> task = oc.Task.position(robot, "xy")
+        >>> problem = oc.Problem(robot, task, metric="inertia", domain=oc.Box([0.6, 0.8, 0.8], 0.4))
+        >>> problem.n, problem.m, problem.r
+        (3, 2, 1)
+    """
+
+    robot: Robot
+    task: Task
+    metric: Metric
+    domain: Domain
+    name: str
+
+    def __init__(
+        self,
+        robot: Robot,
+        task: Task,
+        metric: Metric | MetricSpec = "euclidean",
+        domain: Domain | None = None,
+        name: str = "custom",
+        least_singular_value: float | None = None,
+    ) -> None:
+        if not isinstance(task, Task) or not isinstance(robot, Robot):
+            raise InvalidValueError(
+                "robot and task", f"{type(robot).__name__} and {type(task).__name__}", "Robot and Task"
+            )
+        if task.robot is not robot:
+            raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
+        if task.m >= robot.n:
+            raise NotRedundantError(task.m, robot.n)
+        domain = regular_box(robot, task) if domain is None else domain
+        if not isinstance(domain, Domain):
+            raise InvalidValueError("domain", repr(domain), "a Box or a Torus")
+        require_within_limits(robot, domain)
+        task = task.with_reference_at(domain.centre)
+        domain = clear_domain(domain, task, least_singular_value)
+        metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
+        require_shape("metric", metric.function.size_out(0), (robot.n, robot.n))
+        for key, value in (
+            ("robot", robot),
+            ("task", task),
+            ("metric", metric),
+            ("domain", domain),
+            ("name", require_text("name of a problem", str(name))),
+        ):
+            object.__setattr__(self, key, value)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.robot.n
+
+    @property
+    def m(self) -> int:
+        """Number of task components."""
+        return self.task.m
+
+    @property
+    def r(self) -> int:
+        """Degree of redundancy n - m."""
+        return self.n - self.m
+
+    def facts(self) -> dict[str, str]:
+        """Sizes, task, metric, domain and robot."""
+        domain = self.domain
+        return {
+            "problem": f"{self.name}, n = {self.n} joints, m = {self.m} task, r = {self.r} extra",
+            "task": self.task.heading,
+            "metric": self.metric.name,
+            "domain": f"{domain.name}, half-width {number_list(domain.half_width)}{self._endless}",
+            **({"clear": domain.heading} if isinstance(domain, ClearBox) else {}),
+            **({"corridor": domain.heading} if isinstance(domain, Corridor) else {}),
+            "centre": number_list(domain.centre),
+            "robot": self.robot.heading,
+        }
+
+    @property
+    def _endless(self) -> str:
+        """The unbounded joints of the domain, in words."""
+        joints = [self.robot.joint_names[k] for k in getattr(self.domain, "unbounded", ())]
+        return f", unbounded in {listed(joints)}" if joints else ""
+
+
+@dataclass(frozen=True)
+class ProblemCheck:
+    """The result of `check`."""
+
+    samples: int
+    singular_samples: int  #: samples with a relative singular value of the task below NEAR_SINGULAR
+    smallest_singular_value: float  #: relative one of the task, see `orthocas.ClearBox`
+    most_singular_point: tuple[float, ...]  #: joint position of the smallest singular value [rad] or [m]
+    half_turn_samples: int  #: samples where the tool is about half a turn from the reference: x ends there
+
+    @property
+    def half_turn_share(self) -> float:
+        """Share of samples about half a turn from the reference."""
+        return self.half_turn_samples / self.samples
+
+    @property
+    def singular_share(self) -> float:
+        """Share of near-singular samples."""
+        return self.singular_samples / self.samples
+
+
+def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
+    """Check the metric (SPD) and the rank of the task on uniform samples of the domain.
+
+    The rank is that of the rows of `orthocas.ClearBox`: of the frame Jacobian for a task that compares orientations.
+    Rows with the same unit are first divided by their root mean square length over the domain.
+
+    Raises:
+        MetricError: if A is not symmetric positive definite at a sample.
+        SingularTaskError: if J_x loses rank at every sample, or is not finite at one.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> oc.check(problems.get("planar_3r_xy")).singular_share
+        0.0
+    """
+    require_kind("problem", problem, Problem)
+    points = sample_uniform(problem.domain, samples, seed)
+    metric_matrices(problem.metric, points)
+    smallest = relative_singular_values(problem, points)
+    if smallest.max() < _RANK_LOST:
+        raise SingularTaskError(
+            f"the Jacobian of task '{problem.task.name}' has rank below m = {problem.m} "
+            f"at all {samples} samples of the domain"
+        )
+    worst = int(np.argmin(smallest))
+    return ProblemCheck(
+        samples=samples,
+        singular_samples=int((smallest < NEAR_SINGULAR).sum()),
+        smallest_singular_value=float(smallest[worst]),
+        most_singular_point=tuple(points[worst].tolist()),
+        half_turn_samples=int((distance_from_half_a_turn(problem, points) < NEAR_HALF_A_TURN).sum()),
+    )
+
+
+def relative_singular_values(problem: Problem, points: Array) -> Array:
+    """Relative singular values of the task at points (N, n), (N,); see `orthocas.ClearBox`.
+
+    Rows with the same unit are divided by their root mean square length at these points. A ClearBox uses its own rows
+    and scale.
+
+    Raises:
+        SingularTaskError: if a task component does not depend on any joint, or J_x is not finite at a point.
+    """
+    task, domain = problem.task, problem.domain
+    J = task_jacobians(problem, points)
+    idle = np.flatnonzero((J == 0).all(axis=(0, 2)))
+    if idle.size:
+        raise SingularTaskError(f"task component '{task.labels[idle[0]]}' does not depend on any joint")
+    if isinstance(domain, ClearBox):
+        return np.asarray(domain.singular_values(points))
+    if task.turn is not None:
+        J = task.batched_frame_jacobian(points)[0].reshape(J.shape)
+    return np.asarray(np.linalg.svd(J / row_scale(J, task.units)[:, None], compute_uv=False)[:, -1])
+
+
+def is_regular(problem: Problem, points: Array) -> NDArray[np.bool_]:
+    """Whether J_x is far from losing rank at points (N, n), (N,): the robot is, and the tool far from half a turn."""
+    clear = relative_singular_values(problem, points) >= NEAR_SINGULAR
+    return clear & (distance_from_half_a_turn(problem, points) >= NEAR_HALF_A_TURN)
+
+
+def distance_from_half_a_turn(problem: Problem, points: Array) -> Array:
+    """cos(angle / 2) of the tool's turn from the reference at points (N, n), (N,); 1 for tasks without a reference."""
+    task = problem.task
+    if task.turn is None:
+        return np.ones(len(points))
+    return task.turn.distance_from_half_a_turn(task.batched(points)[0].reshape(-1, task.m))
+
+
+def task_sizes(problem: Problem) -> Array:
+    """How far the task components move over the domain, (m,): the mean of sum_j |dh_i/dq_j| half_width_j at 32 samples.
+
+    1 for a component that does not move, or whose gradient is not finite.
+    """
+    points = sample_uniform(problem.domain, 32, 0)
+    J = problem.task.batched_jacobian(points)[0].reshape(-1, problem.m, problem.n)
+    sizes = (np.abs(J) @ problem.domain.half_width).mean(axis=0)
+    return np.where(np.isfinite(sizes) & (sizes > 0), sizes, 1.0)
+
+
+def task_jacobians(problem: Problem, points: Array, results: Array | None = None) -> Array:
+    """J_x at points (N, n), as an array (N, m, n): a new one, or `results`.
+
+    Raises:
+        SingularTaskError: if J_x is not finite at a point (for example polar coordinates at the origin).
+    """
+    J = np.empty((len(points), problem.m, problem.n)) if results is None else results
+    problem.task.batched_jacobian.into(J, points)
+    if not np.isfinite(J).all():
+        bad = ~np.isfinite(J).all(axis=(1, 2))
+        at = np.round(points[np.flatnonzero(bad)[0]], 4).tolist()
+        raise SingularTaskError(f"the Jacobian of task '{problem.task.name}' is not finite at q = {at}")
+    return J

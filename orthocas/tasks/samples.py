@@ -1,0 +1,143 @@
+"""Sample sets of a problem: the data of the loss that do not depend on the coordinates; idle joints."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.metric import metric_matrices
+from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
+
+_NEGLIGIBLE = 1e-10  # robot files give angles with ten decimals
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Samples:
+    """N joint positions with their task gradients and metrics. Samples with a vanishing gradient are left out."""
+
+    points: Array  #: q, (N, n)
+    task_jacobian: Array  #: J_x, (N, m, n)
+    metric_inverse: Array | None  #: A^-1, (N, n, n); None for the identity
+
+    def __repr__(self) -> str:
+        N, m, n = self.task_jacobian.shape
+        return f"Samples({N} joint positions, n = {n}, m = {m})"
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, part: slice | NDArray[np.bool_]) -> "Samples":
+        inverse = None if self.metric_inverse is None else self.metric_inverse[part]
+        return Samples(self.points[part], self.task_jacobian[part], inverse)
+
+    def restricted_to(self, joints: list[int]) -> "Samples":
+        """The samples of some joints only. The metric must not couple them to the others."""
+        inverse = None if self.metric_inverse is None else self.metric_inverse[:, joints][:, :, joints]
+        return Samples(self.points[:, joints], self.task_jacobian[:, :, joints], inverse)
+
+    def raised(self, covectors: Array) -> Array:
+        """A^-1 v for covectors v (N, k, n): gradients in the metric ([AS2023] eq. (16))."""
+        gradients: Array = covectors if self.metric_inverse is None else covectors @ self.metric_inverse
+        return gradients
+
+    @property
+    def unit_task_gradients(self) -> Array:
+        """A^-1 v_x,i / |A^-1 v_x,i| with Euclidean norms, as in [AS2023] eq. (24), (N, m, n)."""
+        gradients = self.raised(self.task_jacobian)
+        unit: Array = gradients / np.linalg.norm(gradients, axis=2, keepdims=True)
+        return unit
+
+    @property
+    def task_basis(self) -> Array:
+        """An A-orthonormal basis e_1..e_m of span{grad_A h_i}, (N, m, n)."""
+        gradients = self.raised(self.task_jacobian)
+        gram = gradients @ self.task_jacobian.transpose(0, 2, 1)
+        scale = np.sqrt(np.einsum("sii->si", gram))  # normalise rows first, so that units do not matter
+        gram = gram / scale[:, :, None] / scale[:, None, :]
+        values, vectors = np.linalg.eigh(gram)
+        values = np.maximum(values, 1e-14)  # keeps singular samples finite
+        whitening = (vectors / np.sqrt(values)[:, None, :]).transpose(0, 2, 1)
+        basis: Array = whitening @ (gradients / scale[:, :, None])
+        return basis
+
+    @cached_property
+    def null_basis(self) -> Array:
+        """An A-orthonormal basis z_1..z_r of ker J_x, (N, n, r), oriented so that det [J_x; Z^T] > 0."""
+        m = self.task_jacobian.shape[1]
+        Z = np.linalg.qr(self.task_jacobian.transpose(0, 2, 1), mode="complete")[0][:, :, m:]
+        if self.metric_inverse is not None:
+            gram = Z.transpose(0, 2, 1) @ np.linalg.solve(self.metric_inverse, Z)
+            Z = Z @ np.linalg.inv(np.linalg.cholesky(gram)).transpose(0, 2, 1)
+        stacked = np.concatenate([self.task_jacobian, Z.transpose(0, 2, 1)], axis=1)
+        Z[:, :, -1] *= np.where(np.linalg.det(stacked) < 0, -1.0, 1.0)[:, None]
+        return Z
+
+    def orientation(self, coordinate_jacobians: Array) -> float:
+        """Sign (+1 or -1), at most of the samples, of the volume that J_xi (N, r, n) spans across the task."""
+        return 1.0 if np.median(np.linalg.det(coordinate_jacobians @ self.null_basis)) >= 0 else -1.0
+
+    def described(self, names: Iterable[str], orientation: float | None) -> list[Array]:
+        """The data of every sample that a loss needs, by name: arrays (N, rows, columns) or (N, rows).
+
+        Args:
+            names: see `orthocas.fitting.terms.SAMPLE_DATA`.
+            orientation: result of `orientation` for the coordinates that a fit starts from. The null basis is oriented
+                like them, so that the volume of their gradients is positive.
+        """
+        found: dict[str, Array] = {name: getattr(self, name) for name in names}
+        if "null_basis" in found:
+            turned = found["null_basis"].copy()
+            turned[:, :, -1] *= orientation or 1.0
+            found["null_basis"] = turned
+        return list(found.values())
+
+
+Draw = Callable[[int, tuple[int, ...]], Samples]  #: draws a number of fresh samples of a problem, with a seed
+
+
+def even_parts(samples: Samples, count: int) -> Iterator[Samples]:
+    """Split samples into `count` parts of nearly equal size. Sizes differ if samples were left out."""
+    edges = np.linspace(0, len(samples), count + 1).astype(int)
+    for start, stop in pairwise(edges):
+        yield samples[int(start) : int(stop)]
+
+
+def sample_problem(problem: Problem, samples: int, seed: int | tuple[int, ...]) -> Samples:
+    """Draw samples uniformly from the problem's domain."""
+    return samples_at(problem, sample_uniform(problem.domain, samples, seed))
+
+
+def samples_at(problem: Problem, points: Array) -> Samples:
+    """Samples at given joint positions (N, n)."""
+    J = task_jacobians(problem, points)
+    kept = np.all(np.einsum("sij,sij->si", J, J) > 0, axis=1)
+    if not kept.all():
+        points, J = points[kept], J[kept]
+    inverse: Array | None = None
+    if not problem.metric.is_identity:
+        inverse = np.asarray(np.linalg.inv(metric_matrices(problem.metric, points)), dtype=float)
+    return Samples(points, J, inverse)
+
+
+def idle_joints(problem: Problem, samples: Samples) -> list[int]:
+    """Joints k on which the task does not depend, and which the metric does not couple to the others.
+
+    At every sample column k of J_x vanishes, row k of A^-1 is zero off the diagonal, and A does not depend on q_k. Then
+    J_x A^-1 e_k = 0, so xi = q_k is exact and orthogonal to every coordinate of the other joints. The rest of the
+    problem does not depend on joint k.
+    """
+    J = samples.task_jacobian
+    size = np.abs(J).max(axis=(0, 1))
+    idle = size <= _NEGLIGIBLE * size.max()
+    if samples.metric_inverse is not None:
+        B = np.abs(samples.metric_inverse).max(axis=0)
+        off_diagonal = (B - np.diag(B.diagonal())).max(axis=1)
+        idle &= off_diagonal <= _NEGLIGIBLE * B.diagonal()
+        felt_by_metric = problem.metric.function.jac_sparsity(0, 0).get_col()
+        idle[felt_by_metric] = False
+    return [int(k) for k in np.flatnonzero(idle)]

@@ -1,0 +1,266 @@
+"""The container of chart files and checkpoints: a zip of a JSON header, `.npy` arrays and checksums."""
+
+import errno
+import hashlib
+import io
+import json
+import lzma
+import os
+import re
+import stat
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.errors import ArchiveError
+from orthocas.tools.files import is_archive, published, require_replaceable, require_writable
+from orthocas.tools.json import from_strict_json
+
+_MOST_AXES = 32
+_LAST_CHARACTER = 0x10FFFF
+_SURROGATES = 0xD800 >> 11  # halves of characters, which cannot be written
+_START = b"\x93NUMPY\x01\x00"
+_NPY_HEADER = re.compile(
+    rb"\{'descr': '([<>|][biuf][1248]|[<>]U\d{1,8})', 'fortran_order': (True|False), "
+    rb"'shape': \(((?:\d{1,18}, ?)*(?:\d{1,18})?)\), \} *\n"
+)
+_DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, RuntimeError, MemoryError),
+    *(NotImplementedError, LookupError, TypeError, ValueError, OverflowError, AttributeError),
+)  # what zipfile raises on damaged files
+_PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_ENCRYPTED = 1  # flag bit
+_SMALL = 2**23  # bytes that any file may unpack to
+_RATIO = 100  # numbers in use hardly shrink; whoever packs zeros could fill the memory
+_MOST_ENTRIES = 10_000
+_HEADER, _DIGEST = "header.json", "digest.txt"
+
+Stored = NDArray[Any]  #: an array in a file, of floats or integers
+
+
+def to_npy(array: Stored) -> bytes:
+    """An array as `np.save` writes it."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.asarray(array), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def from_npy(content: bytes) -> Stored:
+    """The array that `np.save` wrote: numbers, bools or text, no objects.
+
+    Raises:
+        ValueError: if the bytes are anything else.
+    """
+    begin = len(_START) + 2
+    body = begin + int.from_bytes(content[len(_START) : begin], "little")
+    found = _NPY_HEADER.fullmatch(content[begin:body])
+    if not content.startswith(_START) or found is None:
+        raise ValueError("no array of numbers")
+    try:
+        kind = np.dtype(found[1].decode())
+    except TypeError:
+        raise ValueError(f"unknown kind of numbers {found[1].decode()}") from None
+    shape = tuple(int(part) for part in found[3].split(b",") if part.strip())
+    if len(shape) > _MOST_AXES or prod(shape) * kind.itemsize != len(content) - body:
+        raise ValueError(f"{len(content) - body} bytes for the shape {shape[:5]}")
+    if kind.kind == "U":
+        _require_characters(np.frombuffer(content, f"{kind.byteorder}u4", offset=body))
+    flat = np.frombuffer(content, kind, prod(shape), body)
+    return flat.reshape(shape, order="F" if found[2] == b"True" else "C").copy()
+
+
+def _require_characters(codes: Stored) -> None:
+    """Raise ValueError unless all are characters. Python fails on others only when the text is used."""
+    if ((codes > _LAST_CHARACTER) | (codes >> 11 == _SURROGATES)).any():
+        raise ValueError("text with invalid characters")
+
+
+@dataclass(frozen=True, eq=False)
+class Unpacker:
+    """Entries of one zip file by name."""
+
+    source: Path
+    what: str  #: for errors, for example 'chart'
+    error: type[ArchiveError]
+    archive: zipfile.ZipFile
+    sizes: dict[str, int]  #: bytes of each entry, as the file states them
+    most: int  #: bytes that may be unpacked at once
+
+    def read(self, name: str) -> bytes:
+        """The bytes of an entry.
+
+        Raises:
+            ArchiveError: the file's own, if the entry is damaged, packed in an unusual way or too large.
+        """
+        self.require_room([name])
+        entry = self.archive.getinfo(name)
+        if entry.compress_type not in _PACKINGS or entry.flag_bits & _ENCRYPTED:
+            raise self.error(f"entry {name} of {self.source} is encrypted or packed otherwise than stored or deflated")
+        try:
+            with self.archive.open(entry) as stream:
+                content = stream.read(entry.file_size + 1)  # read() without a number would unpack all there is
+        except _DAMAGE:
+            raise self.error(f"entry {name} of {self.source} is truncated or damaged") from None
+        if len(content) != entry.file_size:
+            raise self.error(f"entry {name} of {self.source} has {len(content)} bytes, expected {entry.file_size}")
+        return content
+
+    def require_room(self, names: list[str]) -> None:
+        """Raise the file's error unless all these entries exist and together unpack to a sensible size."""
+        for name in names:
+            if name not in self.sizes:
+                raise self.error(f"{self.source} is not a {self.what} file: it has no entry {name}")
+        size = sum(self.sizes[name] for name in names)
+        if size > self.most:
+            raise self.error(
+                f"{self.source} unpacks to {size / 2**20:.0f} MiB, expected at most {self.most / 2**20:.0f} MiB: "
+                f"{_RATIO} times the size of the file, or {_SMALL / 2**20:.0f} MiB"
+            )
+
+
+@contextmanager
+def unpacking(source: Path, what: str, error: type[ArchiveError]) -> Iterator[Unpacker]:
+    """Open a zip file; `what` names it in errors, for example 'chart'.
+
+    Raises:
+        ArchiveError: the one given, if the file is missing, cannot be read, is no zip file, or has an entry twice.
+    """
+    try:
+        if not source.is_dir() and not stat.S_ISREG(source.stat().st_mode):  # some never end, some never begin
+            raise OSError(errno.EINVAL, "it is a device or a pipe")
+        stream = source.open("rb")
+    except FileNotFoundError:
+        raise error(f"{what} file {source} does not exist") from None
+    except (OSError, ValueError) as reason:
+        text = reason.strerror if isinstance(reason, OSError) else reason
+        raise error(f"cannot read {what} file {source}: {text}") from None
+    with stream:
+        try:
+            archive = zipfile.ZipFile(stream)
+            entries = archive.infolist()
+        except _DAMAGE:
+            raise error(f"{source} is truncated, damaged or not a {what} file") from None
+        sizes = {entry.filename: entry.file_size for entry in entries}
+        if len(sizes) < len(entries) or len(entries) > _MOST_ENTRIES:
+            raise error(f"{source} has {len(entries)} entries, {len(sizes)} of them different: not a {what} file")
+        most = max(_SMALL, _RATIO * os.fstat(stream.fileno()).st_size)
+        yield Unpacker(source, what, error, archive, sizes, most)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file, and the error that its readers and writers raise."""
+
+    name: str  #: 'chart' or 'checkpoint'
+    version: int  #: newest format version
+    error: type[ArchiveError]
+
+    @property
+    def format(self) -> str:
+        """Name of the format in the header."""
+        return f"orthocas-{self.name}"
+
+
+def write_archive(
+    path: str | Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, Stored], force: bool = False
+) -> None:
+    """Write header and arrays to a file that appears whole or not at all.
+
+    Raises:
+        ArchiveError: if the folder is missing or not writable, the header holds NaN or infinity, or there is another
+            kind of file (unless `force`) or a symbolic link. The error is `kind.error`.
+    """
+    target = Path(path)
+    require_free(target, kind, force)
+    entries = {f"{name}.npy": to_npy(array) for name, array in arrays.items()}
+    full = {
+        "format": kind.format,
+        "version": kind.version,
+        **header,
+        "sha256": {k: _digest(v) for k, v in entries.items()},
+    }
+    try:
+        text = json.dumps(full, indent=1, allow_nan=False).encode()
+    except ValueError:
+        raise kind.error(f"cannot write {target}: its header would hold NaN or infinity") from None
+    entries = {_HEADER: text, _DIGEST: _digest(text).encode(), **entries}
+    try:
+        with (
+            published(target.parent) as drafts,
+            zipfile.ZipFile(drafts / target.name, "w", zipfile.ZIP_DEFLATED) as draft,
+        ):
+            for name, content in entries.items():
+                draft.writestr(zipfile.ZipInfo(name), content)
+    except OSError as error:
+        raise kind.error(f"cannot write {target}: {error.strerror}") from None
+
+
+def require_free(path: Path, kind: Kind, force: bool) -> None:
+    """Check early, before long work, that a file can be written and replaces none but one of its kind.
+
+    Raises:
+        ArchiveError: the kind's own, if it cannot, or would.
+    """
+    require_writable(path, kind.error)
+    require_replaceable(path, is_archive(path, kind.format), force, kind.error)
+
+
+def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str, Stored]]:
+    """Read header and arrays back; entries that the header does not list are left alone.
+
+    Raises:
+        ArchiveError: if the file is missing, truncated, edited, of another format, or from a newer version. The error
+            is `kind.error`.
+    """
+    source = Path(path)
+    with unpacking(source, kind.name, kind.error) as zipped:
+        text = zipped.read(_HEADER)
+        header = _checked_header(source, kind, text)
+        if zipped.sizes.get(_DIGEST) != len(_digest(b"")) or zipped.read(_DIGEST) != _digest(text).encode():
+            raise kind.error(f"{source} has been edited: its header does not match its checksum")
+        zipped.require_room(list(header["sha256"]))
+        arrays = {name.removesuffix(".npy"): _array(zipped, name, digest) for name, digest in header["sha256"].items()}
+    return header, arrays
+
+
+def _array(zipped: Unpacker, name: str, digest: str) -> Stored:
+    """An entry that matches its checksum, as an array."""
+    content = zipped.read(name)
+    if _digest(content) != digest:
+        raise zipped.error(f"{zipped.source} has been edited: entry {name} does not match its checksum")
+    try:
+        return from_npy(content)
+    except ValueError as error:
+        raise zipped.error(f"{zipped.source} contains an array that cannot be read: {name}, {error}") from None
+
+
+def _checked_header(source: Path, kind: Kind, text: bytes) -> dict[str, Any]:
+    """Check format and version before anything else is believed."""
+    try:
+        header = from_strict_json(text)
+    except ValueError as error:
+        raise kind.error(f"{source} is not an orthocas {kind.name} file: {error}") from None
+    sums = header.get("sha256") if isinstance(header, dict) else None
+    if not isinstance(sums, dict) or not {"format", "version"} <= header.keys():
+        raise kind.error(f"{source} is not an orthocas {kind.name} file")
+    name, version = header["format"], header["version"]
+    if name != kind.format:
+        raise kind.error(f"{source} has format '{name}', expected '{kind.format}'")
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+        raise kind.error(f"{source} has format version {version}, expected 1 to {kind.version}")
+    if version > kind.version:
+        raise kind.error(f"{source} has format version {version}, this orthocas reads up to {kind.version}: upgrade")
+    return dict(header)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,211 @@
+"""CasADi functions on sets of samples, and work in threads."""
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from functools import cache
+from queue import SimpleQueue
+from threading import Lock, local
+from typing import Any, TypeVar
+
+import casadi as ca
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
+from orthocas.tools.cached import building
+from orthocas.tools.checks import Array
+from orthocas.tools.interrupts import deferred
+
+_CHUNKS = (1, 8, 64)  # samples in one call: the smallest number that holds the set, or the largest
+_LARGE = 512  # samples in one call of sets of at least so many, where starting threads pays off
+
+
+def _threads() -> int:
+    """Number of cores this process may use, or OMP_NUM_THREADS if it is set, as in other libraries."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isascii() and wanted.isdigit() and int(wanted) > 0:
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+THREADS = _threads()  #: threads that mapped functions of this process use
+
+
+def dense_function(
+    name: str, inputs: Sequence[Any], outputs: Sequence[Any], input_names: Sequence[str] = ()
+) -> ca.Function:
+    """A CasADi function, SX or MX, whose outputs have no structural zeros, as `Batched` needs.
+
+    The first output is called `out`. A single input is called `q` unless `input_names` is given.
+    """
+    names = list(input_names) or (["q"] if len(inputs) == 1 else [f"i{k}" for k in range(len(inputs))])
+    results = ["out", *(f"out{k}" for k in range(1, len(outputs)))]
+    return ca.Function(name, inputs, [ca.densify(out) for out in outputs], names, results)
+
+
+@dataclass(frozen=True)
+class Batched:
+    """A function of one sample that is called with N samples.
+
+    It takes one array per input, (N, rows) for a column or (N, rows, columns) for a matrix, and returns one array per
+    output in the same form. Inputs and outputs are dense.
+    """
+
+    function: ca.Function
+    _mapped: dict[int, ca.Function] = field(default_factory=dict, repr=False)
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate N samples."""
+        N = len(arguments[0])
+        chunk = _LARGE if N >= _LARGE else next((size for size in _CHUNKS if size >= N), _CHUNKS[-1])
+        if chunk not in self._mapped:
+            how = ("thread", THREADS) if chunk == _LARGE and THREADS > 1 else ()
+            with building:
+                self._mapped[chunk] = self.function.map(chunk, *how)
+        return evaluate_columns(self._mapped[chunk], chunk, *arguments)
+
+
+def evaluate_columns(function: ca.Function, chunk: int, *arguments: Array) -> list[Array]:
+    """Like `Batched`, for a function that takes `chunk` samples side by side as columns."""
+    N = len(arguments[0])
+    arguments = tuple(_column_major(a) for a in arguments)
+    buffer: Any
+    buffer, run = function.buffer()  # Any: the stubs of set_arg and set_res ask for a size, the methods take none
+    inputs = [np.empty((chunk, *a.shape[1:])) for a in arguments]
+    shapes = [function.size_out(i) for i in range(function.n_out())]
+    outputs = [np.empty((chunk, columns // chunk, rows)) for rows, columns in shapes]
+    for i, array in enumerate(inputs):
+        buffer.set_arg(i, array.data)
+    for i, array in enumerate(outputs):
+        buffer.set_res(i, array.data)
+    results = [np.empty((N, *out.shape[1:])) for out in outputs]
+    for start in range(0, N, chunk):
+        count = min(chunk, N - start)
+        for array, argument in zip(inputs, arguments, strict=True):
+            array[:count] = argument[start : start + count]
+            array[count:] = argument[start]  # pad the last chunk with a valid sample
+        with deferred():
+            run()
+        for result, out in zip(results, outputs, strict=True):
+            result[start : start + count] = out[:count]
+    return [_row_major(result) for result in results]
+
+
+def _column_major(array: Array) -> Array:
+    """Transpose each sample's matrix (rows, columns): CasADi stores matrices column by column."""
+    return array if array.ndim == 2 else array.transpose(0, 2, 1)
+
+
+def _row_major(result: Array) -> Array:
+    """Undo the transposition. A single column becomes a vector."""
+    return result[:, 0, :] if result.shape[1] == 1 else result.transpose(0, 2, 1)
+
+
+Piece = TypeVar("Piece")
+Result = TypeVar("Result")
+Tool = TypeVar("Tool")
+
+_wanted: ContextVar[int | None] = ContextVar("threads", default=None)
+_here = local()  # .works: whether this thread is one of a pool
+
+
+def thread_count() -> int:
+    """Number of threads that share work: what `using_threads` says, or `THREADS`; 1 within such a thread."""
+    return 1 if hasattr(_here, "works") else _wanted.get() or THREADS
+
+
+@contextmanager
+def using_threads(count: int | None) -> Iterator[None]:
+    """Let so many threads share the work of the block. None changes nothing."""
+    token = _wanted.set(count or _wanted.get())
+    try:
+        yield
+    finally:
+        _wanted.reset(token)
+
+
+def in_threads(work: Callable[[Piece], Result], pieces: Sequence[Piece]) -> list[Result]:
+    """Results of all pieces in their order; `thread_count` threads share the pieces.
+
+    After an exception, and after Ctrl-C, no piece is still at work.
+    """
+    count = thread_count()
+    if min(count, len(pieces)) < 2:
+        return [work(piece) for piece in pieces]
+    futures: list[Future[Result]] = []
+    try:
+        futures += (_pool(count).submit(work, piece) for piece in pieces)
+        return [future.result() for future in futures]
+    finally:
+        wait([future for future in futures if not future.cancel()])
+
+
+def in_threads_with(
+    tools: Sequence[Tool], work: Callable[[Tool, Piece], Result], pieces: Sequence[Piece]
+) -> list[Result]:
+    """The same with tools that only one piece can use at a time; one for each thread, or for each piece, is enough."""
+    ready: SimpleQueue[Tool] = SimpleQueue()
+    for tool in tools:
+        ready.put(tool)
+
+    def with_a_tool(piece: Piece) -> Result:
+        tool = ready.get()
+        try:
+            return work(tool, piece)
+        finally:
+            ready.put(tool)
+
+    return in_threads(with_a_tool, pieces)
+
+
+@cache
+def _pool(count: int) -> ThreadPoolExecutor:
+    """Threads that sleep while there is nothing to do: to start them for every call costs more than the work."""
+    return ThreadPoolExecutor(count, initializer=setattr, initargs=(_here, "works", True))
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of the threads
+
+
+class _BlasHold:
+    """BLAS held to one thread while anyone wants it so."""
+
+    def __init__(self) -> None:
+        self._lock, self._count = Lock(), 0
+        self._libraries: ThreadpoolController | None = None
+        self._modules = 0  # when the libraries were searched, which takes 1 ms
+        self._limits: Any = None
+
+    def begin(self) -> None:
+        """One more wants it."""
+        with self._lock:
+            if not self._count:
+                if self._libraries is None or self._modules != len(sys.modules):  # which may have brought some
+                    self._libraries, self._modules = ThreadpoolController(), len(sys.modules)
+                self._limits = self._libraries.limit(limits=1, user_api="blas")
+            self._count += 1
+
+    def end(self) -> None:
+        """One less wants it; after the last one BLAS has its threads back."""
+        with self._lock:
+            self._count -= 1
+            if not self._count and self._limits is not None:
+                self._limits.restore_original_limits()
+
+
+_hold = _BlasHold()
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Hold BLAS to one thread, in the whole process; the end of the last block gives the others back."""
+    _hold.begin()
+    try:
+        yield
+    finally:
+        _hold.end()

@@ -1,0 +1,172 @@
+"""Dense MX graphs at BLAS speed: NumPy evaluates the matrix products and tanh of a finished graph.
+
+CasADi multiplies dense matrices with a triple loop, and differentiation drops any other choice of kernel. So CasADi
+builds the whole graph, derivatives included, and the products are replaced at the end.
+"""
+
+from collections.abc import Callable, Sequence
+from threading import local
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.tools.checks import Array
+from orthocas.tools.interrupts import deferred
+
+
+class NumpyNode(ca.Callback):
+    """A node of an MX graph that NumPy evaluates in place. It has no derivatives."""
+
+    def __init__(self, name: str, inputs: Sequence[tuple[int, int]], output: tuple[int, int]) -> None:
+        ca.Callback.__init__(self)
+        self._inputs, self._output = tuple(inputs), output
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        """Number of input matrices."""
+        return len(self._inputs)
+
+    def get_n_out(self) -> int:
+        """One output matrix."""
+        return 1
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Dense."""
+        return ca.Sparsity.dense(*self._inputs[i])
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Dense."""
+        return ca.Sparsity.dense(*self._output)
+
+    def has_eval_buffer(self) -> bool:
+        """Tell CasADi to pass buffers, so that nothing is copied."""
+        return True
+
+    def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
+        """Evaluate the node. CasADi stores matrices column by column, so NumPy sees them transposed."""
+        inputs = [np.frombuffer(memory).reshape(shape[::-1]) for memory, shape in zip(arg, self._inputs, strict=True)]
+        self.compute(inputs, np.frombuffer(res[0]).reshape(self._output[::-1]))
+        return 0
+
+    def compute(self, transposed: list[Array], result: Array) -> None:
+        """Write the transposed output, given the transposed inputs."""
+        raise NotImplementedError
+
+
+class Product(NumpyNode):
+    """op(A) op(B), where op transposes or does nothing."""
+
+    def __init__(self, a: tuple[int, int], b: tuple[int, int], flip_a: bool, flip_b: bool) -> None:
+        self._flips = flip_a, flip_b
+        NumpyNode.__init__(self, "product", (a, b), (a[1] if flip_a else a[0], b[0] if flip_b else b[1]))
+
+    def compute(self, transposed: list[Array], result: Array) -> None:
+        """(op(A) op(B))^T = op(B)^T op(A)^T."""
+        a, b = transposed
+        np.matmul(b.T if self._flips[1] else b, a.T if self._flips[0] else a, out=result)
+
+
+class Tanh(NumpyNode):
+    """tanh of every entry."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        NumpyNode.__init__(self, "tanh", [shape], shape)
+
+    def compute(self, transposed: list[Array], result: Array) -> None:
+        """Evaluate tanh of all entries."""
+        np.tanh(transposed[0], out=result)
+
+
+class NumpyGraph:
+    """A CasADi function of MX symbols whose dense products and tanh NumPy evaluates.
+
+    Args:
+        name: name of the function.
+        inputs: MX symbols.
+        outputs: expressions of these symbols; derivatives are allowed.
+
+    Attributes:
+        function: the CasADi function. It is valid as long as this object lives, which owns its nodes.
+    """
+
+    def __init__(self, name: str, inputs: Sequence[ca.MX], outputs: Sequence[ca.MX]) -> None:
+        self._nodes: list[NumpyNode] = []
+        with deferred():  # CasADi calls the nodes for their shapes, and would swallow Ctrl-C there
+            self.function = ca.Function(name, list(inputs), self._rewritten(inputs, ca.cse(list(outputs))))
+        self._memory = local()
+
+    def __call__(self, *inputs: Array) -> list[Array]:
+        """Evaluate without copies. Inputs and outputs are transposed matrices, contiguous and of the right size.
+
+        Large graphs need large scratch memory. Every thread keeps its own from call to call.
+        """
+        if not hasattr(self._memory, "buffer"):
+            self._memory.buffer, self._memory.evaluate = self.function.buffer()
+        buffer, evaluate = self._memory.buffer, self._memory.evaluate
+        for i, array in enumerate(inputs):
+            buffer.set_arg(i, array.data)
+        results = [np.empty(self.function.size_out(i)[::-1]) for i in range(self.function.n_out())]
+        for i, array in enumerate(results):
+            buffer.set_res(i, array.data)
+        with deferred():
+            evaluate()
+        return results
+
+    def on_one_block(self) -> Callable[[Array], Array]:
+        """A function of this graph's one input with its own memory. It returns the same array at every call."""
+        buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
+        buffer, evaluate = self.function.buffer()
+        values, result = (np.empty(size[::-1]) for size in (self.function.size_in(0), self.function.size_out(0)))
+        buffer.set_arg(0, values.data)
+
+        def run(block: Array) -> Array:
+            values[...] = block.T
+            buffer.set_res(0, result.data)  # also keeps the buffer alive, which `evaluate` does not
+            with deferred():
+                evaluate()
+            return result.T
+
+        return run
+
+    def _rewritten(self, inputs: Sequence[ca.MX], outputs: list[ca.MX]) -> list[ca.MX]:
+        """Cut the graph at its expensive nodes, and join the pieces with NumPy's nodes in between."""
+        plain = ca.Function("plain", list(inputs), outputs)
+        heavy = [
+            plain.instruction_MX(k)
+            for k in range(plain.n_instructions())
+            if plain.instruction_id(k) in (ca.OP_MTIMES, ca.OP_TANH)
+        ]
+        if not heavy:
+            return outputs
+        cuts = [ca.MX.sym("cut", *node.shape) for node in heavy]
+        operands = [[_untransposed(node.dep(i)) for i in range(node.n_dep())] for node in heavy]
+        pieces = iter(ca.graph_substitute([x for xs in operands for x, _ in xs] + outputs, heavy, cuts))
+        definitions = []
+        for node, xs in zip(heavy, operands, strict=True):
+            flips = [flipped for _, flipped in xs]
+            definitions.append(self._replacement(node, [next(pieces) for _ in xs], flips))
+        _, rewritten = ca.substitute_inplace(cuts, definitions, list(pieces))
+        return list(rewritten)
+
+    def _replacement(self, node: ca.MX, operands: list[ca.MX], flips: list[bool]) -> ca.MX:
+        """The NumPy node for a product z + x y (operands z, x, y) or for tanh."""
+        new: NumpyNode
+        if node.op() == ca.OP_TANH:
+            new = Tanh(node.shape)
+            arguments = [operands[0].T if flips[0] else operands[0]]
+        else:
+            new = Product(operands[1].shape, operands[2].shape, flips[1], flips[2])
+            arguments = operands[1:]
+        self._nodes.append(new)
+        result: ca.MX = new(*arguments)
+        if node.op() == ca.OP_MTIMES and not operands[0].is_zero():
+            result = (operands[0].T if flips[0] else operands[0]) + result
+        return result
+
+
+def _untransposed(operand: ca.MX) -> tuple[ca.MX, bool]:
+    """The operand without a transposition, and whether it had one."""
+    if operand.op() == ca.OP_TRANSPOSE:
+        return operand.dep(0), True
+    return operand, False

@@ -1,0 +1,229 @@
+"""Large SX functions on columns of samples, and in blocks of samples shared by threads."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.errors import OrthocasError
+from orthocas.tools.batch import Batched, in_threads_with, thread_count
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
+from orthocas.tools.expressions import Tape, replay, to_tape
+
+COLUMNS = 256  #: samples in a block
+MANY = 64  #: joint positions from which blocks pay off
+_PIECE = 8 * COLUMNS  # joint positions that a thread takes at once
+
+#: Evaluates contiguous inputs (entries, c), and writes contiguous outputs (entries, c).
+Run = Callable[[Sequence[Array], Sequence[Array]], None]
+
+
+def blocked(stack: Array) -> Array:
+    """Arrange samples (N, rows, columns) or (N, rows) in blocks (B, entries, c)."""
+    flat = (stack.transpose(0, 2, 1) if stack.ndim == 3 else stack).reshape(len(stack), -1)
+    blocks = -(-len(flat) // COLUMNS)
+    filled = np.concatenate([flat, np.repeat(flat[:1], blocks * COLUMNS - len(flat), axis=0)])
+    return np.ascontiguousarray(filled.reshape(blocks, COLUMNS, -1).transpose(0, 2, 1))
+
+
+def shares(samples: int) -> Array:
+    """Weights of a mean over N samples in blocks, (B, c): 1 / N for samples, 0 for the padding."""
+    blocks = -(-samples // COLUMNS)
+    return np.where(np.arange(blocks * COLUMNS) < samples, 1 / samples, 0.0).reshape(blocks, COLUMNS)
+
+
+def by_sample(blocks: Array, samples: int, every: int = 1) -> Array:
+    """Matrices (N, rows, columns) of the samples in blocks (B, columns, rows, c).
+
+    Args:
+        blocks: entries of matrices, column by column.
+        samples: number N of samples, without the padding.
+        every: take only every second, third, ... sample.
+    """
+    stack = blocks.transpose(0, 3, 2, 1).reshape(-1, blocks.shape[2], blocks.shape[1])
+    return stack[:samples:every] if every == 1 else np.ascontiguousarray(stack[:samples:every])
+
+
+class ColumnFunction:
+    """A dense SX function of one sample, for blocked arrays.
+
+    Args:
+        function: a function with any number of matrix inputs and outputs.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        self._function = function
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Outputs (B, entries, c) for contiguous inputs (B, entries, c). Threads share the blocks."""
+        blocks, count = len(arguments[0]), thread_count()
+        results = [np.empty((blocks, *shape)) for shape in self._shapes]
+
+        def evaluate(run: Run, part: range) -> None:
+            for b in part:
+                run([argument[b] for argument in arguments], [result[b] for result in results])
+
+        with self.borrowed(min(count, blocks)) as runs:
+            in_threads_with(runs, evaluate, [range(k, blocks, count) for k in range(len(runs))])
+        return results
+
+    @contextmanager
+    def borrowed(self, count: int) -> Iterator[list[Run]]:
+        """Functions of blocks for so many threads, with scratch memory that nobody else uses meanwhile.
+
+        They are kept for the next time. CasADi lets go of Python's lock while it evaluates. It must not build in a
+        thread of a pool: its own lock against Python's is a deadlock.
+        """
+        runs: list[Run] = []
+        for _ in range(count):
+            try:
+                runs.append(self._spare.pop())
+            except IndexError:
+                runs.append(self._new_run())
+        try:
+            yield runs
+        finally:
+            self._spare.extend(runs)
+
+    def on_one_block(self) -> Callable[..., list[Array]]:
+        """A function of contiguous inputs (entries, c) that returns the same arrays (entries, c) at every call."""
+        run, results = self._new_run(), [np.empty(shape) for shape in self._shapes]
+
+        def evaluate(*arguments: Array) -> list[Array]:
+            run(arguments, results)
+            return results
+
+        return evaluate
+
+    def _new_run(self) -> Run:
+        buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
+        buffer, evaluate = self._on_block.buffer()
+
+        def run(arguments: Sequence[Array], results: Sequence[Array]) -> None:
+            for i, array in enumerate(arguments):
+                buffer.set_arg(i, array.data)
+            for i, array in enumerate(results):
+                buffer.set_res(i, array.data)
+            evaluate()
+
+        return run
+
+    @cached_property
+    def _spare(self) -> list[Run]:
+        """Functions that nobody uses now."""
+        return []
+
+    @property
+    def _shapes(self) -> list[tuple[int, int]]:
+        """Shapes of the outputs on one block."""
+        return [(self._function.numel_out(i), COLUMNS) for i in range(self._function.n_out())]
+
+    @cached_property
+    def _on_block(self) -> ca.Function:
+        """The function of matrices whose rows are samples."""
+        sizes = [self._function.numel_in(i) for i in range(self._function.n_in())]
+        inputs = [ca.MX.sym(f"i{i}", COLUMNS, size) for i, size in enumerate(sizes)]
+        entries = iter(replay(self.tape, [column for x in inputs for column in ca.horzsplit(x)]))
+        outputs = [
+            ca.horzcat(*(next(entries) for _ in range(self._function.numel_out(i))))
+            for i in range(self._function.n_out())
+        ]
+        return ca.Function(f"{self._function.name()}_columns", inputs, outputs)
+
+    @property
+    def supported(self) -> bool:
+        """Whether tapes know all operations of the function."""
+        try:
+            return bool(self.tape)
+        except OrthocasError:
+            return False
+
+    @cached_property
+    def tape(self) -> Tape:
+        """The tape that maps all entries of the inputs, as one column, to all entries of the outputs, as one column."""
+        shapes = [self._function.size_in(i) for i in range(self._function.n_in())]
+        column = ca.SX.sym("x", sum(rows * columns for rows, columns in shapes))
+        parts, start = [], 0
+        for rows, columns in shapes:
+            parts.append(ca.reshape(column[start : start + rows * columns], rows, columns))
+            start += rows * columns
+        outputs = self._function.call(parts)
+        stacked = ca.densify(ca.vertcat(*(ca.vec(ca.densify(out)) for out in outputs)))
+        return to_tape(ca.Function("flat", [column], [ca.cse(stacked)]))
+
+
+#: A function of contiguous columns (n, c) with its own scratch memory; it may return the same array at every call.
+BlockFunction = Callable[..., Array]
+
+
+def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction], *others: Array) -> None:
+    """Write a function's values at points (N, n) to `results`, (N, ...), which may be part of a larger array.
+
+    Args:
+        results: the values; entries of one sample in row-major order.
+        points: joint positions.
+        make: makes the function (n, c) -> (entries, c), once for each thread.
+        others: further arguments of the function, (N, k) each.
+    """
+    starts = range(0, len(points), _PIECE)
+    functions = [make() for _ in range(min(thread_count(), len(starts)))]  # not in the threads, see ColumnFunction
+
+    def one_piece(function: BlockFunction, start: int) -> None:
+        for first in range(start, min(start + _PIECE, len(points)), COLUMNS):
+            count = min(COLUMNS, len(points) - first)
+            values = function(*(_columns(array[first : first + COLUMNS]) for array in (points, *others)))
+            by_entry = values.reshape(*results.shape[1:], COLUMNS)[..., :count]
+            results[first : first + COLUMNS] = np.moveaxis(by_entry, -1, 0)
+
+    in_threads_with(functions, one_piece, starts)
+
+
+def _columns(points: Array) -> Array:
+    """Joint positions (k, n) as columns (n, c). The last block is padded with its first position."""
+    columns = np.empty((points.shape[1], COLUMNS))
+    columns[:, : len(points)] = points.T
+    columns[:, len(points) :] = points[:1].T
+    return columns
+
+
+class BlockedFunction:
+    """A dense SX function of q (n, 1), for sets of joint positions of any size; it is called like `Batched`.
+
+    Args:
+        function: the function, with one output: a column, or a matrix.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        self._function, self._few = function, Batched(function)
+
+    def __call__(self, points: Array) -> list[Array]:
+        """Values (N, rows) or (N, rows, columns) at points (N, n)."""
+        rows, columns = self._function.size_out(0)
+        shape = (len(points), rows) if columns == 1 else (len(points), rows, columns)
+        return [self.into(np.empty(shape), points)]
+
+    def into(self, results: Array, points: Array) -> Array:
+        """Write the values to `results`, which may be part of a larger array, and return it."""
+        if len(points) < MANY or self._by_rows is None:
+            results[...] = self._few(points)[0].reshape(results.shape)
+        else:
+            fill(results, points, self._on_one_block)
+        return results
+
+    def _on_one_block(self) -> BlockFunction:
+        """The function for `fill`."""
+        assert self._by_rows is not None
+        run = self._by_rows.on_one_block()
+        return lambda columns: run(columns)[0]
+
+    @cached_property
+    def _by_rows(self) -> ColumnFunction | None:
+        """The function with its entries row by row; None if it has an operation that columns do not support."""
+        q = ca.SX.sym("q", self._function.size_in(0)[0])
+        entries = ca.vec(ca.densify(self._function(q)).T)
+        columns = ColumnFunction(ca.Function(self._function.name(), [q], [entries]))
+        return columns if columns.supported else None

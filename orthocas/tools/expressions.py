@@ -1,0 +1,263 @@
+"""SX expressions as data: tapes for files, their structure, scalar code, and users' functions of q."""
+
+from collections.abc import Callable, Mapping, Sequence
+from math import inf
+from typing import Any, TypeVar
+
+import casadi as ca
+import numpy as np
+
+from orthocas.errors import InvalidValueError, OrthocasError
+from orthocas.tools.checks import require_count
+from orthocas.tools.interrupts import deferred
+
+_LARGEST = 1e300  # of finite constants
+ARITHMETIC = {
+    "neg": "-{0}",
+    "sq": "{0} * {0}",
+    "twice": "2.0 * {0}",
+    "inv": "1.0 / {0}",
+    "assign": "{0}",
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+}  #: operations that Python and C write alike
+UNARY = (  #: operations on one number, by their names in tapes
+    *("neg", "exp", "log", "sqrt", "sq", "twice", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
+    *("inv", "fabs", "sign", "not", "floor", "ceil", "erf", "log1p", "expm1", "asinh", "acosh", "atanh", "assign"),
+)
+BINARY = (  #: on two
+    *("add", "sub", "mul", "div", "pow", "constpow", "atan2", "hypot", "fmod", "copysign", "fmin", "fmax"),
+    *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
+)
+_LINEAR = ("assign", "neg", "twice", "add", "sub")
+WRITTEN_OUT = 10  #: rows of the largest matrices whose products and inverses are written out
+Tape = dict[str, Any]
+Entry = TypeVar("Entry", ca.SX, ca.MX)
+
+
+#: CasADi's numbers of the operations
+CODES = {name: int(getattr(ca, f"OP_{name.upper()}")) for name in (*UNARY, *BINARY)}
+_NAMES: dict[int, str] = {code: name for name, code in CODES.items()} | {
+    getattr(ca, f"OP_{name.upper()}"): name for name in ("const", "input", "output")
+}
+
+
+def to_tape(function: ca.Function) -> Tape:
+    """Write an SX function of one column and one output as a tape.
+
+    Raises:
+        OrthocasError: if the function uses an operation that tapes do not support.
+    """
+    rows, columns = function.size_out(0)
+    steps: list[list[Any]] = []
+    for k in range(function.n_instructions()):
+        operation = function.instruction_id(k)
+        if operation not in _NAMES:
+            raise OrthocasError(f"custom expression uses CasADi operation {operation}, which chart files cannot store")
+        name, into, of = _NAMES[operation], function.instruction_output(k), function.instruction_input(k)
+        if name == "const":
+            steps.append([name, into[0], function.instruction_constant(k)])
+        elif name == "input":
+            steps.append([name, into[0], of[1]])
+        elif name == "output":
+            steps.append([name, into[1], of[0]])
+        else:
+            steps.append([name, into[0], *of[: 2 if name in BINARY else 1]])
+    return {"rows": rows, "columns": columns, "steps": steps}
+
+
+def require_tape(tape: Tape, inputs: int) -> None:
+    """Check a tape that comes from a file, before anything is built.
+
+    Raises:
+        InvalidValueError: if it is not a tape of an expression of that many inputs; the step to blame is named.
+    """
+    keys = tape.keys() if isinstance(tape, dict) else ()
+    if set(keys) != {"rows", "columns", "steps"} or not isinstance(tape["steps"], list | tuple):
+        raise InvalidValueError("tape", f"an object with {sorted(keys)[:5]}", "one with rows, columns and steps")
+    rows, columns = require_count("rows of a tape", tape["rows"]), require_count("columns of a tape", tape["columns"])
+    written: set[int] = set()
+    results: set[int] = set()
+    for k, step in enumerate(tape["steps"]):
+        if not _makes_sense(step, inputs, written):
+            raise InvalidValueError(f"step {k} of a tape", repr(step)[:80], "a known operation on earlier results")
+        (results if step[0] == "output" else written).add(step[1])
+    if len(results) != rows * columns or results != set(range(len(results))):
+        raise InvalidValueError("number of outputs of a tape", len(results), f"{rows} rows times {columns} columns")
+
+
+def _makes_sense(step: Any, inputs: int, written: set[int]) -> bool:
+    """Whether a step is [operation, place of the result, what it needs ...]."""
+    if not isinstance(step, list | tuple) or len(step) < 3 or not isinstance(step[0], str) or not _is_index(step[1]):
+        return False
+    name, _, *of = step
+    if name == "const":
+        return len(of) == 1 and isinstance(of[0], int | float) and (abs(of[0]) <= _LARGEST or abs(of[0]) == inf)
+    if name == "input":
+        return len(of) == 1 and _is_index(of[0]) and of[0] < inputs
+    needs = 2 if name in BINARY else 1
+    return (
+        (name in UNARY or name in BINARY or name == "output")
+        and len(of) == needs
+        and all(_is_index(place) and place in written for place in of)
+    )
+
+
+def _is_index(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
+    """Rebuild the expression of a tape at q (n, 1).
+
+    Raises:
+        InvalidValueError: if it is no tape for n inputs.
+    """
+    require_tape(tape, q.shape[0])
+    entries = replay(tape, [q[i] for i in range(q.shape[0])])
+    return ca.reshape(ca.vertcat(*entries), tape["rows"], tape["columns"])
+
+
+def replay(tape: Tape, inputs: Sequence[Entry]) -> list[Entry]:
+    """The entries of a checked tape's output, column by column, for the entries of its input."""
+    work: dict[int, Any] = {}
+    result: dict[int, Any] = {}
+    kind: Any = type(inputs[0])  # its static methods take a tenth of the time of operators on Python's side
+    zero = 0 * inputs[0]  # gives constants the shape of the entries
+    for name, into, *of in tape["steps"]:
+        if name == "const":
+            work[into] = zero + float(of[0])
+        elif name == "input":
+            work[into] = inputs[of[0]]
+        elif name == "output":
+            result[into] = work[of[0]]
+        elif name in UNARY:
+            work[into] = kind.unary(CODES[name], work[of[0]])
+        else:
+            work[into] = kind.binary(CODES[name], work[of[0]], work[of[1]])
+    return [result[k] for k in range(tape["rows"] * tape["columns"])]
+
+
+Joints = frozenset[int]
+Gradient = dict[int, Joints]  #: the joints that each derivative depends on; missing ones are 0
+_NOTHING: Joints = frozenset()
+
+
+def gradient_dependences(tape: Tape) -> list[Gradient]:
+    """For each output, the joints that its derivatives depend on."""
+    values: dict[int, Joints] = {}
+    slopes: dict[int, Gradient] = {}
+    results: dict[int, Gradient] = {}
+    for name, into, *of in tape["steps"]:
+        if name == "output":
+            results[into] = slopes[of[0]]
+        elif name in ("const", "input"):
+            joints = frozenset(of) if name == "input" else _NOTHING
+            values[into], slopes[into] = joints, dict.fromkeys(joints, _NOTHING)
+        else:
+            found = _slopes(name, [values[k] for k in of], [slopes[k] for k in of])
+            values[into], slopes[into] = frozenset().union(*(values[k] for k in of)), found
+    return [results[k] for k in range(len(results))]
+
+
+def _slopes(name: str, values: list[Joints], slopes: list[Gradient]) -> Gradient:
+    """What the derivatives of a step depend on."""
+    everything = frozenset().union(*values)
+    partials = [everything] * len(values)
+    if name in _LINEAR:
+        partials = [_NOTHING] * len(values)
+    elif name == "mul":
+        partials = values[::-1]
+    elif name == "div":
+        partials[0] = values[1]
+    total: Gradient = {}
+    for partial, part in zip(partials, slopes, strict=True):
+        for j, own in part.items():
+            total[j] = total.get(j, _NOTHING) | partial | own
+    return total
+
+
+def periodic_joints(tape: Tape, n: int) -> Joints:
+    """The joints k of n for which h(q + 2 pi e_k) - h(q) is the same constant at every q, for all outputs h."""
+    shifts: dict[int, Any] = {}  # change by a turn of each joint / 2 pi; NaN where it is no constant
+    constants: dict[int, float] = {}
+    alike = np.ones(n, dtype=bool)
+    for name, into, *of in tape["steps"]:
+        if name == "output":
+            alike &= ~np.isnan(shifts[of[0]])
+            continue
+        found = np.zeros(n)
+        if name == "input":
+            found[of[0]] = 1.0
+        elif name != "const":
+            found = _shift(name, [shifts[k] for k in of], [constants.get(k) for k in of])
+        constants.pop(into, None)
+        if name == "const":
+            constants[into] = float(of[0])
+        shifts[into] = found
+    return frozenset(np.flatnonzero(alike).tolist())
+
+
+def _shift(name: str, shifts: list[Any], constants: list[float | None]) -> Any:
+    """The change of a step. Only whole numbers of moderate size are added and multiplied, which is exact."""
+    if name in _EXACT:
+        return _whole(_EXACT[name](*shifts))
+    if name == "mul" and any(constant is not None for constant in constants):
+        factor, shift = (constants[0], shifts[1]) if constants[0] is not None else (constants[1], shifts[0])
+        return _whole(np.where(shift == 0, 0.0, shift * factor))
+    still = np.all([shift == 0 for shift in shifts], axis=0)
+    if name in ("sin", "cos", "tan"):
+        still = ~np.isnan(shifts[0])
+    return np.where(still, 0.0, np.nan)
+
+
+_EXACT: Mapping[str, Callable[..., Any]] = {
+    "assign": lambda a: a,
+    "neg": lambda a: -a,
+    "twice": lambda a: 2 * a,
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+}
+
+
+def _whole(shift: Any) -> Any:
+    return np.where((shift == np.round(shift)) & (np.abs(shift) < 2.0**40), shift, np.nan)
+
+
+def fast_form(graph: ca.Function, rows: int) -> ca.Function:
+    """Scalar code of a graph with matrices of so many rows, or the graph itself where that would be too long."""
+    return scalar_code(graph) if rows <= WRITTEN_OUT else graph
+
+
+def scalar_code(function: ca.Function) -> ca.Function:
+    """Expand a function into scalar operations. One that cannot be expanded (a network) is returned as it is."""
+    with deferred():  # `expand` turns Ctrl-C into a RuntimeError
+        try:
+            flat = function.expand()
+        except RuntimeError:
+            return function
+        inputs = flat.sx_in()
+        outputs = ca.cse(list(flat.call(inputs)))
+        return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())
+
+
+def expression_of(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function, q: ca.SX) -> ca.SX:
+    """The SX expression that a user's function returns for q.
+
+    Raises:
+        InvalidValueError: if the function fails on q, does not return an SX expression, or uses other symbols.
+    """
+    if not callable(function):
+        raise InvalidValueError(what, repr(function), "a function of an SX column q")
+    try:
+        value = ca.SX(function(q))
+    except (RuntimeError, TypeError, ValueError, LookupError, ArithmeticError, AttributeError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise InvalidValueError(what, f"failing ({reason})", f"a function of an SX column q {q.shape}") from None
+    known = {str(symbol) for symbol in ca.vertsplit(q)}
+    free = [str(symbol) for symbol in ca.symvar(value) if str(symbol) not in known]
+    if free:
+        raise InvalidValueError(what, f"using the free symbols {', '.join(free[:5])}", "an expression in q alone")
+    return value

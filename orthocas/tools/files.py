@@ -1,0 +1,258 @@
+"""Files that appear whole or not at all: drafts, replacement, and the mark of files that orthocas wrote."""
+
+import errno
+import hashlib
+import json
+import os
+import re
+import shutil
+import socket
+import tempfile
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
+
+from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.tools.interrupts import deferred
+
+LIST = ".orthocas.json"
+_LONGEST_HEADER = 2**26  # bytes; of charts with thousands of terms on tape
+_HOST = re.sub(r"[^A-Za-z0-9]", "", socket.gethostname())[:32] or "host"  # a process id means nothing elsewhere
+_NAME = re.compile(r"\.?orthocas-(?P<host>[A-Za-z0-9]+)-(?P<process>\d+)-\w+")
+_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+
+
+def require_replaceable(path: Path, ours: bool, force: bool, error: type[ArchiveError] = ArchiveError) -> None:
+    """Refuse to replace what somebody else wrote.
+
+    Args:
+        path: what is to be written.
+        ours: whether a file there is known as one that orthocas wrote.
+        force: replace it anyway.
+        error: class of the error.
+
+    Raises:
+        ArchiveError: if the file is neither ours nor empty, or a symbolic link.
+    """
+    if path.is_symlink():
+        raise error(f"cannot write {path}: it is a symbolic link, expected a file name that is free or a file")
+    if path.is_file() and not (ours or force) and path.stat().st_size > 0:
+        raise error(
+            f"cannot write {path}: orthocas did not write the file that is there, or it was changed; "
+            "expected another name, or force (--force) to replace it"
+        )
+
+
+def is_archive(path: Path, format_name: str) -> bool:
+    """Whether a file is an archive of ours with a format, such as 'orthocas-chart', damaged or not."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("header.json") as header:
+            return bool(json.loads(header.read(_LONGEST_HEADER))["format"] == format_name)
+    except Exception:  # zipfile, its decompressors and json raise many kinds; a file that is not read is not ours
+        return False
+
+
+def is_numpy_archive(path: Path, names: Iterable[str]) -> bool:
+    """Whether a file is an NPZ file with these arrays."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {f"{name}.npy" for name in names} <= set(archive.namelist())
+    except Exception:  # as above
+        return False
+
+
+def is_listed(path: Path) -> bool:
+    """Whether the list of its folder has a file, as it is now."""
+    try:
+        return path.is_file() and digest(path) in read_list(path.parent).get(path.name, [])
+    except OSError:
+        return False
+
+
+def read_list(folder: Path) -> dict[str, list[str]]:
+    """Names of files that were written to a folder, and the checksums that each may have."""
+    try:
+        found = json.loads((folder / LIST).read_text(encoding="utf-8"))["files"]
+        return {str(name): [str(entry) for entry in entries] for name, entries in found.items()}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
+def list_text(folder: Path, drafts: Iterable[Path]) -> str:
+    """The list of a folder once these drafts are there; what they replace stays known, should that never happen."""
+    known = read_list(folder)
+    for draft in drafts:
+        now = folder / draft.name
+        known[draft.name] = [digest(file) for file in (now, draft) if file.is_file()]
+    return json.dumps({"format": "orthocas-list", "files": known}, indent=1) + "\n"
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+@contextmanager
+def draft_folder(parent: Path | None = None) -> Iterator[Path]:
+    """A hidden folder in `parent`, or one where the system keeps temporary files, for the time of the block.
+
+    Its name holds host and process id. Those that processes left which no longer run are removed first.
+    """
+    place = Path(tempfile.gettempdir()) if parent is None else parent
+    sweep(place)
+    prefix = f"{'' if parent is None else '.'}orthocas-{_HOST}-{os.getpid()}-"
+    folder: str | None = None
+    try:
+        with deferred():  # Ctrl-C between the folder and its name would leave it
+            folder = tempfile.mkdtemp(dir=place, prefix=prefix)
+        yield Path(folder)
+    finally:
+        if folder is not None:
+            with deferred():  # and here half of it
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def write_temporary(file: Path, content: bytes) -> None:
+    """Write a file in a draft folder.
+
+    Raises:
+        ArchiveError: if it cannot be written, for example because the disk for temporary files is full.
+    """
+    try:
+        file.write_bytes(content)
+    except OSError as error:
+        raise ArchiveError(f"cannot write the temporary file {file}: {error.strerror}") from None
+
+
+def sweep(folder: Path) -> None:
+    """Remove the drafts of processes of this machine that no longer run."""
+    with suppress(OSError):  # a folder that cannot be listed or changed fails elsewhere, with a message
+        for entry in list(os.scandir(folder)):
+            if _is_left(entry.name) and entry.is_dir(follow_symlinks=False):
+                shutil.rmtree(entry.path, ignore_errors=True)
+
+
+def _is_left(name: str) -> bool:
+    parts = _NAME.fullmatch(name)
+    return parts is not None and parts["host"] == _HOST and not _runs(int(parts["process"]))
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it is another user's
+        return True
+    return True
+
+
+@contextmanager
+def published(folder: Path, listed: bool = False, force: bool = False) -> Iterator[Path]:
+    """A draft folder. Its files move to `folder` when the block ends, and are deleted if the block raises.
+
+    Each file appears whole or not at all: its content is on disk before its name is. Files of the same name are
+    replaced.
+
+    Args:
+        folder: where the files go.
+        listed: keep a list there of what was written, and replace only files on it (`orthocas.tools.files`).
+        force: replace others too.
+
+    Raises:
+        ArchiveError: if files are listed and one in the way is not, or the disk is full; or if a symbolic link is in
+            the way.
+    """
+    with draft_folder(folder) as drafts, _full_disk_named(folder, drafts) if listed else nullcontext():
+        yield drafts
+        files = sorted(drafts.iterdir())
+        for file in files:
+            require_replaceable(folder / file.name, not listed or is_listed(folder / file.name), force)
+        if listed:
+            text = list_text(folder, files)
+            files.insert(0, drafts / LIST)  # first: what it announces may be missing, but nothing that is there unknown
+            files[0].write_text(text, encoding="utf-8")
+        for file in files:
+            with file.open("rb") as stream:
+                os.fsync(stream.fileno())
+        for file in files:
+            os.replace(file, folder / file.name)
+
+
+@contextmanager
+def _full_disk_named(folder: Path, drafts: Path) -> Iterator[None]:
+    """Say which file did not fit: libraries that draw and save leave its name out.
+
+    Raises:
+        ArchiveError: if the disk, or what the user may write, is full.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        begun = sorted(drafts.iterdir(), key=lambda file: file.stat().st_mtime_ns)
+        target = folder / begun[-1].name if begun else folder
+        raise ArchiveError(f"cannot write {target}: {error.strerror}") from None
+
+
+def require_replaceable_files(folder: Path, names: Iterable[str], force: bool) -> None:
+    """Check early, before long work, that no file with one of these names is there that orthocas did not write.
+
+    Raises:
+        ArchiveError: if there is one, or a symbolic link.
+    """
+    for name in names:
+        require_replaceable(folder / name, is_listed(folder / name), force)
+
+
+def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) -> None:
+    """Check that a file can be written, before a long computation starts.
+
+    Raises:
+        ArchiveError: if the folder is missing or read-only, or the path exists and is not a writable file.
+    """
+    try:
+        if not path.parent.is_dir():
+            raise error_type(f"cannot write {path}: folder {path.parent} does not exist")
+        sweep(path.parent)
+        if path.is_dir():
+            raise error_type(f"cannot write {path}: it is a folder, expected a file name")
+        if path.exists() and not (path.is_file() and os.access(path, os.W_OK)):
+            raise error_type(f"cannot write {path}: it is not a writable file")
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise error_type(f"cannot write {str(path)[:200]}: {error.strerror}") from None
+
+
+def made_folder(name: str, out: str | Path) -> Path:
+    """Create the output folder if needed, and check that files can be written there.
+
+    Raises:
+        InvalidValueError: if they cannot. The message names the argument `name`.
+    """
+    folder = Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        sweep(folder)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InvalidValueError(name, str(folder), f"a folder that can be written ({error.strerror})") from None
+    return folder
+
+
+@contextmanager
+def output_folder(name: str, out: str | Path) -> Iterator[Path]:
+    """`made_folder` for the time of a block; at its end, folders that it made and that stayed empty go away again."""
+    folder = Path(out)
+    new = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        yield made_folder(name, folder)
+    finally:
+        for place in new:
+            with suppress(OSError):  # it is not empty, as it should be
+                place.rmdir()

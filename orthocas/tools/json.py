@@ -1,0 +1,163 @@
+"""JSON of results, and strict reading of JSON: what programs wrote, and what people write."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from math import inf, isfinite
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from orthocas.errors import InvalidValueError, StepsFileError
+from orthocas.tools.checks import Array
+
+T = TypeVar("T")
+_KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "text"}
+_LARGEST_FILE = 2**23  # bytes
+_LARGEST = 1e6  # larger numbers are mistakes and would overflow later
+_LONGEST = 80  # most characters of the input that an error repeats
+
+
+def plain(value: Any) -> Any:
+    """Convert arrays and tuples to lists, and numbers that are not finite to None, at all levels."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def to_json(data: Mapping[str, Any], indent: int | None = None) -> str:
+    """Write one JSON object. Values are converted by `plain`."""
+    return json.dumps(plain(data), allow_nan=False, indent=indent)
+
+
+def from_strict_json(text: str | bytes) -> Any:
+    """Data of a file that programs wrote: finite numbers, no key twice, no halves of surrogate pairs.
+
+    Raises:
+        ValueError: in one line, for everything else.
+    """
+    try:
+        data = json.loads(text, parse_constant=_refused, parse_float=_finite, object_pairs_hook=without_doubles)
+        json.dumps(data, ensure_ascii=False).encode()
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{error.msg} (line {error.lineno}, column {error.colno})") from None
+    except UnicodeError:
+        raise ValueError("it holds half a surrogate pair or is not UTF-8") from None
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+    return data
+
+
+def part(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
+    """A field of data that were read.
+
+    Raises:
+        InvalidValueError: if it is missing, or of another kind.
+    """
+    want = _KINDS.get(kind, "an array")
+    if name not in data:
+        raise InvalidValueError(f"field '{name}'", "missing", want)
+    value = data[name]
+    if not isinstance(value, kind):
+        raise InvalidValueError(f"field '{name}'", repr(value)[:80], want)
+    return value
+
+
+def without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON.
+
+    Raises:
+        ValueError: if a key comes twice.
+    """
+    data = dict(pairs)
+    if len(data) < len(pairs):
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"the key '{twice[:80]}' appears twice in one object, expected once")
+    return data
+
+
+def _refused(text: str) -> None:
+    raise ValueError(f"it holds {text}, expected finite numbers")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        _refused(text[:80])
+    return value
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Reads values from JSON data. Every method raises StepsFileError for data of the wrong kind."""
+
+    path: Path
+
+    def parsed(self) -> object:
+        """The data of the file. NaN and duplicate keys are errors."""
+        try:
+            with self.path.open("rb") as stream:
+                content = stream.read(_LARGEST_FILE + 1)
+        except OSError as error:
+            raise self.fault(f"cannot be read, {error.strerror}") from None
+        except ValueError as error:  # a path with a zero
+            raise self.fault(f"cannot be read, {error}") from None
+        if len(content) > _LARGEST_FILE:
+            raise self.fault(f"larger than {_LARGEST_FILE / 2**20:.0f} MiB, no steps file")
+        try:
+            return from_strict_json(content.decode("utf-8-sig"))
+        except ValueError as error:  # also bytes that are no text
+            raise self.fault(f"truncated or not JSON, {str(error)[:_LONGEST]}") from None
+
+    def fault(self, text: str) -> StepsFileError:
+        """An error that names the file."""
+        return StepsFileError(f"steps file {self.path}: {text}")
+
+    def wrong(self, where: str, got: object, want: str) -> StepsFileError:
+        """An error that names the place, the value there and what was expected."""
+        return self.fault(f"{where} is {json.dumps(got)[:_LONGEST]}, expected {want}")
+
+    def fields(self, data: object, where: str, known: Collection[str], what: str = "key") -> dict[str, Any]:
+        """An object that has only known keys."""
+        if not isinstance(data, dict):
+            raise self.wrong(where, data, "an object")
+        for key in data:
+            if key not in known:
+                names = ", ".join(known)
+                raise self.fault(f"{where} has an unknown {what} '{key[:_LONGEST]}', known: {names}")
+        return data
+
+    def items(self, data: object, where: str) -> list[Any]:
+        """A list."""
+        if not isinstance(data, list):
+            raise self.wrong(where, data, "a list")
+        return data
+
+    def number(self, data: object, where: str, least: float = -_LARGEST, above: float = -inf) -> float:
+        """A number that is at least `least` or above `above`, and at most 1e6."""
+        if data is None:
+            raise self.fault(f"{where} is missing, expected a number")
+        low = f"above {above:g}" if isfinite(above) else f"from {least:g}"
+        if (
+            isinstance(data, bool)
+            or not isinstance(data, int | float)
+            or not (above < data and least <= data <= _LARGEST)
+        ):
+            raise self.wrong(where, data, f"a number {low} to {_LARGEST:g}")
+        return float(data)
+
+    def numbers(self, data: object, where: str, length: int) -> Array:
+        """A list of finite numbers, (length,)."""
+        items = self.items(data, where)
+        if len(items) != length:
+            raise self.wrong(where, items, f"a list of {length} numbers")
+        return np.array([self.number(item, f"{where}[{i}]") for i, item in enumerate(items)])

@@ -1,0 +1,6 @@
+"""Charts, robots and motions in the browser. Only what opens a page needs the extra `[view]`."""
+
+from orthocas.viewer.motion import Motion, cyclic_motions
+from orthocas.viewer.view import View, export_page, view
+
+__all__ = ["Motion", "View", "cyclic_motions", "export_page", "view"]

@@ -1,0 +1,242 @@
+"""The page of a chart: sliders and a handle that are solved live, bars, ghosts, home, undo and a sweep."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from orthocas.charts.chart import Chart
+from orthocas.charts.self_motion import Fan, fan_along
+from orthocas.errors import OrthocasError
+from orthocas.viewer.arm import GHOSTS, Arm, Ghosts
+from orthocas.viewer.looks import Look, chain_length
+from orthocas.viewer.panel import ChartPanel
+from orthocas.viewer.session import Session
+from orthocas.viewer.window import Loop, place_camera, place_floor, place_lights
+
+_STEP = 1e-3  # of the sliders
+_SWEEP = 6.0  # [s] there and back
+_CALM = 0.97  # share of the range that a sweep uses
+_HANDLE = 0.17  # size, as a share of the length of the arm
+_NONE = "none"
+
+
+class ChartPage:
+    """The page of a chart on a viser server."""
+
+    def __init__(self, server: Any, session: Session, look: Look) -> None:
+        self.session = session
+        self._server = server
+        self._panel = ChartPanel(session.chart, session.place)
+        self._loop = Loop(self._settle, self._failed)
+        self._gesture = self._dragging = self._sweeping = False
+        self._fans: list[Fan] = []
+        robot = session.chart.problem.robot
+        self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
+        place_floor(server, robot)
+        place_lights(server, robot)
+        place_camera(server, robot, self.session.home[None])
+        self._handle = self._add_handle()
+        self._readings = self._add_readings()
+        self._sliders = self._add_sliders()
+        self._add_buttons()
+        self._show()
+        self._settle()
+        self._loop.start()
+
+    @property
+    def _chart(self) -> Chart:
+        return self.session.chart
+
+    def close(self) -> None:
+        """End the thread of the page."""
+        self._loop.stop()
+
+    def _add_readings(self) -> Any:
+        panel = self._server.gui.add_panel()
+        with panel.add_tab("Readings", "gauge"):
+            html = self._server.gui.add_html("")
+        panel.dock_left()
+        panel.set_width(310)
+        return html
+
+    def _add_sliders(self) -> dict[str, Any]:
+        """One slider for each component of phi: coordinates first."""
+        gui, chart, m = self._server.gui, self._chart, self._chart.m
+        phi, sizes = chart.phi(self.session.home), chart.phi_sizes
+        sliders = {}
+        with gui.add_folder("Coordinates: the task stays"):
+            for label, value in zip(chart.labels[m:], phi[m:].tolist(), strict=True):
+                hint = f"Moves the joints along {label}, and keeps the task and the other coordinates."
+                sliders[label] = self._slider(label, value, 0.5, hint)
+        with gui.add_folder("Task: the coordinates stay"):
+            units = chart.problem.task.units
+            for label, unit, value, size in zip(chart.labels[:m], units, phi[:m].tolist(), sizes[:m], strict=True):
+                name = f"{label} [{unit}]" if unit else label
+                sliders[label] = self._slider(
+                    name, value, float(size), "Moves the task, and keeps all coordinates.", label
+                )
+        return sliders
+
+    def _slider(self, name: str, value: float, reach: float, hint: str, label: str = "") -> Any:
+        low, high, shown = round(value - reach, 3), round(value + reach, 3), round(value, 3)
+        slider = self._server.gui.add_slider(name, low, high, _STEP, min(max(shown, low), high), hint=hint)
+        what = label or name
+
+        async def moved(event: Any) -> None:
+            if event.client is not None:  # otherwise the page itself moved it
+                given = float(event.target.value)
+                self._loop.ask(what, lambda: self._wish({what: given}))
+
+        slider.on_update(moved)
+        return slider
+
+    def _add_buttons(self) -> None:
+        gui = self._server.gui
+        self._button("Home", "home", self._go_home)
+        self._undo = self._button("Undo", "arrow-back-up", self._undone)
+        with gui.add_folder("What a coordinate reaches"):
+            labels = self._chart.labels[self._chart.m :]
+            self._chosen = gui.add_dropdown("coordinate", (*labels, _NONE), initial_value=self._widest())
+            self._sweep = self._button("Sweep", "repeat", self._swept)
+        self._chosen.on_update(self._another)
+
+    async def _another(self, event: Any) -> None:
+        self._loop.ask("fan", self._show_fan)
+
+    def _widest(self) -> str:
+        """The coordinate that moves the joints farthest."""
+        robot = self._chart.problem.robot
+        self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
+        return max(self._fans, key=lambda fan: float(np.ptp(robot.joint_points(fan.spread(5)), axis=0).max())).label
+
+    def _button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
+        button = self._server.gui.add_button(label, icon=icon)
+
+        async def clicked(event: Any) -> None:
+            self._loop.ask(label, job)
+
+        button.on_click(clicked)
+        return button
+
+    def _add_handle(self) -> Any:
+        """A handle at the tool, if the task has components of its position."""
+        chart = self._chart
+        kind = str(chart.problem.task.recipe["kind"])
+        axes = tuple(kind.startswith(("position", "pose")) and axis in chart.labels[: chart.m] for axis in "xyz")
+        if not any(axes):
+            return None
+        size = _HANDLE * chain_length(chart.problem.robot.tree)
+        handle = self._server.scene.add_transform_controls(
+            "/tool", scale=size, active_axes=axes, disable_rotations=True, depth_test=False, opacity=0.8
+        )
+        moved = [axis for axis, active in zip("xyz", axes, strict=True) if active]
+
+        async def dragged(event: Any) -> None:
+            place = dict(zip("xyz", map(float, event.target.position), strict=True))
+            self._dragging = event.phase != "end"
+            self._loop.ask("tool", lambda: self._wish({axis: place[axis] for axis in moved}))
+
+        handle.on_update(dragged)
+        return handle
+
+    def _wish(self, values: dict[str, float]) -> None:
+        """Move towards what the user wishes, as the first or a later part of a gesture."""
+        self._rest()
+        self._begin()
+        self.session.wish(values)
+        self.session.follow()
+        self._show(moved=values)
+
+    def _begin(self) -> None:
+        """At the start of a gesture, remember where it began."""
+        if not self._gesture:
+            self.session.remember()
+            self._gesture = True
+
+    def _go_home(self) -> None:
+        self._rest()
+        self.session.go_home()
+        self._show()
+
+    def _undone(self) -> None:
+        self._rest()
+        self.session.undo()
+        self._show()
+
+    def _swept(self) -> None:
+        """Move the chosen coordinate to its ends and back, until something else is wished for; or end that."""
+        fan = self._fan()
+        if self._sweeping or fan is None:
+            self._rest()
+            return
+        self._begin()
+        self._sweeping, self._sweep.label = True, "Stop"
+        middle, half = (fan.xi[-1] + fan.xi[0]) / 2, _CALM * (fan.xi[-1] - fan.xi[0]) / 2
+        here = float(self.session.readings.xi[self._chart.labels.index(fan.label) - self._chart.m])
+        phase = np.arcsin(np.clip((here - middle) / max(half, 1e-9), -1, 1))
+
+        def tick(seconds: float) -> bool:
+            self.session.wish({fan.label: float(middle + half * np.sin(2 * np.pi * seconds / _SWEEP + phase))})
+            self.session.follow()
+            self._show()
+            return True
+
+        self._loop.animate(tick)
+
+    def _rest(self) -> None:
+        """End a sweep."""
+        self._loop.animate(None)
+        self._sweeping, self._sweep.label = False, "Sweep"
+
+    def _show(self, moved: Any = ()) -> None:
+        """Draw the arm and the readings, and move the sliders that the user does not hold."""
+        readings = self.session.readings
+        if self._panel.chart is not self._chart:
+            self._rest()
+            self._panel = ChartPanel(self._chart, self.session.place)
+        with self._server.atomic():
+            self._arm.show(readings.q)
+            self._readings.content = self._panel.html(readings)
+            for label, value in zip(self._chart.labels, np.concatenate([readings.x, readings.xi]), strict=True):
+                if label not in moved:
+                    self._set(self._sliders[label], float(value))
+            if self._handle is not None and not self._dragging:
+                self._handle.position = tuple(self._chart.problem.robot.tip_position(readings.q))
+            self._undo.disabled = not self.session.can_undo
+
+    def _set(self, slider: Any, value: float) -> None:
+        slider.value = min(max(round(value, 3), slider.min), slider.max)
+
+    def _settle(self) -> None:
+        """After a gesture: ranges of the sliders, the fan, and values that were not reached."""
+        self._gesture = self._dragging = False
+        self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
+        for fan in self._fans:
+            slider = self._sliders[fan.label]
+            room = self.session.beyond * (fan.xi[-1] - fan.xi[0])
+            low, high = (
+                np.ceil((fan.xi[0] - room) / _STEP) * _STEP,
+                np.floor((fan.xi[-1] + room) / _STEP) * _STEP,
+            )
+            slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
+        self._show()
+        self._show_fan()
+
+    def _fan(self) -> Fan | None:
+        """The fan of the chosen coordinate."""
+        return next((fan for fan in self._fans if fan.label == self._chosen.value), None)
+
+    def _show_fan(self) -> None:
+        fan = self._fan()
+        with self._server.atomic():
+            if fan is None:
+                self._ghosts.hide()
+            else:
+                self._ghosts.show(fan.spread(GHOSTS), fan.spread(4 * GHOSTS))
+
+    def _failed(self, error: Exception) -> None:
+        """Tell an error to whoever looks at the page."""
+        text = str(error) if isinstance(error, OrthocasError) else f"{type(error).__name__}: {error}"
+        for client in self._server.get_clients().values():
+            client.add_notification("This did not work", text, color="red", auto_close_seconds=8.0)

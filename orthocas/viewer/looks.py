@@ -1,0 +1,310 @@
+"""How robots look: meshes of a URDF file, or drums and rods made from the kinematic tree."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+from xml.etree import ElementTree
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from orthocas.errors import RobotError
+from orthocas.robots.pinocchio_model import frame_index, joint_axis
+from orthocas.robots.spatial import rotation_z_to
+from orthocas.robots.tree import KinematicTree
+from orthocas.robots.urdf import lock_joints, lock_off_chain, read_urdf
+from orthocas.robots.xml import read_xml
+from orthocas.tools.checks import Array, Indices
+
+FINE, COARSE = 24, 6  #: facets around an axis
+SHELL, JOINT, TOOL = (226, 229, 233), (72, 80, 92), (214, 96, 20)
+_THICK = 0.042  # radius of the first rod, as a share of the length of the chain
+_TAPER = 0.45  # share of the radius that is lost on the way to the tip
+_SHORT = 0.35  # radii below which a rod is left out
+_SAME = 1e-6  # [m] between the joints of two files of one robot
+_MOST_TRIANGLES = 3_000_000  # of all meshes, more is slow to send and to draw
+
+Colour = tuple[int, int, int]  #: red, green, blue, 0 to 255
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """Triangles of one colour."""
+
+    vertices: Array  #: (V, 3) in the frame of the body [m]
+    faces: Indices  #: (F, 3) rows of vertices, counterclockwise from outside
+    colour: Colour
+
+    def moved(self, rotation: Array, translation: Array) -> "Solid":
+        """The solid turned by a rotation (3, 3), then shifted by a translation (3,)."""
+        return replace(self, vertices=self.vertices @ rotation.T + translation)
+
+
+def joined(solids: Sequence[Solid], colour: Colour) -> Solid:
+    """All triangles of some solids as one, in one colour."""
+    first = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
+    faces = [solid.faces + start for solid, start in zip(solids, first, strict=False)]
+    return Solid(np.concatenate([solid.vertices for solid in solids]), np.concatenate(faces), colour)
+
+
+def by_colour(solids: Sequence[Solid]) -> list[Solid]:
+    """One solid for each colour, which is faster to draw than many."""
+    colours = dict.fromkeys(solid.colour for solid in solids)
+    return [joined([solid for solid in solids if solid.colour == colour], colour) for colour in colours]
+
+
+def capsule(start: Array, end: Array, radii: tuple[float, float], colour: Colour, facets: int = FINE) -> Solid:
+    """A rod with round ends from one point (3,) to another, with a radius at each end [m]."""
+    length = float(np.linalg.norm(end - start))
+    low, high = (
+        _arc(radii[0], -np.pi / 2, 0.0, facets),
+        _arc(radii[1], 0.0, np.pi / 2, facets) + np.array([0.0, length]),
+    )
+    axis = np.array([0.0, 0.0, 1.0]) if length == 0 else (end - start) / length
+    return _revolved(np.concatenate([low, high]), colour, facets).moved(rotation_z_to(axis), start)
+
+
+def drum(radius: float, half_height: float, colour: Colour, facets: int = FINE) -> Solid:
+    """A cylinder with rounded edges about the z axis, with its middle at the origin."""
+    edge = 0.25 * min(radius, half_height)
+    lower, upper = _arc(edge, -np.pi / 2, 0.0, facets), _arc(edge, 0.0, np.pi / 2, facets)
+    shift = np.array([radius - edge, half_height - edge])
+    rim = np.concatenate([lower + shift * [1, -1], upper + shift])
+    return _revolved(np.concatenate([[[0.0, -half_height]], rim, [[0.0, half_height]]]), colour, facets)
+
+
+def block(size: Array, colour: Colour) -> Solid:
+    """A box of a size (3,) [m] with its middle at the origin. Faces share no vertices, so that edges look sharp."""
+    vertices: list[Array] = []
+    faces: list[list[int]] = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            across = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)[:: int(sign)]
+            corner = np.insert(across, 0, sign, axis=1)
+            faces += [[4 * len(vertices) + k for k in triple] for triple in ((0, 1, 2), (0, 2, 3))]
+            vertices.append(np.roll(corner, axis, axis=1))
+    return Solid(np.concatenate(vertices) * np.asarray(size) / 2, np.array(faces), colour)
+
+
+def ball(radius: float, colour: Colour, facets: int = FINE) -> Solid:
+    """A sphere about the origin."""
+    return _revolved(_arc(radius, -np.pi / 2, np.pi / 2, facets), colour, facets)
+
+
+def _arc(radius: float, start: float, end: float, facets: int) -> Array:
+    """Points (r, z) on an arc about the origin."""
+    count = max(round(facets * (end - start) / (2.5 * np.pi)), 1) + 1
+    angle = np.linspace(start, end, count)
+    return radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _revolved(profile: Array, colour: Colour, facets: int) -> Solid:
+    """A profile of points (r, z), from bottom to top, turned about the z axis."""
+    angle = np.linspace(0.0, 2 * np.pi, facets, endpoint=False)
+    r, z = profile.T
+    ring = np.stack([np.outer(r, np.cos(angle)), np.outer(r, np.sin(angle)), np.outer(z, np.ones_like(angle))], axis=-1)
+    index = np.arange(len(profile) * facets).reshape(len(profile), facets)
+    here, next_ = index, np.roll(index, -1, axis=1)
+    lower = np.stack([here[:-1], next_[:-1], next_[1:]], axis=-1).reshape(-1, 3)
+    upper = np.stack([here[:-1], next_[1:], here[1:]], axis=-1).reshape(-1, 3)
+    return Solid(ring.reshape(-1, 3), np.concatenate([lower, upper]), colour)
+
+
+Look = list[list[Solid]]  #: what each frame of `BodyPoses` carries: base, bodies, tip
+
+
+def stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = FINE) -> Look:
+    """Drums about the joint axes and tapered rods between the frames, thinner or thicker than usual by a factor."""
+    look: Look = [[] for _ in range(tree.n + 2)]
+    radii = thickness * _radii(tree)
+    for i, parent in enumerate(tree.parents):
+        r = radii[i + 1]
+        look[i + 1].append(_joint(tree, i, r, facets))
+        _add_rod(look[parent + 1], tree.translations[i], (radii[parent + 1], r), facets)
+    r = radii[tree.tip_parent + 1]
+    _add_rod(look[tree.tip_parent + 1], tree.tip_translation, (r, 0.75 * r), facets)
+    look[-1].append(ball(0.55 * r, TOOL, facets))
+    if np.linalg.norm(tree.translations[0]) > radii[0]:
+        look[0].append(drum(1.7 * radii[0], 0.35 * radii[0], JOINT, facets))
+    return look
+
+
+def chain_length(tree: KinematicTree) -> float:
+    """Length of the chain from the base to the tip, through all joint frames [m]."""
+    length, i = float(np.linalg.norm(tree.tip_translation)), tree.tip_parent
+    while i >= 0:
+        length += float(np.linalg.norm(tree.translations[i]))
+        i = tree.parents[i]
+    return max(length, 1e-3)
+
+
+def _radii(tree: KinematicTree) -> Array:
+    """Radius of the rods that begin at the base and at each body, (n + 1,)."""
+    total = chain_length(tree)
+    run = np.zeros(tree.n + 1)
+    for i, parent in enumerate(tree.parents):
+        run[i + 1] = run[parent + 1] + np.linalg.norm(tree.translations[i])
+    return np.asarray(_THICK * total * (1 - _TAPER * np.clip(run / total, 0.0, 1.0)))
+
+
+def _joint(tree: KinematicTree, i: int, r: float, facets: int) -> Solid:
+    """A drum about the axis of a revolute joint, or a slim rail along that of a prismatic one."""
+    if tree.prismatic[i]:
+        return drum(0.8 * r, 2.2 * r, JOINT, facets)
+    return drum(1.18 * r, 1.3 * r, JOINT, facets)
+
+
+def _add_rod(solids: list[Solid], end: Array, radii: tuple[float, float], facets: int) -> None:
+    """A rod from the origin of a body to a point of it, unless it is hidden in the drums."""
+    if np.linalg.norm(end) > _SHORT * radii[0]:
+        solids.append(capsule(np.zeros(3), end, radii, SHELL, facets))
+
+
+@dataclass(frozen=True)
+class UrdfLook:
+    """What a URDF file shows."""
+
+    look: Look  #: empty where the file has nothing to show, or its mesh is missing
+    missing: tuple[str, ...]  #: mesh files that cannot be found or read
+
+
+def urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] | None = None) -> UrdfLook:
+    """Solids of all links of a URDF file, carried by the bodies of a robot that was built from it.
+
+    Joints off the chain to the tip are locked as in `Robot.from_urdf`, so their links are shown too.
+
+    Args:
+        path: the URDF file.
+        tree: the robot.
+        locked: joints that were locked when the robot was built, with their positions [rad] or [m].
+
+    Raises:
+        RobotError: if the file cannot be read, or its joints are not those of the robot.
+    """
+    root = read_xml(path, "URDF", "robot")
+    model = lock_off_chain(lock_joints(read_urdf(path), locked or {}), tree.tip_name)
+    _require_same(path, model, tree)
+    turns = [np.eye(3), *(rotation_z_to(joint_axis(model, i)[1]) for i in range(1, model.njoints))]
+    colours = _materials(root)
+    look: Look = [[] for _ in range(tree.n + 2)]
+    missing: list[str] = []
+    for link in root.findall("link"):
+        frame = model.frames[frame_index(model, link.get("name", ""))]
+        body = frame.parentJoint
+        for visual in link.findall("visual"):
+            solid = _solid(path, visual, colours, missing)
+            if solid is not None:
+                place = frame.placement * _pose(visual)
+                look[body].append(solid.moved(turns[body].T @ place.rotation, turns[body].T @ place.translation))
+    triangles = sum(len(solid.faces) for solids in look for solid in solids)
+    if triangles > _MOST_TRIANGLES:
+        raise RobotError(f"{path} shows {triangles:,} triangles, expected at most {_MOST_TRIANGLES:,}")
+    return UrdfLook(look, tuple(missing))
+
+
+def _require_same(path: Path, model: pin.Model, tree: KinematicTree) -> None:
+    """Raise RobotError unless a model has the joints of a tree at the same places."""
+    names = tuple(model.names)[1:]
+    if names != tree.joint_names:
+        raise RobotError(f"{path} has the joints {', '.join(names)}, expected {', '.join(tree.joint_names)}")
+    lengths = np.array([np.linalg.norm(model.jointPlacements[i + 1].translation) for i in range(tree.n)])
+    apart = np.abs(lengths - np.linalg.norm(tree.translations, axis=1))
+    if apart.max() > _SAME:
+        joint = names[int(np.argmax(apart))]
+        raise RobotError(f"{path} places joint '{joint}' elsewhere, expected the robot file that the chart was made of")
+
+
+def _materials(root: ElementTree.Element) -> dict[str, Colour]:
+    """Colours of the named materials of a file."""
+    found = {}
+    for material in root.iter("material"):
+        colour = _colour_of(material)
+        if colour is not None and material.get("name"):
+            found[material.get("name", "")] = colour
+    return found
+
+
+def _colour_of(material: ElementTree.Element) -> Colour | None:
+    """The colour that a material defines itself."""
+    element = material.find("color")
+    if element is None:
+        return None
+    red, green, blue, *_ = (round(255 * value) for value in np.clip(_numbers(element, "rgba", 4, (1, 1, 1, 1)), 0, 1))
+    return red, green, blue
+
+
+def _solid(path: Path, visual: ElementTree.Element, colours: Mapping[str, Colour], missing: list[str]) -> Solid | None:
+    """The geometry of a visual element in its own frame; None if there is none to show."""
+    material = visual.find("material")
+    colour = SHELL
+    if material is not None:
+        colour = _colour_of(material) or colours.get(material.get("name", ""), SHELL)
+    shape = next(iter(visual.find("geometry") if visual.find("geometry") is not None else ()), None)  # type: ignore[arg-type]
+    if shape is None:
+        return None
+    if shape.tag == "box":
+        return block(_numbers(shape, "size", 3, (0.1, 0.1, 0.1)), colour)
+    if shape.tag == "sphere":
+        return ball(float(_numbers(shape, "radius", 1, (0.1,))[0]), colour)
+    if shape.tag == "cylinder":
+        radius, length = (float(_numbers(shape, name, 1, (0.1,))[0]) for name in ("radius", "length"))
+        return drum(radius, length / 2, colour)
+    if shape.tag == "mesh":
+        return _mesh(path, shape, colour, missing)
+    return None
+
+
+def _mesh(path: Path, shape: ElementTree.Element, colour: Colour, missing: list[str]) -> Solid | None:
+    """The triangles of a mesh file; None if it cannot be found or read."""
+    name = shape.get("filename", "")
+    file = _located(path, name)
+    try:
+        if file is None:
+            raise ValueError("not found")
+        mesh: Any = coal.MeshLoader().load(str(file), _numbers(shape, "scale", 3, (1, 1, 1)))
+        vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
+        faces = np.array([[t[0], t[1], t[2]] for t in map(mesh.tri_indices, range(mesh.num_tris))], dtype=np.intp)
+        if not (len(faces) and np.isfinite(vertices).all()):
+            raise ValueError("empty")
+    except (ValueError, RuntimeError):
+        missing.append(name)
+        return None
+    return Solid(vertices, faces, colour)
+
+
+def _located(path: Path, name: str) -> Path | None:
+    """The mesh file that a URDF file names: beside it, absolute, or in a package above it or on ROS_PACKAGE_PATH."""
+    name = unquote(name)
+    scheme, _, rest = name.rpartition("://")
+    folder = path.resolve().parent
+    if scheme in ("package", "model"):
+        package, _, inside = rest.partition("/")
+        roots = [*folder.parents, folder, *map(Path, filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(":")))]
+        places = [root / package / inside for root in roots]
+        places += [root / inside for root in roots if root.name == package]
+    else:
+        places = [folder / (rest if scheme == "file" else name)]
+    return next((place for place in places if place.is_file()), None)
+
+
+def _pose(visual: ElementTree.Element) -> Any:
+    """The pose of a visual element in the frame of its link."""
+    origin = visual.find("origin")
+    if origin is None:
+        return pin.SE3.Identity()
+    roll, pitch, yaw = _numbers(origin, "rpy", 3, (0, 0, 0))
+    return pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, yaw), _numbers(origin, "xyz", 3, (0, 0, 0)))
+
+
+def _numbers(element: ElementTree.Element, name: str, count: int, default: tuple[float, ...]) -> Array:
+    """Numbers of an attribute; the default if it is missing or is not that many finite numbers."""
+    try:
+        values = np.array([float(word) for word in element.get(name, "").split()])
+    except ValueError:
+        values = np.empty(0)
+    good = values.shape == (count,) and np.isfinite(values).all() and np.abs(values).max() < 1e6
+    return values if good else np.array(default, dtype=float)

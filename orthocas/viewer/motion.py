@@ -1,0 +1,219 @@
+"""Motions to play: runs, joint motions, their files, and a tool path followed in two ways."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.charts.chart import Chart
+from orthocas.charts.solutions import TrackerStatus
+from orthocas.errors import InvalidValueError, PathError, PathFileError
+from orthocas.paths.joint_motion import JointMotion
+from orthocas.robots.robot import Robot
+from orthocas.simulation.trajectory import Trajectory
+from orthocas.tools.checks import Array, as_point_set, frozen_array, require_count, require_kind
+from orthocas.tools.csv_table import column_places, read_table
+
+_MOST_INSTANTS = 1_000_000
+_TIME = "time_s"
+_PERIOD = 5.0  # [s] of a cycle
+_POINTS = 250  # of a cycle
+_SHARE, _SMALLEST = 0.6, 1e-3  # radius of the default circle, as a share of how far the task moves over the domain
+_MOST_CYCLES = 20
+_CORRECTIONS = 2
+_CLOSED = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Joint positions over time, and quantities that belong to them."""
+
+    name: str
+    times: Array  #: (N,) [s], increasing
+    q: Array  #: (N, n) [rad] or [m]
+    labels: tuple[str, ...]  #: names of the quantities
+    values: Array  #: (N, k)
+    references: Array | None = None  #: (N, k)
+    marked: NDArray[np.bool_] | None = None  #: (N,) where the controller used its fallback
+    cycles: tuple[float, ...] = ()  #: ends of the cycles of a motion that repeats a path [s]
+
+    @classmethod
+    def of_run(cls, run: Trajectory) -> "Motion":
+        """The motion of a simulated run."""
+        return cls(run.controller, run.times, run.q, run.labels, run.value, run.reference, run.fell_back)
+
+    @classmethod
+    def of_path(cls, motion: JointMotion) -> "Motion":
+        """The motion along a tool path."""
+        return cls("tool path", motion.times, motion.q, motion.labels, np.hstack([motion.x, motion.xi]))
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+        return float(self.times[-1] - self.times[0])
+
+    def at(self, seconds: float) -> Array:
+        """The joint position (n,) some seconds after the start."""
+        t = self.times[0] + seconds
+        return np.array([np.interp(t, self.times, column) for column in self.q.T])
+
+    def index(self, seconds: float) -> int:
+        """The row of the last instant up to some seconds after the start."""
+        return int(np.clip(np.searchsorted(self.times, self.times[0] + seconds + 1e-9) - 1, 0, len(self.times) - 1))
+
+    def returns(self, seconds: float) -> list[tuple[int, float]]:
+        """For each cycle that is over: its number, and how far a joint then is from its start at most [deg]."""
+        over = [(k, end) for k, end in enumerate(self.cycles, 1) if end <= seconds + 1e-9]
+        return [(k, float(np.degrees(np.abs(self.at(end) - self.q[0]).max()))) for k, end in over]
+
+
+def require_joints(names: tuple[str, ...], robot: Robot, what: str) -> None:
+    """Raise InvalidValueError unless a motion has the joints of a robot."""
+    if names != robot.joint_names:
+        raise InvalidValueError(f"joints of {what}", ", ".join(names), ", ".join(robot.joint_names))
+
+
+def read_run(path: Path, robot: Robot) -> Motion:
+    """Read a file of `orthocas simulate`.
+
+    Raises:
+        TrajectoryFileError: if the file is no run.
+        InvalidValueError: if its joints are not those of the robot.
+    """
+    run = Trajectory.load(path)
+    require_joints(run.joint_names, robot, str(path))
+    return Motion.of_run(run)
+
+
+def read_joint_motion(path: Path, robot: Robot) -> Motion:
+    """Read a file of `orthocas follow`: a header with time_s and the names of all joints, then one row an instant.
+
+    Columns for velocities and accelerations are left out; others are quantities to show.
+
+    Raises:
+        PathFileError: names the file, and what is wrong there.
+    """
+    header: list[str] = []
+
+    def columns(names: Sequence[str]) -> list[int]:
+        column_places(names, (_TIME, *robot.joint_names))
+        header.extend(names)
+        return column_places(names, names)
+
+    table = read_table(path, "motion file", "instants", _MOST_INSTANTS, columns)
+    rates = {f"{order}_{name}" for order in ("d", "dd") for name in robot.joint_names}
+    labels = tuple(name for name in header if name not in {_TIME, *robot.joint_names, *rates})
+    times, q, values = (
+        table[:, [header.index(name) for name in names]] for names in ([_TIME], robot.joint_names, labels)
+    )
+    if (np.diff(times[:, 0]) <= 0).any():
+        raise PathFileError(f"motion file {path}: time_s does not increase in every line")
+    arrays = (frozen_array("a column", part, (None, None)) for part in (q, values))
+    return Motion(Path(path).stem, times[:, 0], next(arrays), labels, next(arrays))
+
+
+Place = Callable[[Array], Array]  #: shares of a cycle (N,) -> task values (N, m)
+
+
+def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> tuple[Motion, Motion]:
+    """The joints along a closed tool path with constant xi, and along the same path by the pseudo-inverse.
+
+    The second takes the shortest step of the joints in each interval, q' = q + J_x^+ (x' - h(q)), corrected until the
+    tool is on the path. Both begin at the centre of the domain.
+
+    Args:
+        chart: a fitted chart.
+        path: task values of waypoints of a closed path (N, m), joined by straight lines; its first point should be near
+            the task value at the centre. Default: the largest of some circles there that the chart can follow.
+        cycles: how often.
+
+    Raises:
+        PathError: if the path is not closed, or leaves the domain with constant xi.
+        NoExpressionError: for grown charts.
+    """
+    require_kind("chart", chart, Chart)
+    require_count("cycles", cycles, most=_MOST_CYCLES)
+    times, shares = _timing(cycles)
+    start = chart.problem.domain.centre
+    if path is None:
+        along, q = _largest_circle(chart, start, shares)
+    else:
+        along = _polygon(chart, path)
+        q = _with_constant_xi(chart, along(shares), start)
+    x = along(shares)
+    ends = tuple(_PERIOD * (k + 1) for k in range(cycles))
+    other = _by_pseudo_inverse(chart, x, q[0])
+    labels = chart.labels[: chart.m]
+    return (
+        Motion("constant ξ", times, q, labels, x, cycles=ends),
+        Motion("pseudo-inverse", times, other, labels, chart.task(other), cycles=ends),
+    )
+
+
+def _timing(cycles: int) -> tuple[Array, Array]:
+    """Instants [s], and the share of a cycle that is done: from rest to rest in each cycle."""
+    t = np.linspace(0.0, 1.0, _POINTS + 1)
+    share = t**3 * (10 - 15 * t + 6 * t**2)
+    times = _PERIOD * np.concatenate([[0.0], *(k + t[1:] for k in range(cycles))])
+    return times, np.concatenate([[0.0], *(share[1:] for _ in range(cycles))])
+
+
+def _largest_circle(chart: Chart, start: Array, shares: Array) -> tuple[Place, Array]:
+    """A circle in the first two components of the task, or a line in one, as large as the chart can follow."""
+    x0, m = chart.task(start), min(chart.m, 2)
+    radius = _SHARE * float(chart.phi_sizes[:m].min())
+    while True:
+
+        def along(share: Array, radius: float = radius) -> Array:
+            angle = 2 * np.pi * share
+            across = radius * np.stack([np.cos(angle) - 1, np.sin(angle)], axis=-1)
+            return x0 + np.pad(across[..., 2 - m :], ((0, 0), (0, chart.m - m)))
+
+        try:
+            return along, _with_constant_xi(chart, along(shares), start)
+        except PathError:
+            radius /= 1.3
+            if radius < _SMALLEST * float(chart.phi_sizes[:m].min()):
+                raise
+
+
+def _polygon(chart: Chart, path: Array) -> Place:
+    """Straight lines between waypoints."""
+    points, _ = as_point_set("path", path, chart.m)
+    sizes = chart.phi_sizes[: chart.m]
+    if len(points) < 3 or np.abs((points[-1] - points[0]) / sizes).max() > _CLOSED:
+        raise PathError(f"the path of {len(points)} waypoints is not closed, expected its last to be its first")
+    lengths = np.linalg.norm(np.diff(points, axis=0) / sizes, axis=1)
+    if not lengths.sum() > 0:
+        raise InvalidValueError("path", "one point", "waypoints at different places")
+    place = np.append(0.0, np.cumsum(lengths)) / lengths.sum()
+    return lambda share: np.column_stack([np.interp(share, place, column) for column in points.T])
+
+
+def _with_constant_xi(chart: Chart, x: Array, start: Array) -> Array:
+    """Joint positions (N, n) with task values x (N, m) and the coordinates of the start."""
+    xi = chart.xi(start)
+    q = chart.solve(np.concatenate([x[0], xi]), start).require(inside=True).q[0]
+    tracker = chart.tracker(q)
+    found = np.empty((len(x), chart.n))
+    for k, value in enumerate(x):
+        found[k] = tracker.step(np.concatenate([value, xi]))
+        if tracker.status is not TrackerStatus.OK:
+            raise PathError(
+                f"the path cannot be followed with constant xi from point {k} of {len(x)}: {tracker.status.name}"
+            )
+    return found
+
+
+def _by_pseudo_inverse(chart: Chart, x: Array, start: Array) -> Array:
+    """Joint positions (N, n) with task values x (N, m), each by the shortest step from the one before."""
+    task, q = chart.problem.task, start
+    found = np.empty((len(x), chart.n))
+    for k, value in enumerate(x):
+        for _ in range(_CORRECTIONS + 1):
+            J = task.batched_jacobian(q[None])[0].reshape(chart.m, chart.n)
+            q = q + np.linalg.lstsq(J, value - chart.task(q), rcond=None)[0]
+        found[k] = q
+    return found

@@ -1,0 +1,202 @@
+"""Pages without a chart: motions with a time slider, and one slider for each joint of a robot."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from orthocas.robots.robot import Robot
+from orthocas.tools.checks import Array
+from orthocas.viewer.arm import Arm
+from orthocas.viewer.looks import Look, chain_length
+from orthocas.viewer.motion import Motion
+from orthocas.viewer.panel import PlayerPanel, RobotPanel
+from orthocas.viewer.window import Loop, direction_of_camera, place_camera, place_floor, place_lights, up_of
+
+PATHS = ((31, 95, 168), (217, 95, 2), (27, 158, 119))  #: colours of the tool paths
+_APART = 0.9  # of arms that are side by side, as a share of their length
+_SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x")
+_MOST_POINTS = 2000  # of a tool path
+_TICK = 0.01  # [s] of the time slider
+_ENDLESS = np.pi  # [rad] or [m] of a slider without limits
+_STEP = 1e-3
+
+
+class Stage:
+    """Arms in a scene that move together, each with its tool path."""
+
+    def __init__(self, scene: Any, robot: Robot, look: Look, motions: Sequence[Motion]) -> None:
+        self.motions = motions
+        self.shifts = side_by_side(robot, len(motions))
+        self._arms = []
+        size = chain_length(robot.tree)
+        for k, (motion, shift) in enumerate(zip(motions, self.shifts, strict=True)):
+            self._arms.append(Arm(scene, f"/arm{k}", robot, look, shift))
+            rows = np.unique(np.linspace(0, len(motion.q) - 1, _MOST_POINTS).astype(int))
+            way = robot.tip_position(motion.q[rows]) + shift
+            ends = np.stack([way[:-1], way[1:]], axis=1)
+            scene.add_line_segments(f"/path{k}", ends, PATHS[k % len(PATHS)], thickness=0.005 * size)
+            if len(motions) > 1:
+                place = shift + 1.25 * size * up_of(robot) * 0.55
+                scene.add_label(f"/name{k}", motion.name, position=tuple(place), anchor="bottom-center")
+
+    @property
+    def duration(self) -> float:
+        """Length of the longest motion [s]."""
+        return max(motion.duration for motion in self.motions)
+
+    def show(self, seconds: float) -> None:
+        """Move all arms to where they are some seconds after the start."""
+        for arm, motion in zip(self._arms, self.motions, strict=True):
+            arm.show(motion.at(seconds))
+
+
+class PlayerPage:
+    """The page of motions on a viser server."""
+
+    def __init__(self, server: Any, robot: Robot, look: Look, motions: Sequence[Motion]) -> None:
+        self._server = server
+        self._stage = Stage(server.scene, robot, look, motions)
+        self._panel = PlayerPanel(robot, motions)
+        self._loop = Loop(lambda: None, lambda error: None)
+        self._now = 0.0
+        place_floor(server, robot)
+        place_lights(server, robot)
+        place_camera(server, robot, np.concatenate([few(motion.q) for motion in motions]), self._stage.shifts)
+        panel = server.gui.add_panel()
+        with panel.add_tab("Readings", "gauge"):
+            self._readings = server.gui.add_html("")
+        panel.dock_left()
+        panel.set_width(310)
+        self._add_controls()
+        self._show(0.0)
+        self._loop.start()
+
+    def close(self) -> None:
+        """End the thread of the page."""
+        self._loop.stop()
+
+    def _add_controls(self) -> None:
+        gui = self._server.gui
+        self._play = gui.add_button("Play", icon="player-play")
+        self._time = gui.add_slider("time [s]", 0.0, max(round(self._stage.duration, 2), _TICK), _TICK, 0.0)
+        self._speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1x")
+        self._again = gui.add_checkbox("repeat", initial_value=True)
+        self._playing = False
+        self._play.on_click(self._clicked)
+        self._time.on_update(self._slid)
+
+    async def _clicked(self, event: Any) -> None:
+        self._loop.ask("play", self._toggle)
+
+    async def _slid(self, event: Any) -> None:
+        if event.client is not None:  # otherwise the page itself moved it
+            wanted = float(event.target.value)
+            self._loop.ask("time", lambda: self._jump(wanted))
+
+    def _toggle(self) -> None:
+        """Play from where the slider is, or stop."""
+        if self._playing:
+            self._pause()
+            return
+        self._playing, last = True, 0.0
+        self._play.label, self._play.icon = "Pause", "player-pause"
+        if self._now >= self._stage.duration:
+            self._now = 0.0
+
+        def tick(seconds: float) -> bool:
+            nonlocal last
+            speed = float(self._speed.value.removesuffix("x"))
+            now, last = self._now + speed * (seconds - last), seconds
+            if now >= self._stage.duration and not self._again.value:
+                self._show(self._stage.duration)
+                self._pause()
+                return False
+            self._show(now % self._stage.duration if self._stage.duration > 0 else 0.0)
+            return True
+
+        self._loop.animate(tick)
+
+    def _pause(self) -> None:
+        self._playing = False
+        self._play.label, self._play.icon = "Play", "player-play"
+        self._loop.animate(None)
+
+    def _jump(self, seconds: float) -> None:
+        self._pause()
+        self._show(seconds, slide=False)
+
+    def _show(self, seconds: float, slide: bool = True) -> None:
+        self._now = seconds
+        with self._server.atomic():
+            self._stage.show(seconds)
+            self._readings.content = self._panel.html(seconds)
+            if slide:
+                self._time.value = min(round(seconds, 2), self._time.max)
+
+
+def side_by_side(robot: Robot, count: int) -> Array:
+    """Where arms stand, (count, 3) [m]: in a row from left to right for the camera."""
+    places = (np.arange(count) - (count - 1) / 2) * _APART * chain_length(robot.tree)
+    return np.outer(places, np.cross(up_of(robot), direction_of_camera(robot)))
+
+
+def few(q: Array) -> Array:
+    """Some of the joint positions (N, n), from first to last."""
+    rows: Array = q[np.unique(np.linspace(0, len(q) - 1, 20).astype(int))]
+    return rows
+
+
+class RobotPage:
+    """The page of a robot on a viser server."""
+
+    def __init__(self, server: Any, robot: Robot, look: Look) -> None:
+        self._server, self._panel = server, RobotPanel(robot)
+        self._arm = Arm(server.scene, "/arm", robot, look)
+        self._home = robot.tree.middle
+        self._robot = robot
+        self._loop = Loop(lambda: None, lambda error: None)
+        place_floor(server, robot)
+        place_lights(server, robot)
+        place_camera(server, robot, self._home[None])
+        panel = server.gui.add_panel()
+        with panel.add_tab("Readings", "gauge"):
+            self._readings = server.gui.add_html("")
+        panel.dock_left()
+        panel.set_width(310)
+        with server.gui.add_folder("Joints"):
+            self._sliders = [self._slider(i) for i in range(robot.n)]
+        home = server.gui.add_button("Home", icon="home")
+
+        home.on_click(self._go_home)
+        self._show()
+        self._loop.start()
+
+    def close(self) -> None:
+        """End the thread of the page."""
+        self._loop.stop()
+
+    def _slider(self, i: int) -> Any:
+        robot, middle = self._robot, float(self._home[i])
+        low, high = np.clip([robot.lower[i], robot.upper[i]], middle - _ENDLESS, middle + _ENDLESS).tolist()
+        low, high = round(low + 4.9e-4, 3), round(high - 4.9e-4, 3)
+        high = max(low, high)
+        slider = self._server.gui.add_slider(
+            robot.joint_names[i], low, high, _STEP, min(max(round(middle, 3), low), high)
+        )
+
+        slider.on_update(self._moved)
+        return slider
+
+    async def _moved(self, event: Any) -> None:
+        self._loop.ask("joints", self._show)
+
+    async def _go_home(self, event: Any) -> None:
+        for slider, value in zip(self._sliders, self._home.tolist(), strict=True):
+            slider.value = min(max(round(value, 3), slider.min), slider.max)
+
+    def _show(self) -> None:
+        q = np.array([slider.value for slider in self._sliders])
+        with self._server.atomic():
+            self._arm.show(q)
+            self._readings.content = self._panel.html(q)

@@ -1,0 +1,219 @@
+"""`orthocas.view`: charts, robots and motions in a browser."""
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+from orthocas.charts.chart import Chart, GrownChart
+from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError
+from orthocas.paths.joint_motion import JointMotion
+from orthocas.robots.robot import Robot
+from orthocas.simulation.trajectory import Trajectory
+from orthocas.tools.checks import as_path
+from orthocas.tools.files import published, require_replaceable, require_writable
+from orthocas.viewer.chart_page import ChartPage
+from orthocas.viewer.looks import Look, stick_arm, urdf_look
+from orthocas.viewer.motion import Motion, require_joints
+from orthocas.viewer.player import PlayerPage, RobotPage
+from orthocas.viewer.recording import Scene, chart_scene, motion_scene, recorded, robot_scene
+from orthocas.viewer.session import Session
+from orthocas.viewer.window import LOCAL, close_window, open_window
+
+PORT = 8080
+_OURS = b"<!-- written by orthocas -->"
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How a robot looks."""
+
+    look: Look
+    missing: tuple[str, ...] = ()  #: mesh files that were not found; rods stand for their links
+
+
+@dataclass(eq=False)
+class View:
+    """A page that a browser can open, until `close`; also a context manager.
+
+    In a notebook it shows itself in a frame.
+    """
+
+    url: str
+    missing: tuple[str, ...]  #: mesh files that were not found; rods stand for their links
+    _server: Any = field(repr=False)
+    _page: Any = field(repr=False)
+    _closed: threading.Event = field(default_factory=threading.Event, repr=False)
+
+    def wait(self) -> None:
+        """Wait until `close` is called elsewhere, or Ctrl-C."""
+        while not self._closed.wait(0.2):
+            pass
+
+    def close(self) -> None:
+        """End the page."""
+        if not self._closed.is_set():
+            self._closed.set()
+            self._page.close()
+            close_window(self._server)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{self.url}" width="100%" height="620" style="border:1px solid #ddd"></iframe>'
+
+
+def view(
+    shown: Any,
+    *,
+    robot: Robot | Chart | None = None,
+    robot_file: str | Path | None = None,
+    locked: Mapping[str, float] | None = None,
+    host: str = LOCAL,
+    port: int = PORT,
+) -> View:
+    """Open a page for the browser: a chart to play with, an atlas from chart to chart, a robot, or a motion.
+
+    Args:
+        shown: a fitted chart, an atlas, a robot, a `Trajectory` of `simulate`, a `JointMotion` of `follow`, or a
+            sequence of `Motion` of one robot, which move side by side.
+        robot: for motions: whose they are, or a chart of that robot.
+        robot_file: URDF file of the robot with its meshes. Default: drums and rods, made from the kinematic tree.
+        locked: joints that were locked when the robot was built from that file, with their positions [rad] or [m].
+        host: address to listen at. By default only this machine can open the page. The page's address holds a random
+            token, which stands for a password.
+        port: of the page; 0 takes any free one.
+
+    Returns:
+        The running page, with its `url`. It lives in threads of this process.
+
+    Raises:
+        MissingExtraError: if viser is not installed.
+        ViewError: if the port is taken, or the host is no address of this machine.
+        NoExpressionError: for grown charts.
+        RobotError: if the robot file is another robot's.
+    """
+    arm, motions = subject(shown, robot)
+    shape = shape_of(arm, robot_file, locked)
+    server, url = open_window(host, port, "orthocas")
+    try:
+        page: ChartPage | RobotPage | PlayerPage
+        if motions:
+            page = PlayerPage(server, arm, shape.look, motions)
+        elif isinstance(shown, Chart):
+            page = ChartPage(server, Session(shown), shape.look)
+        elif _is_several(shown):
+            page = ChartPage(server, shown.view_session(), shape.look)
+        else:
+            page = RobotPage(server, arm, shape.look)
+    except BaseException:
+        close_window(server)
+        raise
+    return View(url, shape.missing, server, page)
+
+
+def export_page(
+    shown: Any,
+    path: str | Path,
+    *,
+    robot: Robot | Chart | None = None,
+    robot_file: str | Path | None = None,
+    locked: Mapping[str, float] | None = None,
+    force: bool = False,
+) -> Shape:
+    """Write one self-contained HTML file that shows the same without a server, and works offline.
+
+    A chart moves each coordinate to its ends and back. Sliders need `view`.
+
+    Args:
+        shown: as in `view`, but no atlas: sliders lead through it.
+        path: the file.
+        robot: as in `view`.
+        robot_file: as in `view`.
+        locked: as in `view`.
+        force: replace a file that orthocas did not write.
+
+    Raises:
+        ArchiveError: if the file cannot be written.
+    """
+    target = as_path("path", path)
+    require_page(target, force)
+    if _is_several(shown):
+        raise InvalidValueError("shown", "an atlas", "one of its charts, a robot or a motion; `view` shows atlases")
+    arm, motions = subject(shown, robot)
+    shape = shape_of(arm, robot_file, locked)
+    scene: Scene
+    if motions:
+        scene = motion_scene(arm, shape.look, motions)
+    elif isinstance(shown, Chart):
+        scene = chart_scene(shown, shape.look)
+    else:
+        scene = robot_scene(arm, shape.look)
+    page = recorded(scene)
+    with published(target.parent) as drafts:
+        (drafts / target.name).write_bytes(page.encode() + _OURS)
+    return shape
+
+
+def require_page(path: Path, force: bool) -> None:
+    """Check, before long work, that a page can be written.
+
+    Raises:
+        ArchiveError: if the folder is missing or not writable, or there is a file of others, or a symbolic link.
+    """
+    require_writable(path, ArchiveError)
+    ours = path.is_file() and path.read_bytes().endswith(_OURS)
+    require_replaceable(path, ours, force)
+
+
+def subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequence[Motion]]:
+    """The robot to draw, and what moves it; no motions for a chart and a robot."""
+    if isinstance(shown, GrownChart):
+        raise NoExpressionError("a view needs coordinates with a CasADi expression; received grown coordinates")
+    if isinstance(shown, Chart) or _is_several(shown):
+        robot_of: Robot = shown.problem.robot
+        return robot_of, ()
+    if isinstance(shown, Robot):
+        return shown, ()
+    motions = _motions(shown)
+    if not isinstance(robot, Robot | Chart):
+        raise InvalidValueError("robot", repr(robot)[:80], "the robot that moved, or a chart of it")
+    arm = robot if isinstance(robot, Robot) else robot.problem.robot
+    if isinstance(shown, Trajectory | JointMotion):
+        require_joints(shown.joint_names, arm, "the motion")
+    return arm, motions
+
+
+def _is_several(shown: Any) -> bool:
+    """Whether it consists of several charts, such as an atlas, and brings a session of its own."""
+    return hasattr(shown, "view_session")
+
+
+def _motions(shown: Any) -> tuple[Motion, ...]:
+    """A motion, or several."""
+    if isinstance(shown, Trajectory):
+        return (Motion.of_run(shown),)
+    if isinstance(shown, JointMotion):
+        return (Motion.of_path(shown),)
+    several = shown if isinstance(shown, list | tuple) else [shown]
+    if not several or not all(isinstance(part, Motion) for part in several):
+        raise InvalidValueError(
+            "shown", f"a {type(shown).__name__}", "a chart, an atlas, a robot, a run or a joint motion"
+        )
+    return tuple(several)
+
+
+def shape_of(robot: Robot, robot_file: str | Path | None, locked: Mapping[str, float] | None) -> Shape:
+    """How a robot looks: as its file says, or drums and rods where that shows nothing."""
+    sticks = stick_arm(robot.tree)
+    if robot_file is None:
+        return Shape(sticks)
+    found = urdf_look(as_path("robot_file", robot_file), robot.tree, locked)
+    bare = bool(found.missing) or not any(found.look)
+    look = [part or (sticks[i] if bare else []) for i, part in enumerate(found.look)]
+    return Shape([*look[:-1], sticks[-1]], found.missing)

@@ -1,0 +1,386 @@
+"""The server that a browser looks at: viser, bound to one address, guarded, with one thread of work."""
+
+import contextlib
+import errno
+import hmac
+import io
+import ipaddress
+import logging
+import re
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from http import HTTPStatus
+from importlib import import_module
+from threading import Lock
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from orthocas.errors import InvalidValueError, ViewError
+from orthocas.robots.robot import Robot
+from orthocas.tools.checks import Array, of_extra, require_count
+from orthocas.viewer.looks import chain_length
+
+_FRAME = 1 / 30  # [s] between ticks; browsers without a graphics card fall behind more
+_QUIET = 0.25  # [s] without jobs, after which the page settles
+_VISER = "viser.infra._infra"  # the module that starts the server
+_LARGEST = 2**20  # bytes of a message from a browser; sliders and cameras need hundreds
+_HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[0-9a-z._-]+)(?::\d{1,5})?")
+LOCAL = "127.0.0.1"
+BRAND = (31, 95, 168)
+_VIEW_ANGLE = 0.7  # [rad] of the camera
+_ROOM = 1.1  # around the arms in the picture
+_FLAT = 1e-9
+
+Job = Callable[[], None]
+Tick = Callable[[float], bool]  #: seconds since it began -> whether it goes on
+
+_log = logging.getLogger(__name__)
+
+
+class Loop:
+    """Runs jobs, ticks of an animation, and `settle` once after a while without jobs.
+
+    Args:
+        settle: what to do when nothing was asked for during a quarter of a second.
+        failed: told of an error in a job.
+    """
+
+    def __init__(self, settle: Job, failed: Callable[[Exception], None]) -> None:
+        self._settle, self._failed = settle, failed
+        self._jobs: dict[str, Job] = {}
+        self._tick: Tick | None = None
+        self._begun = 0.0
+        self._wake = threading.Condition()
+        self._running = False
+        self._thread = threading.Thread(target=self._run, name="orthocas view", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._running = True
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, after the job that is being done."""
+        with self._wake:
+            self._running = False
+            self._wake.notify()
+        if self._thread is not threading.current_thread() and self._thread.is_alive():
+            self._thread.join(timeout=2.0)
+
+    def ask(self, what: str, job: Job) -> None:
+        """Ask for a job; one that was asked for under the same name and has not begun is dropped."""
+        with self._wake:
+            self._jobs.pop(what, None)
+            self._jobs[what] = job
+            self._wake.notify()
+
+    def animate(self, tick: Tick | None) -> None:
+        """Call a function up to 30 times a second until it returns False; None ends an animation."""
+        with self._wake:
+            self._tick, self._begun = tick, time.monotonic()
+            self._wake.notify()
+
+    def _run(self) -> None:
+        settled = True
+        while self._running:
+            jobs, tick = self._next(settled)
+            if not jobs and tick is None and not settled:
+                jobs, settled = [self._settle], True
+            elif jobs or tick is not None:
+                settled = False
+            for job in jobs:
+                self._do(job)
+            if tick is not None:
+                self._do(lambda tick=tick: self._advance(tick))  # type: ignore[misc]
+
+    def _next(self, settled: bool) -> tuple[list[Job], Tick | None]:
+        """What to do now; waits until there is something."""
+        with self._wake:
+            if not self._jobs and self._running:
+                self._wake.wait(_FRAME if self._tick else None if settled else _QUIET)
+            jobs, self._jobs = list(self._jobs.values()), {}
+            return jobs, self._tick
+
+    def _advance(self, tick: Tick) -> None:
+        """One tick of an animation."""
+        if not tick(time.monotonic() - self._begun):
+            with self._wake:
+                self._tick = None if self._tick is tick else self._tick
+
+    def _do(self, job: Job) -> None:
+        try:
+            job()
+        except Exception as error:  # a page goes on after an error, and tells it
+            _log.debug("a job of the view failed", exc_info=True)
+            self._failed(error)
+
+
+_starting = Lock()
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Judges requests for pages and websockets by their path and by the headers `Host` and `Origin`.
+
+    A browser sets both headers, and no page can change them. `Host` is the address that the browser asked; a name of
+    somebody else there means that his name leads here (DNS rebinding). `Origin` is the page that asks; it must be one
+    of this server's own. The path begins with a random token, so who has not been told the address gets nothing, not
+    even viser's own page, which an address could make connect to another server.
+    """
+
+    host: str  #: the address that the server listens at
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(16))
+    seen: list[bool] = field(default_factory=list)  #: not empty once a server is guarded
+
+    def admitted(self, path: str, hosts: list[str], origins: list[str]) -> str | None:
+        """The path of a request behind the token; None if the request is refused.
+
+        Args:
+            path: path and query, as they came.
+            hosts: all headers `Host`.
+            origins: all headers `Origin`; programs that are no browsers, and browsers that open a page, send none.
+        """
+        place, mark, query = path.partition("?")
+        first, _, rest = place.removeprefix("/").partition("/")
+        known = hmac.compare_digest(first.encode(errors="replace"), self.token.encode())
+        own = len(hosts) == 1 and self._is_own(hosts[0]) and origins in ([], [f"http://{hosts[0]}"])
+        return f"/{rest}{mark}{query}" if known and own else None
+
+    def _is_own(self, host: str) -> bool:
+        """Whether a header `Host` can name this server. Any port can: tunnels change it.
+
+        A server that other machines reach has addresses that it does not know, behind routers and in containers. So it
+        takes all that are numbers: no name of somebody else can lead to them.
+        """
+        found = _HOST.fullmatch(host.lower())
+        if found is None:
+            return False
+        name = found["name"].strip("[]")
+        own = is_local(self.host)
+        if name in ("localhost", self.host.lower()):
+            return True
+        try:
+            return ipaddress.ip_address(name).is_loopback or not own
+        except ValueError:
+            return not own and name == socket.gethostname().lower()
+
+
+def is_local(host: str) -> bool:
+    """Whether only this machine can reach an address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+@contextmanager
+def guarded(host: str) -> Iterator[Guard]:
+    """Guard the server that viser starts within the block.
+
+    viser has no option for that. It looks `serve` of the package websockets up when it starts, so another function
+    stands there for that time, which puts the guard before viser's own answers.
+
+    A later viser may start it in another way: then `Guard.seen` stays empty.
+    """
+    guard, module = Guard(host), _serving()
+    with _starting:
+        serve = module.serve
+        module.serve = _with_guard(serve, guard)
+        try:
+            yield guard
+        finally:
+            module.serve = serve
+
+
+def _serving() -> Any:
+    """The module whose function `serve` is looked up."""
+    return import_module("websockets.asyncio.server")
+
+
+def _with_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
+    """`serve`, which asks the guard before anything else; servers that are not viser's stay as they are."""
+    answer_of = import_module("websockets.http11").Response
+    headers_of = import_module("websockets.datastructures").Headers
+
+    def serve_guarded(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        if getattr(handler, "__module__", None) != _VISER:
+            return serve(handler, *arguments, process_request=process_request, **options)
+        guard.seen.append(True)
+
+        def judge(connection: Any, request: Any) -> Any:
+            headers = request.headers
+            path = guard.admitted(request.path, headers.get_all("Host"), headers.get_all("Origin"))
+            if path is None:
+                text = b"Open the whole address that orthocas printed.\n"
+                told = headers_of({"Content-Type": "text/plain", "Content-Length": str(len(text))})
+                return answer_of(HTTPStatus.FORBIDDEN, "Forbidden", told, text)
+            return process_request(connection, replace(request, path=path))
+
+        return serve(handler, *arguments, process_request=judge, **{**options, "max_size": _LARGEST})
+
+    return serve_guarded
+
+
+def viser() -> ModuleType:
+    """The package `viser`, which only views need.
+
+    Raises:
+        MissingExtraError: if it is not installed.
+    """
+    return of_extra("viser", "a view in the browser", "view")
+
+
+def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
+    """A `viser.ViserServer`, and its address for a browser; port 0 takes any free port.
+
+    Raises:
+        MissingExtraError: if viser is not installed.
+        ViewError: if the port is taken, the host is no address of this machine, or viser cannot be guarded.
+    """
+    package = viser()
+    require_free(host, port)
+    with guarded(host) as guard, contextlib.redirect_stdout(io.StringIO()):  # it announces itself
+        server = package.ViserServer(host=host, port=port, label=title, verbose=False)
+    if not guard.seen:
+        close_window(server)
+        raise ViewError("this version of viser starts its server in another way, expected one that can be guarded")
+    if port not in (0, server.get_port()):  # somebody else was faster
+        close_window(server)
+        raise _taken(host, port)
+    server.request_share_url = _not_shared
+    server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=BRAND)
+    server.scene.configure_environment_map(None)
+    server.scene.configure_default_lights(False)  # `place_lights` has lights without shadows
+    return server, f"{url_of(host, server.get_port())}/{guard.token}"
+
+
+def close_window(server: Any) -> None:
+    """Stop a server; pages that are open in browsers say that they lost it."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def require_free(host: str, port: int) -> None:
+    """Check that a server can listen there: viser itself would wait forever, or take another port.
+
+    Raises:
+        InvalidValueError: if the port is no number from 0 to 65535.
+        ViewError: if the port is taken, or the host is no address of this machine.
+    """
+    require_count("port", port, least=0, most=65535)
+    if not isinstance(host, str) or not host:
+        raise InvalidValueError("host", repr(host)[:80], "an address of this machine, such as 127.0.0.1")
+    try:
+        numeric = 0 if host == "localhost" else socket.AI_NUMERICHOST  # no questions to other machines
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=numeric)[0]
+    except (OSError, UnicodeError):
+        raise ViewError(f"host is {host[:80]!r}, expected an address of this machine, such as {LOCAL}") from None
+    with socket.socket(family, kind, protocol) as trial:
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind(address)
+        except OSError as error:
+            raise _refused(host, port, error) from None
+
+
+def url_of(host: str, port: int) -> str:
+    """The address for a browser, without its token."""
+    shown = LOCAL if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+    return f"http://{shown}:{port}"
+
+
+def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None) -> None:
+    """Look at an arm from the front and slightly above, or at a planar arm from the side where its plane is seen.
+
+    Args:
+        server: the window.
+        robot: the arm.
+        q: joint positions (N, n) that should be in the picture.
+        shift: places of further arms, (k, 3) [m].
+    """
+    points = robot.joint_points(q).reshape(-1, 3)
+    points = np.concatenate([points, *(points + other for other in ([] if shift is None else shift))])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 0.4 * chain_length(robot.tree))
+    up = up_of(robot)
+    server.scene.set_up_direction(tuple(up))
+    camera = server.initial_camera
+    camera.fov = _VIEW_ANGLE
+    camera.position = tuple(middle + _ROOM * radius / np.sin(_VIEW_ANGLE / 2) * direction_of_camera(robot))
+    camera.look_at = tuple(middle)
+
+
+def place_floor(server: Any, robot: Robot) -> None:
+    """A grid under the arm, or behind a planar one."""
+    size = chain_length(robot.tree)
+    up = np.abs(up_of(robot))
+    plane = "xy" if is_planar(robot) else ("yz", "xz", "xy")[int(np.argmax(up))]
+    position = (0.0, 0.0, -0.15 * size) if is_planar(robot) else (0.0, 0.0, 0.0)
+    cell = 10.0 ** np.round(np.log10(size / 8))
+    server.scene.add_grid(
+        "/floor", plane=plane, infinite_grid=True, position=position, cell_size=cell, section_size=5 * cell,
+        cell_color=(228, 231, 235), section_color=(205, 210, 217), fade_distance=12 * size, shadow_opacity=0.0,
+    )  # fmt: skip
+
+
+def place_lights(server: Any, robot: Robot) -> None:
+    """Light from the sky, from the left of the camera, and weaker from its right.
+
+    There are no shadows and no environment map: without a graphics card, they take most of the time of a picture.
+    """
+    scene, up, ahead = server.scene, up_of(robot), direction_of_camera(robot)
+    left = np.cross(ahead, up)
+    scene.add_light_hemisphere(
+        "/lights/sky", sky_color=(255, 255, 255), ground_color=(150, 156, 166), intensity=2.1, position=tuple(up)
+    )
+    for name, intensity, place in (("key", 1.8, left + 1.5 * up + ahead), ("fill", 0.5, ahead - left)):
+        scene.add_light_directional(f"/lights/{name}", intensity=intensity, position=tuple(map(float, place)))
+
+
+def is_planar(robot: Robot) -> bool:
+    """Whether an arm moves in the x-y plane."""
+    tree = robot.tree
+    return bool(
+        np.abs(tree.rotations[:, 2] - [0, 0, 1]).max() < _FLAT and np.abs(tree.translations[:, 2]).max() < _FLAT
+    )
+
+
+def direction_of_camera(robot: Robot) -> Array:
+    """Unit vector to the camera: from the front, the side and above, or from where a plane is seen."""
+    if is_planar(robot):
+        return np.array([0.0, 0.0, 1.0])
+    up = up_of(robot)
+    ahead = np.eye(3)[int(np.argmin(np.abs(up)))]
+    ahead = ahead - (ahead @ up) * up
+    direction = ahead / np.linalg.norm(ahead) - 1.25 * np.cross(up, ahead) + 0.55 * up
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def up_of(robot: Robot) -> Array:
+    """Against gravity; z without gravity."""
+    gravity = robot.tree.gravity
+    strength = float(np.linalg.norm(gravity))
+    return np.array([0.0, 0.0, 1.0]) if strength < _FLAT else -gravity / strength
+
+
+def _not_shared(verbose: bool = True) -> None:
+    """In place of viser's tunnel to a server of others, which any page in the browser could ask for."""
+
+
+def _refused(host: str, port: int, error: OSError) -> ViewError:
+    if error.errno == errno.EADDRINUSE:
+        return _taken(host, port)
+    if error.errno == errno.EACCES:
+        return ViewError(f"port is {port}, which this user may not open; expected one from 1024 on")
+    return ViewError(f"host is {host[:80]!r}, expected an address of this machine, such as {LOCAL}")
+
+
+def _taken(host: str, port: int) -> ViewError:
+    return ViewError(f"port {port} of {host} is taken, expected a free one; 0 finds one")
