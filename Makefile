@@ -25,7 +25,7 @@ docs: $(INSTALLED)  ## the documentation site in build/docs, its pages run; a wa
 
 COUNT ?= 1000
 fuzz: $(INSTALLED)  ## the campaign of faults; COUNT mutants of each kind, CAMPAIGN="charts ..." for some kinds
-	cd tests && ../$(BIN)/python -m fuzz $(COUNT) $(CAMPAIGN)
+	cd tests && PYTHONPATH=../examples ../$(BIN)/python -m fuzz $(COUNT) $(CAMPAIGN)
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

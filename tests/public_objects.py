@@ -199,7 +199,7 @@ def certificate() -> oc.Certificate:
 
 
 @cache
-def joint_motion() -> oc.following.JointMotion:
+def joint_motion() -> oc.paths.JointMotion:
     x = fitted().chart.task(planar().domain.centre)
     return oc.follow(fitted().chart, [x, x + 0.05, x], velocity_limits=1.0, period=0.05)
 

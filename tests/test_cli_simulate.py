@@ -173,7 +173,7 @@ def test_points_and_pushes(run_simulate: Run) -> None:
 @pytest.mark.usefixtures("blank_pictures")
 def test_mujoco_is_another_plant(run_simulate: Run) -> None:
     """The same run, up to the tolerance of CVODES, which adds up over 600 ticks; a push at a link reaches both."""
-    pytest.importorskip("mujoco", reason="the extra orthocas[sim] is not installed")
+    pytest.importorskip("mujoco", reason="the extra orthocas[mujoco] is not installed")
     push = {"start": 0.1, "duration": 0.1, "force": [20, 0, 0], "link": "q2", "point": [0.5, 0, 0]}
     points = {"points": [{"time": 0.5, "move": {"x": 0.02}}], "pushes": [push]}
     Path("pushed.json").write_text(json.dumps(points))

@@ -81,8 +81,8 @@ def test_basis_keeps_one_term_of_a_cyclic_joint() -> None:
         assert len(terms) == kind.term_count(7)
 
 
-def _space(problem: oc.Problem) -> oc.parametrisations.JointSpace:
-    return oc.parametrisations.JointSpace.of(problem)
+def _space(problem: oc.Problem) -> oc.bases.JointSpace:
+    return oc.bases.JointSpace.of(problem)
 
 
 @pytest.mark.slow
@@ -198,7 +198,7 @@ def test_torus_keeps_its_full_turns() -> None:
         ("polynomial:3", oc.Polynomial(3)),
     ],
 )
-def test_labels_name_cyclic_joints(label: str, wanted: oc.parametrisations.Parametrisation) -> None:
+def test_labels_name_cyclic_joints(label: str, wanted: oc.bases.Parametrisation) -> None:
     assert parse_parametrisation(label) == wanted
     assert wanted.label == label
 

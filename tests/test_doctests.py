@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 import orthocas
-from orthocas import codegen, control, parametrisations, simulation, solvers
+from orthocas import bases, codegen, control, simulation, solvers
 from orthocas.bases import registry as families
 from orthocas.fitting import terms as loss_terms
 from orthocas.tools.cached import cached_property
 
-PACKAGES: tuple[ModuleType, ...] = (orthocas, control, simulation, solvers, parametrisations, codegen)
+PACKAGES: tuple[ModuleType, ...] = (orthocas, control, simulation, solvers, bases, codegen)
 FEWEST_EXAMPLES = 20
 CALLED = (classmethod, staticmethod, property, cached_property)
 

@@ -23,7 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 assert [stage.result.status.value for stage in fit.stages] == ["converged"]
 assert fit.chart.notes["solver"] == "gauss_newton"
 assert oc.load("radial.orthocas").coordinates.parametrisation == Radial(60)
-assert oc.parametrisations.parse_parametrisation("radial:7") == Radial(7)
+assert oc.bases.parse_parametrisation("radial:7") == Radial(7)
 points = problem.domain.centre + 0.1 * np.random.default_rng(1).normal(size=(3, 3))
 J = fit.chart.jacobian(points)
 step = 1e-6 * np.eye(3)

@@ -227,7 +227,7 @@ def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
     with pytest.raises(InvalidValueError, match="precision is 'single' with max_mutual_deg"):
         oc.fit(planar_x, max_mutual_deg=3.0, precision="single")
     with pytest.raises(InvalidValueError, match="precision is 'single' with circle:mlp:3"):
-        oc.fit(planar_x, oc.parametrisations.Circle(oc.MLP((3,))), samples=50, precision="single")
+        oc.fit(planar_x, oc.bases.Circle(oc.MLP((3,))), samples=50, precision="single")
     with pytest.raises(InvalidValueError, match="samples is 0"):
         oc.fit(planar_x, samples=0)
     with pytest.raises(InvalidValueError, match="parametrisation is 'polynomial:3'"):

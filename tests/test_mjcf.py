@@ -6,9 +6,10 @@ import gymnasium
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 
 import orthocas as oc
-from orthocas.errors import RobotError, UnknownNameError
+from orthocas.errors import InvalidValueError, RobotError, UnknownNameError
 from orthocas.robots.mjcf import model_from_mjcf
 from orthocas.robots.urdf import lock_joints
 
@@ -184,77 +185,94 @@ def write(folder: Path, body: str = "", before: str = "", after: str = "") -> Pa
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        ('<site name="s" pos="0.4"/>', "pos of <site name='s'> of body 'b' is '0.4', expected 3 numbers"),
-        ('<joint range="l4"/>', "range of <joint> of body 'b' is 'l4', expected 2 numbers"),
-        ('<joint axis="0 0 0"/>', "axis of <joint> of body 'b' is '0 0 0', expected a vector that is not zero"),
-        ('<joint axis="0 0 nan"/>', "axis of <joint> of body 'b' is '0 0 nan'"),
-        ('<joint range="1 -1"/>', r"range \[1, -1\]"),
-        ('<joint type="screw"/>', "type of <joint> of body 'b' is 'screw'"),
-        ('<joint armature="-1"/>', "armature -1"),
-        ('<joint class="none"/>', "<joint class='none'> of body 'b' is of class 'none', known: main"),
-        ('<joint name="j"/>', "<joint name='j'> of body 'b' has the name of another joint"),
-        ('<body name="b"/>', "<body name='b'> has the name of another body"),
-        ('<geom size="0.1" mas="2"/>', "<geom> of body 'b' has an unknown attribute 'mas'"),
-        ('<geom size="0.1" mass="1e999"/>', "mass of <geom> of body 'b' is '1e999'"),
-        ('<geom size="0.1" mass="-1"/>', "negative mass"),
-        ('<geom type="box" size="0.1 0.2"/>', "size '0.1 0.2', expected 3 numbers for a box"),
-        ('<geom size="-0.1"/>', "size '-0.1', expected numbers > 0"),
-        ('<geom type="mesh" mesh="m"/>', "<geom> of body 'b' takes its inertia from a mesh"),
-        ('<geom type="box" mesh="m"/>', "takes its inertia from a mesh"),
-        ('<geom size="0.1" shellinertia="true"/>', "shellinertia"),
-        ('<geom fromto="0 0 0 1 0 0" size="0.1"/>', "fromto"),
-        ('<inertial mass="1" diaginertia="1 1 1"/>', "<inertial> of body 'b' has no attribute 'pos'"),
-        ('<inertial pos="0 0 0" mass="1"/>', "diaginertia or fullinertia"),
-        ('<inertial pos="0 0 0" mass="-1" diaginertia="1 1 1"/>', "mass -1 kg"),
-        ('<inertial pos="0 0 0" mass="1" diaginertia="1 1 3"/>', "moments of inertia 1, 1, 3"),
-        ('<inertial pos="0 0 0" mass="1" diaginertia="-1 1 1"/>', "moments of inertia -1, 1, 1"),
-        ('<inertial pos="0 0 0" mass="1" quat="1 0 0 1" fullinertia="1 1 1 0 0 0"/>', "fullinertia and an orientation"),
-        ('<site name="s" euler="1 2 3" quat="1 0 0 0"/>', "several orientations"),
-        ('<site name="s" quat="0 0 0 0"/>', "quaternion 0 0 0 0"),
-        ('<frame scale="2"/>', "<frame> of body 'b' scales"),
-        ('<replicate count="2"/>', "<replicate> of body 'b'"),
-        ('<include file="nowhere.xml"/>', r"nowhere\.xml: No such file"),
-        ('<include file="arm.xml"/>', r"arm\.xml a second time"),
+        ('<site name="s" pos="0.4"/>', "attribute 'pos' does not have enough data Element 'site', line 1"),
+        ('<joint range="l4"/>', "bad format in attribute 'range'"),
+        ('<joint axis="0 0 0"/>', "axis too small in joint"),
+        ('<joint axis="0 0 nan"/>', "axis of <joint> is '0 0 nan', expected finite numbers"),
+        ('<joint class="none"/>', "unknown default class name 'none'"),
+        ('<joint name="j"/>', "repeated name 'j' in joint"),
+        ('<geom size="0.1" mas="2"/>', "unrecognized attribute: 'mas'"),
+        ('<geom size="0.1" mass="1e999"/>', "number is too large in attribute 'mass'"),
+        ('<geom type="mesh" mesh="m"/>', "mesh 'm' not found"),
+        ('<inertial pos="0 0 0" mass="1" diaginertia="1 1 3"/>', r"inertia must satisfy A \+ B >= C"),
+        ('<include file="nowhere.xml"/>', "Error opening file 'nowhere.xml'"),
+        ('<include file="arm.xml"/>', "File 'arm.xml' already included"),
     ],
 )
-def test_files_that_cannot_be_read_right_are_refused_by_name(tmp_path: Path, body: str, message: str) -> None:
-    with pytest.raises(RobotError, match=rf"arm\.xml.*{message}|{message}"):
+def test_what_mujoco_refuses_is_refused_with_its_reason(tmp_path: Path, body: str, message: str) -> None:
+    with pytest.raises(RobotError, match=rf"arm\.xml: .*{message}"):
         oc.Robot.from_mjcf(write(tmp_path, body), "b")
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "message"),
+    ("after", "message"),
     [
-        ('<compiler angle="grad"/>', "", "angle of <compiler> is 'grad'"),
-        ('<compiler eulerseq="xy"/>', "", "eulerseq 'xy'"),
-        ('<compiler coordinate="global"/>', "", "global coordinates"),
-        ('<option gravity="0 0"/>', "", "gravity of <option> is '0 0', expected 3 numbers"),
-        ('<option gravty="0 0 0"/>', "", "attribute 'gravty'"),
-        ("<defaults/>", "", "<defaults> is an unknown element in <mujoco>"),
-        ("<default><jiont/></default>", "", "<jiont> is an unknown element in <default>"),
-        ('<default class="other"/>', "", "outermost class"),
-        ('<default><default class="a"/><default class="a"/></default>', "", "class 'a' a second time"),
-        ('<default><tendon armature="1"/></default>', "", "<tendon> has an armature"),
-        ("", '<tendon><fixed name="t" armature="1"/></tendon>', "<fixed name='t'> has an armature"),
-        ("", '<actuator><motor joint="j" armature="1"/></actuator>', "<motor> has an armature"),
-        ("", '<deformable><flex name="f"/></deformable>', "<flex name='f'> is a flexible body"),
-        ('<worldbody><attach model="m" prefix=""/></worldbody>', "", "<attach> of body 'world'"),
-        ("<worldbody><joint/></worldbody>", "", "<joint> is in the world"),
+        ('<actuator><motor name="a" joint="j" armature="1"/></actuator>', "'a' of .*arm.xml has an armature"),
+        ('<tendon><fixed name="t" armature="1"><joint joint="j" coef="1"/></fixed></tendon>', "'t' of .* an armature"),
     ],
 )
-def test_settings_that_cannot_be_read_right_are_refused_by_name(
-    tmp_path: Path, before: str, after: str, message: str
-) -> None:
+def test_armatures_elsewhere_than_on_joints_are_refused_by_name(tmp_path: Path, after: str, message: str) -> None:
     with pytest.raises(RobotError, match=message):
-        oc.Robot.from_mjcf(write(tmp_path, before=before, after=after), "b")
+        oc.Robot.from_mjcf(write(tmp_path, after=after), "b")
 
 
-def test_range_without_limited_needs_autolimits(tmp_path: Path) -> None:
-    path = write(tmp_path, '<joint range="0 1"/>', '<compiler autolimits="false"/>')
-    with pytest.raises(ValueError, match="limited"):
-        mujoco.MjModel.from_xml_path(str(path))
-    with pytest.raises(RobotError, match="range but not limited"):
-        oc.Robot.from_mjcf(path, "b")
+@pytest.mark.filterwarnings("ignore:.*negative:RuntimeWarning")
+def test_negative_armatures_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="joint 'joint1' has armature -1, expected >= 0"):
+        oc.Robot.from_mjcf(write(tmp_path, '<joint armature="-1" axis="1 0 0"/>'), "b")
+
+
+def test_meshes_replicas_and_attached_bodies_have_the_dynamics_of_mujoco(tmp_path: Path) -> None:
+    trimesh.creation.icosphere(1, 0.2).apply_scale([1, 2, 3]).export(tmp_path / "egg.stl")
+    (tmp_path / "hand.xml").write_text(
+        '<mujoco model="hand"><worldbody><body name="palm" pos="0 0 0.3"><joint name="wrist" axis="0 1 0"/>'
+        '<geom type="capsule" size="0.03 0.1"/><site name="grip" pos="0 0.1 0"/></body></worldbody></mujoco>'
+    )
+    path = write(
+        tmp_path,
+        '<geom type="mesh" mesh="egg"/><replicate count="3" euler="0 0 1"><geom size="0.02" pos="0.3 0 0"/></replicate>'
+        '<attach model="hand" body="palm" prefix="left_"/>',
+        before='<asset><mesh name="egg" file="egg.stl"/><model name="hand" file="hand.xml"/></asset>',
+    )
+    assert_agrees(path)
+    assert oc.Robot.from_mjcf(path, "left_grip").joint_names == ("j", "left_wrist")
+
+
+def test_compiled_models_are_taken_as_they_are() -> None:
+    """For example a model whose masses a program has changed."""
+    path = DATA / "shapes.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.body_mass *= 2
+    model.body_inertia *= 2
+    q, dq = np.random.default_rng(4).uniform(-2, 2, (2, model.nv))
+    _, M, bias = mujoco_dynamics(model, q, dq)
+    robot = oc.Robot.from_mjcf(model, "tip")
+    assert_close(robot.mass_matrix(q), M)
+    assert_close(robot.bias(q, dq), bias)
+    with pytest.raises(InvalidValueError, match=r"path is a list, expected the path .* or a mujoco\.MjModel"):
+        oc.Robot.from_mjcf([1, 2])
+
+
+def test_ranges_of_controls_limit_the_torque_of_motors(tmp_path: Path) -> None:
+    """Torque = gear x control: what MuJoCo applies at the ends of the range."""
+    motors = "".join(
+        f'<motor joint="{joint}" gear="{gear}" ctrlrange="{ends}"/>'
+        for joint, gear, ends in (("j", 50, "-1 1"), ("k", -3, "-2 4"), ("l", 1, "0 1"))
+    )
+    joints = (
+        '<body><joint name="k" axis="1 0 0"/><geom size="0.1"/><body><joint name="l"/><geom size="1"/></body></body>'
+    )
+    path = write(tmp_path, joints, after=f"<actuator>{motors}</actuator>")
+    limits = oc.Robot.from_mjcf(path).effort_limits
+    np.testing.assert_array_equal(limits, [50, 6, np.inf])
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    reached = []
+    for sign in (-1, 1):
+        data.ctrl[:] = sign * np.array([1e6, -1e6, 0])
+        mujoco.mj_forward(model, data)
+        reached.append(sign * data.qfrc_actuator)
+    np.testing.assert_array_equal(np.min(reached, axis=0)[:2], limits[:2])
 
 
 def test_file_without_joints_says_so(tmp_path: Path) -> None:
@@ -317,10 +335,10 @@ def test_files_larger_than_any_robot_are_refused(tmp_path: Path, text: str, mess
         oc.Robot.from_mjcf(path, "b")
 
 
-def test_long_chain_of_includes_is_refused(tmp_path: Path) -> None:
+def test_long_chain_of_includes_ends_in_an_error(tmp_path: Path) -> None:
     for i in range(300):
         (tmp_path / f"{i}.xml").write_text(f'<mujoco><include file="{i + 1}.xml"/></mujoco>')
-    with pytest.raises(RobotError, match="nest more than 200 deep"):
+    with pytest.raises(RobotError, match=r"Error opening file .*300\.xml"):
         oc.Robot.from_mjcf(tmp_path / "0.xml", "b")
 
 
@@ -350,11 +368,9 @@ def test_effort_limits_are_the_largest_forces_that_mujoco_applies(tmp_path: Path
     np.testing.assert_array_equal(np.min(reached, axis=0)[[0, 1, 2]], limits[:3])
 
 
-def test_forces_of_one_sign_are_no_limit_of_effort_and_empty_ranges_are_refused(tmp_path: Path) -> None:
+def test_forces_of_one_sign_are_no_limit_of_effort(tmp_path: Path) -> None:
     path = tmp_path / "robot.xml"
-    text = '<mujoco><worldbody><body><joint actuatorfrcrange="{}"/><geom size="1"/></body></worldbody></mujoco>'
-    path.write_text(text.format("0 10"))
+    path.write_text(
+        '<mujoco><worldbody><body><joint actuatorfrcrange="0 10"/><geom size="1"/></body></worldbody></mujoco>'
+    )
     assert np.isinf(oc.Robot.from_mjcf(path).effort_limits).all()
-    path.write_text(text.format("3 -3"))
-    with pytest.raises(RobotError, match=r"has actuatorfrcrange \[3, -3\], expected the first below the second"):
-        oc.Robot.from_mjcf(path)

@@ -15,7 +15,7 @@ from orthocas.simulation import Elasticity, Friction, MuJoCoPlant, Payload, Wall
 from orthocas.tools import checks
 from orthocas.tools.checks import Array
 
-pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[sim] is not installed")
+pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[mujoco] is not installed")
 
 Q = np.array([0.3, -0.5, 0.2, -1.5, 0.1, 1.5, 0.2])  # of the panda
 

@@ -14,7 +14,7 @@ from programs import needs_c, needs_cmake
 import orthocas as oc
 from orthocas.fitting.fit import Fit
 
-mujoco = pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[sim] is not installed")
+mujoco = pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[mujoco] is not installed")
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from orthocas.simulation.run import Plant
 from orthocas.tools.checks import Array
 from orthocas.tools.progress import Progress
 
-pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[sim] is not installed")
+pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[mujoco] is not installed")
 
 PUSHES = (
     Push(0.1, 0.2, [20.0, -10.0, 0.0], link="q2", point=[0.5, 0.1, 0.0]),

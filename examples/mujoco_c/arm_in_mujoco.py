@@ -2,7 +2,7 @@
 
 This script fits coordinates for the 7-DoF arm, generates C, writes the scene, builds `main.c` with CMake and runs it.
 The program holds the arm, moves it, is pushed at the elbow until the arm leaves the domain, leads it back, and touches
-a wall. The script draws its log and a film. Needs cmake, a C compiler and the extra `orthocas[sim]`.
+a wall. The script draws its log and a film. Needs cmake, a C compiler and the extra `orthocas[mujoco]`.
 """
 
 import argparse
@@ -56,7 +56,7 @@ def build(out: Path) -> Path:
     """Build main.c with the generated library and with libmujoco; the path of the program."""
     spec = find_spec("mujoco")
     if spec is None or not spec.submodule_search_locations:
-        raise SystemExit("this example needs MuJoCo: pip install orthocas[sim]")
+        raise SystemExit("this example needs MuJoCo: pip install orthocas[mujoco]")
     folders = {"ARM_FOLDER": out / "generated", "MUJOCO_FOLDER": Path(spec.submodule_search_locations[0])}
     settings = [f"-D{name}={folder.resolve()}" for name, folder in folders.items()]
     subprocess.run(["cmake", "-S", HERE, "-B", out / "build", *settings], check=True, stdout=subprocess.DEVNULL)

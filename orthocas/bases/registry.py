@@ -49,7 +49,7 @@ def register(name: str, kind: type[Parametrisation], parse: Callable[[str], Para
         ... class Cubic(oc.Polynomial):
         ...     degree: int = 3
         >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
-        >>> oc.parametrisations.parse_parametrisation("cubic")
+        >>> oc.bases.parse_parametrisation("cubic")
         Cubic(degree=3, cyclic=())
     """
     require_kind("name", name, str)

@@ -72,7 +72,7 @@ def simulate(
         float | None, typer.Option("--rate", parser=number, help="Control rate [Hz]; default: continuous control.")
     ] = None,
     plant: Annotated[
-        str, typer.Option("--plant", help="Simulator: cvodes, or mujoco (needs --rate and the extra [sim]).")
+        str, typer.Option("--plant", help="Simulator: cvodes, or mujoco (needs --rate and the extra [mujoco]).")
     ] = CVODES,
     supervised: Annotated[
         bool,

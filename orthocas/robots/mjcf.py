@@ -1,213 +1,183 @@
-"""Convert an MJCF file to a `pin.Model` with the mass matrix and bias of MuJoCo."""
+"""MJCF files and MuJoCo's compiled models as a `pin.Model` with the mass matrix and bias of MuJoCo."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import re
 from pathlib import Path
+from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
-from orthocas.errors import RobotError
-from orthocas.robots.mjcf_document import MAIN, Document
-from orthocas.robots.mjcf_efforts import Ranges, effort_of_actuators
-from orthocas.robots.mjcf_inertias import MassRules, Placed, body_inertia
-from orthocas.robots.mjcf_poses import Angles, pose, shape_pose
-from orthocas.robots.xml import MOST_LINKS, Attributes
+from orthocas.errors import InvalidValueError, RobotError, one_line
+from orthocas.robots.xml import MOST_LINKS, read_xml
+from orthocas.tools.checks import Array, of_extra
 
-_GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2], MuJoCo's default
-_LEAST_TOTAL = 1e-15  # [kg], as in MuJoCo
-_SEEN = ("camera", "light")  # elements without mass or motion
-_READ = ("inertial", "joint", "freejoint", "geom", "site", "body")
+_WORDS = ("name", "class", "childclass", "joint", "body", "file", "mesh", "material")  # attributes that hold names
 
 
-def model_from_mjcf(path: str | Path) -> pin.Model:
-    """Read the kinematics, masses, armatures, limits of position and effort, and gravity of an MJCF file.
+def model_from_mjcf(source: Any) -> pin.Model:
+    """The kinematics, masses, armatures, limits of position and effort, and gravity of an MJCF file.
 
-    The model has a frame for every body, named site and joint. If they share a name, `frame_index` prefers the body to
-    the site, and the site to the joint. Bodies and joints without a name are called body<i> and joint<i>, with MuJoCo's
-    indices i.
+    MuJoCo's own compiler reads the file, with meshes, includes, default classes, attached and replicated bodies. The
+    model has a frame for every body, named site and joint. If they share a name, `frame_index` prefers the body to the
+    site, and the site to the joint. Bodies and joints without a name are called body<i> and joint<i>, with MuJoCo's
+    indices i. Named keyframes become reference configurations.
 
     Mass matrix and bias are those of MuJoCo (qM and qfrc_bias). A `Robot` has no passive and constraint forces:
-    springs, damping, friction, gravity compensation (gravcomp), fluids, actuators, contacts and <equality>.
+    springs, damping, friction, gravity compensation (gravcomp), fluids, contacts and <equality>.
+
+    The effort limit of a joint is the sum of |gear| times the force range of its actuators, or of |gain| times the
+    control range of motors, and at most its actuatorfrcrange.
+
+    Args:
+        source: the path of a file, or a `mujoco.MjModel`.
 
     Raises:
-        RobotError: if the file is not MJCF, or contains elements that are not supported: masses that depend on meshes,
-            armatures of tendons and actuators, scaled frames, flexible bodies, and elements that generate others
-            (attach, replicate, composite, ...). The message gives file, element and reason.
+        MissingExtraError: if MuJoCo is not installed.
+        RobotError: if MuJoCo refuses the file, or the model has no joint, armatures of tendons or actuators, or
+            flexible bodies.
     """
-    document = Document(path)
-    _refuse_unread(document)
-    model = _Builder(document).build()
-    if model.njoints == 1:
-        raise RobotError(f"{path} has no joint, expected at least one")
+    mujoco = of_extra("mujoco", "reading MJCF files", "mujoco")
+    if isinstance(source, mujoco.MjModel):
+        return _converted(mujoco, source, "the model")
+    if not isinstance(source, str | Path):
+        raise InvalidValueError("path", f"a {type(source).__name__}", "the path of an MJCF file, or a mujoco.MjModel")
+    root = read_xml(source, "MJCF", "mujoco")  # bounds its size and depth, and refuses document types
+    if sum(1 for _ in root.iter("body")) > MOST_LINKS:
+        raise RobotError(f"{source} has more than {MOST_LINKS} bodies")
+    _require_numbers(root, source)
+    try:
+        compiled = mujoco.MjModel.from_xml_path(str(source))
+    except ValueError as error:
+        raise RobotError(f"MuJoCo refuses {source}: {one_line(str(error))}") from None
+    return _converted(mujoco, compiled, str(source))
+
+
+def _require_numbers(root: Element, source: str | Path) -> None:
+    """Refuse NaN, of which MuJoCo only prints a warning."""
+    for element in root.iter():
+        for attribute, value in element.attrib.items():
+            if attribute not in _WORDS and re.search(r"(?<!\w)[-+]?nan(?!\w)", value, re.IGNORECASE):
+                raise RobotError(f"{source}: {attribute} of <{element.tag}> is '{value}', expected finite numbers")
+
+
+def _converted(mujoco: Any, compiled: Any, name: str) -> pin.Model:
+    _refuse_unread(compiled, name)
+    model = pin.Model()
+    off = bool(compiled.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    model.gravity.linear = np.zeros(3) if off else compiled.opt.gravity
+    carriers = [(0, pin.SE3.Identity())]  # of each body: the joint that moves it, and its pose in the joint's frame
+    for i in range(1, compiled.nbody):
+        carriers.append(_add_body(mujoco, model, compiled, i, *carriers[compiled.body_parentid[i]]))
+    for i in range(compiled.nsite):
+        if compiled.site(i).name:
+            joint, placement = carriers[compiled.site_bodyid[i]]
+            there = placement * _pose(compiled.site_pos[i], compiled.site_quat[i])
+            model.addFrame(pin.Frame(compiled.site(i).name, joint, there, pin.FrameType.OP_FRAME))
+    for i in range(compiled.nkey):
+        if compiled.key(i).name:
+            model.referenceConfigurations[compiled.key(i).name] = compiled.key_qpos[i]
     return model
 
 
-def _refuse_unread(document: Document) -> None:
-    """Refuse elements outside the bodies that change the mass matrix."""
-    for section in ("default", "tendon", "actuator"):
-        for top in document.sections(section):
-            for element in top.iter():
-                label = document.label(element)
-                if element.tag != "joint" and label.number("armature", 0) != 0:
-                    raise label.error("has an armature, which orthocas supports on joints only")
-    for top in document.sections("deformable"):
-        for element in top.findall("flex"):
-            raise document.label(element).error("is a flexible body, which orthocas does not support")
+def _refuse_unread(compiled: Any, name: str) -> None:
+    """Refuse what changes the mass matrix and is not read."""
+    if not compiled.njnt:
+        raise RobotError(f"{name} has no joint, expected at least one")
+    if compiled.nbody - 1 > MOST_LINKS:
+        raise RobotError(f"{name} has more than {MOST_LINKS} bodies")
+    placed = (
+        "body_pos",
+        "body_quat",
+        "body_ipos",
+        "body_inertia",
+        "body_mass",
+        "jnt_pos",
+        "jnt_axis",
+        "jnt_range",
+        "qpos0",
+    )
+    if not all(np.isfinite(getattr(compiled, part)).all() for part in placed):
+        raise RobotError(f"{name} holds numbers that are not finite")
+    if compiled.nflex:
+        raise RobotError(f"{name} has a flexible body, which orthocas does not support")
+    for kind in ("tendon", "actuator"):
+        loaded = np.flatnonzero(getattr(compiled, f"{kind}_armature", np.zeros(0)))
+        if loaded.size:
+            element = getattr(compiled, kind)(int(loaded[0])).name or f"{kind} {loaded[0]}"
+            raise RobotError(f"'{element}' of {name} has an armature, which orthocas supports on joints only")
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """An element of a body, with the frames around it resolved."""
-
-    element: Element
-    frame: pin.SE3  # pose of the frame around it, in the body
-    childclass: str
-
-
-class _Builder:
-    """Adds bodies to a model, from the world outwards."""
-
-    def __init__(self, document: Document) -> None:
-        compiler = document.settings("compiler")
-        if compiler.text("coordinate", "local") != "local":
-            raise compiler.error("has global coordinates, which MuJoCo and orthocas do not support")
-        self._document = document
-        self._angles = Angles.of(compiler)
-        self._rules = MassRules.of(compiler)
-        self._ranges = Ranges(compiler.flag("autolimits", True))
-        self._efforts = effort_of_actuators(document, self._ranges)
-        self._model = pin.Model()
-        self._names: dict[str, set[str]] = {"body": {"world"}, "joint": set(), "site": set()}
-        self._masses: list[tuple[int, pin.SE3, pin.Inertia]] = []
-
-    def build(self) -> pin.Model:
-        """Build the model of the whole file."""
-        off = self._document.settings("option/flag").keyword("gravity", ("enable", "disable"), "enable") == "disable"
-        gravity = self._document.settings("option").numbers("gravity", 3, _GRAVITY)
-        self._model.gravity.linear = np.zeros(3) if off else gravity
-        for world in self._document.sections("worldbody"):
-            parts = list(self._parts(world, pin.SE3.Identity(), MAIN, "world"))
-            for part in parts:
-                if part.element.tag in ("joint", "freejoint", "inertial"):
-                    raise self._document.label(part.element).error("is in the world, expected it in a body")
-            self._add_sites(parts, 0, pin.SE3.Identity(), "world")
-            self._add_bodies(parts, 0, pin.SE3.Identity())
-        total = sum(inertia.mass for _, _, inertia in self._masses)
-        scale = self._rules.total / max(total, _LEAST_TOTAL) if self._rules.total > 0 else 1.0
-        for joint, placement, inertia in self._masses:
-            scaled = pin.Inertia(scale * inertia.mass, inertia.lever, scale * inertia.inertia)
-            self._model.appendBodyToJoint(joint, scaled, placement)
-        self._add_keyframes()
-        return self._model
-
-    def _add_keyframes(self) -> None:
-        """Add keyframes as reference configurations. The numbers of free and ball joints stay in MuJoCo's order."""
-        for section in self._document.sections("keyframe"):
-            for key in section.findall("key"):
-                if "name" in key.attrib and "qpos" in key.attrib:
-                    position = self._document.label(key).numbers("qpos", self._model.nq, ())
-                    self._model.referenceConfigurations[key.attrib["name"]] = np.array(position)
-
-    def _add_bodies(self, parts: list[_Part], joint: int, placement: pin.SE3) -> None:
-        for part in parts:
-            if part.element.tag == "body":
-                self._add_body(part, joint, placement * part.frame)
-
-    def _add_body(self, part: _Part, joint: int, placement: pin.SE3) -> None:
-        """Add a body and all its children to a joint. `placement` is that of the frame around it."""
-        body = self._document.attributes(part.element)
-        name = self._take_name(body, "body", f"body{len(self._names['body'])}")
-        if len(self._names["body"]) - 1 > MOST_LINKS:
-            raise RobotError(f"{body.file} has more than {MOST_LINKS} bodies")
-        childclass = self._childclass(body, part.childclass)
-        parts = list(self._parts(part.element, pin.SE3.Identity(), childclass, name))
-        placement = placement * pose(body, self._angles)
-        for child in parts:
-            if child.element.tag in ("joint", "freejoint"):
-                joint, placement = self._add_joint(child, joint, placement, name)
-        self._model.addFrame(pin.Frame(name, joint, placement, pin.FrameType.BODY))
-        self._add_sites(parts, joint, placement, name)
-        if joint or self._rules.total > 0:  # bodies fixed to the world load no joint
-            self._masses.append((joint, placement, self._inertia(body, parts, name)))
-        self._add_bodies(parts, joint, placement)
-
-    def _parts(self, parent: Element, frame: pin.SE3, childclass: str, body: str) -> Iterator[_Part]:
-        """The elements of a body, including those inside its frames."""
-        for element in parent:
-            if element.tag == "frame":
-                inner = self._document.attributes(element, body=body)
-                if any(name in inner.values for name in ("scale", "scaling", "massscale")):
-                    raise inner.error("scales its content, which orthocas does not support")
-                below = frame * pose(inner, self._angles)
-                yield from self._parts(element, below, self._childclass(inner, childclass), body)
-            elif element.tag in _READ:
-                yield _Part(element, frame, childclass)
-            elif element.tag not in _SEEN:
-                raise self._document.label(element, body).error("is an element that orthocas does not support")
-
-    def _childclass(self, label: Attributes, inherited: str) -> str:
-        return self._document.known_class(label.text("childclass", inherited), label)
-
-    def _add_joint(self, part: _Part, parent: int, placement: pin.SE3, body: str) -> tuple[int, pin.SE3]:
-        """Add a joint to a body at `placement`. Returns its index, and the placement of the body after the joint."""
-        joint = self._document.attributes(part.element, part.childclass, body)
-        name = self._take_name(joint, "joint", f"joint{len(self._names['joint'])}")
-        kind = joint.keyword("type", ("hinge", "slide", "ball", "free"), "hinge")
-        armature = joint.number("armature", 0)
-        if armature < 0:
-            raise joint.error(f"has armature {armature:g}, expected >= 0")
-        if kind == "free" or part.element.tag == "freejoint":
-            anchor, index = pin.SE3.Identity(), self._model.addJoint(parent, pin.JointModelFreeFlyer(), placement, name)
-        else:
-            anchor = pin.SE3(np.eye(3), part.frame.act(joint.numbers("pos", 3, (0, 0, 0))))
-            if kind == "ball":
-                index = self._model.addJoint(parent, pin.JointModelSpherical(), placement * anchor, name)
-            else:
-                index = self._add_axis(joint, kind, part.frame.rotation, parent, placement * anchor, name)
-        self._model.addJointFrame(index)
-        first = self._model.joints[index].idx_v
-        self._model.armature[first : first + self._model.joints[index].nv] = armature
-        return index, anchor.inverse()
-
-    def _add_axis(
-        self, joint: Attributes, kind: str, turn: np.ndarray, parent: int, placement: pin.SE3, name: str
-    ) -> int:
-        """Add a hinge or a slide. In the pose of the file its position is `ref`."""
-        axis = turn @ joint.direction("axis", (0, 0, 1))
-        unit = self._angles.unit if kind == "hinge" else 1.0
-        lower, upper = self._ranges.of(joint) * unit
-        back = -axis * joint.number("ref", 0) * unit
-        shift = pin.SE3(pin.exp3(back), np.zeros(3)) if kind == "hinge" else pin.SE3(np.eye(3), back)
-        make = pin.JointModelRevoluteUnaligned if kind == "hinge" else pin.JointModelPrismaticUnaligned
-        effort = min(
-            self._ranges.reach(joint, "actuatorfrcrange", "actuatorfrclimited"), self._efforts.get(name, np.inf)
+def _add_body(mujoco: Any, model: pin.Model, compiled: Any, i: int, joint: int, placement: pin.SE3) -> Any:
+    """Add a body to the joint that moves its parent. Returns the joint that moves it, and its pose in that frame."""
+    placement = placement * _pose(compiled.body_pos[i], compiled.body_quat[i])
+    for k in range(compiled.body_jntadr[i], compiled.body_jntadr[i] + compiled.body_jntnum[i]):
+        joint, placement = _add_joint(mujoco, model, compiled, k, joint, placement)
+    model.addFrame(pin.Frame(compiled.body(i).name or f"body{i}", joint, placement, pin.FrameType.BODY))
+    if joint:  # bodies fixed to the world load no joint
+        turn = pin.Quaternion(*compiled.body_iquat[i]).matrix()
+        inertia = turn @ np.diag(compiled.body_inertia[i]) @ turn.T
+        model.appendBodyToJoint(
+            joint, pin.Inertia(compiled.body_mass[i], compiled.body_ipos[i].copy(), inertia), placement
         )
-        limits = np.array([effort]), np.full(1, np.inf), np.array([lower]), np.array([upper])
-        return int(self._model.addJoint(parent, make(axis), placement * shift, name, *limits))
+    return joint, placement
 
-    def _add_sites(self, parts: list[_Part], joint: int, placement: pin.SE3, body: str) -> None:
-        for part in parts:
-            if part.element.tag == "site" and "name" in part.element.attrib:
-                site = self._document.attributes(part.element, part.childclass, body)
-                name = self._take_name(site, "site", "")
-                there = placement * part.frame * shape_pose(site, self._angles)[0]
-                self._model.addFrame(pin.Frame(name, joint, there, pin.FrameType.OP_FRAME))
 
-    def _inertia(self, body: Attributes, parts: list[_Part], name: str) -> pin.Inertia:
-        def placed(tag: str) -> list[Placed]:
-            found = (part for part in parts if part.element.tag == tag)
-            return [(part.frame, self._document.attributes(part.element, part.childclass, name)) for part in found]
+def _add_joint(mujoco: Any, model: pin.Model, compiled: Any, k: int, parent: int, placement: pin.SE3) -> Any:
+    """Add joint k to a body at `placement`. Returns its index, and the pose of the body in its frame."""
+    name, kind = compiled.joint(k).name or f"joint{k}", compiled.jnt_type[k]
+    anchor = pin.SE3(np.eye(3), compiled.jnt_pos[k].copy())
+    if kind == mujoco.mjtJoint.mjJNT_FREE:
+        anchor = pin.SE3.Identity()
+        index = model.addJoint(parent, pin.JointModelFreeFlyer(), placement, name)
+    elif kind == mujoco.mjtJoint.mjJNT_BALL:
+        index = model.addJoint(parent, pin.JointModelSpherical(), placement * anchor, name)
+    else:
+        slides, axis = kind == mujoco.mjtJoint.mjJNT_SLIDE, compiled.jnt_axis[k].copy()
+        back = -axis * compiled.qpos0[compiled.jnt_qposadr[k]]  # in the pose of the file its position is `ref`
+        shift = pin.SE3(np.eye(3), back) if slides else pin.SE3(pin.exp3(back), np.zeros(3))
+        moved = (pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned)(axis)
+        lower, upper = compiled.jnt_range[k] if compiled.jnt_limited[k] else (-np.inf, np.inf)
+        limits = (np.array([value]) for value in (_effort(mujoco, compiled, k), np.inf, lower, upper))
+        index = model.addJoint(parent, moved, placement * anchor * shift, name, *limits)
+    model.addJointFrame(index)
+    first, count = model.joints[index].idx_v, model.joints[index].nv
+    model.armature[first : first + count] = compiled.dof_armature[compiled.jnt_dofadr[k]]
+    return index, anchor.inverse()
 
-        inertials = placed("inertial")
-        if len(inertials) > 1:
-            raise body.error(f"has {len(inertials)} <inertial> elements, expected at most one")
-        return body_inertia(body, next(iter(inertials), None), placed("geom"), self._rules, self._angles)
 
-    def _take_name(self, element: Attributes, kind: str, default: str) -> str:
-        name = element.text("name", default)
-        if name in self._names[kind]:
-            raise element.error(f"has the name of another {kind}, expected different names")
-        self._names[kind].add(name)
-        return name
+def _effort(mujoco: Any, compiled: Any, k: int) -> float:
+    """The largest force [N] or torque [N m] of both signs at joint k; inf if an actuator has no limit, or none acts."""
+    limit = _reach(compiled.jnt_actfrcrange[k]) if compiled.jnt_actfrclimited[k] else np.inf
+    at_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    acting = [
+        i for i in range(compiled.nu) if compiled.actuator_trntype[i] in at_joint and compiled.actuator_trnid[i, 0] == k
+    ]
+    forces = [
+        abs(compiled.actuator_gear[i, 0]) * _force(mujoco, compiled, i) for i in acting if compiled.actuator_gear[i, 0]
+    ]
+    return min(limit, sum(forces)) if forces and sum(forces) > 0 else limit
+
+
+def _force(mujoco: Any, compiled: Any, i: int) -> float:
+    """The largest force of actuator i, before its gear; inf without a limit."""
+    force = _reach(compiled.actuator_forcerange[i]) if compiled.actuator_forcelimited[i] else np.inf
+    plain = (
+        compiled.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+        and compiled.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+        and compiled.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
+    )  # a motor: the force is the gain times the control
+    if plain and compiled.actuator_ctrllimited[i]:
+        force = min(force, abs(compiled.actuator_gainprm[i, 0]) * _reach(compiled.actuator_ctrlrange[i]))
+    return float(force)
+
+
+def _reach(ends: Array) -> float:
+    """The largest value that both signs of a range reach; inf if it has only one sign."""
+    lower, upper = ends
+    return float(min(-lower, upper)) if lower < 0 < upper else np.inf
+
+
+def _pose(position: Array, quaternion: Array) -> pin.SE3:
+    """A pose; MuJoCo's quaternions begin with their real part, as the arguments of Pinocchio's do."""
+    return pin.SE3(pin.Quaternion(*quaternion).normalized().matrix(), position.copy())

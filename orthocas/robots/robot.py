@@ -110,9 +110,12 @@ class Robot(Shown):
         return cls(robot.tree, postures(srdf_states(path), robot.joint_names))
 
     @classmethod
-    def from_mjcf(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
-        """Build the chain that moves the tip from a MuJoCo MJCF file; see `from_file`."""
-        return cls._chain(model_from_mjcf(as_path("path", path)), tip, locked, tool)
+    def from_mjcf(cls, path: Any, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
+        """Build the chain that moves the tip from a MuJoCo MJCF file, or from a `mujoco.MjModel`; see `from_file`.
+
+        Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
+        """
+        return cls._chain(model_from_mjcf(path), tip, locked, tool)
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:

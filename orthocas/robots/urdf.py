@@ -1,6 +1,7 @@
 """URDF files: checks for errors that Pinocchio's parser accepts, reading, and locked joints."""
 
 import os
+import re
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,9 +14,11 @@ import pinocchio as pin
 
 from orthocas.errors import InvalidValueError, RobotError
 from orthocas.robots.pinocchio_model import frame_index, joint_axis, leader_of, remedy
-from orthocas.robots.xml import MOST_LINKS, Attributes, read_xml
+from orthocas.robots.xml import MOST_LINKS, read_xml
 from orthocas.tools.checks import Array, require_known
 
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_LARGEST, _SHORTEST = 1e20, 1e-12  # of the vector along an axis
 _WITH_AXIS = ("revolute", "continuous", "prismatic")
 WORLD = "universe"  #: Pinocchio's name for what does not move
 
@@ -34,9 +37,24 @@ def check_urdf(path: str | Path, root: ElementTree.Element) -> None:
     for joint in root.findall("joint"):
         axis = joint.find("axis")
         if axis is not None and joint.get("type") in _WITH_AXIS:
-            Attributes(str(path), f"<axis> of joint '{joint.get('name')}'", axis.attrib).direction("xyz")
+            _require_direction(path, f"<axis> of joint '{joint.get('name')}'", axis.get("xyz"))
         _require_limits(path, joint)
     _require_tree(path, root)
+
+
+def _require_direction(path: str | Path, label: str, text: str | None) -> None:
+    """Raise RobotError unless the text is three plausible numbers, not all zero."""
+    if text is None:
+        raise RobotError(f"{path}: {label} has no attribute 'xyz'")
+    words = text.split()
+    unfit = f"{path}: xyz of {label} is '{text[:80]}', expected"
+    if len(words) != 3 or not all(_NUMBER.fullmatch(word) for word in words):
+        raise RobotError(f"{unfit} 3 numbers")
+    length = sum(float(word) ** 2 for word in words)
+    if not length <= _LARGEST**2:
+        raise RobotError(f"{unfit} 3 numbers up to {_LARGEST:g}")
+    if length < _SHORTEST**2:
+        raise RobotError(f"{unfit} a vector that is not zero")
 
 
 def _require_limits(path: str | Path, joint: ElementTree.Element) -> None:

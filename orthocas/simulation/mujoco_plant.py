@@ -35,7 +35,7 @@ def mujoco() -> ModuleType:
     Raises:
         MissingExtraError: if it is not installed.
     """
-    return of_extra("mujoco", "MuJoCo as plant", "sim")
+    return of_extra("mujoco", "MuJoCo as plant", "mujoco")
 
 
 def body_name(i: int) -> str:
@@ -186,7 +186,7 @@ class MuJoCoPlant(Shown):
 
     M ddq + C dq + g = clip(torque) + loads + pushes - friction, with stops at the joint limits. The physics takes steps
     of fourth order (RK4), shorter ones where viscous friction is stiff for the inertia of a joint (docs/simulate.md).
-    Not for several threads at once. Needs the extra `orthocas[sim]`.
+    Not for several threads at once. Needs the extra `orthocas[mujoco]`.
 
     Args:
         robot: the true robot.

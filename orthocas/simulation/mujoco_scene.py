@@ -108,7 +108,7 @@ class MuJoCo:
     """MuJoCo as plant of `simulate`: `simulate(..., plant=MuJoCo(...), control_rate=1000)`.
 
     The model is made from the robot's own numbers, so every chart file has one; see `MuJoCoPlant`. Needs the extra
-    `orthocas[sim]`.
+    `orthocas[mujoco]`.
 
     Args:
         robot: the true robot; default the controller's model.

@@ -332,7 +332,7 @@ def simulate(
         control_rate: ticks per second of a sampled controller, which holds its command between ticks. The instants of
             the result are then the ticks. Default: a controller in continuous time.
         plant: the true robot, for example `robot.with_scaled_masses(1.1)`; default the controller's model. Or "mujoco",
-            or `MuJoCo(robot, ...)`: the robot in MuJoCo, for sampled torque controllers (extra `orthocas[sim]`).
+            or `MuJoCo(robot, ...)`: the robot in MuJoCo, for sampled torque controllers (extra `orthocas[mujoco]`).
         pushes: external loads, at the tip, at links or at joints.
         friction: friction in the joints.
         stops: joint stops for CVODES; default none. For torque controllers only. MuJoCo has its own.

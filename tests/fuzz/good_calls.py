@@ -25,7 +25,7 @@ from public_objects import (
 )
 
 import orthocas as oc
-from orthocas import control, parametrisations, plotting, problems, simulation, solvers, viewing
+from orthocas import bases, control, plotting, problems, simulation, solvers, viewer
 from orthocas.atlas.laws import BlendedImpedance, HandedOver
 from orthocas.atlas.simulate import AtlasControl
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
@@ -100,7 +100,7 @@ def _views() -> dict[str, Call]:
             lambda **given: oc.view(**given).close(),
             {"shown": chart, "host": "127.0.0.1", "port": 0},
         ),
-        "cyclic_motions": (viewing.cyclic_motions, {"chart": chart, "path": [x, x + 0.05, x], "cycles": 1}),
+        "cyclic_motions": (viewer.cyclic_motions, {"chart": chart, "path": [x, x + 0.05, x], "cycles": 1}),
         "Session": (Session, {"chart": chart, "q": q}),
         "session.wish": (session.wish, {"values": {"xi1": 0.1}}),
         "chart.plot": (lambda postures: plotting.self_motion_figure(chart, postures, None), {"postures": 3}),
@@ -267,9 +267,9 @@ def _functions() -> dict[str, Call]:
             {"name": "polynomial", "kind": oc.MLP, "parse": None},
         ),
         "register_loss_term": (oc.register_loss_term, {"term": None}),
-        "parse": (parametrisations.parse_parametrisation, {"label": "polynomial:2"}),
-        "from data": (parametrisations.parametrisation_from_data, {"data": {"name": "polynomial", "degree": 2}}),
-        "to data": (parametrisations.parametrisation_to_data, {"parametrisation": oc.Polynomial(2)}),
+        "parse": (bases.parse_parametrisation, {"label": "polynomial:2"}),
+        "from data": (bases.parametrisation_from_data, {"data": {"name": "polynomial", "degree": 2}}),
+        "to data": (bases.parametrisation_to_data, {"parametrisation": oc.Polynomial(2)}),
         "solvers.get": (solvers.get, {"name": "lbfgs"}),
         "problems.get": (problems.get, {"name": "planar_2r"}),
         "self_motion_figure": (plotting.self_motion_figure, {"chart": chart, "postures": 2, "reach": 0.1}),
