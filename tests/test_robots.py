@@ -274,3 +274,72 @@ def test_slightly_indefinite_inertias_of_published_robots_are_accepted() -> None
     robot = oc.Robot.from_urdf(robot_data("romeo_description/urdf/romeo_laas_small.urdf"), "RKneePitch_link")
     assert np.linalg.eigvalsh(robot.tree.inertias)[:, 0].min() < -1e-3
     assert np.linalg.eigvalsh(robot.mass_matrix(np.zeros(robot.n)))[0] > 0
+
+
+LATE_LEADER = """<robot name="r"><link name="base"/>
+<link name="arm"><inertial><mass value="2"/><origin xyz="0.1 0 0.2"/><inertia ixx="0.1" iyy="0.2" izz="0.2"
+ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="9" velocity="3"/></joint>{fingers}</robot>"""
+FINGER = """<link name="{name}"><inertial><mass value="0.7"/><origin xyz="0.3 0 0"/><inertia ixx="0.01" iyy="0.02"
+izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="{name}_joint" type="{kind}"><parent link="arm"/>
+<child link="{name}"/><origin xyz="0 0 0.5" rpy="0 {pitch} 0"/>{rest}</joint>"""
+TURNS = '<axis xyz="0 1 0"/><limit lower="0.2" upper="1" effort="9" velocity="3"/>'
+
+
+def test_joints_that_mimic_a_later_joint_are_locked_where_it_is(tmp_path: Path) -> None:
+    """Pinocchio refuses such files. The same arm with fixed fingers is the reference."""
+    path = tmp_path / "arm.urdf"
+
+    def written(*fingers: tuple[str, str, float, str]) -> Path:
+        parts = [FINGER.format(name=name, kind=kind, pitch=pitch, rest=rest) for name, kind, pitch, rest in fingers]
+        path.write_text(LATE_LEADER.format(fingers="".join(parts)))
+        return path
+
+    def mimic(leader: str) -> str:
+        return f'{TURNS}<mimic joint="{leader}_joint" multiplier="-2" offset="0.1"/>'
+
+    hand = (("a", "revolute", 0.0, mimic("b")), ("b", "revolute", 0.0, mimic("z")), ("z", "revolute", 0.0, TURNS))
+    for locked, leader in (({}, 0.2), ({"z_joint": 0.9}, 0.9)):  # 0.2 is the limit closest to 0
+        robot = oc.Robot.from_urdf(written(*hand), "arm", locked)
+        follower = 0.1 - 2 * leader
+        pitches = (("a", 0.1 - 2 * follower), ("b", follower), ("z", leader))
+        fixed = oc.Robot.from_urdf(written(*((name, "fixed", pitch, "") for name, pitch in pitches)), "arm")
+        assert robot.joint_names == ("shoulder",)
+        np.testing.assert_allclose(robot.mass_matrix([0.3]), fixed.mass_matrix([0.3]), rtol=1e-12)
+        np.testing.assert_allclose(robot.gravity([0.3]), fixed.gravity([0.3]), rtol=1e-12)
+    with pytest.raises(RobotError, match="'a_joint' is a mimic joint, .*lock it with locked={'b_joint': 0.0}"):
+        oc.Robot.from_urdf(written(*hand), "a")
+    with pytest.raises(RobotError, match="joint 'a_joint' mimics itself"):
+        oc.Robot.from_urdf(written(("a", "revolute", 0.0, mimic("b")), ("b", "revolute", 0.0, mimic("a"))), "arm")
+
+
+@pytest.mark.parametrize(
+    ("file", "tip", "n"),
+    [
+        ("talos_data/robots/talos_full_v2.urdf", "gripper_left_joint", 10),
+        ("romeo_description/urdf/romeo.urdf", "l_wrist", 8),
+    ],
+)
+def test_humanoids_with_late_leaders_have_the_dynamics_of_pinocchio(file: str, tip: str, n: int) -> None:
+    """Arms in front of hands of mimic joints: M and g are those of the file read without mimics, fingers locked."""
+    path = robot_data(file)
+    robot = oc.Robot.from_urdf(path, tip)
+    model = pin.buildModelFromUrdf(str(path))
+    data, q = model.createData(), pin.neutral(model)
+    for name, value in zip(robot.joint_names, np.linspace(0.1, 0.5, robot.n), strict=True):
+        q[model.joints[model.getJointId(name)].idx_q] = value
+    pin.framesForwardKinematics(model, data, q)
+    placed = data.oMf[model.getFrameId(tip)]
+    assert robot.n == n
+    np.testing.assert_allclose(robot.tip_position(np.linspace(0.1, 0.5, n)), placed.translation, atol=1e-12)
+    rows = [model.joints[model.getJointId(name)].idx_v for name in robot.joint_names]
+    for i in range(1, model.njoints):  # the limit closest to zero, or what a finger mimics
+        if model.names[i] not in robot.joint_names:
+            k = model.joints[i].idx_q
+            q[k] = np.clip(0.0, model.lowerPositionLimit[k], model.upperPositionLimit[k])
+    whole = pin.crba(model, data, q)
+    whole = np.triu(whole) + np.triu(whole, 1).T
+    np.testing.assert_allclose(
+        robot.mass_matrix(np.linspace(0.1, 0.5, n)), whole[np.ix_(rows, rows)], rtol=1e-3, atol=1e-4
+    )

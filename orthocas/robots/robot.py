@@ -106,7 +106,7 @@ class Robot(Shown):
     @classmethod
     def from_urdf(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
         """Build the chain that moves the tip from a URDF file; see `from_file`."""
-        robot = cls._chain(urdf.read_urdf(as_path("path", path)), tip, locked, tool)
+        robot = cls._chain(urdf.read_urdf(as_path("path", path), tip, locked), tip, locked, tool)
         return cls(robot.tree, postures(srdf_states(path), robot.joint_names))
 
     @classmethod

@@ -19,6 +19,7 @@ from orthocas.tools.checks import Array, require_known
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _LARGEST, _SHORTEST = 1e20, 1e-12  # of the vector along an axis
+_LATE_LEADER = "parent joint of the mimic joint is not in the kinematic tree"  # what Pinocchio says
 _WITH_AXIS = ("revolute", "continuous", "prismatic")
 WORLD = "universe"  #: Pinocchio's name for what does not move
 
@@ -102,22 +103,87 @@ def _link(joint: ElementTree.Element, end: str) -> str:
     return "" if element is None else element.get("link", "")
 
 
-def read_urdf(path: str | Path) -> pin.Model:
+def read_urdf(path: str | Path, tip: str | None = None, locked: Mapping[str, float] | None = None) -> pin.Model:
     """Read a URDF file. Mimic joints are kept, so that they can be refused or locked later.
 
+    Pinocchio cannot keep joints that mimic a joint which comes later in its order. In files with such joints, all
+    mimic joints are locked where their leaders are, at 0, at the limit closest to 0, or as `locked` says.
+
+    Args:
+        path: the file.
+        tip: name of the frame that the robot moves; default: the last frame of a robot with a single chain.
+        locked: positions of joints [rad] or [m] that are going to be locked.
+
     Raises:
-        RobotError: if the file is missing or not a URDF model, or a joint has a zero axis.
+        RobotError: if the file is missing or not a URDF model, or a joint has a zero axis; if a mimic joint that had to
+            be locked moves the tip and its leader is not in `locked`.
     """
-    check_urdf(path, read_xml(path, "URDF", "robot"))
+    root = read_xml(path, "URDF", "robot")
+    check_urdf(path, root)
+    try:
+        return _parsed(path, mimic=True)
+    except RobotError as error:
+        if _LATE_LEADER not in str(error):
+            raise
+    return _with_locked_mimics(_parsed(path, mimic=False), root, tip, locked or {})
+
+
+def _parsed(path: str | Path, mimic: bool) -> pin.Model:
+    """The file as Pinocchio reads it."""
     with _captured_stderr() as notes:
         try:
-            model = pin.buildModelFromUrdf(str(path), mimic=True)
+            model = pin.buildModelFromUrdf(str(path), mimic=mimic)
         except (ValueError, RuntimeError) as error:
             raise RobotError(f"{path} is not a usable URDF model: {_text(notes) or error}") from None
         complaints = _text(notes)
     if "Error:" in complaints:  # the parser skips what it cannot read, for example a mass
         raise RobotError(f"{path} is not a usable URDF model: {complaints}")
     return model
+
+
+def _with_locked_mimics(
+    model: pin.Model, root: ElementTree.Element, tip: str | None, locked: Mapping[str, float]
+) -> pin.Model:
+    """The model with every mimic joint locked at multiplier x position of its leader + offset."""
+    leaders = {joint.get("name", ""): mimic for joint in root.findall("joint") for mimic in joint.findall("mimic")}
+    chain = model.supports[model.frames[frame_index(model, tip or default_tip(model))].parentJoint]
+    position, ids = pin.neutral(model), []
+    for name, mimic in leaders.items():
+        leader, i = mimic.get("joint", ""), model.getJointId(name)
+        if i >= model.njoints:
+            continue  # of a fixed joint
+        if i in chain and leader not in locked:
+            raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: {remedy(leader)}")
+        if name in locked:
+            raise RobotError(f"joint '{name}' mimics joint '{leader}', expected an independent joint: {remedy(leader)}")
+        _set_position(model, i, _followed(model, name, leaders, locked), position)
+        ids.append(i)
+    return _without_joints(model, ids, position)
+
+
+def _followed(
+    model: pin.Model, name: str, leaders: Mapping[str, ElementTree.Element], locked: Mapping[str, float]
+) -> float:
+    """Where a joint is locked: multiplier x position of the joint that it follows + offset, along all leaders."""
+    factor, place, followed = 1.0, 0.0, set()
+    while name in leaders:
+        if name in followed:
+            raise RobotError(f"joint '{name}' mimics itself")
+        followed.add(name)
+        mimic = leaders[name]
+        place += factor * float(mimic.get("offset", 0))
+        factor *= float(mimic.get("multiplier", 1))
+        name = mimic.get("joint", "")
+    return place + factor * _leading(model, name, locked)
+
+
+def _leading(model: pin.Model, leader: str, locked: Mapping[str, float]) -> float:
+    """The position at which a joint is going to be locked, 0 or the limit closest to 0 unless `locked` has another."""
+    i = model.getJointId(leader)
+    if leader in locked or i >= model.njoints:
+        return float(locked.get(leader, 0.0))
+    k = model.joints[i].idx_q
+    return float(np.clip(0.0, model.lowerPositionLimit[k], model.upperPositionLimit[k]))
 
 
 def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
