@@ -25,6 +25,7 @@ from orthocas.bases.mlp import MLP as MLP
 from orthocas.bases.products import Fourier as Fourier
 from orthocas.bases.products import Linear as Linear
 from orthocas.bases.products import Polynomial as Polynomial
+from orthocas.bases.registry import register_parametrisation as register_parametrisation
 from orthocas.bases.sew import SEW as SEW
 from orthocas.certificates.certify import certified_box as certified_box
 from orthocas.certificates.certify import certify as certify
@@ -57,6 +58,7 @@ from orthocas.fitting.fit import fit as fit
 from orthocas.fitting.suggest_domain import suggest_domain as suggest_domain
 from orthocas.fitting.symbolic_loss import loss as loss
 from orthocas.fitting.terms import Weights as Weights
+from orthocas.fitting.terms import register_loss_term as register_loss_term
 from orthocas.paths.follow import follow as follow
 from orthocas.robots import obstacles as obstacles
 from orthocas.robots.robot import Robot as Robot
@@ -65,9 +67,11 @@ from orthocas.simulation.run import simulate_many as simulate_many
 from orthocas.tasks.clear_box import ClearBox as ClearBox
 from orthocas.tasks.corridor import Corridor as Corridor
 from orthocas.tasks.domains import Box as Box
+from orthocas.tasks.domains import Domain as Domain
 from orthocas.tasks.domains import Torus as Torus
 from orthocas.tasks.domains import contains as contains
 from orthocas.tasks.domains import default_box as default_box
+from orthocas.tasks.domains import register_domain as register_domain
 from orthocas.tasks.metric import Metric as Metric
 from orthocas.tasks.problem import Problem as Problem
 from orthocas.tasks.problem import check as check

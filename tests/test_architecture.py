@@ -121,6 +121,22 @@ def test_nothing_imports_the_faces() -> None:
             assert not imports_of(path, inside=True, types=True) & set(FACES), name
 
 
+def test_domains_answer_for_themselves() -> None:
+    """Few files outside their package know a kind of domain by its name; boxes are the language of all."""
+    kinds = {"ClearBox", "Corridor", "Torus"}
+    known = {
+        name
+        for name, path in MODULES.items()
+        if package(name) != "tasks" and any(isinstance(n, ast.Name) and n.id in kinds for n in ast.walk(tree(path)))
+    }
+    assert known == {
+        "orthocas.atlas.chart_of_box",
+        "orthocas.fitting.corridor_problem",
+        "orthocas.fitting.fit",
+        "orthocas.problems.planar",
+    }
+
+
 def test_modules_are_not_named_by_strings() -> None:
     """But for commands, which are imported when they are called; plug-ins are named in pyproject.toml."""
     named = {

@@ -21,7 +21,7 @@ from programs import python
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.bases import register
+from orthocas.bases import register_parametrisation
 from orthocas.errors import ArchiveError, ChartFileError, Interrupted, InvalidValueError
 from orthocas.fitting import grid as cells
 from orthocas.fitting.comparison import Comparison
@@ -63,7 +63,7 @@ class Breaks:
         raise KeyError("a defect")
 
 
-register("breaks", Breaks)
+register_parametrisation("breaks", Breaks)
 
 
 class InThisThread(Executor):

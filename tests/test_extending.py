@@ -8,7 +8,7 @@ from programs import needs_c, python
 
 PAGE = Path(__file__).parent.parent / "docs" / "extending.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
-BASIS, TERM, LOSS, LAW, TASK, SOLVER = BLOCKS[1:]
+BASIS, TERM, LOSS, LAW, TASK, DOMAIN, SOLVER = BLOCKS[1:]
 
 
 def run(folder: Path, *blocks: str) -> list[list[float]]:
@@ -122,6 +122,43 @@ assert law_of("drag") is Drag
 def test_task_and_metric_keep_names_and_units_in_files(tmp_path: Path) -> None:
     out = python("\n".join([BLOCKS[0], TASK, "print(oc.load('own.orthocas').problem.task.units)"]), tmp_path)
     assert out.splitlines() == ["friction", "('m',)"]
+
+
+def test_domain_of_a_user_does_what_the_package_s_own_do(tmp_path: Path) -> None:
+    more = """
+import copy, pickle
+from orthocas.tasks.domains import sample_heavily, sample_uniform
+ball = round_problem.domain
+for points in (sample_uniform(ball, 2000, 0), sample_heavily(ball, 2000, 0)):
+    assert len(points) == 2000 and (np.linalg.norm(points - ball.centre, axis=1) <= 0.5).all()
+loaded = oc.load("ball.orthocas")
+assert isinstance(loaded.problem.domain, Ball) and loaded.problem.domain.radius == 0.5
+for other in (loaded, pickle.loads(pickle.dumps(ball_chart)), copy.deepcopy(ball_chart)):
+    assert np.array_equal(other.phi(points), ball_chart.phi(points))
+q = sample_uniform(ball, 300, 7)
+phi = ball_chart.phi(q)
+solved = ball_chart.solve(phi)
+assert solved.found.mean() > 0.95
+assert (np.linalg.norm(solved.q - ball.centre, axis=1)[solved.found] <= 0.5 + 1e-9).all()
+assert np.abs(ball_chart.phi(solved.q) - phi)[solved.found].max() < 1e-8
+law = oc.control.PDPlus.on_chart(ball_chart)
+reference = oc.control.Reference.steps(law.labels, ball_chart.phi(ball.centre), [], duration=0.2)
+run = oc.simulate(law, reference, ball.centre)
+assert np.abs(run.q - ball.centre).max() < 1e-6
+assert "ball" in repr(ball_chart), repr(ball_chart)
+"""
+    refused = """
+from orthocas.errors import DomainError
+for call in (oc.certify, lambda chart: oc.generate_c(chart, "ball")):
+    try:
+        call(ball_chart)
+    except DomainError as error:
+        assert "'ball'" in str(error), error
+    else:
+        raise AssertionError
+"""
+    (angle,) = run(tmp_path, DOMAIN, more, refused)[0]
+    assert 0 < angle < 3
 
 
 def test_solver_minimises(tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ def test_tokens_differ_and_cannot_be_guessed() -> None:
 
 
 @pytest.fixture(scope="module")
-def view() -> Iterator[oc.viewing.View]:
+def view() -> Iterator[oc.viewer.View]:
     with oc.view(oc.Robot.planar([1.0, 1.0], [1.0, 1.0]), port=0) as shown:
         yield shown
 
@@ -129,7 +129,7 @@ def connected(url: str, path: str, origin: str | None, host: str | None = None) 
 
 
 @needs_viser
-def test_pages_are_served_to_those_with_the_address_only(view: oc.viewing.View) -> None:
+def test_pages_are_served_to_those_with_the_address_only(view: oc.viewer.View) -> None:
     parts = urlsplit(view.url)
     assert status(view.url, parts.path) == 200
     assert status(view.url, f"{parts.path}/?fixedDpr=0.3", Origin=f"http://{parts.netloc}") == 200
@@ -142,7 +142,7 @@ def test_pages_are_served_to_those_with_the_address_only(view: oc.viewing.View) 
 
 
 @needs_viser
-def test_websockets_are_opened_to_own_pages_only(view: oc.viewing.View) -> None:
+def test_websockets_are_opened_to_own_pages_only(view: oc.viewer.View) -> None:
     refused = import_module("websockets.exceptions").InvalidStatus
     parts = urlsplit(view.url)
     for origin in (None, f"http://{parts.netloc}"):
@@ -160,7 +160,7 @@ def test_websockets_are_opened_to_own_pages_only(view: oc.viewing.View) -> None:
 
 
 @needs_viser
-def test_huge_messages_end_the_connection(view: oc.viewing.View) -> None:
+def test_huge_messages_end_the_connection(view: oc.viewer.View) -> None:
     closed = import_module("websockets.exceptions").ConnectionClosedError
     with connected(view.url, urlsplit(view.url).path, None) as socket_:
         socket_.send(bytes(2**20 + 1))
@@ -192,7 +192,7 @@ ATTACK = """new Promise(done => {
 
 @needs_viser
 @pytest.mark.slow
-def test_pages_of_others_in_a_real_browser_get_no_websocket(view: oc.viewing.View, tmp_path: Path) -> None:
+def test_pages_of_others_in_a_real_browser_get_no_websocket(view: oc.viewer.View, tmp_path: Path) -> None:
     """Even with the whole address: an origin of another port, a file, and a sandboxed frame, whose origin is null."""
     if PROGRAM is None:
         pytest.skip("no chromium: apt-get install chromium")

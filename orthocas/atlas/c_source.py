@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.atlas.atlas_file import Turns
+from orthocas.atlas.chart_of_box import clear_part
 from orthocas.atlas.lattice import Outcome
 from orthocas.charts.chart import Chart
 from orthocas.codegen.chart_source import condition_code, position_within
@@ -22,8 +23,7 @@ from orthocas.codegen.rows import TABLE_CODE, TableCoordinates
 from orthocas.control.controller import Controller, without_border
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.clear_box import ClearBox
-from orthocas.tasks.domains import Box
+from orthocas.tasks.domains import Box, Domain
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.expressions import scalar_code
@@ -287,14 +287,14 @@ class AtlasSource:
         return cls(part, first, Chart(first.problem, TableCoordinates(first.coordinates)))
 
     @cached_property
-    def condition(self) -> ClearBox | None:
+    def condition(self) -> Domain | None:
         """The condition on singular values, if some of the charts need it."""
         plan = self.part.plan
         if (self.part.clear_shares(self.tables.fits) >= 1).all():
             return None
         domain = self.first.problem.domain
         box = Box(domain.centre, domain.half_width)
-        return ClearBox(box, plan.problem.task, plan.settings.least_singular_value, plan.scale, rows="x")
+        return clear_part(box, plan.problem.task, plan)
 
     @property
     def somewhere(self) -> Array:

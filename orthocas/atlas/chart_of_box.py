@@ -16,6 +16,7 @@ from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import Box, Domain
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.problem_file import problem_from_data, problem_to_data
+from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array
 from orthocas.tools.json import plain
 
@@ -87,10 +88,9 @@ def chart_of(plan: Plan, box: Box, numbers: Array, clear: float, problem: Proble
         problem: that of the plan, or `without_limits` of it for a box beyond them.
     """
     base = problem
-    bound = plan.settings.least_singular_value
     domain: Domain = box
     if clear < 1 or is_turning(base.task):
-        domain = ClearBox(box, base.task, bound, plan.scale, rows="x")  # ends before x does, half a turn away
+        domain = clear_part(box, base.task, plan)
     problem = Problem(base.robot, base.task, base.metric, domain, base.name)
     parametrisation = Polynomial(plan.settings.degree, plan.cyclic_names)
     r = plan.fitted
@@ -98,6 +98,11 @@ def chart_of(plan: Plan, box: Box, numbers: Array, clear: float, problem: Proble
         parametrisation, JointSpace.of(problem), plan.idle, numbers[:, 1:].ravel(), -numbers[:, 0], np.ones(r)
     )
     return Chart(problem, coordinates)
+
+
+def clear_part(box: Box, task: Task, plan: Plan) -> ClearBox:
+    """What the atlas covers of a box. It ends before x does, half a turn away from the reference."""
+    return ClearBox(box, task, plan.settings.least_singular_value, plan.scale, rows="x")
 
 
 def without_limits(problem: Problem) -> Problem:

@@ -154,7 +154,7 @@ class Plan:
         centre, half_width = domain.centre.copy(), domain.half_width.copy()
         joints = list(self.joints)
         centre[joints], half_width[joints] = (low + high) / 2, (high - low) / 2
-        unbounded = [i for i in getattr(domain, "unbounded", ()) if i not in self.joints]
+        unbounded = [i for i in domain.unbounded if i not in self.joints]
         return Box(centre, half_width, unbounded)
 
 

@@ -26,7 +26,7 @@ from orthocas.bases.registry import (
     parametrisation_names,
     parametrisation_to_data,
     parse_parametrisation,
-    register,
+    register_parametrisation,
     require_savable,
     warn_unless_savable,
 )
@@ -61,7 +61,7 @@ __all__ = [
     "parametrisation_names",
     "parametrisation_to_data",
     "parse_parametrisation",
-    "register",
+    "register_parametrisation",
     "require_savable",
     "warn_unless_savable",
 ]

@@ -10,7 +10,7 @@ from orthocas.bases.family import JointSpace
 from orthocas.errors import InvalidValueError
 from orthocas.robots.kinematics import TipTurn
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.domains import Box, Conditioned, sample_uniform
+from orthocas.tasks.domains import Box, sample_uniform
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem, is_regular
 from orthocas.tasks.task import Task
@@ -76,7 +76,7 @@ def over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
     """
     require_kind("problem", problem, Problem)
     robot, domain = problem.robot, problem.domain
-    if not names or not isinstance(domain, Box):
+    if not names or domain.full_turns:
         return problem
     centre, half_width, unbounded = domain.centre.copy(), domain.half_width.copy(), set(domain.unbounded)
     for k in map(robot.joint_names.index, names):
@@ -86,8 +86,7 @@ def over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
             unbounded.add(k)
         else:
             centre[k] = (low + high) / 2
-    wider = Box(centre, half_width, sorted(unbounded))
-    wider = domain.within(wider) if isinstance(domain, Conditioned) else wider
+    wider = domain.within(Box(centre, half_width, sorted(unbounded)))
     return Problem(robot, problem.task, problem.metric, wider, problem.name)
 
 

@@ -28,7 +28,9 @@ class Registration:
 _REGISTERED: dict[str, Registration] = {}
 
 
-def register(name: str, kind: type[Parametrisation], parse: Callable[[str], Parametrisation] | None = None) -> None:
+def register_parametrisation(
+    name: str, kind: type[Parametrisation], parse: Callable[[str], Parametrisation] | None = None
+) -> None:
     """Register a parametrisation, so that its charts can be saved and loaded, and the command line accepts it.
 
     A program that loads such a chart file must register the same name first.
@@ -165,10 +167,10 @@ def _linear(text: str) -> Linear:
     return Linear()
 
 
-register("linear", Linear, _linear)
-register("polynomial", Polynomial, lambda text: Polynomial(*_degree_and_cyclic(text)))
-register("fourier", Fourier, lambda text: Fourier(*_degree_and_cyclic(text)))
-register("mlp", MLP, _mlp)
-register("sew", SEW, lambda text: SEW(text or "stereographic"))
-register("circle", Circle, lambda text: Circle(parse_parametrisation(text)))
-register("given", Given)
+register_parametrisation("linear", Linear, _linear)
+register_parametrisation("polynomial", Polynomial, lambda text: Polynomial(*_degree_and_cyclic(text)))
+register_parametrisation("fourier", Fourier, lambda text: Fourier(*_degree_and_cyclic(text)))
+register_parametrisation("mlp", MLP, _mlp)
+register_parametrisation("sew", SEW, lambda text: SEW(text or "stereographic"))
+register_parametrisation("circle", Circle, lambda text: Circle(parse_parametrisation(text)))
+register_parametrisation("given", Given)

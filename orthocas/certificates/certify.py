@@ -16,7 +16,7 @@ from orthocas.charts.certificate import METHOD, OPEN, Certificate, Subdivision
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
-from orthocas.tasks.domains import Box, Domain, SelfDrawing, contains, reach, sample_heavily, slack
+from orthocas.tasks.domains import Box, Domain, contains, reach, sample_heavily, slack
 from orthocas.tools.checks import Array, as_number, require_at_least, require_executor, require_kind
 from orthocas.tools.progress import Monitor, Progress, silent
 
@@ -226,7 +226,7 @@ def _suspects(chart: Chart) -> Array:
     powers = rng.choice([1.0, 0.5, 0.25], (_SAMPLES, 1))
     points = np.vstack([domain.centre, domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers])
     points = points[contains(domain, points)]
-    if isinstance(domain, SelfDrawing):
+    if domain.draws_itself:
         points = sample_heavily(domain, _SAMPLES, 0)
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))

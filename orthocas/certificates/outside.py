@@ -30,9 +30,7 @@ from orthocas.certificates.taylor import UP, TaylorModel, Variables
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
-from orthocas.tasks.clear_box import ClearBox
-from orthocas.tasks.corridor import Corridor
-from orthocas.tasks.domains import borders
+from orthocas.tasks.domains import PathBound, SingularBound, borders
 from orthocas.tools.batch import dense_function, one_blas_thread
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import Tape, gradient_dependences, periodic_joints, to_tape
@@ -108,7 +106,7 @@ class OutsideJudge:
 
     inside: RegularityJudge
     rows: GraphRows  #: J, the rows that judge, or C(q) J with orthogonal C if all entries of D are the same
-    domain: ClearBox
+    domain: SingularBound
     sign: float  #: of det J at the centre of the domain
     variables: Variables
 
@@ -169,7 +167,7 @@ class CorridorJudge:
     """
 
     inside: RegularityJudge
-    domain: Corridor
+    domain: PathBound
     sign: float
 
     @property
@@ -199,30 +197,32 @@ def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
         CertifyError: if a joint is unbounded, and a proof for its half-width is none for all its positions. In a
             corridor, an unbounded joint whose distance to the path counts is one of these.
     """
+    domain = chart.problem.domain
+    domain.require_bounds("proof")
     require_all_positions(chart, rows.variables)
-    judge, domain = RegularityJudge(rows, bound), chart.problem.domain
-    if isinstance(domain, Corridor):
-        _require_uncounted(domain, chart.problem.robot.joint_names)
-        start = domain.postures[domain.contains(domain.postures)][:1]
-        return CorridorJudge(judge, domain, float(judge(start, start).sign[0]))
-    if not isinstance(domain, ClearBox):
+    judge, near, clear = RegularityJudge(rows, bound), domain.path_bound, domain.singular_bound
+    if near is not None:
+        _require_uncounted(near, chart.problem.robot.joint_names)
+        start = near.postures[near.contains(near.postures)][:1]
+        return CorridorJudge(judge, near, float(judge(start, start).sign[0]))
+    if clear is None:
         return judge
-    own, variables = _judging_rows(chart, domain)
+    own, variables = _judging_rows(chart, clear)
     require_all_positions(chart, variables)
     sign = float(judge(domain.centre[None], domain.centre[None]).sign[0])  # rows have other scales than the chart's
-    return OutsideJudge(judge, own, domain, sign, tuple(sorted(variables)))
+    return OutsideJudge(judge, own, clear, sign, tuple(sorted(variables)))
 
 
-def _judging_rows(chart: Chart, domain: ClearBox) -> tuple[GraphRows, set[int]]:
+def _judging_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[int]]:
     """The rows that judge positions, just as `domain.is_clear` takes them, and the joints that they depend on."""
     task, joints = chart.problem.task, range(chart.n)
     if domain.jacobian_function is not task.jacobian_function:
         return closed_form_rows(domain.jacobian_function, joints)
     rotated = task.recipe["kind"] == "position:xyz" and bool((domain.scale == domain.scale[0]).all())
-    return task_gradients(task, domain, joints) if rotated else true_gradients(task, joints)
+    return task_gradients(task, chart.problem.domain, joints) if rotated else true_gradients(task, joints)
 
 
-def _require_uncounted(domain: Corridor, joint_names: Sequence[str]) -> None:
+def _require_uncounted(domain: PathBound, joint_names: Sequence[str]) -> None:
     """Raise CertifyError if an unbounded joint counts: after a turn, what is far from the path may be near it."""
     for joint in {*domain.unbounded} & {*domain.counted.tolist()}:
         name = joint_names[joint]

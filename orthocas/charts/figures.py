@@ -129,4 +129,4 @@ def _bound(length: float) -> str:
 def _require(name: str, value: object, part: str, wanted: str) -> None:
     """Raise InvalidValueError unless the value has the part that is drawn; its class imports this module."""
     if not hasattr(value, part):
-        raise InvalidValueError(name, repr(value)[:80], wanted)
+        raise InvalidValueError(name, f"a {type(value).__name__}", wanted)

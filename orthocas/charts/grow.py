@@ -11,7 +11,7 @@ from orthocas.exact.grown import GrownCoordinates
 from orthocas.exact.involutivity import involutivity
 from orthocas.exact.leaf import LeafChart, turning_joints
 from orthocas.exact.leaves import LEAVES, CircleLeaf, circle_leaf, linear_leaf
-from orthocas.tasks.domains import Box, Torus, sample_evenly
+from orthocas.tasks.domains import Box, sample_evenly
 from orthocas.tasks.problem import Problem, check
 from orthocas.tools.checks import (
     Array,
@@ -112,7 +112,7 @@ def require_involutive(problem: Problem) -> None:
 
 
 def _default_leaf(problem: Problem) -> str:
-    if problem.r == 1 and isinstance(problem.domain, Torus):
+    if problem.r == 1 and problem.domain.full_turns:
         return "circle"
     return "disk" if (problem.n, problem.m) == (3, 1) else "linear"
 
@@ -135,7 +135,7 @@ def _leaf_chart(
         return disk_leaf(problem, x0, _region(problem, x0) if region is None else region, cells)
     start = _start(problem, x0, origin)
     if leaf == "linear":
-        if isinstance(problem.domain, Torus):
+        if problem.domain.full_turns:
             raise GrowError("a linear leaf is not periodic and the domain is a torus: use a Box domain or another leaf")
         return linear_leaf(problem, start)
     if problem.r != 1:

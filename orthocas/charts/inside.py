@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from orthocas.charts.in_domain import KEPT, BoxedPhi, solve_in_box
 from orthocas.charts.newton import Starts
 from orthocas.charts.phi import PhiMap, largest, shortest
-from orthocas.tasks.clear_box import ClearBox
-from orthocas.tasks.domains import Conditioned, Domain, borders
+from orthocas.tasks.domains import Domain, borders
 from orthocas.tools.batch import evaluate_columns
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
@@ -234,13 +233,14 @@ class Nearest:
         difference = shortest(self.phi(q) - target, self.phi_map.turns)
         constraints = [difference[:m] / ca.DM(self.phi_map.sizes[:m])]
         upper = np.zeros(m)
-        if isinstance(domain, ClearBox):
-            pivots = domain.pivots(q) / domain.least_singular_value**2
+        clear = domain.singular_bound
+        if clear is not None:
+            pivots = clear.pivots(q) / clear.least_singular_value**2
             constraints += [_CLEAR - _products(pivots)]  # the pivots themselves have poles
             upper = np.zeros(m + m)
-        elif isinstance(domain, Conditioned):
-            constraints += [-domain.pivots(q)]
-            upper = np.zeros(m + domain.pivots.size1_out(0))
+        elif domain.condition is not None:
+            constraints += [-domain.condition.pivots(q)]
+            upper = np.zeros(m + domain.condition.pivots.size1_out(0))
         lower = np.where(np.arange(len(upper)) < m, 0.0, -np.inf)
         equations: dict[str, Any] = {
             "x": q,

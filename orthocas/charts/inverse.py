@@ -12,7 +12,7 @@ from orthocas.charts.newton import Attempt, LocalSolver, Starts
 from orthocas.charts.phi import PhiMap, largest
 from orthocas.charts.solutions import InverseStatus, Solutions
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.domains import Conditioned, borders
+from orthocas.tasks.domains import borders
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, Indices
@@ -138,7 +138,7 @@ class Inverse:
             q, _ = self.in_domain.search(targets[rows], tolerance)
             attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
             best.improve(rows, self._judged(attempt, tolerance))
-        if isinstance(self.problem.domain, Conditioned):  # it may be a small part of its box
+        if not self.problem.domain.is_box:  # it may be a small part of its box
             self._restart(targets, best, rows, _RESTARTS, InverseStatus.FOUND, tolerance)
 
     def _restart(

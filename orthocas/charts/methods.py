@@ -14,7 +14,7 @@ from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, Poi
 from orthocas.charts.phi import PhiFunctions, PhiMap
 from orthocas.charts.solutions import Solutions, Tracker
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, SingularTaskError
-from orthocas.tasks.domains import Conditioned, borders
+from orthocas.tasks.domains import borders
 from orthocas.tasks.problem import task_sizes
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
@@ -248,7 +248,7 @@ class InverseMethods(PhiFunctions):
         reason = (
             f"joint '{self.problem.robot.joint_names[j]}' at {q[j]:.4g}, expected within [{low[j]:.4g}, {high[j]:.4g}]"
         )
-        if isinstance(domain, Conditioned) and low[j] <= q[j] <= high[j]:
+        if not domain.is_box and low[j] <= q[j] <= high[j]:
             reason = domain.told(q)
         return InverseError(
             f"q with phi(q) = phi lies outside the domain for {found.named(beyond)}: {reason}. "

@@ -13,7 +13,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import Judged
 from orthocas.charts.worst_points import WorstPoints, worst_points
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.tasks.domains import Torus, sample_uniform
+from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.samples import idle_joints, samples_at
 from orthocas.tools.batch import in_threads
 from orthocas.tools.checks import Array, Indices, as_point_set, require_count, require_kind, require_memory
@@ -356,7 +356,7 @@ def evaluate(
     if points is None:
         count, drawn = _count(chart, SAMPLES if samples is None else samples), SEED if seed is None else seed
         drawn = require_count("seed", drawn, least=0)
-        searched = isinstance(chart.coordinates, Coordinates) and not isinstance(chart.problem.domain, Torus)
+        searched = isinstance(chart.coordinates, Coordinates) and not chart.problem.domain.full_turns
         problem, found = chart.problem, chart.coordinates
         worst = worst_points(problem, found, drawn, thorough=True) if searched else None
         return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst)

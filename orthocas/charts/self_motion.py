@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import borders, contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, Indices, as_number, as_point, frozen_array, require_count
@@ -77,7 +76,7 @@ class Walls:
         domain = problem.domain
         self._domain, self._robot = domain, problem.robot
         self._low, self._high = borders(domain)
-        self._clear = domain if isinstance(domain, ClearBox) else None
+        self._clear = domain.singular_bound
         endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
         self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.newton import GOAL, REFRESHES, Bound, PointFunctions, PointSolver
 from orthocas.errors import InvalidValueError, InverseError
-from orthocas.tasks.domains import Conditioned, Domain, contains, reach
+from orthocas.tasks.domains import Domain, contains, reach
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array, Indices, as_float_array, as_point, require_shape
 from orthocas.tools.display import Shown, listed, number_list
@@ -260,6 +260,6 @@ def _guard(domain: Domain, limit: Array) -> ca.Function:
     """q before, q -> the largest change relative to its limit, and a number > 0 outside the domain."""
     before, q = (ca.MX.sym(name, len(limit)) for name in ("before", "q"))
     outside = ca.mmax(ca.fabs(q - ca.DM(domain.centre)) - ca.DM(reach(domain)))
-    if isinstance(domain, Conditioned):
-        outside = ca.fmax(outside, ca.if_else(ca.mmin(domain.pivots(q)) > 0, -1, 1))
+    if domain.condition is not None:
+        outside = ca.fmax(outside, ca.if_else(ca.mmin(domain.condition.pivots(q)) > 0, -1, 1))
     return dense_function("guard", [before, q], [ca.vertcat(ca.norm_inf((q - before) / ca.DM(limit)), outside)])

@@ -19,8 +19,6 @@ from orthocas.cli.problem_argument import (
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
-from orthocas.tasks.clear_box import ClearBox
-from orthocas.tasks.domains import Domain
 from orthocas.tasks.problem import Problem, check
 from orthocas.tools.json import plain
 
@@ -92,8 +90,8 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "domain": problem.domain.name,
         "centre": problem.domain.centre.tolist(),
         "half_width": problem.domain.half_width.tolist(),
-        "unbounded_joints": [problem.robot.joint_names[k] for k in getattr(problem.domain, "unbounded", ())],
-        **_clear(problem.domain),
+        "unbounded_joints": [problem.robot.joint_names[k] for k in problem.domain.unbounded],
+        **problem.domain.numbers_of_condition(),
         "cyclic_joints": list(cyclic_joints(problem)),
         "near_singular_share": found.singular_share,
         "half_turn_share": found.half_turn_share,
@@ -114,18 +112,6 @@ def _reach(chart: "Chart") -> dict[str, Any]:
     return {
         "xi_range": {part.label: [plain(part.low), plain(part.high)] for part in reach},
         "xi_stops": {part.label: [str(part.low_stop), str(part.high_stop)] for part in reach},
-    }
-
-
-def _clear(domain: Domain) -> dict[str, Any]:
-    """What a ClearBox leaves of its box."""
-    if not isinstance(domain, ClearBox):
-        return {}
-    return {
-        "least_singular_value": domain.least_singular_value,
-        "judged_rows": domain.rows,
-        "row_scale": domain.scale.tolist(),
-        "clear_share": domain.share,
     }
 
 

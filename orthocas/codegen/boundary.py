@@ -1,6 +1,6 @@
 """What C is written from, and the condition of the domain's boundary in C."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -12,9 +12,7 @@ from orthocas.codegen.description import numbers
 from orthocas.codegen.precision import Precision
 from orthocas.control.controller import Controller
 from orthocas.control.safety import Safety
-from orthocas.tasks.clear_box import ClearBox
-from orthocas.tasks.corridor import Corridor
-from orthocas.tasks.domains import Conditioned, Domain
+from orthocas.tasks.domains import Domain, PathBound, SingularBound
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import scalar_code
 
@@ -33,7 +31,7 @@ class Source(Protocol):
         ...
 
     @property
-    def condition(self) -> Conditioned | None:
+    def condition(self) -> Domain | None:
         """The condition of the domain beside its box, if there is one."""
         ...
 
@@ -90,9 +88,12 @@ class BorderCondition:
 
 def border_condition(source: Source, controller: Controller) -> BorderCondition | None:
     """The condition of the law's domain as a part of its border, if it has one."""
-    condition: Any = source.condition
-    make = _MADE.get(type(condition))
-    return None if controller.chart is None or make is None else make(condition)
+    domain = source.condition
+    if controller.chart is None or domain is None:
+        return None
+    if domain.singular_bound is not None:
+        return _clear(domain.singular_bound)
+    return None if domain.path_bound is None else _near_path(domain.path_bound)
 
 
 def border_units(domain: Domain) -> Any:
@@ -100,10 +101,11 @@ def border_units(domain: Domain) -> Any:
 
     A path of a corridor ends one radius before the border of its box, which may be many radii wide.
     """
-    return np.minimum(domain.half_width, domain.radius) if isinstance(domain, Corridor) else domain.half_width
+    near = domain.path_bound
+    return domain.half_width if near is None else np.minimum(domain.half_width, near.radius)
 
 
-def _clear(clear: ClearBox) -> BorderCondition:
+def _clear(clear: SingularBound) -> BorderCondition:
     span = float(clear.singular_values(clear.centre)) - clear.least_singular_value
     return BorderCondition(
         "clear_border.c",
@@ -114,7 +116,7 @@ def _clear(clear: ClearBox) -> BorderCondition:
     )
 
 
-def _near_path(corridor: Corridor) -> BorderCondition:
+def _near_path(corridor: PathBound) -> BorderCondition:
     starts, axes, squares = corridor.lines
     values = {
         "lines": str(len(squares)),
@@ -135,6 +137,3 @@ def _near_path(corridor: Corridor) -> BorderCondition:
 
 def _rows(values: Any) -> str:
     return ",\n  ".join(f"{{{numbers(row)}}}" for row in values)
-
-
-_MADE: dict[type, Callable[[Any], BorderCondition]] = {ClearBox: _clear, Corridor: _near_path}

@@ -15,8 +15,7 @@ from orthocas.codegen.precision import Precision, bounds_inside
 from orthocas.control.controller import Controller
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.corridor import Corridor
-from orthocas.tasks.domains import Conditioned, Domain, borders, contains, reach
+from orthocas.tasks.domains import Domain, borders, contains, reach
 from orthocas.tools.checks import Array
 
 
@@ -29,10 +28,15 @@ class ChartSource:
     title: ClassVar[str] = "chart"
 
     @property
-    def condition(self) -> Conditioned | None:
-        """The domain, if it has a condition."""
+    def condition(self) -> Domain | None:
+        """The domain, if it has a condition.
+
+        Raises:
+            DomainError: if its condition has no form in C.
+        """
         domain = self.chart.problem.domain
-        return domain if isinstance(domain, Conditioned) else None
+        domain.require_bounds("form in C")
+        return None if domain.is_box else domain
 
     @property
     def somewhere(self) -> Array:
@@ -104,16 +108,19 @@ class ChartSource:
         return values
 
 
-def condition_code(domain: Conditioned, values: Mapping[str, str]) -> str:
-    """The test of the condition of a domain."""
-    condition = {"pivots": str(domain.pivots.size1_out(0)), "condition": "\n * ".join(words([domain.heading]))}
+def condition_code(domain: Domain, values: Mapping[str, str]) -> str:
+    """The test of the condition of a domain that has one."""
+    known = domain.condition
+    assert known is not None
+    condition = {"pivots": str(known.pivots.size1_out(0)), "condition": "\n * ".join(words([known.heading]))}
     return filled("clear.c", {**values, **condition})
 
 
 def position_within(domain: Domain) -> Array:
     """A joint position of a domain between its centre and a corner, (n,); of a corridor one on the path."""
-    if isinstance(domain, Corridor):
-        inside = domain.postures[domain.contains(domain.postures)]
+    near = domain.path_bound
+    if near is not None:
+        inside = near.postures[near.contains(near.postures)]
         return np.asarray(inside[len(inside) // 2])
     shares = [0.5**k for k in range(1, 20) if contains(domain, domain.centre + 0.5**k * domain.half_width)]
     return np.round(domain.centre + (shares[0] if shares else 0.0) * domain.half_width, 3)

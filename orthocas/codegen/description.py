@@ -12,7 +12,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.control.controller import Controller
 from orthocas.robots.kinematics import TipTurn
-from orthocas.tasks.domains import Conditioned, Domain, borders
+from orthocas.tasks.domains import Domain, borders
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array
 
@@ -142,9 +142,10 @@ def _border_lines(names: list[str], lower: Array, upper: Array) -> str:
 
 def clear_line(domain: Domain) -> str:
     """The condition of a domain that has one."""
-    if not isinstance(domain, Conditioned):
+    condition = domain.condition
+    if condition is None:
         return ""
-    return f"\n *   and the {domain.heading},\n *   or else the status is OUTSIDE_DOMAIN"
+    return f"\n *   and the {condition.heading},\n *   or else the status is OUTSIDE_DOMAIN"
 
 
 def control_values(controller: Controller) -> dict[str, str]:

@@ -81,13 +81,14 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
         ca.Function("curvature", [q, dq, v], [chart.function("second_derivative")(q, dq, v)]),
         fast_form(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)]), n),
     ]
-    if source.condition is not None:
-        found.append(scalar_code(ca.Function("pivots", [q], [source.condition.pivots(q)])))
+    condition = None if source.condition is None else source.condition.condition
+    if condition is not None:
+        found.append(scalar_code(ca.Function("pivots", [q], [condition.pivots(q)])))
     if controller is not None:
         graph = source.graph(precision.graph(controller))
         inputs = graph.mx_in()
-        condition = border_condition(source, controller)
-        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, condition)]
+        border = border_condition(source, controller)
+        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, border)]
     return found
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.domains import Conditioned, Domain, reach
+from orthocas.tasks.domains import Domain, reach
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array
 from orthocas.tools.display import listed, number_list
@@ -103,7 +103,8 @@ def _cut(command: ca.SX, limit: ca.SX, keep_direction: bool) -> ca.SX:
 
 def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
     """Whether q (n, 1) lies in the domain: between its borders, and where its condition holds, if it has one."""
-    clear = _all(domain.pivots(q) > 0) if isinstance(domain, Conditioned) else ca.SX(1)
+    condition = None if domain is None else domain.condition
+    clear = ca.SX(1) if condition is None else _all(condition.pivots(q) > 0)
     return ca.logic_and(_is_between_borders(domain, q), clear)
 
 

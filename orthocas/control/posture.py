@@ -8,7 +8,7 @@ from orthocas.charts.self_motion import too_far
 from orthocas.charts.solutions import Tracker, TrackerStatus
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError
-from orthocas.tasks.domains import Conditioned, borders, contains
+from orthocas.tasks.domains import borders, contains
 from orthocas.tools.checks import Array, as_point, require_kind
 
 
@@ -75,7 +75,7 @@ class _Follower:
 
 def _outside(chart: Chart, q: Array) -> str:
     domain = chart.problem.domain
-    if isinstance(domain, Conditioned) and not np.all(np.asarray(domain.pivots(q)) > 0):
+    if domain.condition is not None and not np.all(np.asarray(domain.condition.pivots(q)) > 0):
         return domain.told(q)
     low, high = borders(domain)
     i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))

@@ -9,7 +9,6 @@ from orthocas.bases.family import CyclicParametrisation
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.phi import shortest
-from orthocas.tasks.domains import Box
 from orthocas.tools.checks import Array
 
 
@@ -35,7 +34,7 @@ def without_turns(chart: Chart, difference: Any) -> Any:
 def _turns(chart: Chart) -> Array:
     """What a turn of each unbounded joint adds to phi, (n, u)."""
     problem, coordinates = chart.problem, chart.coordinates
-    if not (isinstance(problem.domain, Box) and isinstance(coordinates, Coordinates)):
+    if problem.domain.full_turns or not isinstance(coordinates, Coordinates):
         return np.zeros((chart.n, 0))
     chosen = coordinates.parametrisation
     cyclic = chosen.cyclic if isinstance(chosen, CyclicParametrisation) else ()

@@ -32,7 +32,6 @@ from orthocas.fitting.stages import Plan, StageRunner
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, LEAST_CONDITIONING, WeightNumbers, Weights
 from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.clear_box import ClearBox
-from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem, ProblemCheck, check
 from orthocas.tasks.samples import Samples, idle_joints, sample_problem
@@ -77,10 +76,11 @@ def clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints | None)
     """
     domain = problem.domain
     failed = np.zeros((0, problem.n)) if worst is None else worst.below(_FAILS)
-    if not isinstance(domain, Box) or isinstance(domain, Corridor) or not (len(failed) or check.singular_samples):
+    clear = domain.singular_bound
+    if not (isinstance(domain, Box) and (domain.is_box or clear)) or not (len(failed) or check.singular_samples):
         return None
     try:
-        measured = domain if isinstance(domain, ClearBox) else ClearBox(domain, problem.task, _ANY)
+        measured = clear or ClearBox(domain, problem.task, _ANY)
         values = measured.singular_values(failed)
         wanted = float(np.quantile(values, _MOST)) if len(failed) else 0.0
         if not wanted <= _LARGEST:

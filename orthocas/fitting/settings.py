@@ -14,9 +14,6 @@ from orthocas.solvers.ipopt import Ipopt
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import Solver
 from orthocas.solvers.quasi_newton import QuasiNewton
-from orthocas.tasks.clear_box import ClearBox
-from orthocas.tasks.corridor import Corridor
-from orthocas.tasks.domains import Torus
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_problem
 from orthocas.tools.checks import as_number, require_count, require_kind, require_known
@@ -90,7 +87,7 @@ class FitSettings:
 
     def fold_weight(self, problem: Problem) -> float:
         """Weight of the fold term; 0 on a torus, where every coordinate has critical points, and with a bound."""
-        free = not isinstance(problem.domain, Torus) and self.max_mutual_deg is None
+        free = not problem.domain.full_turns and self.max_mutual_deg is None
         return self.weights.folds if free else 0.0
 
     def identity(self, problem: Problem) -> dict[str, str]:
@@ -146,8 +143,5 @@ def _digest(problem: Problem) -> str:
     samples = sample_problem(problem, *_TELLTALE)
     parts = [samples.points, samples.task_jacobian]
     parts += [] if samples.metric_inverse is None else [samples.metric_inverse]
-    domain, own = problem.domain, problem.task.jacobian_function
-    parts += [np.append(domain.scale, domain.least_singular_value)] if isinstance(domain, ClearBox) else []
-    parts += [np.array([1.0])] if isinstance(domain, ClearBox) and domain.jacobian_function is not own else []
-    parts += [domain.postures, domain.radius] if isinstance(domain, Corridor) else []
+    parts += problem.domain.identity()
     return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]

@@ -285,7 +285,7 @@ FOLD_TERM = RegularityTerm("folds", _FOLD_VOLUME)  #: for the worst points of th
 _TERMS: dict[str, LossTerm] = {}
 
 
-def register(term: LossTerm) -> None:
+def register_loss_term(term: LossTerm) -> None:
     """Register a loss term. `Weights(extra={name: weight})` then adds it to the loss.
 
     Raises:
@@ -331,7 +331,7 @@ def term_of(name: str) -> LossTerm:
 
 _OURS = (MetricTaskTerm(), MetricMutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM)
 for _term in (TaskTerm(), MutualTerm(), *_OURS):
-    register(_term)
+    register_loss_term(_term)
 
 WeightNumbers = Sequence[float]  #: two to five numbers: task, mutual, regularity, length, folds
 

@@ -12,7 +12,7 @@ from orthocas.paths.joint_curve import Lost
 from orthocas.paths.joint_motion import Margins
 from orthocas.paths.plan import Plan
 from orthocas.robots.obstacles import LinkDistances
-from orthocas.tasks.clear_box import ClearBox, row_scale
+from orthocas.tasks.clear_box import row_scale
 from orthocas.tasks.domains import borders, contains, sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
@@ -37,15 +37,15 @@ class Limits:
     @property
     def rows(self) -> ca.Function:
         """q (n, 1) -> the rows J (m, n) that tell how near to a singular position the robot is."""
-        domain, task = self.chart.problem.domain, self.chart.problem.task
-        return domain.jacobian_function if isinstance(domain, ClearBox) else task.frame_jacobian_function
+        clear, task = self.chart.problem.domain.singular_bound, self.chart.problem.task
+        return task.frame_jacobian_function if clear is None else clear.jacobian_function
 
     @cached_property
     def scale(self) -> Array:
         """The scale of these rows, (m,); see `orthocas.ClearBox`."""
         domain = self.chart.problem.domain
-        if isinstance(domain, ClearBox):
-            return domain.scale
+        if domain.singular_bound is not None:
+            return domain.singular_bound.scale
         J = self._rows_at(sample_uniform(domain, _SAMPLES, 0))
         return row_scale(J[np.isfinite(J).all(axis=(1, 2))], self.chart.problem.task.units)
 

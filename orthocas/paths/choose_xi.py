@@ -11,7 +11,6 @@ from orthocas.charts.phi import counted_on
 from orthocas.paths.checks import Limits
 from orthocas.paths.joint_curve import Solver
 from orthocas.paths.plan import Plan
-from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import borders
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
@@ -67,8 +66,8 @@ class Costs:
 
     def _of_task(self, q: Array) -> tuple[Array, Array]:
         left, values, right = np.linalg.svd(self.limits.scaled_rows(q), full_matrices=False)
-        domain = self.limits.chart.problem.domain
-        bound = domain.least_singular_value if isinstance(domain, ClearBox) else 0.0
+        clear = self.limits.chart.problem.domain.singular_bound
+        bound = 0.0 if clear is None else clear.least_singular_value
         residuals, slopes = _inverse(values[:, -1:] - bound, _REGULAR, _NEARLY_SINGULAR)
         gradients = self._turning(q, left[:, :, -1] / self.limits.scale, right[:, -1])[0]
         return residuals, slopes[..., None] * gradients[:, None]

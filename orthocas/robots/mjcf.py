@@ -8,9 +8,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pinocchio as pin
 
-from orthocas.errors import InvalidValueError, RobotError, one_line
+from orthocas.errors import RobotError, one_line
 from orthocas.robots.xml import MOST_LINKS, read_xml
-from orthocas.tools.checks import Array, of_extra
+from orthocas.tools.checks import Array, as_path, of_extra
 
 _WORDS = ("name", "class", "childclass", "joint", "body", "file", "mesh", "material")  # attributes that hold names
 
@@ -40,8 +40,7 @@ def model_from_mjcf(source: Any) -> pin.Model:
     mujoco = of_extra("mujoco", "reading MJCF files", "mujoco")
     if isinstance(source, mujoco.MjModel):
         return _converted(mujoco, source, "the model")
-    if not isinstance(source, str | Path):
-        raise InvalidValueError("path", f"a {type(source).__name__}", "the path of an MJCF file, or a mujoco.MjModel")
+    source = as_path("path", source)
     root = read_xml(source, "MJCF", "mujoco")  # bounds its size and depth, and refuses document types
     if sum(1 for _ in root.iter("body")) > MOST_LINKS:
         raise RobotError(f"{source} has more than {MOST_LINKS} bodies")

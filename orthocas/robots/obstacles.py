@@ -15,6 +15,8 @@ from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point_set, frozen_array, require_kind
 
+__all__ = ["Capsule", "LinkDistances", "Obstacle", "Plane", "Sphere"]
+
 _TINY = 1e-18  # [m^2], keeps square roots differentiable
 _FARTHEST = 1e6  # [m]
 _POSTURES, _MOVES = 20, 1e-9  # postures that tell which links move, and how far they do [m]

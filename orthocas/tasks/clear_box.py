@@ -1,18 +1,27 @@
 """The part of a box that stays clear of near-singular positions of a task (ours)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self, cast
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import DomainError, InvalidValueError, SingularTaskError
-from orthocas.tasks.domains import Box, Domain, sample_evenly, sample_uniform
+from orthocas.tasks.domains import (
+    Box,
+    Domain,
+    register_domain,
+    require_within_limits,
+    sample_evenly,
+    sample_uniform,
+)
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_number, as_point_set, frozen_array, require_kind, require_known
+from orthocas.tools.json import part
 
 CLEAR_BOX = "clear box"  #: name of the kind
 ROWS = ("frame", "x")  #: Jacobians by which a position is judged
@@ -36,6 +45,7 @@ def row_scale(J: Array, units: tuple[str, ...]) -> Array:
     return np.sqrt([mean if mean > 0 else 1.0 for mean in means])
 
 
+@register_domain
 @dataclass(frozen=True, eq=False, init=False, kw_only=True)
 class ClearBox(Box):
     """All q of a box at which the relative singular value of a task is above a bound (ours).
@@ -72,6 +82,8 @@ class ClearBox(Box):
         [True, False]
     """
 
+    name: str = CLEAR_BOX
+    is_box = False
     task: Task
     least_singular_value: float
     scale: Array
@@ -97,7 +109,7 @@ class ClearBox(Box):
         for name, value in (("least_singular_value", bound), ("scale", sizes.min())):
             if not 0 < value < np.inf:
                 raise InvalidValueError(name, value, "positive and finite")
-        for field, value in (("name", CLEAR_BOX), ("least_singular_value", bound), ("scale", sizes)):
+        for field, value in (("least_singular_value", bound), ("scale", sizes)):
             object.__setattr__(self, field, value)
         if not self.is_clear(self.centre[None])[0]:
             raise DomainError(f"the centre of the domain {self._value_told(self.centre)}")
@@ -108,6 +120,52 @@ class ClearBox(Box):
         rows = "J_x" if self.jacobian_function is self.task.jacobian_function else "the frame Jacobian"
         sizes = f"(rows of {rows} over {_lengths(self.scale, self.task.units)})"
         return f"relative singular value of the task above {self.least_singular_value:g} {sizes}"
+
+    @property
+    def condition(self) -> Self:
+        """Itself."""
+        return self
+
+    @property
+    def singular_bound(self) -> Self:
+        """Itself."""
+        return self
+
+    def facts_of_condition(self) -> dict[str, str]:
+        """The condition in one line."""
+        return {"clear": self.heading}
+
+    def numbers_of_condition(self) -> dict[str, Any]:
+        """Bound, rows and their sizes, and how much of the box is left."""
+        return {
+            "least_singular_value": self.least_singular_value,
+            "judged_rows": self.rows,
+            "row_scale": self.scale.tolist(),
+            "clear_share": self.share,
+        }
+
+    def identity(self) -> list[Array]:
+        """Scale and bound, and a mark if other rows than J_x count."""
+        own = self.jacobian_function is self.task.jacobian_function
+        return [np.append(self.scale, self.least_singular_value), *([] if own else [np.array([1.0])])]
+
+    def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """The bound, and the rows that count if they are not J_x: older files, which do not name them, mean J_x."""
+        of_x = self.jacobian_function is self.task.jacobian_function
+        rows = {} if of_x else {"judged_rows": self.rows}
+        return {**super().to_data()[0], "least_singular_value": self.least_singular_value, **rows}, {
+            "row_scale": self.scale
+        }
+
+    @classmethod
+    def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
+        """The domain of a file. Its box is checked before the task is evaluated there."""
+        box = Box.from_data(task, data, arrays)
+        require_kind("box", box, Box)
+        require_within_limits(task.robot, box)
+        rows = part(data, "judged_rows", str) if "judged_rows" in data else "frame" if task.turn is None else "x"
+        bound = part(data, "least_singular_value", float)
+        return cls(cast("Box", box), task, bound, part(arrays, "row_scale", np.ndarray), rows)
 
     @property
     def jacobian_function(self) -> ca.Function:
@@ -199,7 +257,7 @@ def clear_domain(domain: Domain, task: Task, least_singular_value: float | None)
         DomainError: if the centre is not clear.
     """
     if least_singular_value is not None:
-        if not isinstance(domain, Box) or domain.name not in ("box", CLEAR_BOX):
+        if not isinstance(domain, Box) or not (domain.is_box or domain.singular_bound):
             raise InvalidValueError("least_singular_value", least_singular_value, f"none with a {domain.name}")
         return ClearBox(domain, task, least_singular_value)
     if isinstance(domain, ClearBox) and domain.task is not task:

@@ -1,23 +1,26 @@
 """The surroundings of a path of postures: the domain of one chart for a long motion (ours)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.tasks.domains import Box
+from orthocas.tasks.domains import Box, Domain, register_domain
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_point_set, frozen_array, require_kind
 from orthocas.tools.display import number_list
+from orthocas.tools.json import part
 
 CORRIDOR = "corridor"  #: name of the kind
 _MOST_POSTURES = 2000
 
 
+@register_domain
 @dataclass(frozen=True, eq=False, init=False, kw_only=True)
 class Corridor(Box):
     """All q of a box near a path of postures (ours): sum_i ((q_i - p_i) / radius_i)^2 <= 1 for a point p of the path.
@@ -43,6 +46,9 @@ class Corridor(Box):
         [True, False]
     """
 
+    name: str = CORRIDOR
+    is_box = False
+    draws_itself = True
     postures: Array
     radius: Array
 
@@ -60,7 +66,7 @@ class Corridor(Box):
             raise InvalidValueError("radius", sizes.tolist(), "positive numbers, at least one of them finite")
         sizes = np.array(np.broadcast_to(sizes, (n,)))
         sizes.setflags(write=False)
-        for field, value in (("name", CORRIDOR), ("postures", path), ("radius", sizes)):
+        for field, value in (("postures", path), ("radius", sizes)):
             object.__setattr__(self, field, value)
         if not self.contains(path).any():
             raise InvalidValueError("postures", "outside the box", "postures of which at least one lies in the box")
@@ -70,6 +76,34 @@ class Corridor(Box):
         """The condition in one line."""
         sizes = number_list(self.radius[self.counted])
         return f"distance to a path of {len(self.postures)} postures at most 1 in units of {sizes}"
+
+    @property
+    def condition(self) -> Self:
+        """Itself."""
+        return self
+
+    @property
+    def path_bound(self) -> Self:
+        """Itself."""
+        return self
+
+    def facts_of_condition(self) -> dict[str, str]:
+        """The condition in one line."""
+        return {"corridor": self.heading}
+
+    def identity(self) -> list[Array]:
+        """Path and radius."""
+        return [self.postures, self.radius]
+
+    def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Path and radius, beside those of the box."""
+        return super().to_data()[0], {"postures": self.postures, "radius": self.radius}
+
+    @classmethod
+    def from_data(cls, task: Any, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
+        """The corridor of a file."""
+        box = cast("Box", Box.from_data(task, data, arrays))
+        return cls(box, *(part(arrays, name, np.ndarray) for name in ("postures", "radius")))
 
     def within(self, box: Box) -> Self:
         """The same condition on another box. Joints that have more room there do not count."""

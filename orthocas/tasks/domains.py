@@ -1,17 +1,19 @@
 """Domains: the regions of joint space on which charts are fitted and evaluated, with seeded sampling."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
+from orthocas.tools import json
 from orthocas.tools.checks import (
     Array,
     as_float_array,
@@ -19,8 +21,12 @@ from orthocas.tools.checks import (
     frozen_array,
     require_count,
     require_kind,
+    require_known,
     require_memory,
 )
+
+if TYPE_CHECKING:
+    from orthocas.tasks.task import Task
 
 _MOST_JOINTS = 1000
 _MOST_SAMPLES = 10**12
@@ -30,42 +36,97 @@ _BLOCK = 1000  # fewest points to draw at once, after the first ones
 _WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes, and overflow later
 
 
-@runtime_checkable
-class Domain(Protocol):
-    """A box in joint space. A torus is the box of full turns."""
+class Domain(ABC):
+    """A region of joint space inside a box, and what it answers about itself.
 
-    @property
-    def name(self) -> str:
-        """Kind of the domain: 'box' or 'torus'."""
-        ...
+    A domain of your own derives from this class, sets `name`, `centre` and `half_width`, and defines `contains`. That
+    is enough to fit, evaluate and invert. It is saved if it defines `to_data` and `from_data` and is registered with
+    `orthocas.register_domain`; laws and trackers need a `condition`, proofs and C a `singular_bound` or a `path_bound`.
+    """
 
-    @property
-    def centre(self) -> Array:
-        """Middle of the domain, (n,)."""
-        ...
+    name: str  #: of the kind, as files and messages have it
+    centre: Array  #: middle of the box around it, (n,)
+    half_width: Array  #: half of the edge lengths of that box, (n,), > 0
+    unbounded: tuple[int, ...] = ()  #: joints whose every position lies inside
+    full_turns: bool = False  #: whether all joints turn without end and positions repeat after a turn
+    is_box: bool = False  #: whether all of the box between its borders lies inside
+    draws_itself: bool = False  #: whether it is a small part of its box, so that `draw` does not try the whole box
 
-    @property
-    def half_width(self) -> Array:
-        """Half of the edge lengths, (n,), > 0."""
-        ...
-
+    @abstractmethod
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie in the domain: a bool, or (N,)."""
-        ...
 
+    @property
+    def condition(self) -> "Condition | None":
+        """The condition that holds in a part of the box, as an expression; None for the whole box.
 
-@runtime_checkable
-class SelfDrawing(Protocol):
-    """A domain that is a small part of its box, and draws points itself."""
+        Raises:
+            DomainError: if the domain has a condition, but no expression of it.
+        """
+        if self.is_box:
+            return None
+        raise DomainError(f"a domain of kind '{self.name}' has no condition as an expression, which this needs")
+
+    @property
+    def singular_bound(self) -> "SingularBound | None":
+        """The condition, if it is a bound on the singular values of a task."""
+        return None
+
+    @property
+    def path_bound(self) -> "PathBound | None":
+        """The condition, if it is a bound on the distance to a path."""
+        return None
+
+    def require_bounds(self, what: str) -> None:
+        """Raise DomainError unless proofs and C know the form of the condition."""
+        if not (self.is_box or self.singular_bound or self.path_bound):
+            raise DomainError(
+                f"a domain of kind '{self.name}' has no {what}, which exists for boxes, tori, and domains with a bound "
+                "on singular values or on the distance to a path"
+            )
 
     def draw(self, rng: np.random.Generator, count: int, power: float) -> Array:
-        """At most `count` points (M, n): uniform for power 1, nearer to the border for smaller powers."""
-        ...
+        """At most `count` points (M, n), of which those in the domain count: |u|^power half-widths from the centre.
+
+        With power 1 they are uniform, with smaller ones nearer to the borders.
+        """
+        u = rng.uniform(-1.0, 1.0, (count, len(self.centre)))
+        return _scaled(self, u if power == 1 else np.sign(u) * np.abs(u) ** power)
+
+    def within(self, box: "Box") -> "Domain":
+        """The same condition on another box."""
+        raise DomainError(f"a domain of kind '{self.name}' has no other size, expected a box")
+
+    def told(self, q: Array) -> str:
+        """What is wrong with a position (n,) of the box that lies outside the domain."""
+        return f"the position {np.round(q, 4).tolist()} lies outside the {self.name}"
+
+    def facts_of_condition(self) -> dict[str, str]:
+        """The condition in one line, by its name."""
+        return {}
+
+    def numbers_of_condition(self) -> dict[str, Any]:
+        """What `orthocas info --json` has of the condition."""
+        return {}
+
+    def identity(self) -> list[Array]:
+        """Numbers by which a checkpoint knows the domain, beside samples of it."""
+        return []
+
+    def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Plain data and arrays for files, beside name, centre and half-width."""
+        raise DomainError(
+            f"a domain of kind '{self.name}' cannot be saved, expected `to_data`, `from_data` and a registered kind"
+        )
+
+    @classmethod
+    def from_data(cls, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> "Domain":
+        """The domain from what `to_data` gave; `arrays` also has centre and half_width. They may be anything."""
+        raise NotImplementedError
 
 
-@runtime_checkable
-class Conditioned(Protocol):
-    """A part of a box with a condition: `ClearBox` and `Corridor`."""
+class Condition(Protocol):
+    """A condition that holds in a part of a box."""
 
     @property
     def heading(self) -> str:
@@ -77,17 +138,127 @@ class Conditioned(Protocol):
         """q (n, 1) -> numbers that are all positive just at those points of the box where the condition holds."""
         ...
 
-    def within(self, box: "Box") -> "Box":
-        """The same condition on another box."""
+
+class SingularBound(Condition, Protocol):
+    """A condition s(q) > bound on the relative singular value of a task; see `orthocas.ClearBox`."""
+
+    @property
+    def centre(self) -> Array:
+        """Middle of the box, (n,)."""
         ...
 
-    def told(self, q: Array) -> str:
-        """What is wrong with a position (n,) of the box where the condition does not hold."""
+    @property
+    def least_singular_value(self) -> float:
+        """The bound, > 0."""
+        ...
+
+    @property
+    def scale(self) -> Array:
+        """Sizes of the rows, (m,) > 0."""
+        ...
+
+    @property
+    def rows(self) -> str:
+        """Which rows count: "frame" or "x"."""
+        ...
+
+    @property
+    def jacobian_function(self) -> ca.Function:
+        """q (n, 1) -> J (m, n), the rows that count."""
+        ...
+
+    @property
+    def gram(self) -> ca.Function:
+        """q (n, 1) -> D^-1 J J^T D^-1, (m, m)."""
+        ...
+
+    def is_clear(self, points: Array) -> NDArray[np.bool_]:
+        """Whether s(q) > bound at points (N, n), (N,)."""
+        ...
+
+    def singular_values(self, q: ArrayLike) -> Any:
+        """s(q) at points (n,) or (N, n)."""
         ...
 
 
+class PathBound(Condition, Protocol):
+    """A condition on the distance to a path of postures, in radii; see `orthocas.Corridor`."""
+
+    @property
+    def centre(self) -> Array:
+        """Middle of the box, (n,)."""
+        ...
+
+    @property
+    def unbounded(self) -> tuple[int, ...]:
+        """Joints whose every position lies inside."""
+        ...
+
+    @property
+    def postures(self) -> Array:
+        """The path, (N, n)."""
+        ...
+
+    @property
+    def radius(self) -> Array:
+        """The largest distances (n,), infinite for joints that do not count."""
+        ...
+
+    @property
+    def counted(self) -> Any:
+        """The joints that count."""
+        ...
+
+    @property
+    def lines(self) -> tuple[Array, Array, Array]:
+        """Start, unit direction and squared length of every line, in joints that count and units of the radius."""
+        ...
+
+    def contains(self, q: ArrayLike) -> Any:
+        """Whether points lie in the domain."""
+        ...
+
+    def squared_distance(self, points: Array) -> Array:
+        """Squared distance of points (N, n) from the path in radii, (N,)."""
+        ...
+
+    def lengths(self, steps: Array) -> Array:
+        """Lengths of steps (N, n) in radii, (N,)."""
+        ...
+
+
+_KINDS: dict[str, type[Domain]] = {}
+
+
+def register_domain(kind: type[Domain]) -> type[Domain]:
+    """Let files hold domains of a kind of your own; also a decorator. Its class attribute `name` names it there.
+
+    Raises:
+        InvalidValueError: if it is no kind of domain, or its name is taken.
+    """
+    if not (isinstance(kind, type) and issubclass(kind, Domain)):
+        raise InvalidValueError("kind", repr(kind)[:80], "a class derived from orthocas.tasks.domains.Domain")
+    name = getattr(kind, "name", "")
+    if not isinstance(name, str) or not name or _KINDS.get(name, kind) is not kind:
+        raise InvalidValueError("name of the kind", repr(name)[:80], f"a name other than {', '.join(_KINDS)}")
+    _KINDS[name] = kind
+    return kind
+
+
+def domain_from_data(name: str, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
+    """The domain of a file.
+
+    Raises:
+        UnknownNameError: if no registered kind has that name.
+        OrthocasError: if the data make no sense, and the errors that Python and NumPy have for damaged data.
+    """
+    require_known("domain", name, _KINDS)
+    return _KINDS[name].from_data(task, data, arrays)
+
+
+@register_domain
 @dataclass(frozen=True, eq=False)
-class Box:
+class Box(Domain):
     """All q with |q_i - centre_i| <= half_width_i.
 
     Args:
@@ -109,6 +280,7 @@ class Box:
     half_width: Array
     unbounded: tuple[int, ...] = ()
     name: str = "box"
+    is_box = True
 
     def __init__(self, centre: ArrayLike, half_width: ArrayLike, unbounded: Sequence[int] = ()) -> None:
         middle = frozen_array("centre", centre, (None,))
@@ -149,9 +321,24 @@ class Box:
         """Whether points (n,) or (N, n) lie in the box: a bool, or (N,)."""
         return _between_borders(self, q)
 
+    def within(self, box: "Box") -> "Box":
+        """The other box."""
+        return box
 
+    def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """The unbounded joints."""
+        return {"unbounded": list(self.unbounded)}, {}
+
+    @classmethod
+    def from_data(cls, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> "Domain":
+        """The box of a file."""
+        unbounded = json.part(data, "unbounded", list) if "unbounded" in data else ()  # missing in older files
+        return Box(json.part(arrays, "centre", np.ndarray), json.part(arrays, "half_width", np.ndarray), unbounded)
+
+
+@register_domain
 @dataclass(frozen=True, eq=False)
-class Torus:
+class Torus(Domain):
     """Full turns of n revolute joints, sampled on (-pi, pi].
 
     Example:
@@ -161,31 +348,36 @@ class Torus:
     """
 
     n: int
+    centre: Array = field(repr=False)  #: the zero posture, (n,)
+    half_width: Array = field(repr=False)  #: pi for every joint, (n,)
     name: str = "torus"
+    is_box = True
+    full_turns = True
 
     def __init__(self, n: int) -> None:
         require_count("n", n, most=_MOST_JOINTS)
         object.__setattr__(self, "n", n)
-
-    @property
-    def centre(self) -> Array:
-        """The zero posture, (n,)."""
-        return np.zeros(self.n)
-
-    @property
-    def half_width(self) -> Array:
-        """pi for every joint, (n,)."""
-        return np.full(self.n, np.pi)
+        object.__setattr__(self, "centre", frozen_array("centre", np.zeros(n), (n,)))
+        object.__setattr__(self, "half_width", frozen_array("half_width", np.full(n, np.pi), (n,)))
 
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie on the torus: a bool, or (N,). All finite angles do."""
         return _between_borders(self, q)
 
+    def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Nothing: a torus is known by its number of joints."""
+        return {}, {}
+
+    @classmethod
+    def from_data(cls, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> "Domain":
+        """The torus of the robot's joints."""
+        return cls(task.robot.n)
+
 
 def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
     """Draw points uniformly from the domain, (samples, n)."""
     rng = _generator(domain, samples, seed)
-    return _inside(domain, samples, lambda count: _drawn(domain, rng, count, 1.0))
+    return _inside(domain, samples, lambda count: domain.draw(rng, count, 1.0))
 
 
 def sample_heavily(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
@@ -200,7 +392,7 @@ def sample_heavily(domain: Domain, samples: int, seed: int | tuple[int, ...]) ->
 
     sizes = (samples - 2 * third, third, third)
     parts = [
-        _inside(domain, size, partial(_drawn, domain, rng, power=power))
+        _inside(domain, size, partial(domain.draw, rng, power=power))
         for size, power in zip(sizes, _POWERS, strict=True)
     ]
     return np.vstack(parts)
@@ -216,7 +408,7 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
     Source:
         M. Roberts, docs/references.md [R2018]. The use for training is ours.
     """
-    if isinstance(domain, SelfDrawing):
+    if domain.draws_itself:
         return sample_uniform(domain, samples, seed)
     rng, n = _generator(domain, samples, seed), len(domain.centre)
     g = 1.5
@@ -241,14 +433,14 @@ def contains(domain: Domain, q: ArrayLike) -> Any:
 
 def require_domain(domain: Domain) -> None:
     """Raise InvalidValueError unless the object is a domain."""
-    if isinstance(domain, type) or not isinstance(domain, Domain):
-        raise InvalidValueError("domain", f"a {type(domain).__name__}", "a Box or a Torus")
+    if not isinstance(domain, Domain):
+        raise InvalidValueError("domain", f"a {type(domain).__name__}", "a Box, a Torus or another Domain")
 
 
 def borders(domain: Domain) -> tuple[Array, Array]:
     """Lowest and highest joint positions, (n,) each. They are infinite for unbounded joints, and for a torus."""
     half_width = domain.half_width.copy()
-    half_width[list(domain.unbounded) if isinstance(domain, Box) else slice(None)] = np.inf
+    half_width[slice(None) if domain.full_turns else list(domain.unbounded)] = np.inf
     return domain.centre - half_width, domain.centre + half_width
 
 
@@ -304,11 +496,11 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
     """
     if len(domain.centre) != robot.n:
         raise ShapeError("domain", (len(domain.centre),), (robot.n,))
-    if isinstance(domain, Torus) and any(robot.tree.prismatic):
+    if domain.full_turns and any(robot.tree.prismatic):
         name = robot.joint_names[robot.tree.prismatic.index(True)]
         raise DomainError(f"joint '{name}' is prismatic, expected a Box domain instead of a Torus")
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
-    if isinstance(domain, Box):
+    if not domain.full_turns:
         low, high = borders(domain)
     slack = 1e-9 * domain.half_width  # limits in a URDF are decimal, so sums are not exact
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
@@ -330,14 +522,6 @@ def _generator(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> np.
         require_count("seed", part, least=0)
     require_memory(f"{samples} samples", 32.0 * samples * len(domain.centre))
     return np.random.default_rng(seed)
-
-
-def _drawn(domain: Domain, rng: np.random.Generator, count: int, power: float) -> Array:
-    """Points of the box around the domain with distances |u|^power half-widths from the centre; see `SelfDrawing`."""
-    if isinstance(domain, SelfDrawing):
-        return domain.draw(rng, count, power)
-    u = rng.uniform(-1.0, 1.0, (count, len(domain.centre)))
-    return _scaled(domain, u if power == 1 else np.sign(u) * np.abs(u) ** power)
 
 
 def _scaled(domain: Domain, u: Array) -> Array:

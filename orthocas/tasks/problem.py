@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
 from orthocas.robots.robot import Robot
-from orthocas.tasks.clear_box import ClearBox, clear_domain, row_scale
-from orthocas.tasks.corridor import Corridor
+from orthocas.tasks.clear_box import clear_domain, row_scale
 from orthocas.tasks.domains import Domain, require_within_limits, sample_uniform
 from orthocas.tasks.metric import Metric, MetricSpec, metric_matrices
 from orthocas.tasks.regular_box import regular_box
@@ -74,7 +73,7 @@ class Problem(Shown):
             raise NotRedundantError(task.m, robot.n)
         domain = regular_box(robot, task) if domain is None else domain
         if not isinstance(domain, Domain):
-            raise InvalidValueError("domain", repr(domain), "a Box or a Torus")
+            raise InvalidValueError("domain", repr(domain), "a Box, a Torus or another Domain")
         require_within_limits(robot, domain)
         task = task.with_reference_at(domain.centre)
         domain = clear_domain(domain, task, least_singular_value)
@@ -112,8 +111,7 @@ class Problem(Shown):
             "task": self.task.heading,
             "metric": self.metric.name,
             "domain": f"{domain.name}, half-width {number_list(domain.half_width)}{self._endless}",
-            **({"clear": domain.heading} if isinstance(domain, ClearBox) else {}),
-            **({"corridor": domain.heading} if isinstance(domain, Corridor) else {}),
+            **domain.facts_of_condition(),
             "centre": number_list(domain.centre),
             "robot": self.robot.heading,
         }
@@ -121,7 +119,7 @@ class Problem(Shown):
     @property
     def _endless(self) -> str:
         """The unbounded joints of the domain, in words."""
-        joints = [self.robot.joint_names[k] for k in getattr(self.domain, "unbounded", ())]
+        joints = [self.robot.joint_names[k] for k in self.domain.unbounded]
         return f", unbounded in {listed(joints)}" if joints else ""
 
 
@@ -195,8 +193,8 @@ def relative_singular_values(problem: Problem, points: Array) -> Array:
     idle = np.flatnonzero((J == 0).all(axis=(0, 2)))
     if idle.size:
         raise SingularTaskError(f"task component '{task.labels[idle[0]]}' does not depend on any joint")
-    if isinstance(domain, ClearBox):
-        return np.asarray(domain.singular_values(points))
+    if domain.singular_bound is not None:
+        return np.asarray(domain.singular_bound.singular_values(points))
     if task.turn is not None:
         J = task.batched_frame_jacobian(points)[0].reshape(J.shape)
     return np.asarray(np.linalg.svd(J / row_scale(J, task.units)[:, None], compute_uv=False)[:, -1])

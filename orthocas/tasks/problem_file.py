@@ -10,14 +10,11 @@ import numpy as np
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.clear_box import CLEAR_BOX, ClearBox
-from orthocas.tasks.corridor import CORRIDOR, Corridor
-from orthocas.tasks.domains import Box, Domain, Torus, require_within_limits
+from orthocas.tasks.domains import domain_from_data
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.archive import Stored
-from orthocas.tools.checks import require_known
 from orthocas.tools.expressions import from_tape, require_tape, to_tape
 from orthocas.tools.json import part
 
@@ -32,9 +29,8 @@ def problem_to_data(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]
     arrays = {f"robot_{name}": value for name, value in numbers.items() if isinstance(value, np.ndarray)}
     domain = problem.domain
     arrays |= {"domain_centre": domain.centre, "domain_half_width": domain.half_width}
-    arrays |= {"domain_row_scale": domain.scale} if isinstance(domain, ClearBox) else {}
-    if isinstance(domain, Corridor):
-        arrays |= {"domain_postures": domain.postures, "domain_radius": domain.radius}
+    data, more = domain.to_data()
+    arrays |= {f"domain_{name}": value for name, value in more.items()}
     header = {
         "robot": {name: value for name, value in numbers.items() if not isinstance(value, np.ndarray)},
         "problem": {
@@ -42,8 +38,7 @@ def problem_to_data(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]
             "task": _with_tape(problem.task.recipe, problem.task.function),
             "metric": _with_tape(problem.metric.recipe, problem.metric.function),
             "domain": domain.name,
-            **({"unbounded": list(domain.unbounded)} if isinstance(domain, Box) else {}),
-            **(_condition(domain) if isinstance(domain, ClearBox) else {}),
+            **data,
         },
     }
     return header, arrays
@@ -57,12 +52,6 @@ def problem_from_data(header: Mapping[str, Any], arrays: Mapping[str, Stored]) -
     """
     robot = Robot(_tree(part(header, "robot", dict), arrays))
     return _problem(robot, part(header, "problem", dict), arrays)
-
-
-def _condition(domain: ClearBox) -> dict[str, Any]:
-    """The bound, and the rows that count if they are not J_x: older files, which do not name them, mean J_x."""
-    of_x = domain.jacobian_function is domain.task.jacobian_function
-    return {"least_singular_value": domain.least_singular_value, **({} if of_x else {"judged_rows": domain.rows})}
 
 
 def _with_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:
@@ -88,26 +77,10 @@ def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTre
 
 
 def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
-    domain = _domain(robot.n, data, arrays)
-    task, metric = _task(robot, part(data, "task", dict)), _metric(robot, part(data, "metric", dict))
-    if data["domain"] == CLEAR_BOX and isinstance(domain, Box):
-        require_within_limits(robot, domain)  # before the task is evaluated there
-        scale = part(arrays, "domain_row_scale", np.ndarray)
-        rows = part(data, "judged_rows", str) if "judged_rows" in data else "frame" if task.turn is None else "x"
-        domain = ClearBox(domain, task, part(data, "least_singular_value", float), scale, rows)
-    if data["domain"] == CORRIDOR and isinstance(domain, Box):
-        domain = Corridor(domain, *(part(arrays, f"domain_{name}", np.ndarray) for name in ("postures", "radius")))
-    return Problem(robot, task, metric, domain, part(data, "name", str))
-
-
-def _domain(n: int, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Domain:
-    """The box or torus of a file; for a ClearBox or a Corridor its box."""
     kind = part(data, "domain", str)
-    require_known("domain", kind, ("box", "torus", CLEAR_BOX, CORRIDOR))
-    if kind == "torus":
-        return Torus(n)
-    unbounded = part(data, "unbounded", list) if "unbounded" in data else ()  # missing in older files
-    return Box(part(arrays, "domain_centre", np.ndarray), part(arrays, "domain_half_width", np.ndarray), unbounded)
+    task, metric = _task(robot, part(data, "task", dict)), _metric(robot, part(data, "metric", dict))
+    own = {name.removeprefix("domain_"): array for name, array in arrays.items() if name.startswith("domain_")}
+    return Problem(robot, task, metric, domain_from_data(kind, task, data, own), part(data, "name", str))
 
 
 def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
