@@ -115,6 +115,24 @@ def test_packages_import_in_one_order(types: bool) -> None:
             assert not up, f"{name} imports {up}, which stand above it"
 
 
+def test_picture_of_the_packages_is_the_code() -> None:
+    """Drawn by tools/packages.py: its arrows lead just where imports do, and its files are all there are."""
+    page = (ROOT / "CONTRIBUTING.md").read_text()
+    arrows, sizes = re.findall(r"^    (\w+) --> (\w+)$", page, re.MULTILINE), re.findall(r"(\w+)/<br>(\d+) files", page)
+    inside = [package(name) for name in SOURCES if name.count(".") > 1]
+    assert {name: int(size) for name, size in sizes} == {name: inside.count(name) for name in inside}
+    drawn, real = {(a, b) for a, b in arrows}, set[tuple[str, str]]()
+    for name, path in MODULES.items():
+        if package(name) in inside:
+            real |= {(package(name), package(other)) for other in imports_of(path, inside=True)}
+    assert closure(drawn) == closure({(a, b) for a, b in real if {a, b} <= set(inside) - {"tools"} and a != b})
+
+
+def closure(arrows: set[tuple[str, str]]) -> set[tuple[str, str]]:
+    longer = arrows | {(a, d) for a, b in arrows for c, d in arrows if b == c}
+    return arrows if longer == arrows else closure(longer)
+
+
 def test_nothing_imports_the_faces() -> None:
     for name, path in MODULES.items():
         if name not in FACES:

@@ -1,6 +1,6 @@
 """[AS2023] Fig. 2: a spring along the self-motion manifold, and a projected spring that is stuck, with real numbers.
 
-The arm and both springs are those of `orthocas.reproduce.hidden_spring`. Each joint axis is scaled by the square root
+The arm and both springs are those of `hidden_spring.py`. Each joint axis is scaled by the square root
 of the joint's stiffness. So the energy of the posture spring is proportional to the square of its drawn length, its
 torque points along the spring, and a torque that the projector hides is orthogonal to the curve.
 """

@@ -1,6 +1,6 @@
 """[AS2023] Fig. 22: interleaved steps in x and xi1 with PD+ and linear coordinates, where leaves have low curvature.
 
-Arm, base, gains and steps are defined in `orthocas.reproduce.planar_loop`. Fig. 23 uses the same with fitted
+Arm, base, gains and steps are defined in `planar_loop.py`. Fig. 23 uses the same with fitted
 coordinates.
 """
 

@@ -81,7 +81,7 @@ def draw_log(path: str | Path, chart: Chart) -> Drawing:
     """Draw logged joint positions, and the task and coordinates that they have on a chart.
 
     Args:
-        path: CSV file, see `orthocas.reproduce.joint_log`.
+        path: CSV file, see `joint_log.py`.
         chart: a chart of the arm. Where the log leaves its domain, coordinates mean nothing; a number tells the share.
 
     Raises:
