@@ -73,9 +73,11 @@ from orthocas.tasks.domains import contains as contains
 from orthocas.tasks.domains import default_box as default_box
 from orthocas.tasks.domains import register_domain as register_domain
 from orthocas.tasks.metric import Metric as Metric
+from orthocas.tasks.metric import register_metric as register_metric
 from orthocas.tasks.problem import Problem as Problem
 from orthocas.tasks.problem import check as check
 from orthocas.tasks.task import Task as Task
+from orthocas.tasks.task import register_task as register_task
 from orthocas.tools.progress import progress as progress
 from orthocas.viewer.view import view as view
 

@@ -237,6 +237,8 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["fit", "iiwa", "--weights", "1000,nan"], "lambda2 is nan"),
         (["fit", "iiwa", "--weights", "1000"], "two to five numbers"),
         (["fit", "iiwa", "--weights", "0,1"], "lambda1 is 0.0"),
+        (["fit", "iiwa", "--weights", "calm=3"], "unknown loss term 'calm'"),
+        (["fit", "iiwa", "--weights", "1000,30,calm=much"], "--weights calm is ['much']"),
         (["fit", "iiwa", "--out", "no/such/folder/x.orthocas"], "folder no/such/folder does not exist"),
         (["fit", "iiwa", "--out", "/proc/x.orthocas"], "cannot write /proc/x.orthocas"),
         (["fit"], "Missing argument"),

@@ -12,7 +12,7 @@ from scipy.linalg import eigvalsh
 from simulate_command import FILES, report_of, written
 
 import orthocas as oc
-from orthocas.cli.controller_argument import ControllerOptions, build_controller
+from orthocas.cli.controller_argument import build_controller
 from orthocas.control import ControlStatus, matched_posture_stiffness, matched_stiffness
 from orthocas.fitting.fit import Fit
 from orthocas.simulation import Trajectory
@@ -91,11 +91,11 @@ def test_projectors_move_extra_coordinates_on_request(run_simulate: Run, chart: 
 
 
 def test_gains_of_projectors_of_extra_coordinates(chart: oc.Chart) -> None:
-    options = ControllerOptions(second="xi")
+    options = {"second": "xi"}
     law = build_controller("projector", chart, options, None)
-    direct = build_controller("impedance", chart, ControllerOptions(), None)
+    direct = build_controller("impedance", chart, {}, None)
     np.testing.assert_array_equal(law.gains["stiffness"], direct.gains["stiffness"])
-    options = ControllerOptions(second="xi", feedback="1,2,3")
+    options = {"second": "xi", "feedback": "1,2,3"}
     assert build_controller("kinematic_projector", chart, options, None).gains["feedback"].tolist() == [1, 2, 3]
 
 
@@ -104,8 +104,8 @@ def test_springs_that_are_not_given_are_matched(chart: oc.Chart) -> None:
     points = sample_uniform(chart.problem.domain, 256, 0)
     J, M = chart.jacobian(points), np.array([chart.problem.robot.mass_matrix(q) for q in points])
     half = np.linalg.inv(J)
-    stiffness = build_controller("pd_plus", chart, ControllerOptions(), None).gains["stiffness"]
-    projector = build_controller("projector", chart, ControllerOptions(), None).gains["stiffness"]
+    stiffness = build_controller("pd_plus", chart, {}, None).gains["stiffness"]
+    projector = build_controller("projector", chart, {}, None).gains["stiffness"]
     np.testing.assert_array_equal(stiffness, matched_stiffness(chart))
     np.testing.assert_array_equal(projector[1:], matched_posture_stiffness(chart.problem))
     for K, inertias in ((stiffness, half.transpose(0, 2, 1) @ M @ half), (projector[1:], M)):
@@ -120,11 +120,11 @@ def test_gains_and_limits_are_those_given(run_simulate: Run, chart: oc.Chart) ->
     report = report_of(run_simulate, "impedance", *words)
     assert report["gains"] == {"stiffness": [100, 2000, 3000], "damping_ratio": [0.9] * 3, "limit": [400] * 3}
     assert report["coupling"] == "decoupled"
-    options = ControllerOptions(stiffness="300", posture_stiffness="30,20,10")
+    options = {"stiffness": "300", "posture_stiffness": "30,20,10"}
     projector = build_controller("projector", chart, options, "50,60,70").gains
     assert projector["stiffness"].tolist() == [300, 30, 20, 10]
     assert projector["limit"].tolist() == [50, 60, 70]
-    each, all_of_them = ControllerOptions(feedback="1,2,3,4"), ControllerOptions(feedback="5")
+    each, all_of_them = {"feedback": "1,2,3,4"}, {"feedback": "5"}
     assert build_controller("kinematic_projector", chart, each, None).gains["feedback"].tolist() == [1, 2, 3, 4]
     assert build_controller("kinematic", chart, all_of_them, None).gains["feedback"].tolist() == [5, 5, 5]
 

@@ -108,15 +108,27 @@ def test_law_brakes_and_becomes_c(tmp_path: Path) -> None:
 from orthocas.codegen import check_c
 proof = check_c(oc.generate_c(usual, "proved", law), usual, law, states=100)
 print(max(proof.differences.values()))
-from orthocas.control import law_of
-assert law_of("drag") is Drag
+import json, sys
+from orthocas.cli import main
+usual.save("usual.orthocas")
+with open("stay.json", "w") as file:
+    json.dump({"points": [{"time": 0.1, "move": {}}]}, file)
+words = "simulate usual.orthocas --controller drag --drag 7 --steps stay.json --out run --animation none"
+sys.argv = ["orthocas", *words.split()]
+try:
+    main()
+except SystemExit as end:
+    assert not end.code
+with open("run/report.json") as file:
+    assert json.load(file)["gains"]["drag"] == [7, 7, 7]
 """
-    _, (speed,), (difference,) = run(tmp_path, TERM, LAW, more)
+    lines = python("\n".join([BLOCKS[0], TERM, LAW, more]), tmp_path).splitlines()
+    speed, difference = (float(line) for line in lines[1:3])
     assert speed < 0.1 * 0.3
     assert difference < 1e-10
     header = next((tmp_path / "drag").glob("*.h")).read_text()
     assert "tau = g(q) - D dq" in header
-    assert "damping_ratio[3]; /* N m s/rad, >= 0 */" in header
+    assert "drag[3]; /* N m s/rad, >= 0 */" in header
 
 
 def test_task_and_metric_keep_names_and_units_in_files(tmp_path: Path) -> None:

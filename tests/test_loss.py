@@ -8,6 +8,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.bases import JointSpace
+from orthocas.cli.problem_argument import parse_weights
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import graph_objective
 from orthocas.fitting.array_objective import ArrayObjective
@@ -272,3 +273,9 @@ def test_batches_share_out_what_is_left_of_dropped_samples() -> None:
         assert len(parts) == 4
         assert all(np.isfinite(part.value(theta)) for part in parts)
     assert set(objective._graphs.known) <= {20, len(sample_problem(problem, 64, 1))}
+
+
+def test_weights_of_a_command_line_have_terms_by_name() -> None:
+    """Numbers stand for the terms in order; without any, those of the package keep their defaults."""
+    assert parse_weights("1000,30, calm=3", None) == Weights(1000, 30, 0, 0, 0, {"calm": 3.0})
+    assert parse_weights("calm=5", "metric") == Weights(extra={"calm": 5.0}, angles="metric")

@@ -8,21 +8,10 @@ import typer
 from orthocas.charts.chart import Chart
 from orthocas.cli.controller_argument import (
     CONTROLLERS,
-    ControllerOptions,
-    CouplingName,
-    DampingName,
-    DampingRatio,
-    DampingStiffness,
-    Feedback,
-    GravityName,
-    InputNames,
     Limit,
-    ModelName,
-    PostureStiffness,
-    SecondName,
-    Stiffness,
     build_controller,
-    require_options,
+    require_settings,
+    with_settings,
 )
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows
 from orthocas.codegen.generate import generate_c
@@ -36,23 +25,14 @@ from orthocas.tools.plugins import opened
 _NONE = "none"
 
 
+@with_settings(for_codegen=True)
 def codegen(
     chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file, or an atlas file.")],
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)} or {_NONE}.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the generated library.")],
+    settings: dict[str, str],
     name: Annotated[str | None, typer.Option("--name", help="Prefix of all C names; default: from the chart.")] = None,
-    stiffness: Stiffness = None,
-    damping_ratio: DampingRatio = None,
-    coupling: CouplingName = None,
-    damping: DampingName = None,
-    posture_stiffness: PostureStiffness = None,
-    second: SecondName = None,
-    feedback: Feedback = None,
     limit: Limit = None,
-    damping_stiffness: DampingStiffness = None,
-    model: ModelName = None,
-    gravity: GravityName = None,
-    inputs: InputNames = None,
     along: Annotated[
         Path | None,
         typer.Option("--along", metavar="POSTURES.csv", help="Of an atlas: the charts of these postures."),
@@ -71,23 +51,14 @@ def codegen(
     json: AsJson = False,
 ) -> None:
     """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
-    options = ControllerOptions(
-        *(stiffness, damping_ratio, coupling, posture_stiffness, feedback),
-        damping=damping,
-        damping_stiffness=damping_stiffness,
-        model=model,
-        gravity=gravity,
-        inputs=inputs,
-        second=second,
-    )
     if controller != _NONE:
-        require_options(controller, options)
-    elif options != ControllerOptions() or limit is not None:
+        require_settings(controller, settings)
+    elif settings or limit is not None:
         raise InvalidValueError("--controller", _NONE, "a controller, because a controller option was given")
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         shown, loaded = _opened(chart, along, radius)
         loaded.function("xi")  # raises for grown charts
-        law = None if controller == _NONE else build_controller(controller, loaded, options, limit)
+        law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
         generated = generate_c(shown, out, law, name, force, single_precision=single_precision)
         remarks = [] if law is None else law.remarks()
     proof = check_c(generated, shown, law) if check else None

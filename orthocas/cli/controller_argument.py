@@ -1,64 +1,20 @@
 """Builds a controller from command-line options, and rejects options that belong to another controller."""
 
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
 
 import typer
 
 from orthocas.charts.chart import Chart
+from orthocas.cli.output import spread
 from orthocas.cli.problem_argument import parse_numbers
-from orthocas.control.controller import Controller, Law
+from orthocas.control.controller import Controller
+from orthocas.control.gains import Setting
 from orthocas.control.registry import law_names, law_of
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array
 
 CONTROLLERS = law_names()
-_OF_THE_PLANT = ("mass_factor", "friction")  # options for laws that command torques
-_CHOICES = ("coupling", "damping", "model", "gravity", "inputs", "second")  # options that are words
-
-Stiffness = Annotated[
-    str | None,
-    typer.Option("--stiffness", help='"100", or "100,50,..." per quantity; default: modes around 6 Hz.'),
-]
-DampingRatio = Annotated[
-    str | None, typer.Option("--damping-ratio", help='"0.7", or "0.7,1,..." per quantity; default: 0.7.')
-]
-CouplingName = Annotated[
-    str | None, typer.Option("--coupling", help="coupled (default) or decoupled; for impedance and pd_plus.")
-]
-DampingName = Annotated[
-    str | None, typer.Option("--damping", help="double_diagonal (default) or square_root; for impedance and pd_plus.")
-]
-DampingStiffness = Annotated[
-    str | None,
-    typer.Option(
-        "--damping-stiffness", help="Design the damping for this stiffness, so that --stiffness may be 0 in places."
-    ),
-]
-ModelName = Annotated[
-    str | None, typer.Option("--model", help="own (default), or given: mass matrix and torques become inputs.")
-]
-GravityName = Annotated[
-    str | None, typer.Option("--gravity", help="law (default) compensates gravity; robot: the robot does so itself.")
-]
-InputNames = Annotated[
-    str | None, typer.Option("--inputs", help="Additional inputs: payload, wrench, extra_torque, with commas between.")
-]
-PostureStiffness = Annotated[
-    str | None,
-    typer.Option(
-        "--posture-stiffness",
-        help="Stiffness of the springs in the second task; for projector. Default: modes around 6 Hz.",
-    ),
-]
-SecondName = Annotated[
-    str | None,
-    typer.Option("--second", help="joints (default) or xi, what the projector moves; for projector laws."),
-]
-Feedback = Annotated[
-    str | None,
-    typer.Option("--feedback", help="Feedback gain [1/s]; for kinematic and kinematic_projector. Default: 0."),
-]
 Limit = Annotated[
     str | None,
     typer.Option(
@@ -67,58 +23,74 @@ Limit = Annotated[
 ]
 
 
-@dataclass(frozen=True)
-class ControllerOptions:
-    """The command-line options that only some controllers take."""
+def with_settings(for_codegen: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator of commands: the settings of all laws, as options, take the place of the parameter `settings`.
 
-    stiffness: str | None = None
-    damping_ratio: str | None = None
-    coupling: str | None = None
-    posture_stiffness: str | None = None
-    feedback: str | None = None
-    mass_factor: float | None = None
-    friction: str | None = None
-    damping: str | None = None
-    damping_stiffness: str | None = None
-    second: str | None = None
-    model: str | None = None
-    gravity: str | None = None
-    inputs: str | None = None
+    The command gets those that were given, by name, as texts.
+    """
+    known = {
+        name: setting
+        for law in map(law_of, law_names())
+        for name, setting in law.options.items()
+        if for_codegen or not setting.codegen_only
+    }
+    options = {
+        name: Annotated[str | None, typer.Option(_option(name), help=_help(name, setting))]
+        for name, setting in known.items()
+    }
+    return spread("settings", options, lambda given: {name: text for name, text in given.items() if text is not None})
 
 
-def require_options(name: str, options: ControllerOptions) -> None:
-    """Check that a controller exists and takes every option that was given.
+def require_settings(name: str, settings: Mapping[str, str]) -> None:
+    """Check that a controller exists and takes every setting that was given.
 
     Raises:
         UnknownNameError: if there is no such controller.
-        InvalidValueError: for an option that the controller would ignore.
+        InvalidValueError: for a setting that the controller would ignore.
     """
-    taken = _taken(law_of(name))
-    for field, value in vars(options).items():
-        if value is not None and field not in taken:
-            takers = ", ".join(other for other in CONTROLLERS if field in _taken(law_of(other)))
-            option = f"--{field.replace('_', '-')}"
-            raise InvalidValueError(option, value, f"no {option} with {name}, because it belongs to {takers}")
+    law = law_of(name)
+    for field, text in settings.items():
+        if field not in law.options:
+            raise InvalidValueError(_option(field), text, _belongs(field, name, _takers(field)))
 
 
-def build_controller(name: str, chart: Chart, options: ControllerOptions, limit: str | None) -> Controller:
-    """Build the controller that a command line describes; `require_options` has checked the options.
+def require_torques(name: str, **words: Any) -> None:
+    """Raise InvalidValueError for conditions of the plant that matter only to laws that command torques."""
+    for field, value in words.items():
+        if value is not None and law_of(name).command != "torque":
+            takers = [other for other in law_names() if law_of(other).command == "torque"]
+            raise InvalidValueError(_option(field), value, _belongs(field, name, takers))
+
+
+def build_controller(name: str, chart: Chart, settings: Mapping[str, str], limit: str | None = None) -> Controller:
+    """Build the controller that a command line describes; `require_settings` has checked the settings.
 
     Raises:
         OrthocasError: if anything does not fit together.
     """
     law = law_of(name)
-    words = {field: value for field in law.options if (value := getattr(options, field)) is not None}
-    settings = {
-        field: word if field in _CHOICES else _one_or_all(f"--{field.replace('_', '-')}", word)
-        for field, word in words.items()
+    values = {
+        field: text if law.options[field].is_word else _one_or_all(_option(field), text)
+        for field, text in settings.items()
     }
-    return law.on_chart(chart, None if limit is None else _one_or_all("--limit", limit), **settings)
+    return law.on_chart(chart, None if limit is None else _one_or_all("--limit", limit), **values)
 
 
-def _taken(law: type[Law]) -> tuple[str, ...]:
-    """Names of the options that a law takes."""
-    return (*law.options, *(_OF_THE_PLANT if law.command == "torque" else ()))
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _help(name: str, setting: Setting) -> str:
+    takers = _takers(name)
+    return setting.help + ("" if len(takers) == len(law_names()) else f" For {', '.join(takers)}.")
+
+
+def _takers(name: str) -> list[str]:
+    return [law for law in law_names() if name in law_of(law).options]
+
+
+def _belongs(field: str, name: str, takers: list[str]) -> str:
+    return f"no {_option(field)} with {name}, because it belongs to {', '.join(takers)}"
 
 
 def _one_or_all(option: str, text: str) -> Array:

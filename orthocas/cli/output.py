@@ -1,6 +1,8 @@
-"""Output of the commands: aligned text for people, or one JSON object."""
+"""What commands share: how options are read, and output as aligned text for people or one JSON object."""
 
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -33,6 +35,38 @@ _UNEVEN = 30.0  # ratio of gradient lengths above which the same gain means too 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 
 Force = Annotated[bool, typer.Option("--force", help="Replace files of the same names that orthocas did not write.")]
+
+
+def spread(
+    parameter: str, options: Mapping[str, Any], made: Callable[[dict[str, Any]], Any]
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator of commands: options take the place of one parameter.
+
+    Args:
+        parameter: its name.
+        options: annotations of the options, by name; they are optional.
+        made: the parameter, from the values of the options.
+    """
+
+    def decorated(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command).parameters.values()
+        added = [
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+            for name, annotation in options.items()
+        ]
+        parts = [added if part.name == parameter else [part.replace(kind=part.KEYWORD_ONLY)] for part in own]
+
+        @wraps(command)
+        def called(**given: Any) -> None:
+            chosen = {name: given.pop(name) for name in options}
+            command(**{parameter: made(chosen)}, **given)
+
+        parameters = [part for some in parts for part in some]
+        vars(called)["__signature__"] = inspect.Signature(parameters)
+        called.__annotations__ = {part.name: part.annotation for part in parameters}
+        return called
+
+    return decorated
 
 
 def print_json(data: Mapping[str, Any]) -> None:

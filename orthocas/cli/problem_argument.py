@@ -1,9 +1,7 @@
 """Arguments that describe a problem: a name or a robot file, task, metric, domain, weights."""
 
-import inspect
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
-from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +10,7 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.family import Parametrisation
-from orthocas.cli.output import number, whole_number
+from orthocas.cli.output import number, spread, whole_number
 from orthocas.errors import InvalidValueError, UnknownNameError
 from orthocas.fitting.corridor_problem import RADIUS, corridor_problem
 from orthocas.fitting.probe import Bounds
@@ -71,7 +69,6 @@ _OPTIONS: dict[str, Any] = {
 ROBOT = ("tip", "lock", "tool")
 CHAIN = (*ROBOT, "task", "metric")
 DOMAIN = ("centre", "home", "half_width")
-_WORDS = "words"  # the parameter of a command that takes its `ProblemOptions`
 _NUMBERS = ("task", "mutual", "regularity", "length", "folds")
 
 ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem or a URDF file.")]
@@ -110,27 +107,8 @@ class ProblemOptions:
 
 def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A decorator of commands: options of these names take the place of the parameter `words`, a `ProblemOptions`."""
-
-    def decorated(command: Callable[..., None]) -> Callable[..., None]:
-        own = inspect.signature(command).parameters.values()
-        options = [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=_OPTIONS[name])
-            for name in names
-        ]
-        spread = [[*options] if part.name == _WORDS else [part.replace(kind=part.KEYWORD_ONLY)] for part in own]
-
-        @wraps(command)
-        def called(**given: Any) -> None:
-            chosen = {name: given.pop(name) for name in names}
-            chosen["lock"] = tuple(chosen.get("lock") or ())
-            command(words=ProblemOptions(**chosen), **given)
-
-        parameters = [part for parts in spread for part in parts]
-        vars(called)["__signature__"] = inspect.Signature(parameters)
-        called.__annotations__ = {part.name: part.annotation for part in parameters}
-        return called
-
-    return decorated
+    options = {name: _OPTIONS[name] for name in names}
+    return spread("words", options, lambda given: ProblemOptions(**{**given, "lock": tuple(given.get("lock") or ())}))
 
 
 def is_robot_file(name: str) -> bool:
@@ -224,7 +202,7 @@ SampleCount = Annotated[
     typer.Option("--samples", parser=whole_number, help="Number of training samples; default: from the problem size."),
 ]
 WeightsText = Annotated[
-    str, typer.Option("--weights", help='"lambda1,lambda2", optionally followed by lambda3, lambda4 and lambda5.')
+    str, typer.Option("--weights", help='"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own.')
 ]
 AnglesName = Annotated[
     str | None,
@@ -243,11 +221,15 @@ WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _NUMBE
 
 
 def parse_weights(text: str, angles: str | None) -> Weights:
-    """Read two to five numbers, such as "1000,30" or "1000,30,150,0.01,1000", with the kind of angles."""
-    numbers = parse_numbers("--weights", text).tolist()
-    if not 2 <= len(numbers) <= 5:
-        raise InvalidValueError("--weights", repr(text), "two to five numbers")
-    return replace(Weights.of(numbers), angles=angles)
+    """Read two to five numbers and terms by name, such as "1000,30,quiet=5", with the kind of angles."""
+    words = [word.strip() for word in text.split(",")]
+    numbers = [float(value) for word in words if "=" not in word for value in parse_numbers("--weights", word)]
+    if not (2 <= len(numbers) <= 5 or (not numbers and text)):
+        raise InvalidValueError("--weights", repr(text), "two to five numbers, and NAME=NUMBER for terms of your own")
+    extra = {}
+    for name, _, value in (word.partition("=") for word in words if "=" in word):
+        extra[name.strip()] = float(parse_numbers(f"--weights {name}", value)[0])
+    return replace(Weights.of(numbers) if numbers else Weights(), extra=extra, angles=angles)
 
 
 def suggested(

@@ -11,18 +11,11 @@ import typer
 from orthocas.charts.chart import Chart
 from orthocas.cli.controller_argument import (
     CONTROLLERS,
-    ControllerOptions,
-    CouplingName,
-    DampingName,
-    DampingRatio,
-    DampingStiffness,
-    Feedback,
     Limit,
-    PostureStiffness,
-    SecondName,
-    Stiffness,
     build_controller,
-    require_options,
+    require_settings,
+    require_torques,
+    with_settings,
 )
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
 from orthocas.cli.problem_argument import parse_numbers
@@ -52,6 +45,7 @@ CVODES = "cvodes"  #: the default plant
 _DIVERGED = 1  # exit code when the integrator gave up: the input was valid but the run failed
 
 
+@with_settings(for_codegen=False)
 def simulate(
     chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)}.")],
@@ -59,15 +53,8 @@ def simulate(
         Path, typer.Option("--steps", help="JSON file with the motion of the robot, see docs/simulate.md.")
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder for the run, its pictures and the report.")],
-    stiffness: Stiffness = None,
-    damping_ratio: DampingRatio = None,
-    coupling: CouplingName = None,
-    damping: DampingName = None,
-    posture_stiffness: PostureStiffness = None,
-    second: SecondName = None,
-    feedback: Feedback = None,
+    settings: dict[str, str],
     limit: Limit = None,
-    damping_stiffness: DampingStiffness = None,
     rate: Annotated[
         float | None, typer.Option("--rate", parser=number, help="Control rate [Hz]; default: continuous control.")
     ] = None,
@@ -104,16 +91,15 @@ def simulate(
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
-    words = (stiffness, damping_ratio, coupling, posture_stiffness, feedback, mass_factor, friction)
-    options = ControllerOptions(*words, damping, damping_stiffness, second)
-    require_options(controller, options)
+    require_settings(controller, settings)
+    require_torques(controller, mass_factor=mass_factor, friction=friction)
     _require_plant(plant, rate, supervised)
     _require_folder(out, animation, force)
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         loaded = Chart.load(chart)
         loaded.function("xi")  # raises for grown charts
         plan = read_steps(steps, loaded)
-        law = build_controller(controller, loaded, options, limit)
+        law = build_controller(controller, loaded, settings, limit)
     conditions = {
         "control_rate": rate,
         "plant": _plant(plant, loaded.problem.robot, mass_factor),

@@ -1,7 +1,7 @@
 """Controllers as CasADi functions of state, reference and gains, with the references they follow."""
 
 from orthocas.control.controller import Controller, ControlStatus, Law
-from orthocas.control.gains import matched_posture_stiffness, matched_stiffness
+from orthocas.control.gains import Setting, matched_posture_stiffness, matched_stiffness
 from orthocas.control.kinematic import Kinematic
 from orthocas.control.operational_space import DampingCheck, Impedance, Modes, PDPlus
 from orthocas.control.posture import joint_path, posture_reference
@@ -25,6 +25,7 @@ __all__ = [
     "Reference",
     "RunTimeModel",
     "Safety",
+    "Setting",
     "joint_path",
     "law_names",
     "law_of",

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.control.gains import Setting
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import Domain, reach
@@ -226,7 +227,7 @@ class Law(Controller, Protocol):
 
     name: ClassVar[str]
     command: ClassVar[Command]
-    options: ClassVar[tuple[str, ...]]  #: names of the settings that `on_chart` takes
+    options: ClassVar[Mapping[str, Setting]]  #: the settings that `on_chart` takes, by name
 
     @classmethod
     def on_chart(cls, chart: "Chart", limit: ArrayLike | None = None, **settings: Any) -> Self:

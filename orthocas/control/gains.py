@@ -1,4 +1,6 @@
-"""Gains by stiffness and damping ratio, and stiffness that two laws have in common."""
+"""Settings that laws share: gains by stiffness and damping ratio, and the stiffness that two laws have in common."""
+
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -22,6 +24,26 @@ SPRING_FREQUENCY = 12 * np.pi  #: [rad/s], 6 Hz: arms whose masses are 20 % off 
 FASTEST = 36 * np.pi  #: [rad/s], 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7
 _SAMPLES, _SEED = 512, 0
 _TOO_FAST = 3000.0  # weight of the squared logarithm by which a mode exceeds the fastest frequency
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting of a law that commands offer as an option.
+
+    Example:
+        >>> from orthocas.control import Setting
+        >>> Setting("Damping of the joints [N m s/rad]; default: 1.")
+        Setting(help='Damping of the joints [N m s/rad]; default: 1.', is_word=False, codegen_only=False)
+    """
+
+    help: str  #: what it is, with its unit and default
+    is_word: bool = False  #: passed on as text; otherwise it is one number, or several with commas between
+    codegen_only: bool = False  #: about inputs that simulations do not give, so `orthocas simulate` does not offer it
+
+
+STIFFNESS_SETTING = Setting('"100", or "100,50,..." per quantity; default: modes around 6 Hz.')
+DAMPING_RATIO_SETTING = Setting('"0.7", or "0.7,1,..." per quantity; default: 0.7.')
+FEEDBACK_SETTING = Setting("Feedback gain [1/s]; default: 0.")
 
 
 def positive_gains(name: str, value: ArrayLike, length: int) -> Array:

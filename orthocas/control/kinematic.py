@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
 from orthocas.control.controller import Command, fallback_function, guarded_graph, law_facts, named_inputs
-from orthocas.control.gains import FEEDBACK, LIMIT, command_limit, non_negative_gains
+from orthocas.control.gains import FEEDBACK, FEEDBACK_SETTING, LIMIT, Setting, command_limit, non_negative_gains
 from orthocas.control.linear_algebra import block_inertia, median_volume
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
@@ -48,7 +48,7 @@ class Kinematic(Shown):
     energy_graph: ClassVar[None] = None
     gain_units: ClassVar[Mapping[str, str]] = {"feedback": FEEDBACK, "limit": LIMIT}
     settings: ClassVar[Mapping[str, str]] = {}
-    options: ClassVar[tuple[str, ...]] = ("feedback",)
+    options: ClassVar[Mapping[str, Setting]] = {"feedback": FEEDBACK_SETTING}
 
     def __init__(self, chart: Chart, feedback: ArrayLike = 0.0, limit: ArrayLike | None = None) -> None:
         require_kind("chart", chart, Chart)

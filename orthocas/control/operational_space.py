@@ -20,8 +20,11 @@ from orthocas.control.controller import (
 )
 from orthocas.control.gains import (
     DAMPING_RATIO,
+    DAMPING_RATIO_SETTING,
     LIMIT,
     STIFFNESS,
+    STIFFNESS_SETTING,
+    Setting,
     command_limit,
     matched_stiffness,
     mobility,
@@ -142,10 +145,22 @@ class _OperationalSpace(Shown):
     name: ClassVar[str]
     force: ClassVar[str]  #: the formula, without torques that do not act through the coordinates
     command: ClassVar[Command] = "torque"
-    options: ClassVar[tuple[str, ...]] = (
-        *("stiffness", "damping_ratio", "coupling", "damping"),
-        *("damping_stiffness", "model", "gravity", "inputs"),
-    )
+    options: ClassVar[Mapping[str, Setting]] = {
+        "stiffness": STIFFNESS_SETTING,
+        "damping_ratio": DAMPING_RATIO_SETTING,
+        "coupling": Setting("coupled (default) or decoupled.", is_word=True),
+        "damping": Setting("double_diagonal (default) or square_root.", is_word=True),
+        "damping_stiffness": Setting("Design the damping for this stiffness, so that --stiffness may be 0 in places."),
+        "model": Setting(
+            "own (default), or given: mass matrix and torques become inputs.", is_word=True, codegen_only=True
+        ),
+        "gravity": Setting(
+            "law (default) compensates gravity; robot: the robot does so itself.", is_word=True, codegen_only=True
+        ),
+        "inputs": Setting(
+            "Additional inputs: payload, wrench, extra_torque, with commas between.", is_word=True, codegen_only=True
+        ),
+    }
 
     def __init__(
         self,

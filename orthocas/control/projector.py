@@ -19,10 +19,14 @@ from orthocas.control.controller import (
 )
 from orthocas.control.gains import (
     DAMPING_RATIO,
+    DAMPING_RATIO_SETTING,
     FEEDBACK,
+    FEEDBACK_SETTING,
     LIMIT,
     SECOND_FORCE,
     STIFFNESS,
+    STIFFNESS_SETTING,
+    Setting,
     command_limit,
     finite_gains,
     matched_posture_stiffness,
@@ -36,6 +40,8 @@ from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, frozen_array, require_kind
+
+_SECOND = Setting("joints (default) or xi, what the projector moves.", is_word=True)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -71,7 +77,7 @@ class KinematicProjector(TwoTaskLaw):
     energy: ClassVar[None] = None
     energy_graph: ClassVar[None] = None
     gain_units: ClassVar[Mapping[str, str]] = {"feedback": FEEDBACK, "limit": LIMIT}
-    options: ClassVar[tuple[str, ...]] = ("feedback", "second")
+    options: ClassVar[Mapping[str, Setting]] = {"feedback": FEEDBACK_SETTING, "second": _SECOND}
 
     def __init__(
         self,
@@ -195,7 +201,12 @@ class Projector(TwoTaskLaw):
         "second_force": SECOND_FORCE,
         "limit": LIMIT,
     }
-    options: ClassVar[tuple[str, ...]] = ("stiffness", "damping_ratio", "posture_stiffness", "second")
+    options: ClassVar[Mapping[str, Setting]] = {
+        "stiffness": STIFFNESS_SETTING,
+        "damping_ratio": DAMPING_RATIO_SETTING,
+        "posture_stiffness": Setting("Stiffness of the springs in the second task; default: modes around 6 Hz."),
+        "second": _SECOND,
+    }
 
     def __init__(
         self,

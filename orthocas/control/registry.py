@@ -1,6 +1,9 @@
 """Control laws by name, for the command line, and how to add your own."""
 
+from collections.abc import Mapping
+
 from orthocas.control.controller import Law
+from orthocas.control.gains import Setting
 from orthocas.control.kinematic import Kinematic
 from orthocas.control.operational_space import Impedance, PDPlus
 from orthocas.control.projector import KinematicProjector, Projector
@@ -21,6 +24,9 @@ def register(law: type[Law]) -> None:
         raise InvalidValueError("name", repr(law.name), f"a free name, because {_LAWS[law.name].__name__} has this one")
     if not named or not callable(getattr(law, "on_chart", None)):
         raise InvalidValueError("law", repr(law)[:80], "the class of a law")
+    options = getattr(law, "options", None)
+    if not isinstance(options, Mapping) or not all(isinstance(setting, Setting) for setting in options.values()):
+        raise InvalidValueError(f"options of {law.__name__}", repr(options)[:80], "a dictionary of Setting by name")
     _LAWS[law.name] = law
 
 

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.errors import MetricError, ShapeError
+from orthocas.errors import InvalidValueError, MetricError, ShapeError
 from orthocas.robots.pinocchio_model import remedy
 from orthocas.robots.robot import Robot
 from orthocas.tools.batch import Batched, dense_function
@@ -33,6 +33,8 @@ class Metric:
     def from_spec(cls, robot: Robot, spec: MetricSpec) -> Self:
         """Build from "euclidean", "inertia", a constant matrix (n, n), or a map q -> A(q) on SX.
 
+        `orthocas.register_metric` adds names.
+
         Raises:
             UnknownNameError: if the name is unknown.
             ShapeError: if A is not (n, n).
@@ -41,8 +43,10 @@ class Metric:
         """
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
+        if isinstance(spec, str) and spec in _REGISTERED:
+            return cls.custom(robot, spec, _REGISTERED[spec](robot))
         if isinstance(spec, str):
-            require_known("metric", spec, METRIC_KINDS)
+            require_known("metric", spec, (*METRIC_KINDS, *_REGISTERED))
             if spec == "inertia":
                 _require_mass(robot)
             A = robot.function("mass_matrix")(q) if spec == "inertia" else ca.SX.eye(robot.n)
@@ -99,6 +103,35 @@ class Metric:
     def is_inertia(self) -> bool:
         """Whether A = M, the mass matrix."""
         return bool(self.recipe["kind"] == "inertia")
+
+
+_REGISTERED: dict[str, Callable[[Robot], Callable[[ca.SX], ca.SX]]] = {}
+
+
+def register_metric(name: str, build: Callable[[Robot], Callable[[ca.SX], ca.SX]]) -> None:
+    """Let `Problem` and the option --metric build a metric of your own by its name. Files need no registration.
+
+    Args:
+        name: a short name.
+        build: makes the map of q to A(q), as for `Metric.custom`, from a robot.
+
+    Raises:
+        InvalidValueError: if the name is taken.
+
+    Example:
+        >>> import casadi as ca
+        >>> import orthocas as oc
+        >>> oc.register_metric("stiff base", lambda robot: lambda q: ca.diag(ca.vertcat(5, ca.SX.ones(robot.n - 1))))
+        >>> robot = oc.Robot.planar([1.0, 1.0], [3.0, 3.0])
+        >>> oc.Problem(robot, oc.Task.position(robot, "x"), "stiff base").metric.name
+        'stiff base'
+    """
+    require_text("name", name)
+    if name in METRIC_KINDS or _REGISTERED.get(name, build) is not build:
+        raise InvalidValueError("name", repr(name), "a free name")
+    if not callable(build):
+        raise InvalidValueError("build", repr(build)[:80], "a function of a robot")
+    _REGISTERED[name] = build
 
 
 def metric_matrices(metric: Metric, points: Array) -> Array:

@@ -186,19 +186,20 @@ class Task(Shown):
     def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> Self:
         """A task by its short name: position, position:xy, polar, orientation, pose, pose:z, axis:x, position+axis.
 
+        `orthocas.register_task` adds names.
+
         Args:
             robot: the robot.
             kind: the short name.
             q_reference: posture (n,) that defines the reference of orientation, pose and axis tasks.
         """
         require_kind("kind", kind, str)
-        if kind == "position" or kind.startswith("position:"):
-            return cls.position(robot, kind.partition(":")[2] or "xyz")
-        if kind == "polar":
-            return cls.polar(robot)
         if (turn := TipTurn.of_kind(kind)) is not None:
             return cls._turned(robot, turn, None if q_reference is None else robot.tip_rotation(q_reference))
-        raise UnknownNameError("task", kind, TASK_KINDS)
+        name, _, words = kind.partition(":")
+        if name not in _REGISTERED or (name == "polar" and words):
+            raise UnknownNameError("task", kind, tuple(dict.fromkeys((*TASK_KINDS, *_REGISTERED))))
+        return _REGISTERED[name](robot, words)
 
     @classmethod
     def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> Self:
@@ -311,3 +312,36 @@ class Task(Shown):
         q = ca.SX.sym("q", robot.n)
         x = components(robot.function("tip_rotation")(q), robot.function("tip_position")(q))
         return cls(robot, name, labels, units, dense_function("h", [q], [x]), {"kind": name, **(extra or {})})
+
+
+_REGISTERED: dict[str, Callable[[Robot, str], Task]] = {
+    "position": lambda robot, axes: Task.position(robot, axes or "xyz"),
+    "polar": lambda robot, _: Task.polar(robot),
+}
+
+
+def register_task(name: str, build: Callable[[Robot, str], Task]) -> None:
+    """Let `Task.named` and the option --task build a task of your own. Files need no registration.
+
+    Args:
+        name: a short name without a colon.
+        build: makes the task from a robot and what follows the colon in "name:words", which may be "".
+
+    Raises:
+        InvalidValueError: if the name has a colon or is taken.
+
+    Example:
+        >>> import orthocas as oc
+        >>> def height(robot, words):
+        ...     return oc.Task.custom(robot, "height", lambda q: robot.tip_position(q)[1], ["height"], ["m"])
+        >>> oc.register_task("height", height)
+        >>> oc.Task.named(oc.Robot.planar([1.0, 1.0], [3.0, 3.0]), "height").labels
+        ('height',)
+    """
+    require_text("name", name)
+    taken = name in TASK_KINDS or TipTurn.of_kind(name) is not None or _REGISTERED.get(name, build) is not build
+    if ":" in name or taken:
+        raise InvalidValueError("name", repr(name), "a free name without a colon")
+    if not callable(build):
+        raise InvalidValueError("build", repr(build)[:80], "a function of a robot and a text")
+    _REGISTERED[name] = build
