@@ -183,7 +183,7 @@ class Task(Shown):
         return cls(robot, str(name), labels, units, dense_function("h", [q], [x]), recipe)
 
     @classmethod
-    def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> Self:
+    def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> "Task":
         """A task by its short name: position, position:xy, polar, orientation, pose, pose:z, axis:x, position+axis.
 
         `orthocas.register_task` adds names.
@@ -202,7 +202,7 @@ class Task(Shown):
         return _REGISTERED[name](robot, words)
 
     @classmethod
-    def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> Self:
+    def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> "Task":
         """The task of a robot that `recipe` describes. Custom tasks have no such recipe."""
         turn = TipTurn.of_kind(recipe["kind"])
         return cls.named(robot, recipe["kind"]) if turn is None else cls._turned(robot, turn, recipe["reference"])
@@ -217,7 +217,7 @@ class Task(Shown):
         """How the task compares the tip's orientation with a reference; None if it does not."""
         return TipTurn.of_kind(self.recipe["kind"])
 
-    def with_reference_at(self, q: ArrayLike) -> Self:
+    def with_reference_at(self, q: ArrayLike) -> "Task":
         """The task with the tip's orientation at q (n,) as its reference, or the task itself if it has one already."""
         return self.named(self.robot, self.recipe["kind"], q) if self.lacks_reference else self
 
