@@ -40,7 +40,8 @@ def test_records_say_how_they_were_measured(name: str) -> None:
     assert record.source in {"measured", "transcribed"}
     words = record.command.split()
     assert words[0] in {"python", "orthocas", "make"}
-    assert words[0] != "python" or (figures.ROOT / words[1]).exists()
+    place = words[2].replace(".", "/") if words[1] == "-m" else words[1]
+    assert words[0] != "python" or (figures.ROOT / place).exists()
     assert not record.script or "\ndef main(" in (figures.ROOT / record.script).read_text()
     assert record.source == "transcribed" or (record.script and record.cpu_seconds and record.tolerance)
     assert set(record.values) == record.used

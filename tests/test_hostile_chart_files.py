@@ -107,7 +107,17 @@ def test_edited_header_and_array_are_noticed(saved: Path) -> None:
             {"problem": {"name": "x", "task": {"kind": 3}, "metric": {}, "domain": "box"}},
             "field 'kind' is 3, expected text",
         ),
-        ({"problem": {"name": "x", "task": {}, "metric": {}, "domain": "sphere"}}, "unknown domain 'sphere'"),
+        (
+            {
+                "problem": {
+                    "name": "x",
+                    "task": {"kind": "position:x"},
+                    "metric": {"kind": "euclidean"},
+                    "domain": "sphere",
+                }
+            },
+            "unknown domain 'sphere'",
+        ),
         ({"coordinates": polynomial(4, idle=[77])}, "expected different indices below 3"),
         (
             {"problem": {"name": "x", "task": {"kind": "import os"}, "metric": {"kind": "euclidean"}, "domain": "box"}},

@@ -309,7 +309,7 @@ def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch
         raise ModuleNotFoundError(name)
 
     monkeypatch.setattr(checks, "import_module", missing)
-    with pytest.raises(MissingExtraError, match=r"MuJoCo as plant needs .* pip install 'orthocas\[sim\]'"):
+    with pytest.raises(MissingExtraError, match=r"MuJoCo as plant needs .* pip install 'orthocas\[mujoco\]'"):
         MuJoCoPlant(plant.robot)
 
 
