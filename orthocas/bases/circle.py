@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -38,8 +38,8 @@ class Circle:
     """
 
     pairs: Parametrisation
-    linear: ClassVar[bool] = False
-    closed_form: ClassVar[None] = None
+    linear = False
+    closed_form = None
 
     def __post_init__(self) -> None:
         fitted = isinstance(self.pairs, Parametrisation) and not isinstance(self.pairs, type)

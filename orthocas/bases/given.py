@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -35,7 +35,7 @@ class Given:
     label: str
     n: int
     tape: Tape = field(repr=False)
-    linear: ClassVar[bool] = True
+    linear = True
 
     def __post_init__(self) -> None:
         require_text("label of given coordinates", self.label)

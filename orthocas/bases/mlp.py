@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -129,8 +129,8 @@ class MLP:
 
     hidden: tuple[int, ...] = (64, 64)
     raw: bool = False
-    linear: ClassVar[bool] = False
-    closed_form: ClassVar[None] = None
+    linear = False
+    closed_form = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.hidden, tuple | list) or not self.hidden:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from math import comb, sqrt
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -196,8 +196,8 @@ class Polynomial:
 
     degree: int
     cyclic: Cyclic = ()
-    linear: ClassVar[bool] = True
-    closed_form: ClassVar[None] = None
+    linear = True
+    closed_form = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", require_count("degree", self.degree))
@@ -261,8 +261,8 @@ class Fourier:
 
     degree: int
     cyclic: Cyclic = ()
-    linear: ClassVar[bool] = True
-    closed_form: ClassVar[None] = None
+    linear = True
+    closed_form = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", require_count("degree", self.degree))
@@ -334,7 +334,7 @@ class Linear:
 
     base: tuple[float, ...] | None = None
     normals: Normals = "orthonormal"
-    linear: ClassVar[bool] = True
+    linear = True
 
     def __post_init__(self) -> None:
         require_known("normals", self.normals, ("orthonormal", "paper"))

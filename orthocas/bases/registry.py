@@ -4,7 +4,7 @@ import json
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass
-from typing import Any
+from typing import Any, cast
 
 from orthocas.bases.circle import Circle
 from orthocas.bases.cyclic import Cyclic, parse_suffix
@@ -12,7 +12,7 @@ from orthocas.bases.family import Parametrisation
 from orthocas.bases.given import Given
 from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Fourier, Linear, Polynomial
-from orthocas.bases.sew import SEW
+from orthocas.bases.sew import SEW, SEWKind
 from orthocas.errors import InvalidValueError, NotSavableWarning
 from orthocas.tools.checks import require_kind, require_known
 
@@ -171,6 +171,6 @@ register_parametrisation("linear", Linear, _linear)
 register_parametrisation("polynomial", Polynomial, lambda text: Polynomial(*_degree_and_cyclic(text)))
 register_parametrisation("fourier", Fourier, lambda text: Fourier(*_degree_and_cyclic(text)))
 register_parametrisation("mlp", MLP, _mlp)
-register_parametrisation("sew", SEW, lambda text: SEW(text or "stereographic"))
+register_parametrisation("sew", SEW, lambda text: SEW(cast(SEWKind, text or "stereographic")))
 register_parametrisation("circle", Circle, lambda text: Circle(parse_parametrisation(text)))
 register_parametrisation("given", Given)

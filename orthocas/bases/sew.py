@@ -1,7 +1,7 @@
 """The shoulder-elbow-wrist (SEW) angle of a seven-joint arm: one number for the position of the elbow."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -16,7 +16,8 @@ from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import require_known
 
-SEW_KINDS = ("conventional", "stereographic")
+SEWKind = Literal["conventional", "stereographic"]
+SEW_KINDS: tuple[SEWKind, ...] = ("conventional", "stereographic")
 
 # (e_t, e_r) in the world. The singular half-line e_t points down into the base. With e_r = -x, an arm that reaches
 # along +x with its elbow up has psi = 0, far from the jump at +-pi.
@@ -149,8 +150,8 @@ class SEW:
         kind: "conventional" or "stereographic"; see `orthocas.bases.sew.sew_angle`.
     """
 
-    kind: str = "stereographic"
-    linear: ClassVar[bool] = True
+    kind: SEWKind = "stereographic"
+    linear = True
 
     def __post_init__(self) -> None:
         require_known("SEW angle", self.kind, SEW_KINDS)

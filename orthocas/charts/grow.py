@@ -10,7 +10,7 @@ from orthocas.exact.flow import TaskFlow
 from orthocas.exact.grown import GrownCoordinates
 from orthocas.exact.involutivity import involutivity
 from orthocas.exact.leaf import LeafChart, turning_joints
-from orthocas.exact.leaves import LEAVES, CircleLeaf, circle_leaf, linear_leaf
+from orthocas.exact.leaves import LEAVES, CircleLeaf, Leaf, circle_leaf, linear_leaf
 from orthocas.tasks.domains import Box, sample_evenly
 from orthocas.tasks.problem import Problem, check
 from orthocas.tools.checks import (
@@ -32,7 +32,7 @@ _MARGIN = 1.15  # of that region
 def grow(
     problem: Problem,
     level: ArrayLike | None = None,
-    leaf: str | None = None,
+    leaf: Leaf | None = None,
     origin: ArrayLike | None = None,
     region: Box | None = None,
     cells: int | None = None,
@@ -111,7 +111,7 @@ def require_involutive(problem: Problem) -> None:
         )
 
 
-def _default_leaf(problem: Problem) -> str:
+def _default_leaf(problem: Problem) -> Leaf:
     if problem.r == 1 and problem.domain.full_turns:
         return "circle"
     return "disk" if (problem.n, problem.m) == (3, 1) else "linear"

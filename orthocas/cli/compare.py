@@ -1,7 +1,7 @@
 """`orthocas compare`: parametrisations and solvers side by side."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -26,7 +26,7 @@ from orthocas.errors import Interrupted, printable
 from orthocas.fitting.compare import compare as compare_fits
 from orthocas.fitting.comparison import Comparison
 from orthocas.fitting.comparison_figures import convergence_figure, front_figure
-from orthocas.fitting.settings import PRECISIONS
+from orthocas.fitting.settings import PRECISIONS, Precision
 from orthocas.solvers import get as get_solver
 from orthocas.tools.files import output_folder, published, require_replaceable_files
 
@@ -79,7 +79,7 @@ def compare(
                     seeds=seeds,
                     weights=loss,
                     samples=samples,
-                    precision=precision,
+                    precision=cast(Precision, precision),
                     held_out=held_out,
                     jobs=jobs,
                     charts=charts,

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 
@@ -34,7 +34,7 @@ from orthocas.errors import Interrupted, InvalidValueError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
 from orthocas.fitting.probe import Bounds
-from orthocas.fitting.settings import PRECISIONS, default_parametrisation
+from orthocas.fitting.settings import PRECISIONS, Precision, default_parametrisation
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion
 from orthocas.fitting.terms import Weights
 from orthocas.solvers import get as get_solver
@@ -131,7 +131,7 @@ def fit(
                 monitor=monitor,
                 max_mutual_deg=max_mutual_deg,
                 checkpoint=checkpoint,
-                precision=precision,
+                precision=cast(Precision, precision),
             )
     except Interrupted as stop:
         result = stop.result

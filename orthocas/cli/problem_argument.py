@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 import typer
@@ -15,7 +15,7 @@ from orthocas.errors import InvalidValueError, UnknownNameError
 from orthocas.fitting.corridor_problem import RADIUS, corridor_problem
 from orthocas.fitting.probe import Bounds
 from orthocas.fitting.suggest_domain import DomainSuggestion, suggest_domain
-from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, Angles, Weights
 from orthocas.robots.homes import read_postures
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import default_box
@@ -229,7 +229,7 @@ def parse_weights(text: str, angles: str | None) -> Weights:
     extra = {}
     for name, _, value in (word.partition("=") for word in words if "=" in word):
         extra[name.strip()] = float(parse_numbers(f"--weights {name}", value)[0])
-    return replace(Weights.of(numbers) if numbers else Weights(), extra=extra, angles=angles)
+    return replace(Weights.of(numbers) if numbers else Weights(), extra=extra, angles=cast(Angles | None, angles))
 
 
 def suggested(

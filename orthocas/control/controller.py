@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
 
 from orthocas.control.gains import Setting
 from orthocas.control.reference import Reference
@@ -138,10 +137,8 @@ Command = Literal["torque", "velocity"]
 class Controller(Protocol):
     """A control law for a robot and a task."""
 
-    @property
-    def name(self) -> str:
-        """Short name, for example 'pd_plus'."""
-        ...
+    name: ClassVar[str]  #: short name, for example 'pd_plus'
+    command: ClassVar[Command]  #: joint torques [N m] or joint velocities [rad/s]
 
     @property
     def formula(self) -> str:
@@ -156,11 +153,6 @@ class Controller(Protocol):
     @property
     def problem(self) -> Problem:
         """Robot (the model that the law uses), task, metric and domain."""
-        ...
-
-    @property
-    def command(self) -> Command:
-        """Kind of the command: joint torques [N m] or joint velocities [rad/s]."""
         ...
 
     @property
@@ -225,17 +217,14 @@ class Controller(Protocol):
 class Law(Controller, Protocol):
     """A controller that can be built by name on a chart, for the command line; see `orthocas.control.registry`."""
 
-    name: ClassVar[str]
-    command: ClassVar[Command]
     options: ClassVar[Mapping[str, Setting]]  #: the settings that `on_chart` takes, by name
 
     @classmethod
-    def on_chart(cls, chart: "Chart", limit: ArrayLike | None = None, **settings: Any) -> Self:
+    def on_chart(cls, *args: Any, **settings: Any) -> Self:
         """Build the law on a chart, or on the problem of the chart.
 
         Args:
-            chart: the chart.
-            limit: largest command of each joint.
+            args: the chart, and the largest command of each joint, which may be left out or None.
             settings: gains and choices by the names in `options`; those left out take their defaults.
         """
         ...

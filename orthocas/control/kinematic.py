@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from types import MappingProxyType
+from typing import ClassVar, Self
 
 import casadi as ca
 from numpy.typing import ArrayLike
@@ -42,12 +43,12 @@ class Kinematic(Shown):
     limit: Array
 
     name: ClassVar[str] = "kinematic"
-    formula: ClassVar[str] = "Velocity control dq = J^-1 (d phi_d + Lambda (phi_d - phi)); does not use the input dq."
+    formula = "Velocity control dq = J^-1 (d phi_d + Lambda (phi_d - phi)); does not use the input dq."
     command: ClassVar[Command] = "velocity"
-    energy: ClassVar[None] = None
-    energy_graph: ClassVar[None] = None
-    gain_units: ClassVar[Mapping[str, str]] = {"feedback": FEEDBACK, "limit": LIMIT}
-    settings: ClassVar[Mapping[str, str]] = {}
+    energy = None
+    energy_graph = None
+    gain_units = MappingProxyType({"feedback": FEEDBACK, "limit": LIMIT})
+    settings = MappingProxyType[str, str]({})
     options: ClassVar[Mapping[str, Setting]] = {"feedback": FEEDBACK_SETTING}
 
     def __init__(self, chart: Chart, feedback: ArrayLike = 0.0, limit: ArrayLike | None = None) -> None:
@@ -58,9 +59,9 @@ class Kinematic(Shown):
         object.__setattr__(self, "limit", command_limit("limit", limit, chart.problem.robot.velocity_limits))
 
     @classmethod
-    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """Build the law on a chart; `feedback` defaults to 0."""
-        return cls(chart, limit=limit, **settings)
+    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, *, feedback: ArrayLike = 0.0) -> Self:
+        """Build the law on a chart."""
+        return cls(chart, feedback, limit)
 
     def remarks(self) -> list[str]:
         """No warnings."""

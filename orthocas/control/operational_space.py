@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import casadi as ca
 import numpy as np
@@ -34,7 +34,7 @@ from orthocas.control.gains import (
 from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, block_inertia, damping_matrix, median_volume
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
-from orthocas.control.run_time_model import RunTimeModel
+from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
 from orthocas.control.turns import without_turns
 from orthocas.robots.kinematics import TipTurn
 from orthocas.tasks.domains import sample_uniform
@@ -194,20 +194,37 @@ class _OperationalSpace(Shown):
             object.__setattr__(self, name, value)
 
     @classmethod
-    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
+    def on_chart(
+        cls,
+        chart: Chart,
+        limit: ArrayLike | None = None,
+        *,
+        stiffness: ArrayLike | None = None,
+        damping_ratio: ArrayLike = 0.7,
+        coupling: Coupling = "coupled",
+        damping: DampingDesign = "double_diagonal",
+        damping_stiffness: ArrayLike | None = None,
+        model: Source = "own",
+        gravity: Gravity = "law",
+        inputs: str = "",
+    ) -> Self:
         """Build the law on a chart.
 
         Args:
             chart: the chart.
             limit: largest torque of each joint.
-            settings: arguments of the law; `stiffness` defaults to `matched_stiffness`, modes around 6 Hz. `model`
-                (own, given), `gravity` (law, robot) and `inputs` ("payload,wrench,extra_torque") are words.
+            stiffness: default: `matched_stiffness`, modes around 6 Hz.
+            damping_ratio: as for the law itself.
+            coupling: as for the law itself.
+            damping: as for the law itself.
+            damping_stiffness: as for the law itself.
+            model: the source of the `RunTimeModel`.
+            gravity: its gravity.
+            inputs: its inputs, such as "payload,wrench,extra_torque".
         """
-        stiffness, inputs = settings.pop("stiffness", None), settings.pop("inputs", "")
-        words = settings.pop("model", "own"), settings.pop("gravity", "law")
-        model = RunTimeModel.with_inputs(*words, inputs.split(",") if inputs else ())
         stiffness = matched_stiffness(chart) if stiffness is None else stiffness
-        return cls(chart, stiffness, limit=limit, model=model, **settings)
+        run_time = RunTimeModel.with_inputs(model, gravity, inputs.split(",") if inputs else ())
+        return cls(chart, stiffness, damping_ratio, coupling, damping, limit, damping_stiffness, run_time)
 
     @property
     def settings(self) -> Mapping[str, str]:
@@ -436,7 +453,7 @@ class Impedance(_OperationalSpace):
     """
 
     feed_forward = False
-    name = "impedance"
+    name: ClassVar[str] = "impedance"
     force = "Impedance control: tau = J^T (-K (phi - phi_d) - D J dq)"
 
 
@@ -458,7 +475,7 @@ class PDPlus(_OperationalSpace):
     """
 
     feed_forward = True
-    name = "pd_plus"
+    name: ClassVar[str] = "pd_plus"
     force = "Operational space PD+: tau = J^T (f_imp + f_FF)"
 
 

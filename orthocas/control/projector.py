@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from types import MappingProxyType
+from typing import ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -35,7 +36,14 @@ from orthocas.control.gains import (
     positive_gains,
 )
 from orthocas.control.linear_algebra import block_inertia, median_volume
-from orthocas.control.two_tasks import TwoTaskLaw, errors_and_damping, named_second, second_task, two_task_forces
+from orthocas.control.two_tasks import (
+    SecondName,
+    TwoTaskLaw,
+    errors_and_damping,
+    named_second,
+    second_task,
+    two_task_forces,
+)
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
@@ -72,11 +80,11 @@ class KinematicProjector(TwoTaskLaw):
     second: Task | Chart | None
 
     name: ClassVar[str] = "kinematic_projector"
-    formula: ClassVar[str] = "Velocity control by pseudo-inverse and projector; does not use the input dq."
+    formula = "Velocity control by pseudo-inverse and projector; does not use the input dq."
     command: ClassVar[Command] = "velocity"
-    energy: ClassVar[None] = None
-    energy_graph: ClassVar[None] = None
-    gain_units: ClassVar[Mapping[str, str]] = {"feedback": FEEDBACK, "limit": LIMIT}
+    energy = None
+    energy_graph = None
+    gain_units = MappingProxyType({"feedback": FEEDBACK, "limit": LIMIT})
     options: ClassVar[Mapping[str, Setting]] = {"feedback": FEEDBACK_SETTING, "second": _SECOND}
 
     def __init__(
@@ -97,16 +105,26 @@ class KinematicProjector(TwoTaskLaw):
         object.__setattr__(self, "second", second)
 
     @classmethod
-    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """Build the law on the problem of a chart; `feedback`, one number or (m + k_2,), defaults to 0.
+    def on_chart(
+        cls,
+        chart: Chart,
+        limit: ArrayLike | None = None,
+        *,
+        feedback: ArrayLike = 0.0,
+        second: SecondName = "joints",
+    ) -> Self:
+        """Build the law on the problem of a chart.
 
-        The setting `second` is "joints" (default) or "xi", the coordinates of the chart.
+        Args:
+            chart: the chart.
+            limit: largest velocity of each joint.
+            feedback: one number or (m + k_2,).
+            second: "joints" or "xi", the coordinates of the chart.
         """
-        name = settings.pop("second", "joints")
-        second = named_second(chart, name)
-        m, k = chart.m, chart.n + (chart.m if second is None else 0)
-        feedback = non_negative_gains(f"feedback (task, then {name})", settings.pop("feedback", 0.0), k)
-        return cls(chart.problem, feedback[:m], feedback[m:], limit, second, **settings)
+        task = named_second(chart, second)
+        m, k = chart.m, chart.n + (chart.m if task is None else 0)
+        gains = non_negative_gains(f"feedback (task, then {second})", feedback, k)
+        return cls(chart.problem, gains[:m], gains[m:], limit, task)
 
     def facts(self) -> dict[str, str]:
         """Quantities, gains and problem."""
@@ -195,12 +213,14 @@ class Projector(TwoTaskLaw):
 
     name: ClassVar[str] = "projector"
     command: ClassVar[Command] = "torque"
-    gain_units: ClassVar[Mapping[str, str]] = {
-        "stiffness": STIFFNESS,
-        "damping_ratio": DAMPING_RATIO,
-        "second_force": SECOND_FORCE,
-        "limit": LIMIT,
-    }
+    gain_units = MappingProxyType(
+        {
+            "stiffness": STIFFNESS,
+            "damping_ratio": DAMPING_RATIO,
+            "second_force": SECOND_FORCE,
+            "limit": LIMIT,
+        }
+    )
     options: ClassVar[Mapping[str, Setting]] = {
         "stiffness": STIFFNESS_SETTING,
         "damping_ratio": DAMPING_RATIO_SETTING,
@@ -238,25 +258,33 @@ class Projector(TwoTaskLaw):
             object.__setattr__(self, name, value)
 
     @classmethod
-    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, **settings: Any) -> Self:
-        """Build the law on the problem of a chart; by default with modes around 6 Hz.
+    def on_chart(
+        cls,
+        chart: Chart,
+        limit: ArrayLike | None = None,
+        *,
+        stiffness: ArrayLike | None = None,
+        damping_ratio: ArrayLike = 0.7,
+        posture_stiffness: ArrayLike | None = None,
+        second: SecondName = "joints",
+    ) -> Self:
+        """Build the law on the problem of a chart.
 
-        The setting `second` is "joints" (default) or "xi", the coordinates of the chart.
+        Args:
+            chart: the chart.
+            limit: largest torque of each joint.
+            stiffness: of the task; default: modes around 6 Hz.
+            damping_ratio: one number or (m + k_2,).
+            posture_stiffness: of the second task; default: modes around 6 Hz.
+            second: "joints" or "xi", the coordinates of the chart.
         """
-        stiffness, posture = settings.pop("stiffness", None), settings.pop("posture_stiffness", None)
-        second = named_second(chart, settings.pop("second", "joints"))
-        if posture is None and second is None:
-            posture = matched_posture_stiffness(chart.problem)
-        elif posture is None:
-            posture = matched_stiffness(chart)[chart.m :]
-        return cls(
-            chart.problem,
-            matched_stiffness(chart)[: chart.m] if stiffness is None else stiffness,
-            posture,
-            limit=limit,
-            second=second,
-            **settings,
-        )
+        task = named_second(chart, second)
+        if posture_stiffness is None and task is None:
+            posture_stiffness = matched_posture_stiffness(chart.problem)
+        elif posture_stiffness is None:
+            posture_stiffness = matched_stiffness(chart)[chart.m :]
+        stiffness = matched_stiffness(chart)[: chart.m] if stiffness is None else stiffness
+        return cls(chart.problem, stiffness, posture_stiffness, damping_ratio, limit, task)
 
     def facts(self) -> dict[str, str]:
         """Quantities, gains and problem."""

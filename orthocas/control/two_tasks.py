@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Literal, Protocol, get_args
 
 import casadi as ca
 import numpy as np
@@ -22,7 +22,7 @@ from orthocas.tools.checks import Array, require_known
 from orthocas.tools.display import Shown
 from orthocas.tools.expressions import fast_form
 
-SECOND_TASKS = ("joints", "xi")  #: second tasks by name, for laws that are built on a chart
+SecondName = Literal["joints", "xi"]  #: second tasks by name, for laws that are built on a chart
 _SAMPLES, _RANK_LOST = 32, 1e-9
 
 
@@ -91,13 +91,13 @@ def second_task(problem: Problem, second: Task | Chart | None) -> SecondTask:
     raise InvalidValueError("second", repr(second)[:80], "a Task, a Chart, or None for the joints")
 
 
-def named_second(chart: Chart, name: str) -> Chart | None:
+def named_second(chart: Chart, name: SecondName) -> Chart | None:
     """The argument `second` by its name: "joints" (None) or "xi" (the chart).
 
     Raises:
         UnknownNameError: for another name.
     """
-    require_known("second task", name, SECOND_TASKS)
+    require_known("second task", name, get_args(SecondName))
     return chart if name == "xi" else None
 
 
@@ -108,7 +108,7 @@ class _Joints:
     problem: Problem
 
     name: ClassVar[str] = "joints"
-    chart: ClassVar[None] = None
+    chart = None
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -154,7 +154,7 @@ class _OwnTask:
     problem: Problem
     task: Task
 
-    chart: ClassVar[None] = None
+    chart = None
 
     def __post_init__(self) -> None:
         problem, task = self.problem, self.task

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -258,6 +258,7 @@ def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, floa
     return trace
 
 
+Leaf = Literal["linear", "circle", "disk"]  #: kinds of base leaves
 LEAVES: dict[str, type[LinearLeaf] | type[CircleLeaf] | type[DiskLeaf]] = {
     kind.kind: kind for kind in (LinearLeaf, CircleLeaf, DiskLeaf)
 }

@@ -16,7 +16,7 @@ from orthocas.codegen.ticks import control_tick
 from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.comparison import Comparison
 from orthocas.fitting.grid import Cell, CellResult, run_cells
-from orthocas.fitting.settings import PRECISIONS, default_solver
+from orthocas.fitting.settings import PRECISIONS, Precision, default_solver
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.protocol import Solver
@@ -63,7 +63,7 @@ def compare(
     seeds: int = 1,
     weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
     samples: int | None = None,
-    precision: str = PRECISIONS[0],
+    precision: Precision = "double",
     held_out: int = 100_000,
     executor: Executor | None = None,
     jobs: int | None = None,

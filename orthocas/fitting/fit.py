@@ -27,7 +27,7 @@ from orthocas.charts.worst_points import WorstPoints
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.fold_search import FoldSearch
-from orthocas.fitting.settings import PRECISIONS, FitSettings, default_parametrisation
+from orthocas.fitting.settings import FitSettings, Precision, default_parametrisation
 from orthocas.fitting.stages import Plan, StageRunner
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, LEAST_CONDITIONING, WeightNumbers, Weights
 from orthocas.solvers.protocol import Solver, Status
@@ -331,7 +331,7 @@ def fit(
     align_to: Chart | None = None,
     threads: int | None = None,
     split_idle: bool = True,
-    precision: str = PRECISIONS[0],
+    precision: Precision = "double",
 ) -> Fit:
     """Find coordinates xi(q) of a family that are nearly orthogonal to the task.
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from orthocas.bases.family import Parametrisation
 from orthocas.charts.quality import Report, evaluate
 from orthocas.fitting.fit import Fit, fit
+from orthocas.fitting.settings import Precision
 from orthocas.fitting.terms import Weights
 from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.problem import Problem
@@ -36,7 +37,7 @@ class Cell:
     seed: int
     weights: Weights
     samples: int | None
-    precision: str
+    precision: Precision
     held_out: int
     chart_file: Path | None  #: file to save the chart in
     force: bool = False  #: replace a file there that is not a chart

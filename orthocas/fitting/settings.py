@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_problem
 from orthocas.tools.checks import as_number, require_count, require_kind, require_known
 
-PRECISIONS = ("double", "single")  #: of the large products of a fit
+Precision = Literal["double", "single"]
+PRECISIONS: tuple[Precision, ...] = ("double", "single")  #: of the large products of a fit
 _MANY_JOINTS = 8  # with more, coordinates are many as well, and the matrix grows with their square
 _MANY_TERMS = 300  # where a Gauss-Newton matrix takes longer than ten gradients: degree 4 for seven joints
 _TELLTALE = (20, (0, 1000))  # number and seed of the samples that identify a problem
@@ -36,7 +38,7 @@ class FitSettings:
     seed: int
     max_mutual_deg: float | None
     split_idle: bool = True
-    precision: str = PRECISIONS[0]
+    precision: Precision = "double"
 
     @classmethod
     def checked(
@@ -49,7 +51,7 @@ class FitSettings:
         seed: int,
         max_mutual_deg: float | None,
         split_idle: bool = True,
-        precision: str = PRECISIONS[0],
+        precision: Precision = "double",
     ) -> "FitSettings":
         """Check the settings, and fill in the default solver and the default angles.
 

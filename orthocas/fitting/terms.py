@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import casadi as ca
 
@@ -14,7 +14,8 @@ from orthocas.tools.checks import as_float_array, as_number, require_kind, requi
 REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
 LEAST_CONDITIONING = 0.2  #: that fits aim at on the whole domain
 _FOLD_VOLUME = 1.6 * LEAST_CONDITIONING  # enough for it: det D <= sqrt(e) times the conditioning
-ANGLES = ("paper", "metric")  #: kinds of angles in the loss
+Angles = Literal["paper", "metric"]
+ANGLES: tuple[Angles, ...] = ("paper", "metric")  #: kinds of angles in the loss
 
 
 @dataclass(frozen=True)
@@ -375,7 +376,7 @@ class Weights:
     length: float = 0.0
     folds: float = 1000.0
     extra: Mapping[str, float] = field(default_factory=dict, hash=False)
-    angles: str | None = None
+    angles: Angles | None = None
 
     def __post_init__(self) -> None:
         for k, name in enumerate(("task", "mutual", "regularity", "length", "folds")):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from os import PathLike
 from typing import Any, Self
 
 import casadi as ca
@@ -82,7 +82,9 @@ class Robot(Shown):
         return cls(tree, postures(model_states(model), tree.joint_names))
 
     @classmethod
-    def from_file(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
+    def from_file(
+        cls, path: str | PathLike[str], tip: str | None = None, locked: Locked = None, tool: Tool = None
+    ) -> Self:
         """Build the chain that moves the tip from a robot file: MJCF if its name ends in .xml, otherwise URDF.
 
         Every joint that does not move the tip, of any type, is locked at zero, or at the limit closest to zero.
@@ -104,10 +106,13 @@ class Robot(Shown):
         return build(path, tip, locked, tool)
 
     @classmethod
-    def from_urdf(cls, path: str | Path, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
+    def from_urdf(
+        cls, path: str | PathLike[str], tip: str | None = None, locked: Locked = None, tool: Tool = None
+    ) -> Self:
         """Build the chain that moves the tip from a URDF file; see `from_file`."""
-        robot = cls._chain(urdf.read_urdf(as_path("path", path), tip, locked), tip, locked, tool)
-        return cls(robot.tree, postures(srdf_states(path), robot.joint_names))
+        file = as_path("path", path)
+        robot = cls._chain(urdf.read_urdf(file, tip, locked), tip, locked, tool)
+        return cls(robot.tree, postures(srdf_states(file), robot.joint_names))
 
     @classmethod
     def from_mjcf(cls, path: Any, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -227,10 +227,11 @@ class PathBound(Condition, Protocol):
         ...
 
 
+Kind = TypeVar("Kind", bound=Domain)
 _KINDS: dict[str, type[Domain]] = {}
 
 
-def register_domain(kind: type[Domain]) -> type[Domain]:
+def register_domain(kind: type[Kind]) -> type[Kind]:
     """Let files hold domains of a kind of your own; also a decorator. Its class attribute `name` names it there.
 
     Raises:

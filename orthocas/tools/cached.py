@@ -6,7 +6,9 @@ from the object's data, so a copy builds its own when needed.
 
 from collections.abc import Callable
 from threading import RLock
-from typing import Any, Generic, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar, overload
+
+__all__ = ["BuiltOnUse", "building", "cached_property"]
 
 T = TypeVar("T")
 
@@ -26,7 +28,7 @@ class _Store(dict[str, Any]):
         return _Store, ()
 
 
-class cached_property(Generic[T]):  # noqa: N801  (takes the place of the one in functools)
+class _CachedProperty(Generic[T]):
     """Like `functools.cached_property`, but thread-safe in every version of Python, and never pickled or copied."""
 
     def __init__(self, build: Callable[[Any], T]) -> None:
@@ -56,6 +58,12 @@ class cached_property(Generic[T]):  # noqa: N801  (takes the place of the one in
                 store[self._name] = self._build(instance)
             value: T = store[self._name]
             return value
+
+
+if TYPE_CHECKING:
+    from builtins import property as cached_property  # to type checkers it is one, also in protocols
+else:
+    cached_property = _CachedProperty
 
 
 class BuiltOnUse(Generic[T]):

@@ -1,0 +1,54 @@
+"""What type checkers say to users: pyright on the tutorials, and on calls with misspelt words."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+MISSPELT = """
+import orthocas as oc
+
+robot = oc.Robot.planar([1.0, 1.0, 1.0], [3.0, 3.0, 3.0])
+problem = oc.Problem(robot, oc.Task.position(robot, "x"))
+fit = oc.fit(problem, oc.Polynomial(3), precision="singel")
+law = oc.control.PDPlus.on_chart(fit.chart, coupling="decoupld", damping="square_rot")
+oc.control.Projector.on_chart(fit.chart, second="joint")
+oc.Weights(angles="metrics")
+oc.grow(problem, leaf="cirle")
+oc.generate_c(fit.chart, "folder", "pd_plus")
+"""
+pytestmark = pytest.mark.slow
+
+
+def errors_of(folder: Path) -> list[str]:
+    """Messages of errors in the programs of a folder, with the line, checked as `basic`, against this package."""
+    settings = {"include": ["*.py"], "typeCheckingMode": "basic", "extraPaths": [str(ROOT)], "venvPath": "/"}
+    (folder / "pyrightconfig.json").write_text(json.dumps(settings))
+    words = ("-m", "basedpyright", "--outputjson", "--pythonpath", sys.executable, "-p", str(folder))
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False)
+    found = json.loads(done.stdout)["generalDiagnostics"]
+    return [
+        f"{Path(each['file']).stem}:{each['range']['start']['line'] + 1}: {each['message']}"
+        for each in found
+        if each["severity"] == "error"
+    ]
+
+
+def test_tutorials_have_no_type_errors(tmp_path: Path) -> None:
+    assert len(TUTORIALS) == 3
+    for page in TUTORIALS:
+        blocks = re.findall(r"```\{code-cell\} python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+        assert len(blocks) > 5
+        (tmp_path / f"{page.stem}.py").write_text(re.sub("^:tags:.*$", "", "\n".join(blocks), flags=re.MULTILINE))
+    assert errors_of(tmp_path) == []
+
+
+def test_misspelt_words_are_type_errors(tmp_path: Path) -> None:
+    (tmp_path / "misspelt.py").write_text(MISSPELT)
+    lines = {int(found.split(":")[1]) for found in errors_of(tmp_path)}
+    assert lines == {6, 7, 8, 9, 10, 11}
