@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -225,3 +227,16 @@ def test_bad_input_is_named(leaf: TriangleMesh) -> None:
     for bad, name in ((np.nan, "points"), (np.inf, "points"), (1e200, "squared distance")):
         with pytest.raises(InvalidValueError, match=f"{name}.* expected a finite number"):
             TriangleLocator(leaf.vertices, leaf.faces).locate(np.full((2, 3), bad))
+
+
+@pytest.mark.slow
+def test_a_tree_that_lives_until_the_end_is_no_leak() -> None:
+    """A reference that Python never gives up, as caches of other libraries hold them."""
+    code = """
+import ctypes
+from orthocas.exact.mesh import TriangleLocator
+locator = TriangleLocator([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+ctypes.pythonapi.Py_IncRef(ctypes.py_object(locator))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr + done.stdout == ""

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from typing import NamedTuple
+from weakref import finalize
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -151,8 +152,9 @@ class TriangleLocator:
         areas = np.linalg.norm(_normals(self._points[self._faces]), axis=1) / 2
         if not areas.min() > 0:
             raise InvalidValueError(f"area of triangle {areas.argmin()}", areas.min(), "a positive number")
-        self._tree = igl.AABB()
-        self._tree.init(self._points, self._faces)
+        self._trees = [igl.AABB()]
+        self._trees[0].init(self._points, self._faces)
+        finalize(self, self._trees.clear)  # also at exit, where libigl would call a tree in use a leak
 
     def __reduce__(self) -> tuple[type["TriangleLocator"], tuple[Array, Indices]]:
         """Pickle and copy only the mesh; the tree is rebuilt."""
@@ -172,7 +174,7 @@ class TriangleLocator:
         return Located(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _locate(self, points: Array) -> Located:
-        squares, face, closest = self._tree.squared_distance(self._points, self._faces, points)
+        squares, face, closest = self._trees[0].squared_distance(self._points, self._faces, points)
         require_finite("squared distance", squares)  # if not finite, libigl has found no face
         return Located(face, _barycentric(closest, self._points[self._faces[face]]), np.sqrt(squares))
 
