@@ -259,9 +259,16 @@ def test_bad_input_is_one_line_and_exit_code_two(run: Run, tmp_path: Path, words
     assert list(tmp_path.iterdir()) == []
 
 
+def test_version_is_that_of_the_package(run: Run) -> None:
+    assert run("--version") == (0, f"orthocas {oc.__version__}\n", "")
+
+
 def test_no_words_show_help(run: Run) -> None:
-    _, out, err = run()
-    assert "fit" in out + err
+    for words in ((), ("atlas",)):
+        code, out, err = run(*words)
+        assert (code, out) == (2, "")
+        assert err.startswith("Usage: orthocas")
+        assert "\n  --help" in err
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
@@ -10,6 +10,7 @@ from orthocas.cli.entry import INTERRUPTED
 from orthocas.errors import OrthocasError, one_line
 from orthocas.tools.interrupts import ended_in_order, remembered
 from orthocas.tools.plugins import plug_ins
+from orthocas.version import VERSION
 
 _GROUP = "orthocas.commands"
 COMMANDS = {
@@ -43,6 +44,7 @@ def app_for(words: Sequence[str]) -> typer.Typer:
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
     )
+    app.callback()(_options)
     for name, summary in helped().items():
         command = _command(name) if name in words else _idle
         if isinstance(command, typer.Typer):
@@ -57,6 +59,21 @@ def _command(name: str) -> Any:
     if name in COMMANDS:
         return getattr(import_module(f"{__package__}.{name}"), name)
     return plug_ins(_GROUP)[name]()
+
+
+def _say_version(wanted: bool) -> None:
+    """Print the version, and end."""
+    if wanted:
+        typer.echo(f"orthocas {VERSION}")
+        raise typer.Exit
+
+
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_say_version, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Options of the command line itself."""
 
 
 def _idle() -> None:
@@ -77,7 +94,9 @@ def run(app: typer.Typer) -> int:
         except KeyboardInterrupt:
             code = INTERRUPTED
         except Exception as error:
-            if not pressed():  # otherwise it is what a library made of Ctrl-C
+            if type(error).__name__ == "NoArgsIsHelpError":  # its message is the help
+                typer.echo(_message(error), err=True)
+            elif not pressed():  # otherwise it is what a library made of Ctrl-C
                 _complain(_message(error))
             code = 2
         return interrupted() if pressed() or code == INTERRUPTED else code
