@@ -19,7 +19,7 @@ from orthocas.tools.checks import Array
 
 T = TypeVar("T")
 HEADER = (
-    "| chart, path | xi | seconds | duration [s] | share of speed, acceleration limits | border [half-widths] "
+    "| chart, path | xi | seconds | duration [s] | share of speed, acceleration limits | boundary [half-widths] "
     "| obstacle [m] | tool error | closed to [rad] |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
 )
 BALL = Sphere([0.2, 0.15, 0.6], 0.1)
@@ -58,7 +58,7 @@ def row(name: str, chart: oc.Chart, path: Array, xi: str, obstacles: list[Obstac
     distance = f"{kept.distance:.3f}" if obstacles else "-"
     return (
         f"| {name} | {xi}{', a ball in the way' if obstacles else ''} | {seconds:.2f} | {motion.duration:.2f} "
-        f"| {100 * kept.velocity:.0f} %, {100 * kept.acceleration:.0f} % | {kept.border:.3f} | {distance} "
+        f"| {100 * kept.velocity:.0f} %, {100 * kept.acceleration:.0f} % | {kept.boundary:.3f} | {distance} "
         f"| {_tool_error(chart, motion):.1e} | {_closed(motion)} |"
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 from benchmark import run, table
 
 import orthocas as oc
-from orthocas.tasks.domains import Domain, borders, sample_uniform
+from orthocas.tasks.domains import Domain, bounds_of, sample_uniform
 from orthocas.tools.checks import Array
 
 QUICK = ("panda-position", "ur5-position")
@@ -36,7 +36,7 @@ def near_corners(domain: Domain, count: int, seed: int) -> Array:
     faces = rng.uniform(-1, 1, (count // 4, n))
     held = rng.uniform(size=faces.shape) < rng.uniform(size=(len(faces), 1))
     unit[: len(faces)] = np.where(held, np.sign(faces), faces)
-    return np.clip(domain.centre + domain.half_width * unit, *borders(domain))
+    return np.clip(domain.centre + domain.half_width * unit, *bounds_of(domain))
 
 
 def misses(name: str, count: int) -> str:

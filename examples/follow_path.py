@@ -27,7 +27,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
         quick: a coarser chart.
 
     Returns:
-        Smallest distance from the post [m] and from the border of the domain [half-widths], and duration [s].
+        Smallest distance from the post [m] and from the boundary of the domain [half-widths], and duration [s].
     """
     out.mkdir(parents=True, exist_ok=True)
     robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
@@ -58,7 +58,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     found: dict[str, float] = {}
     for name, motion in motions.items():
         found[f"{name}: distance from the post [m]"] = float(distances(motion.q).min())
-        found[f"{name}: distance from the border [half-widths]"] = motion.margins.border
+        found[f"{name}: distance from the boundary [half-widths]"] = motion.margins.boundary
         found[f"{name}: duration [s]"] = motion.duration
         found[f"{name}: joints away from their start at the end [rad]"] = float(
             np.abs(motion.q[-1] - motion.q[0]).max()

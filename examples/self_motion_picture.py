@@ -55,7 +55,7 @@ def robot_file(path: str) -> Path:
 
 
 def save_trimmed(picture: Picture, path: Path) -> None:
-    """Save a picture without its white borders, except for a margin."""
+    """Save a picture without its white boundaries, except for a margin."""
     whole = Image.fromarray(picture)
     left, upper, right, lower = ImageChops.invert(whole).getbbox() or (0, 0, *whole.size)
     part = whole.crop((left - MARGIN, upper - MARGIN, right + MARGIN, lower + MARGIN))

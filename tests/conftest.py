@@ -105,7 +105,7 @@ def planar_chart(planar_x: oc.Problem) -> oc.Chart:
 
 @pytest.fixture(scope="session")
 def planar_for_control(planar_x: oc.Problem) -> oc.Chart:
-    """Cubic coordinates that keep away from folds, for laws at the border of the domain."""
+    """Cubic coordinates that keep away from folds, for laws at the boundary of the domain."""
     return oc.fit(planar_x, oc.Polynomial(3), weights=(1000, 30, 150, 0.1, 1000), samples=1500).chart
 
 

@@ -30,15 +30,15 @@ def library(whole: GeneratedC) -> CompiledLibrary:
 
 @pytest.fixture(scope="module")
 def positions(way_atlas: oc.Atlas) -> Array:
-    """Positions around the way, and on borders of cells and of boxes."""
+    """Positions around the way, and on boundaries of cells and of boxes."""
     rng = np.random.default_rng(5)
     somewhere = WAY[rng.integers(len(WAY), size=2500)] + rng.uniform(-0.7, 0.7, (2500, 3))
     somewhere += 2 * np.pi * rng.integers(-1, 2, somewhere.shape)
-    return np.vstack([somewhere, *(on_borders(way_atlas, number, rng) for number in range(len(way_atlas)))])
+    return np.vstack([somewhere, *(on_boundaries(way_atlas, number, rng) for number in range(len(way_atlas)))])
 
 
-def on_borders(way_atlas: oc.Atlas, number: int, rng: np.random.Generator) -> Array:
-    """Positions of a box with one joint or all on a border of the box or of its cell, (20, n)."""
+def on_boundaries(way_atlas: oc.Atlas, number: int, rng: np.random.Generator) -> Array:
+    """Positions of a box with one joint or all on a boundary of the box or of its cell, (20, n)."""
     box, shares = way_atlas.box(number), rng.uniform(-1, 1, (20, 3))
     cell = 1 / (1 + way_atlas.settings.overlap)
     for row in range(20):
@@ -54,7 +54,7 @@ def holds(way_atlas: oc.Atlas, number: int, q: Array) -> bool:
 def test_chart_in_c_is_the_one_that_python_finds(
     way_atlas: oc.Atlas, library: CompiledLibrary, positions: Array
 ) -> None:
-    """On borders both may be right: rounding decides."""
+    """On boundaries both may be right: rounding decides."""
     assert len(way_atlas) > 10
     rng = np.random.default_rng(2)
     for current in (np.full(len(positions), -1), rng.integers(-1, len(way_atlas), len(positions))):

@@ -113,7 +113,7 @@ def test_hand_over_of_bad_numbers_changes_nothing(library: CompiledLibrary) -> N
 
 
 def room(atlas: oc.Atlas, q: Array) -> float:
-    """Distance to the border of the box that holds a position best, in its half-widths."""
+    """Distance to the boundary of the box that holds a position best, in its half-widths."""
     found = []
     for number in range(len(atlas)):
         box = atlas.box(number, near=q)
@@ -134,7 +134,7 @@ def led(supervisor: Supervisor, library: CompiledLibrary, q: Array, dq: Array, t
     return statuses
 
 
-def test_the_border_of_all_charts_has_a_zone_before_it_and_borders_between_charts_have_none(
+def test_the_boundary_of_all_charts_has_a_zone_before_it_and_boundaries_between_charts_have_none(
     way_atlas: oc.Atlas, law: Controller, library: CompiledLibrary
 ) -> None:
     supervisor = Supervisor(library, law)
@@ -143,8 +143,8 @@ def test_the_border_of_all_charts_has_a_zone_before_it_and_borders_between_chart
     assert set(within) <= {ControlStatus.OK, ControlStatus.SATURATED}
     start, out = START + np.array([0.0, -0.55, 0.14]), np.array([0.0, -0.4, 0.1])
     statuses = led(Supervisor(library, law), library, start, out, 1000)
-    near, caught = (statuses.index(status) for status in (ControlStatus.NEAR_BORDER, ControlStatus.CAUGHT))
-    assert set(statuses[near:caught]) == {ControlStatus.NEAR_BORDER}
+    near, caught = (statuses.index(status) for status in (ControlStatus.NEAR_BOUNDARY, ControlStatus.CAUGHT))
+    assert set(statuses[near:caught]) == {ControlStatus.NEAR_BOUNDARY}
     overlap = way_atlas.settings.overlap / (1 + way_atlas.settings.overlap)
     margins = 0.6 * overlap, 0.1 * overlap
     for k, margin, ahead in ((near, margins[0], 0.0), (caught, margins[1], 0.03)):  # caught before it gets there

@@ -236,7 +236,7 @@ def test_the_search_for_worst_points_stays_inside(problem: oc.Problem, chart: oc
     found = worst_points(problem, chart.coordinates, seed=4)
     assert problem.domain.contains(found.points).all()
     values = problem.domain.singular_values(found.points)  # type: ignore[union-attr]
-    assert values.min() < 1.1 * BOUND  # but it goes up to the border
+    assert values.min() < 1.1 * BOUND  # but it goes up to the boundary
 
 
 def test_fits_offer_the_bound_that_helps() -> None:
@@ -349,10 +349,10 @@ def test_references_into_the_singular_part_are_refused(chart: oc.Chart) -> None:
         oc.simulate(law, reference, start)
 
 
-def test_the_border_distance_is_not_positive_outside(chart: oc.Chart) -> None:
+def test_the_boundary_distance_is_not_positive_outside(chart: oc.Chart) -> None:
     quality = chart.quality([chart.problem.domain.centre, STRAIGHT])
-    assert quality.border_distance[0] > 0
-    assert quality.border_distance[1] <= 0
+    assert quality.boundary_distance[0] > 0
+    assert quality.boundary_distance[1] <= 0
 
 
 @needs_c

@@ -46,7 +46,7 @@ def test_motion_is_that_of_python(run: Run, chart: oc.Chart) -> None:
     assert report["closed"]
     assert report["time_stamps"] == len(table)
     assert report["duration"] == pytest.approx(expected.duration)
-    assert report["margins"]["border"] == pytest.approx(expected.margins.border)
+    assert report["margins"]["boundary"] == pytest.approx(expected.margins.boundary)
     assert report["margins"]["distance"] is None
     assert run("follow", "a.orthocas", "p.csv", *LIMITS, "--out", "q.csv")[1].splitlines()[-1].startswith("file ")
 

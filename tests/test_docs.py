@@ -134,7 +134,7 @@ def test_ten_minutes_to_a_controller_in_c_run(run: Run) -> None:
             assert code == 0, f"{line}: {err}"
         else:
             printed = output_of(program, *words)
-    assert "statuses: 2000 ok, 0 saturated, 0 near the border, 0 others" in printed
+    assert "statuses: 2000 ok, 0 saturated, 0 near the boundary, 0 others" in printed
     assert float(printed.split()[-1]) < 1e-4  # the task stays while the arm moves
 
 

@@ -147,7 +147,7 @@ def test_bad_boxes_are_refused() -> None:
         require_within_limits(robot, oc.Torus(3))
 
 
-def test_borders_of_small_boxes_far_out_belong_to_them() -> None:
+def test_boundaries_of_small_boxes_far_out_belong_to_them() -> None:
     rng = np.random.default_rng(0)
     for half_width in (1e-6, 1e-4, 1.0):
         for centre in rng.uniform(-3, 3, (200, 2)):

@@ -105,7 +105,7 @@ def test_limits_are_kept_and_used() -> None:
     assert kept.acceleration == pytest.approx(np.abs(found.ddq).max() / 4.0)
     assert max(kept.velocity, kept.acceleration) > 0.97
     assert planar().problem.domain.contains(found.q).all()
-    assert kept.border == pytest.approx(1 - (np.abs(found.q - START) / 0.7).max())
+    assert kept.boundary == pytest.approx(1 - (np.abs(found.q - START) / 0.7).max())
 
 
 def test_motion_is_nearly_as_fast_as_possible() -> None:
@@ -159,14 +159,14 @@ def test_start_settles_the_coordinates() -> None:
     np.testing.assert_allclose(found.xi[0], chart.xi(other), atol=1e-12)
 
 
-def test_objective_keeps_away_from_borders() -> None:
+def test_objective_keeps_away_from_boundaries() -> None:
     chart, q = planar(), START + np.array([0.4, -0.5, 0.4])
     path = chart.task(q) + loop(chart, 0.1) - loop(chart, 0.1)[0]
     held = oc.follow(chart, path, q_start=q, velocity_limits=1.0)
     chosen = oc.follow(chart, path, "objective", q_start=q, velocity_limits=1.0)
     assert chosen.closed
     np.testing.assert_allclose(chosen.q[-1], chosen.q[0], atol=1e-9)
-    assert chosen.margins.border > held.margins.border + 0.1
+    assert chosen.margins.boundary > held.margins.boundary + 0.1
     np.testing.assert_allclose(chart.task(chosen.q), chosen.x, atol=1e-9)
 
 
@@ -177,7 +177,7 @@ def test_objective_finds_a_way_where_holding_leaves_the_domain(offset: list[floa
     with pytest.raises(PathError, match="it leaves the domain"):
         oc.follow(chart, path, "hold", q_start=q, velocity_limits=1.0)
     found = oc.follow(chart, path, "objective", q_start=q, velocity_limits=1.0)
-    assert found.margins.border > 0.2
+    assert found.margins.boundary > 0.2
     assert chart.problem.domain.contains(found.q).all()
 
 

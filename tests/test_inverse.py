@@ -12,7 +12,7 @@ from orthocas.charts.inverse import beyond_reach
 from orthocas.charts.newton import inverses
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import borders, sample_uniform
+from orthocas.tasks.domains import bounds_of, sample_uniform
 
 FOUND = oc.InverseStatus.FOUND
 BEYOND = (oc.InverseStatus.OUTSIDE_DOMAIN, oc.InverseStatus.LIMIT)
@@ -83,13 +83,13 @@ def test_what_is_found_lies_inside_and_solves(planar_arm: oc.Chart) -> None:
 
 
 def test_corners_of_the_domain_are_found_inside(planar_arm: oc.Chart) -> None:
-    """Rounding does not push solutions on the border out of the domain."""
+    """Rounding does not push solutions on the boundary out of the domain."""
     domain = planar_arm.problem.domain
     corners = domain.centre + domain.half_width * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
     assert planar_arm.solve(planar_arm.phi(corners)).found.all()
 
 
-def test_joint_limits_and_the_border_of_the_domain_are_told_apart() -> None:
+def test_joint_limits_and_the_boundary_of_the_domain_are_told_apart() -> None:
     robot = problems.get("iiwa").robot
     task = oc.Task.position(robot, "xyz")
     centre = np.where(np.isfinite(robot.upper), robot.upper - 0.3, 0.0)
@@ -143,7 +143,7 @@ def test_corner_heavy_round_trips_of_a_ready_chart_are_found(name: str, inside: 
     rng = np.random.default_rng(77)
     unit = rng.uniform(-1, 1, (2000, chart.n))
     unit = np.sign(unit) * np.abs(unit) ** rng.choice([0.25, 0.1, 0.0], (2000, 1))
-    phi = chart.phi(np.clip(domain.centre + domain.half_width * unit, *borders(domain)))
+    phi = chart.phi(np.clip(domain.centre + domain.half_width * unit, *bounds_of(domain)))
     solutions = chart.solve(phi, inside=inside)
     assert solutions.found.all()
     np.testing.assert_allclose(chart.phi(solutions.q), phi, atol=1e-8)

@@ -28,7 +28,7 @@ def test_inside_gives_the_nearest_coordinates_that_keep_the_task(planar_arm: oc.
         inner = self_motion(planar_arm, phi[k, :2])
         if solutions.status[k] == NEAREST:
             least = np.abs(planar_arm.xi(inner) - phi[k, 2]).min() if len(inner) else np.inf
-            assert solutions.distance[k] <= least + 1e-7  # Ipopt stays a little off the border
+            assert solutions.distance[k] <= least + 1e-7  # Ipopt stays a little off the boundary
         else:
             assert len(inner) == 0
 
@@ -62,7 +62,7 @@ def test_inside_keeps_clear_of_singular_positions() -> None:
 
 
 def test_the_search_for_all_rows_agrees_with_ipopt(iiwa_fit: Fit) -> None:
-    """From the same starts, both end at the same distance; Ipopt stays a little off the border."""
+    """From the same starts, both end at the same distance; Ipopt stays a little off the boundary."""
     chart = iiwa_fit.chart
     phi = chart.phi(beyond_domain(chart, 60, 1.3))
     inside = chart._inverse.inside

@@ -138,31 +138,31 @@ def test_quality_of_a_point_is_that_of_the_set(planar_fit: Fit) -> None:
     path = np.linspace(chart.problem.domain.centre, chart.problem.domain.centre + 0.5, 7)
     along = chart.quality(path)
     assert along.leak_deg.shape == (7, 2)
-    assert along.conditioning.shape == along.border_distance.shape == (7,)
+    assert along.conditioning.shape == along.boundary_distance.shape == (7,)
     for k, q in enumerate(path):
         here = chart.quality(q)
         np.testing.assert_allclose(here.leak_deg, along.leak_deg[k], rtol=1e-12)
-        assert here.conditioning.shape == here.border_distance.shape == ()
+        assert here.conditioning.shape == here.boundary_distance.shape == ()
         np.testing.assert_allclose(here.conditioning, along.conditioning[k], rtol=1e-9)
         np.testing.assert_allclose(oc.evaluate(chart, points=q).conditioning.min, here.conditioning, rtol=1e-9)
-    np.testing.assert_allclose(along.border_distance, np.pi / 8 - np.linspace(0, 0.5, 7), atol=1e-12)
+    np.testing.assert_allclose(along.boundary_distance, np.pi / 8 - np.linspace(0, 0.5, 7), atol=1e-12)
     assert "at most" in along.facts()["leak"]
     assert json.loads(json.dumps(along.as_dict()))["conditioning"] == along.conditioning.tolist()
 
 
-def test_quality_is_nan_where_the_task_is_flat_and_a_torus_has_no_border() -> None:
+def test_quality_is_nan_where_the_task_is_flat_and_a_torus_has_no_boundary() -> None:
     robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
     task = oc.Task.custom(robot, "half flat", lambda q: ca.fmax(q[0], 0) ** 2)
     chart = oc.fit(oc.Problem(robot, task, domain=oc.Box([0.5, 0.0], 0.4)), oc.Linear()).chart
     found = chart.quality([[0.5, 0.0], [-0.5, 0.0], [0.6, 0.3]])
     assert np.isnan(found.conditioning).tolist() == [False, True, False]
     assert np.isnan(found.leak_deg).any(axis=1).tolist() == [False, True, False]
-    np.testing.assert_allclose(found.border_distance, [0.4, -0.6, 0.1], atol=1e-12)
+    np.testing.assert_allclose(found.boundary_distance, [0.4, -0.6, 0.1], atol=1e-12)
     assert found.facts()["left out"].startswith("1,")
     with pytest.raises(SingularTaskError, match="all 1 given points"):
         oc.evaluate(chart, points=[-0.5, 0.0])
     everywhere = oc.Chart(oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Torus(2)), chart.coordinates)
-    assert everywhere.quality([0.3, 9.0]).border_distance == np.inf
+    assert everywhere.quality([0.3, 9.0]).boundary_distance == np.inf
 
 
 def test_quality_is_nan_where_gradients_overflow(planar_fit: Fit) -> None:
@@ -170,7 +170,7 @@ def test_quality_is_nan_where_gradients_overflow(planar_fit: Fit) -> None:
         quality = planar_fit.chart.quality([0.3, far, 0.5])
         assert np.isnan(quality.conditioning)
         assert np.isnan(quality.leak_deg).all()
-        assert quality.border_distance < -0.9 * far
+        assert quality.boundary_distance < -0.9 * far
 
 
 def test_prediction_of_info_and_report_of_evaluate_agree_on_small_boxes(planar_xy: oc.Problem) -> None:

@@ -39,7 +39,7 @@ def test_boxes_that_lie_outside_for_a_pose_hold_no_position_that_is_clear_for_th
 
 @pytest.fixture(scope="module")
 def chart(iiwa: oc.Problem) -> oc.Chart:
-    """Of a part of the 7-DoF arm's range at whose border the elbow is stretched."""
+    """Of a part of the 7-DoF arm's range at whose boundary the elbow is stretched."""
     box = oc.Box([0.0, 0.6, 0.2, -0.4, 0.2, 0.5, 0.0], [0.3, 0.3, 0.3, 0.4, 0.3, 0.3, 0.3])
     problem = oc.Problem(iiwa.robot, iiwa.task, iiwa.metric, box, least_singular_value=BOUND)
     return oc.fit(problem, oc.Polynomial(3), samples=2000).chart

@@ -162,7 +162,7 @@ def test_fold_stops_a_coordinate() -> None:
     assert reach.high >= motion.xi[high, 0]
 
 
-def test_joint_limits_are_told_from_other_borders() -> None:
+def test_joint_limits_are_told_from_other_boundaries() -> None:
     arm = oc.Robot.planar([1.0] * LINKS, [3.0] * LINKS)
     robot = oc.Robot(replace(arm.tree, lower=np.array([-np.inf, -np.inf, 0.5])))
     problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.6, 0.8, 0.8], 0.3))

@@ -28,7 +28,7 @@ from orthocas.control import (
 )
 from orthocas.errors import ProofError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import borders
+from orthocas.tasks.domains import bounds_of
 from orthocas.tools.checks import Array
 
 pytestmark = needs_c
@@ -180,7 +180,7 @@ def test_a_processor_in_single_precision_emulates_nothing(generated: GeneratedC,
 
 def test_bounds_belong_to_the_domain(library: CompiledLibrary, law: Controller) -> None:
     low, high = library.domain
-    np.testing.assert_allclose(library.domain, borders(law.problem.domain), rtol=3e-7)
+    np.testing.assert_allclose(library.domain, bounds_of(law.problem.domain), rtol=3e-7)
     for corner in (low, high):
         assert law.problem.domain.contains(corner)
         assert library.chart(corner)[2] == ControlStatus.OK
@@ -210,7 +210,7 @@ def test_hostile_ticks_stay_bounded_with_the_right_status(
     assert (sum(stateless), sum(supervised)) == (100_000, 1_000_000)
     for status in ("OK", "OUTSIDE_DOMAIN", "NOT_FINITE", "SATURATED"):
         assert stateless[ControlStatus[status]] > 500, (status, stateless)
-    for status in ("OK", "SATURATED", "NEAR_BORDER", "CAUGHT", "RETURNING", "BAD_INPUT"):
+    for status in ("OK", "SATURATED", "NEAR_BOUNDARY", "CAUGHT", "RETURNING", "BAD_INPUT"):
         assert supervised[ControlStatus[status]] > 50, (status, supervised)
 
 

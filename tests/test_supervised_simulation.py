@@ -65,7 +65,9 @@ def test_a_push_after_which_the_law_alone_never_recovers_is_caught_and_comes_bac
 
 def test_statuses_follow_one_another_and_their_times_add_up(pushed: Trajectory) -> None:
     order = [status for k, status in enumerate(pushed.status) if k == 0 or pushed.status[k - 1] != status]
-    names = [ControlStatus(int(s)).name for s in order if s not in (ControlStatus.SATURATED, ControlStatus.NEAR_BORDER)]
+    names = [
+        ControlStatus(int(s)).name for s in order if s not in (ControlStatus.SATURATED, ControlStatus.NEAR_BOUNDARY)
+    ]
     assert [a for a, b in zip(names, ["", *names], strict=False) if a != b] == ["OK", "CAUGHT", "RETURNING", "OK"]
     lasting = pushed.seconds_in_status
     assert sum(lasting.values()) == pytest.approx(8.0)

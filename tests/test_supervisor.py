@@ -1,4 +1,4 @@
-"""The supervised law in C: starts without a jump, catches at the border, holds, returns, hands over."""
+"""The supervised law in C: starts without a jump, catches at the boundary, holds, returns, hands over."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -52,7 +52,7 @@ def test_pushed_out_it_is_caught_holds_and_returns_when_asked(
     domain = planar_for_control.problem.domain
     q = domain.centre + 0.9 * domain.half_width
     arm, reference = Arm(planar_for_control.problem.robot, q), at_rest(planar_for_control, q)
-    supervisor.start(domain.centre)  # then the arm is led to the border
+    supervisor.start(domain.centre)  # then the arm is led to the boundary
     supervisor.take_over(q, planar_for_control.problem.robot.gravity(q))
     push = np.array([0.0, 60.0, 0.0])
     statuses, commands, _ = run(supervisor, arm, reference, 0.6, lambda t: push * (0.1 < t < 0.4))
@@ -67,7 +67,7 @@ def test_pushed_out_it_is_caught_holds_and_returns_when_asked(
     supervisor.resume()
     statuses, commands, speeds = run(supervisor, arm, reference, 12.0)
     assert statuses[0] is ControlStatus.RETURNING
-    assert statuses[-1] in (ControlStatus.OK, ControlStatus.NEAR_BORDER)
+    assert statuses[-1] in (ControlStatus.OK, ControlStatus.NEAR_BOUNDARY)
     assert domain.contains(arm.q)
     assert not np.allclose(held, arm.q, atol=0.01)
     assert speeds.max() < 0.8

@@ -53,7 +53,7 @@ def test_a_chart_that_is_regular_on_one_turn_only_is_refused() -> None:
         oc.certify(folding)
     with pytest.raises(CertifyError, match=complaint):
         oc.check_certificate(folding, forged(folding))
-    assert oc.certified_box(folding).half_width[0] > 3  # a box with borders is another matter
+    assert oc.certified_box(folding).half_width[0] > 3  # a box with boundaries is another matter
 
 
 @pytest.mark.parametrize("kind", [oc.Polynomial(2), oc.MLP((4,), raw=True)], ids=lambda kind: kind.label)
@@ -80,7 +80,7 @@ def test_periodic_charts_are_proved_on_the_torus(xi: Callable[[ca.SX], ca.SX]) -
 
 @pytest.mark.parametrize("centre", [0.0, 3.0, -10.0])
 def test_the_box_of_a_full_turn_holds_every_angle(centre: float) -> None:
-    """pi is rounded down, and so may be the borders."""
+    """pi is rounded down, and so may be the boundaries."""
     box = whole_domain(oc.Box([centre], np.pi, [0]))
     assert (box.high[0] - centre) - np.pi > 1e-15
     assert (centre - box.low[0]) - np.pi > 1e-15

@@ -39,7 +39,7 @@ def test_a_task_component_moves_alone(iiwa_fit: Fit) -> None:
     assert session.readings.drift < 1e-9  # from where the task was wished to be
 
 
-def test_a_wish_out_of_reach_ends_at_the_border_and_tells_the_joint() -> None:
+def test_a_wish_out_of_reach_ends_at_the_boundary_and_tells_the_joint() -> None:
     chart = fitted().chart
     session = Session(chart)
     reach = chart.xi_range(session.home)["xi1"]

@@ -54,13 +54,13 @@ def test_panels_hold_the_numbers_and_escape_names() -> None:
     quality = chart.quality(session.q)
     assert float(shown["conditioning"]) == float(quality.conditioning)
     assert float(shown["xi1"]) == quality.leak_deg[0]
-    assert float(shown["border"]) == float(quality.border_distance)
+    assert float(shown["boundary"]) == float(quality.boundary_distance)
 
 
-def test_panels_of_charts_without_borders() -> None:
+def test_panels_of_charts_without_boundaries() -> None:
     chart = linear_on_the_torus()
     page = ChartPanel(chart).html(Session(chart, np.array([0.6, 0.8, 0.8])).readings)
-    assert 'data-oc="border" data-value="inf"' in page
+    assert 'data-oc="boundary" data-value="inf"' in page
 
 
 def test_a_loop_does_the_last_of_several_wishes_and_settles_once() -> None:

@@ -127,7 +127,7 @@ int main(int argc, char **argv) {
     switch (arm_step(&state, &arm_default_safety, q, dq, &reference, &arm_default_gains, PERIOD, torque)) {
       case ARM_OK: ++good; break;
       case ARM_SATURATED: ++cut; break;
-      case ARM_NEAR_BORDER: ++near; break;
+      case ARM_NEAR_BOUNDARY: ++near; break;
       case ARM_CAUGHT: arm_resume(&state); break; /* your program: when the reason is gone (docs/c_controller.md) */
       default: break;                             /* RETURNING: wait; BAD_INPUT: find the fault */
     }
@@ -140,7 +140,7 @@ int main(int argc, char **argv) {
   }
   print_histogram("computing time of a tick", computing);
   if (paced) print_histogram("lateness of a tick", late);
-  printf("statuses: %ld ok, %ld saturated, %ld near the border, %ld others\n", good, cut, near,
+  printf("statuses: %ld ok, %ld saturated, %ld near the boundary, %ld others\n", good, cut, near,
          ticks - good - cut - near);
   printf("largest deviation of the task: %.2e\n", error);
   return good == ticks ? 0 : 1;

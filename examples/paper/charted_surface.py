@@ -57,7 +57,7 @@ def part_below(
 
 
 def add_with_edges(scene: Scene, vertices: Array, faces: Numbers, colours: Array, edge: Array, width: float) -> None:
-    """Add a triangle mesh with its edges drawn as borders inside the triangles, which stay flat.
+    """Add a triangle mesh with its edges drawn as boundaries inside the triangles, which stay flat.
 
     Args:
         scene: scene to add the mesh to.
@@ -65,7 +65,7 @@ def add_with_edges(scene: Scene, vertices: Array, faces: Numbers, colours: Array
         faces: (F, 3).
         colours: colours of the triangles, RGB (F, 3).
         edge: colour of the edges, RGB (3,).
-        width: width of an edge, which covers the borders of both its triangles.
+        width: width of an edge, which covers the boundaries of both its triangles.
     """
     corners = vertices[faces]
     opposite = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)  # (F, 3)
@@ -79,8 +79,8 @@ def add_with_edges(scene: Scene, vertices: Array, faces: Numbers, colours: Array
         [corners[:, here], corners[:, after], inner[:, after]],
         [corners[:, here], inner[:, after], inner[:, here]],
     )
-    borders = [np.stack(three, axis=2).reshape(-1, 3, 3) for three in outside]
-    triangles = np.concatenate([inner, *borders])
+    boundaries = [np.stack(three, axis=2).reshape(-1, 3, 3) for three in outside]
+    triangles = np.concatenate([inner, *boundaries])
     looks = np.concatenate([colours, np.tile(edge, (6 * len(faces), 1))])
     scene.add_surface(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), looks)
 

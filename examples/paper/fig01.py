@@ -50,7 +50,7 @@ class Grid:
         return np.concatenate([np.stack(f, axis=-1).reshape(-1, 3) for f in ((a, b, d), (a, d, c))])
 
     @property
-    def border(self) -> Array:
+    def boundary(self) -> Array:
         """The points around the surface, (4 N - 3, 3)."""
         p = self.points
         return np.concatenate([p[0, :-1], p[:-1, -1], p[-1, :0:-1], p[::-1, 0]])
@@ -77,7 +77,7 @@ def draw(quick: bool) -> Drawing:
     joint_cube(axes, _LOW, _HIGH, parts=1, margin=np.pi / 8)
     scene = _scene(task_leaves, walls)
     base = grid(coordinates, np.zeros(1), _REACH[0] * sheet, _REACH[1] * sheet)
-    scene.add_tube(base.border, 0.022, _BASE)
+    scene.add_tube(base.boundary, 0.022, _BASE)
     _add_gradients(axes, scene, coordinates)
     scene.draw(axes, _VIEW, _LOW, _HIGH, 1.24)
     names = ("$x$ = const", r"$\xi_1$ = const", r"$\xi_2$ = const")

@@ -53,9 +53,9 @@ def _scene(q: Array, rows: Array, curve: Array, centre: Array) -> Scene:
     scene = Scene()
     scene.add_cube(centre - _HALF, centre + _HALF, 0.015)
     scene.add_tube(curve, 0.035, TASK)
-    vertices, faces, border = _plane(q, rows[:2])
+    vertices, faces, boundary = _plane(q, rows[:2])
     scene.add_surface(vertices, faces, GREY, alpha=0.35)
-    scene.add_tube(border, 0.012, GREY)
+    scene.add_tube(boundary, 0.012, GREY)
     for row, colour in zip(rows, _COLOURS, strict=True):
         scene.add_arrow(q, row, 0.04, colour)
     scene.add_ball(q, 0.08, TASK)

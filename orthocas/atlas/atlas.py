@@ -235,7 +235,7 @@ class Atlas(Shown):
         """The number of the chart for joint positions (n,) or (N, n): an int, or (N,); -1 where there is none.
 
         It is the chart whose cell holds q; near holes, a neighbour whose box reaches so far. With `current`, it stays
-        the current chart as long as its box holds q. So the chart does not change back and forth at a border.
+        the current chart as long as its box holds q. So the chart does not change back and forth at a boundary.
 
         Args:
             q: joint positions [rad] or [m].
@@ -342,7 +342,7 @@ class Atlas(Shown):
 
     def box(self, number: int, near: ArrayLike | None = None) -> Box:
         """The box of a chart within the joint limits; see `chart`."""
-        return clipped(self._stock.plan, *self._borders(*self._numbered(number, near)))
+        return clipped(self._stock.plan, *self._boundaries(*self._numbered(number, near)))
 
     def handed_over(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, number: int) -> tuple[Array, Array, Array]:
         """What a chart asks for at a desired motion of the joints: phi, its velocity and its acceleration, (n,) each.
@@ -391,8 +391,8 @@ class Atlas(Shown):
         values = self._evaluation.turned(own[None], numbers)[0]
         if self._evaluation.turns is not None:
             values[:, 0] += self._evaluation.turns.constants[number]
-        borders, active = self._borders(number, turns), list(plan.active)
-        whole, box = plan.box_around(*borders), clipped(plan, *borders)
+        boundaries, active = self._boundaries(number, turns), list(plan.active)
+        whole, box = plan.box_around(*boundaries), clipped(plan, *boundaries)
         if is_turning(plan.problem.task):
             box = part_near(plan, box, turns[len(plan.joints) :])
         shift = ((box.centre - whole.centre) / whole.half_width)[active]
@@ -402,8 +402,8 @@ class Atlas(Shown):
         clear = float(self._stock.records["clear"][self._stock.charts[fitted[0]]])
         return chart_of(plan, box, values, clear, plan.problem)
 
-    def _borders(self, number: int, turns: Turns) -> tuple[Array, Array]:
-        """Borders of the box of a chart in the joints that boxes divide, also beyond the limits."""
+    def _boundaries(self, number: int, turns: Turns) -> tuple[Array, Array]:
+        """Boundaries of the box of a chart in the joints that boxes divide, also beyond the limits."""
         numbers = np.array([number])
         centre = self._index.image_centres(numbers)[0][0] + 2 * np.pi * np.array(
             turns[: self._index.plan.lattice.low.size]

@@ -19,7 +19,7 @@ from orthocas.atlas.atlas_file import ATLAS, Stock, add_results, header_of, read
 from orthocas.atlas.box_fit import BoxChart, BoxFitter, Mask
 from orthocas.atlas.chart_of_box import box_of, chart_of
 from orthocas.atlas.index import Index
-from orthocas.atlas.lattice import Cell, Outcome, Result, cell_borders
+from orthocas.atlas.lattice import Cell, Outcome, Result, cell_boundaries
 from orthocas.atlas.plan import Plan
 from orthocas.atlas.regions import Region
 from orthocas.certificates.certify import folds_nowhere
@@ -290,7 +290,7 @@ class Building:
     def _touched(self, cell: Cell) -> bool:
         """Whether the region touches one of the images of a cell."""
         lattice = self.plan.lattice
-        low, width = cell_borders(lattice, np.array([cell.tile]), np.array([cell.levels]), np.array([cell.places]))
+        low, width = cell_boundaries(lattice, np.array([cell.tile]), np.array([cell.levels]), np.array([cell.places]))
         own = lattice.centres(np.array([cell.tile]))[0]
         centres, signs = self._images[cell.tile]
         middle = centres + signs * (low[0] + width[0] / 2 - own)

@@ -20,7 +20,7 @@ from orthocas.codegen.description import clear_line, filled, numbers, words
 from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.codegen.precision import Precision
 from orthocas.codegen.rows import TABLE_CODE, TableCoordinates
-from orthocas.control.controller import Controller, without_border
+from orthocas.control.controller import Controller, without_boundary
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import Box, Domain
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from orthocas.atlas.atlas import AtlasPart
 
 _NO_CELL = -1
-_BORDER = 1e-12  # of a box, in half-widths, as in `Index.in_boxes`
+_BOUNDARY = 1e-12  # of a box, in half-widths, as in `Index.in_boxes`
 _PREFIX = "cube_basis"  # of the functions of the polynomials
 _LAW = {  # lines of templates that are empty for a single chart
     "posture_evaluations": "12",  # a few steps of Newton's method from the arm, which is near
@@ -57,8 +57,8 @@ _LAW = {  # lines of templates that are empty for a single chart
 }
 _LAW_PARTS = {
     "beyond": "beyond.c",
-    "border_tables": "border_tables_of_atlas.c",
-    "border_c": "border_of_atlas.c",
+    "boundary_tables": "boundary_tables_of_atlas.c",
+    "boundary_c": "boundary_of_atlas.c",
     "hand_over_h": "hand_over.h",
 }
 _PARTS = {
@@ -143,7 +143,7 @@ class AtlasTables:
             "cells_searched": 1 + 2 * len(plan.joints),
         }
         return {name: str(size) for name, size in sizes.items()} | {
-            "border": repr(_BORDER),
+            "boundary": repr(_BOUNDARY),
             "overlap": numbers(overlap * plan.lattice.width / 2),
         }
 
@@ -317,7 +317,7 @@ class AtlasSource:
         return found
 
     def safety(self, controller: Controller) -> Safety:
-        """The default settings, with margins within the overlap of boxes: where charts meet, there is no border."""
+        """The default settings, with margins within the overlap of boxes: where charts meet, there is no boundary."""
         room = self._overlap
         return Safety.of(
             controller,
@@ -327,7 +327,7 @@ class AtlasSource:
         )
 
     def law_values(self, controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
-        """The border of what charts cover, and the hand-over from chart to chart."""
+        """The boundary of what charts cover, and the hand-over from chart to chart."""
         values = {place: Template(text).substitute(known) for place, text in _LAW.items()}
         values["enough"] = repr(round(0.99 * self._overlap, 6))
         everything = {**known, **values}
@@ -342,8 +342,8 @@ class AtlasSource:
         return overlap / (1 + overlap)
 
     def graph(self, graph: ca.Function) -> ca.Function:
-        """The graph without the border of the first chart: C code knows which box counts."""
-        return without_border(graph, self.first.problem.domain.centre)
+        """The graph without the boundary of the first chart: C code knows which box counts."""
+        return without_boundary(graph, self.first.problem.domain.centre)
 
     def stack_bytes(self, size: int) -> int:
         """Work arrays of the polynomials, of their terms and slopes, and positions on the cube."""

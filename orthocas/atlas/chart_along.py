@@ -36,7 +36,7 @@ def follow_in_atlas(atlas: Atlas, x: ArrayLike, q_start: ArrayLike) -> AtlasMoti
     """Hold xi along a path of task values, and hand over to the next chart when q leaves the box of the current one.
 
     At a hand-over, the xi asked for becomes that of the current joint position in the next chart, so the posture asked
-    for does not jump. A chart is left only when its box is: boxes overlap, so charts do not alternate at a border.
+    for does not jump. A chart is left only when its box is: boxes overlap, so charts do not alternate at a boundary.
 
     Args:
         atlas: the atlas.

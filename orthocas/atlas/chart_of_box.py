@@ -28,12 +28,12 @@ def box_of(plan: Plan, cell: Cell) -> Box:
 
     Of images of a box, only the one that is fitted may lie there.
     """
-    low, high = cell.borders(plan.lattice)
+    low, high = cell.bounds_of(plan.lattice)
     return plan.box_around(*widened(plan, low, high))
 
 
 def widened(plan: Plan, low: Array, high: Array) -> tuple[Array, Array]:
-    """Borders of boxes for those of cells, (k,) or (cells, k)."""
+    """Boundaries of boxes for those of cells, (k,) or (cells, k)."""
     room = plan.settings.overlap * (high - low) / 2
     return low - room, high + room
 

@@ -105,7 +105,7 @@ class Blend:
 
     s rises from s(0) = 0 to s(1) = 1 with two continuous derivatives, s(t) = 6 t^5 - 15 t^4 + 10 t^3. It is 1 where the
     box does not reach into its neighbours of the same size: |u| <= u_0 = (1 - overlap) / (1 + overlap). So w_k is twice
-    continuously differentiable inside the union of the boxes, away from its border.
+    continuously differentiable inside the union of the boxes, away from its boundary.
     """
 
     index: Index

@@ -7,7 +7,7 @@ import numpy as np
 
 from orthocas.atlas.atlas_file import Stock
 from orthocas.atlas.chart_of_box import widened
-from orthocas.atlas.lattice import Orbits, Outcome, cell_borders, orbits
+from orthocas.atlas.lattice import Orbits, Outcome, cell_boundaries, orbits
 from orthocas.atlas.plan import Plan
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
@@ -155,7 +155,7 @@ class Index:
     @cached_property
     def _boxes(self) -> tuple[Array, Array]:
         records = self.stock.records[self.stock.charts]
-        low, width = cell_borders(self.plan.lattice, records["tile"], records["levels"], records["places"])
+        low, width = cell_boundaries(self.plan.lattice, records["tile"], records["levels"], records["places"])
         return widened(self.plan, low, low + width)
 
     @cached_property
@@ -196,7 +196,7 @@ class Index:
     def thresholds(self) -> Array:
         """Middle of every cell in the joint that is halved."""
         records = self.stock.records
-        low, width = cell_borders(self.plan.lattice, records["tile"], records["levels"], records["places"])
+        low, width = cell_boundaries(self.plan.lattice, records["tile"], records["levels"], records["places"])
         return np.asarray((low + width / 2)[np.arange(len(records)), np.maximum(self._joint, 0)])
 
     @cached_property

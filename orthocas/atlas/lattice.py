@@ -17,7 +17,7 @@ _TOLERANCE = 1e-6  # robot files give angles with ten decimals
 _POINTS = 16
 _MOST_CANDIDATES = 2**17
 _SEED = 0
-_SLACK = 1e-9  # of a tile; points on a border belong to either side
+_SLACK = 1e-9  # of a tile; points on a boundary belong to either side
 _TURN = 2 * np.pi
 
 
@@ -150,8 +150,8 @@ class Lattice:
 def make_lattice(low: Array, high: Array, endless: NDArray[np.bool_], widest: Array, maps: Symmetries) -> Lattice:
     """Tiles of at most the given widths over a box, such that the maps carry tiles to tiles.
 
-    Joints that some map shifts by half a turn get tiles all around the circle with borders at multiples of their width
-    from 0. Joints that some map reflects get an even number of tiles around 0 or pi / 2.
+    Joints that some map shifts by half a turn get tiles all around the circle with boundaries at multiples of their
+    width from 0. Joints that some map reflects get an even number of tiles around 0 or pi / 2.
 
     Args:
         low: lowest positions, (k,).
@@ -226,13 +226,15 @@ class Cell:
         upper = tuple(2 * place + 1 if i == joint else place for i, place in enumerate(self.places))
         return Cell(self.tile, levels, lower), Cell(self.tile, levels, upper)
 
-    def borders(self, lattice: Lattice) -> tuple[Array, Array]:
+    def bounds_of(self, lattice: Lattice) -> tuple[Array, Array]:
         """Lowest and highest position, (k,) each."""
-        low, width = cell_borders(lattice, np.array([self.tile]), np.array([self.levels]), np.array([self.places]))
+        low, width = cell_boundaries(lattice, np.array([self.tile]), np.array([self.levels]), np.array([self.places]))
         return low[0], low[0] + width[0]
 
 
-def cell_borders(lattice: Lattice, tiles: Indices, levels: NDArray[Any], places: NDArray[Any]) -> tuple[Array, Array]:
+def cell_boundaries(
+    lattice: Lattice, tiles: Indices, levels: NDArray[Any], places: NDArray[Any]
+) -> tuple[Array, Array]:
     """Lowest positions and widths of cells, (cells, k) each."""
     width = lattice.width / 2.0**levels
     return lattice.centres(tiles) - lattice.width / 2 + width * places, width

@@ -149,7 +149,7 @@ class Plan:
         return local_problem(self.problem)
 
     def box_around(self, low: Array, high: Array) -> Box:
-        """The box of all joints with these borders in the joints that boxes divide, (k,) each."""
+        """The box of all joints with these boundaries in the joints that boxes divide, (k,) each."""
         domain = self.problem.domain
         centre, half_width = domain.centre.copy(), domain.half_width.copy()
         joints = list(self.joints)

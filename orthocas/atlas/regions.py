@@ -33,7 +33,7 @@ class Region(Protocol):
         ...
 
     def touches(self, low: Array, high: Array) -> NDArray[np.bool_]:
-        """Whether the region touches boxes with these borders (boxes, k), (boxes,)."""
+        """Whether the region touches boxes with these boundaries (boxes, k), (boxes,)."""
         ...
 
     def sample(self, samples: int, seed: int) -> Array:

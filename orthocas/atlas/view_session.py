@@ -18,7 +18,7 @@ class AtlasSession(Session):
     """A session in the charts of an atlas.
 
     A chart is left where its box ends, if the atlas has another chart there. Boxes overlap, so charts do not alternate
-    at a border. Then the coordinates wished for become those of the joint position in the next chart, and what was
+    at a boundary. Then the coordinates wished for become those of the joint position in the next chart, and what was
     wished for the task stays. Orientations are compared with that at the first joint position.
 
     Args:

@@ -178,7 +178,7 @@ def checked_bound(chart: Chart, bound: float) -> float:
 
 
 def whole_domain(domain: Domain) -> Subdivision:
-    """The domain, with the slack of its borders, as a box in one part; unbounded joints have their half-width.
+    """The domain, with the slack of its boundaries, as a box in one part; unbounded joints have their half-width.
 
     That of a full turn is pi, rounded down. With the slack, the box holds every angle.
     """

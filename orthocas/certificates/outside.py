@@ -30,7 +30,7 @@ from orthocas.certificates.taylor import UP, TaylorModel, Variables
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
-from orthocas.tasks.domains import PathBound, SingularBound, borders
+from orthocas.tasks.domains import PathBound, SingularBound, bounds_of
 from orthocas.tools.batch import dense_function, one_blas_thread
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import Tape, gradient_dependences, periodic_joints, to_tape
@@ -48,7 +48,7 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     and of xi are read. The joints of a torus are unbounded.
     """
     problem = chart.problem
-    endless = np.flatnonzero(np.isinf(borders(problem.domain)[1])).tolist()
+    endless = np.flatnonzero(np.isinf(bounds_of(problem.domain)[1])).tolist()
     asked = [joint for joint in endless if joint in variables]
     if not asked:
         return

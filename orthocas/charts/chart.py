@@ -85,8 +85,8 @@ class Chart(InverseMethods, Shown):
         """How good the chart is at one joint position (n,), or at each of a set or a path (N, n).
 
         Returns:
-            The leak of each coordinate [deg], the conditioning, and the distance to the border of the domain. The leak
-            is the angle in the metric between the gradient of a coordinate and the space orthogonal to the task.
+            The leak of each coordinate [deg], the conditioning, and the distance to the boundary of the domain. The
+            leak is the angle in the metric between the gradient of a coordinate and the space orthogonal to the task.
 
         Raises:
             ShapeError, InvalidValueError: if q has another number of joints, or is not finite.
@@ -96,13 +96,13 @@ class Chart(InverseMethods, Shown):
             >>> from orthocas import problems
             >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
             >>> quality = chart.quality([0.6, 0.8, 0.8])  # the centre, where linear coordinates are exact
-            >>> bool(quality.leak_deg.max() < 1e-4), float(quality.border_distance.round(3))
+            >>> bool(quality.leak_deg.max() < 1e-4), float(quality.boundary_distance.round(3))
             (True, 0.393)
         """
         points, single = as_point_set("q", q, self.n)
         found = point_quality(self.problem, self.coordinates, points)
         if single:
-            found = PointQuality(found.leak_deg[0], found.conditioning[0], found.border_distance[0])
+            found = PointQuality(found.leak_deg[0], found.conditioning[0], found.boundary_distance[0])
         return found
 
     def xi_range(self, q: ArrayLike) -> XiRange:

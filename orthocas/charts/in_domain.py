@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.newton import inverses
 from orthocas.charts.phi import ROUNDING, PhiMap, largest
-from orthocas.tasks.domains import Domain, borders
+from orthocas.tasks.domains import Domain, bounds_of
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
@@ -61,18 +61,18 @@ class BoxedPhi:
 
     @cached_property
     def low(self) -> Array:
-        """Lowest u, (n,): -1, or -inf for joints without borders."""
-        return (borders(self.domain)[0] - self.domain.centre) / self.domain.half_width
+        """Lowest u, (n,): -1, or -inf for joints without boundaries."""
+        return (bounds_of(self.domain)[0] - self.domain.centre) / self.domain.half_width
 
     @cached_property
     def high(self) -> Array:
         """Highest u, (n,)."""
-        return (borders(self.domain)[1] - self.domain.centre) / self.domain.half_width
+        return (bounds_of(self.domain)[1] - self.domain.centre) / self.domain.half_width
 
     def points(self, u: Array) -> Array:
-        """q at u (N, n), within the borders, (N, n)."""
+        """q at u (N, n), within the boundaries, (N, n)."""
         domain = self.domain
-        return np.clip(domain.centre + domain.half_width * u, *borders(domain))
+        return np.clip(domain.centre + domain.half_width * u, *bounds_of(domain))
 
     def of_points(self, q: Array) -> Array:
         """u of the points of the box nearest to q (N, n), (N, n)."""
@@ -292,7 +292,7 @@ class _Run:
         np.maximum(self.damping, _LEAST_DAMPING, out=self.damping)
 
     def _steps(self, rows: Indices) -> Array:
-        """Damped steps that stop at the border, (rows, n)."""
+        """Damped steps that stop at the boundary, (rows, n)."""
         J, errors = self._J[rows], self._errors[rows]
         low, high = self._equations.low - self.u[rows], self._equations.high - self.u[rows]
         wanted = np.einsum("nmi,nm->ni", J, errors)

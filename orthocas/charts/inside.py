@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthocas.charts.in_domain import KEPT, BoxedPhi, solve_in_box
 from orthocas.charts.newton import Starts
 from orthocas.charts.phi import PhiMap, largest, shortest
-from orthocas.tasks.domains import Domain, borders
+from orthocas.tasks.domains import Domain, bounds_of
 from orthocas.tools.batch import evaluate_columns
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
@@ -187,7 +187,7 @@ class _Run:
         x, start = self._targets[rows, : self._boxed.m], self.u[rows] + found.d
         u, error = solve_in_box(self._boxed.task_equations, x, start, found.at_low | found.at_high, _RETURN)
         missed = np.flatnonzero(error > KEPT)
-        if missed.size:  # the joints at the border are needed
+        if missed.size:  # the joints at the boundary are needed
             u[missed], error[missed] = solve_in_box(self._boxed.task_equations, x[missed], start[missed], most=_RETURN)
         return u, np.asarray(error <= KEPT)
 
@@ -213,7 +213,7 @@ class Nearest:
 
     def search(self, targets: Array, starts: Array) -> Array:
         """Where the search from starts (N, n) ends, (N, n); see `keeps_task`."""
-        low, high = borders(self.domain)
+        low, high = bounds_of(self.domain)
         with _one_at_a_time:
             q = evaluate_columns(self._search, 1, np.clip(starts, low, high), targets)[0]
         q = np.clip(q, low, high)  # NaN stays
@@ -249,7 +249,7 @@ class Nearest:
             "g": ca.vertcat(*constraints),
         }
         solver = ca.nlpsol("nearest", "ipopt", equations, _OPTIONS)
-        low, high = (ca.DM(bound) for bound in borders(domain))
+        low, high = (ca.DM(bound) for bound in bounds_of(domain))
         start = ca.MX.sym("start", n)
         found = solver(x0=start, p=target, lbx=low, ubx=high, lbg=ca.DM(lower), ubg=ca.DM(upper))
         return ca.Function("nearest", [start, target], [found["x"]])

@@ -12,7 +12,7 @@ from orthocas.charts.newton import Attempt, LocalSolver, Starts
 from orthocas.charts.phi import PhiMap, largest
 from orthocas.charts.solutions import InverseStatus, Solutions
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.domains import borders
+from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, Indices
@@ -23,7 +23,7 @@ _FIRST = 2  # restarts from points of the table, and the centre, before all of t
 _RESTARTS = 8  # from points of the table, where nothing leads to any solution
 _UNSOLVED = (InverseStatus.NOT_FOUND, InverseStatus.OUT_OF_REACH)
 _MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, *_UNSOLVED)
-_SNAP = 1e-9  # of the half-widths: solutions so close to the border are moved onto it
+_SNAP = 1e-9  # of the half-widths: solutions so close to the boundary are moved onto it
 _SLACK = 1e-9  # of the half-widths: joint limits are decimal numbers, see `require_within_limits`
 
 
@@ -202,8 +202,8 @@ class Inverse:
         return np.where(domain.contains(q), InverseStatus.FOUND, beyond).astype(np.int64)
 
     def _snapped(self, targets: Array, attempt: Attempt, tolerance: float) -> Attempt:
-        """The same points, but on the border where they are solutions that miss it by rounding."""
-        low, high = borders(self.problem.domain)
+        """The same points, but on the boundary where they are solutions that miss it by rounding."""
+        low, high = bounds_of(self.problem.domain)
         moved = np.clip(attempt.q, low, high)
         off = np.abs(moved - attempt.q)
         rows = np.flatnonzero((off > 0).any(axis=1) & (off <= _SNAP * self.problem.domain.half_width).all(axis=1))

@@ -14,7 +14,7 @@ from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, Poi
 from orthocas.charts.phi import PhiFunctions, PhiMap
 from orthocas.charts.solutions import Solutions, Tracker
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, SingularTaskError
-from orthocas.tasks.domains import borders
+from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.problem import task_sizes
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
@@ -243,7 +243,7 @@ class InverseMethods(PhiFunctions):
             inside = self.solve(targets[beyond], starts, tolerance=found.tolerance, inside=True)
             nearest[beyond] = inside.q
         q, domain = found.q[beyond[0]], self.problem.domain
-        low, high = borders(domain)
+        low, high = bounds_of(domain)
         j = int(np.argmax(np.maximum(low - q, q - high) / domain.half_width))
         reason = (
             f"joint '{self.problem.robot.joint_names[j]}' at {q[j]:.4g}, expected within [{low[j]:.4g}, {high[j]:.4g}]"

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.angles import MOST_JOINTS, judge_by_columns, judge_by_lapack
 from orthocas.charts.coordinates import CoordinateMap
-from orthocas.tasks.domains import borders, contains
+from orthocas.tasks.domains import bounds_of, contains
 from orthocas.tasks.problem import Problem, task_jacobians
 from orthocas.tasks.samples import Samples, samples_at
 from orthocas.tools.batch import in_threads
@@ -83,11 +83,13 @@ class PointQuality(Shown):
 
     leak_deg: Array  #: leak of each coordinate [deg], (r,) or (N, r); 0 is perfect
     conditioning: Array  #: smallest singular value of the normalised gradients, () or (N,); 1 perfect, 0 singular
-    border_distance: Array  #: to the nearest face of the domain, () or (N,), <= 0 outside, inf for a torus [rad] or [m]
+    boundary_distance: (
+        Array  #: to the nearest face of the domain, () or (N,), <= 0 outside, inf for a torus [rad] or [m]
+    )
 
     def facts(self) -> dict[str, str]:
         """The worst values of the set, or those of the one position."""
-        leak, conditioning, distance = np.atleast_2d(self.leak_deg), np.ravel(self.conditioning), self.border_distance
+        leak, conditioning, distance = np.atleast_2d(self.leak_deg), np.ravel(self.conditioning), self.boundary_distance
         known = np.isfinite(conditioning)
         single = np.ndim(self.conditioning) == 0
         facts = {"quality": "at one joint position" if single else f"at {len(leak)} joint positions"}
@@ -95,7 +97,7 @@ class PointQuality(Shown):
             facts["leak"] = f"{'' if single else 'at most '}{number_list(leak[known].max(axis=0))} deg"
             facts["conditioning"] = f"{'' if single else 'at least '}{conditioning[known].min():.3g}"
         if np.size(distance):
-            facts["border"] = f"{'' if single else 'at least '}{np.min(distance):.3g} away, in rad or m; < 0 outside"
+            facts["boundary"] = f"{'' if single else 'at least '}{np.min(distance):.3g} away, in rad or m; < 0 outside"
         if not known.all():
             facts["left out"] = f"{int((~known).sum())}, where a gradient vanishes or has no value"
         return facts
@@ -105,7 +107,7 @@ class PointQuality(Shown):
         return {
             "leak_deg": self.leak_deg.tolist(),
             "conditioning": self.conditioning.tolist(),
-            "border_distance": self.border_distance.tolist(),
+            "boundary_distance": self.boundary_distance.tolist(),
         }
 
 
@@ -115,7 +117,7 @@ def point_quality(problem: Problem, coordinates: CoordinateMap, points: Array) -
     leak, conditioning = np.full((len(points), coordinates.r), np.nan), np.full(len(points), np.nan)
     leak[judged.kept] = np.degrees(np.arcsin(np.clip(judged.leak_sines, 0.0, 1.0)))
     conditioning[judged.kept] = judged.conditioning
-    lower, upper = borders(problem.domain)
+    lower, upper = bounds_of(problem.domain)
     distance = np.minimum(points - lower, upper - points).min(axis=1)
     distance = np.where(contains(problem.domain, points), distance, np.minimum(distance, 0.0))  # too near a singularity
     return PointQuality(leak, conditioning, distance)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.tasks.domains import borders, contains
+from orthocas.tasks.domains import bounds_of, contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, Indices, as_number, as_point, frozen_array, require_count
 from orthocas.tools.display import Shown, listed
@@ -21,13 +21,13 @@ from orthocas.tools.display import Shown, listed
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
 
-_AT_LIMIT = 1e-9  # of the half-width: borders closer to a joint limit are that limit
+_AT_LIMIT = 1e-9  # of the half-width: boundaries closer to a joint limit are that limit
 _TOLERANCE = 1e-11  # largest error of the components that are held, relative to `Chart.phi_sizes`
 _CORRECTIONS = 8
 _SHARPEST = np.cos(0.35)  # of the angle between the tangents at both ends of a step
 _SHORTEST = 1e-5  # share of the largest step below which there is no way on
 _LONGEST = 1000.0  # length of a curve [rad] or [m] after which it counts as endless
-_ROUNDING = 2e-12  # of the place of a border on a step
+_ROUNDING = 2e-12  # of the place of a boundary on a step
 _STEP = 0.1  # [rad] or [m], of the widest step
 _PHI_TOLERANCE = 1e-10  # of phi, relative to `Chart.phi_sizes`
 _FARTHEST = 3.0  # distance of a point from its neighbour, in lengths of the predicted step
@@ -37,7 +37,7 @@ _MOST = 4  # times as many points as wanted, at most
 class StopKind(Enum):
     """Why a motion ends."""
 
-    JOINT = "joint"  #: a joint is at the border of the domain, or at its limit
+    JOINT = "joint"  #: a joint is at the boundary of the domain, or at its limit
     NEAR_SINGULAR = "near singular"  #: the relative singular value of the task is at the bound of a `ClearBox`
     FOLD = "fold"  #: the coordinate turns back: J = dphi/dq is singular
     SINGULAR = "singular"  #: no way on: the task is singular there, or grown coordinates end
@@ -51,7 +51,7 @@ class Stop:
     kind: StopKind
     joint: str = ""  #: name of the joint, for JOINT
     value: float = np.nan  #: position of that joint [rad] or [m], or the relative singular value of the task
-    is_limit: bool = False  #: whether the border of the domain is the limit of the joint
+    is_limit: bool = False  #: whether the boundary of the domain is the limit of the joint
 
     def __str__(self) -> str:
         if self.kind is StopKind.JOINT:
@@ -66,7 +66,7 @@ class Stop:
 
 
 class Walls:
-    """The borders of a problem's domain as functions that are positive inside.
+    """The boundaries of a problem's domain as functions that are positive inside.
 
     They are (q_i - low_i) and (high_i - q_i), divided by the half-width of the domain, for every bounded joint; and for
     a `ClearBox` also s(q) - bound.
@@ -75,7 +75,7 @@ class Walls:
     def __init__(self, problem: Problem) -> None:
         domain = problem.domain
         self._domain, self._robot = domain, problem.robot
-        self._low, self._high = borders(domain)
+        self._low, self._high = bounds_of(domain)
         self._clear = domain.singular_bound
         endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
         self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
@@ -96,12 +96,12 @@ class Walls:
             assert self._clear is not None
             return Stop(StopKind.NEAR_SINGULAR, value=float(self._clear.singular_values(q)))
         i = k % n
-        border, limit = (self._low, self._robot.lower) if k < n else (self._high, self._robot.upper)
-        at_limit = bool(abs(border[i] - limit[i]) <= _AT_LIMIT * self._domain.half_width[i])
-        return Stop(StopKind.JOINT, self._robot.joint_names[i], float(border[i]), at_limit)
+        boundary, limit = (self._low, self._robot.lower) if k < n else (self._high, self._robot.upper)
+        at_limit = bool(abs(boundary[i] - limit[i]) <= _AT_LIMIT * self._domain.half_width[i])
+        return Stop(StopKind.JOINT, self._robot.joint_names[i], float(boundary[i]), at_limit)
 
     def worst(self, q: Array) -> Stop:
-        """The border that q (n,) has crossed farthest, or is nearest to."""
+        """The boundary that q (n,) has crossed farthest, or is nearest to."""
         return self.stop(int(np.argmin(self.values(q))), q)
 
     def gap(self, q: Array, start: Array) -> Array:

@@ -54,11 +54,11 @@ class Source(Protocol):
         ...
 
     def law_values(self, controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
-        """Values of the placeholders in the templates of laws that depend on the border or on the chart."""
+        """Values of the placeholders in the templates of laws that depend on the boundary or on the chart."""
         ...
 
     def graph(self, graph: ca.Function) -> ca.Function:
-        """The graph of a law, less the border of a domain that C code looks after."""
+        """The graph of a law, less the boundary of a domain that C code looks after."""
         ...
 
     def stack_bytes(self, size: int) -> int:
@@ -76,18 +76,18 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True)
-class BorderCondition:
+class BoundaryCondition:
     """What the supervised law has to know of a condition."""
 
-    template: str  #: code with `clearance(q)`: 0 at the border, 1 as far inside as the middle
+    template: str  #: code with `clearance(q)`: 0 at the boundary, 1 as far inside as the middle
     meaning: str  #: of that number, for the header
     values: dict[str, str]  #: of the placeholders in the template
     kernels: tuple[ca.Function, ...] = ()
-    inwards: str = ""  #: code that brings `inner` inside, before the borders of the box do
+    inwards: str = ""  #: code that brings `inner` inside, before the boundaries of the box do
 
 
-def border_condition(source: Source, controller: Controller) -> BorderCondition | None:
-    """The condition of the law's domain as a part of its border, if it has one."""
+def boundary_condition(source: Source, controller: Controller) -> BoundaryCondition | None:
+    """The condition of the law's domain as a part of its boundary, if it has one."""
     domain = source.condition
     if controller.chart is None or domain is None:
         return None
@@ -96,27 +96,27 @@ def border_condition(source: Source, controller: Controller) -> BorderCondition 
     return None if domain.path_bound is None else _near_path(domain.path_bound)
 
 
-def border_units(domain: Domain) -> Any:
-    """What distances to the borders of the box count in, (n,): half-widths, or the radius of a corridor if smaller.
+def boundary_units(domain: Domain) -> Any:
+    """What distances to the boundaries of the box count in, (n,): half-widths, or the radius of a corridor if smaller.
 
-    A path of a corridor ends one radius before the border of its box, which may be many radii wide.
+    A path of a corridor ends one radius before the boundary of its box, which may be many radii wide.
     """
     near = domain.path_bound
     return domain.half_width if near is None else np.minimum(domain.half_width, near.radius)
 
 
-def _clear(clear: SingularBound) -> BorderCondition:
+def _clear(clear: SingularBound) -> BoundaryCondition:
     span = float(clear.singular_values(clear.centre)) - clear.least_singular_value
-    return BorderCondition(
-        "clear_border.c",
-        "The bound on the relative singular value of the task is a part of the border; its\n"
+    return BoundaryCondition(
+        "clear_boundary.c",
+        "The bound on the relative singular value of the task is a part of the boundary; its\n"
         " * distance counts in shares of that from the centre.",
         {"clear_bound": repr(clear.least_singular_value), "clear_span": repr(span)},
         (scalar_code(ca.Function("gram", [q := ca.MX.sym("q", len(clear.centre))], [clear.gram(q)])),),
     )
 
 
-def _near_path(corridor: PathBound) -> BorderCondition:
+def _near_path(corridor: PathBound) -> BoundaryCondition:
     starts, axes, squares = corridor.lines
     values = {
         "lines": str(len(squares)),
@@ -127,9 +127,9 @@ def _near_path(corridor: PathBound) -> BorderCondition:
         "path_axes": _rows(axes),
         "path_lengths": numbers(np.sqrt(squares)),
     }
-    return BorderCondition(
-        "corridor_border.c",
-        "The distance to the path of postures is a part of the border; it counts in radii.",
+    return BoundaryCondition(
+        "corridor_boundary.c",
+        "The distance to the path of postures is a part of the boundary; it counts in radii.",
         values,
         inwards="  towards_path(fmax(share, DEEP), inner);\n",
     )

@@ -9,13 +9,13 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.codegen.boundary import border_units
+from orthocas.codegen.boundary import boundary_units
 from orthocas.codegen.description import chart_values, filled, flags, numbers, words
 from orthocas.codegen.precision import Precision, bounds_inside
 from orthocas.control.controller import Controller
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.domains import Domain, borders, contains, reach
+from orthocas.tasks.domains import Domain, bounds_of, contains, reach
 from orthocas.tools.checks import Array
 
 
@@ -54,14 +54,14 @@ class ChartSource:
         return Safety.of(controller)
 
     def law_values(self, controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
-        """The border of the box, which is none for laws without a chart, and nothing about charts."""
+        """The boundary of the box, which is none for laws without a chart, and nothing about charts."""
         domain = controller.problem.domain
-        lower, upper = borders(domain)
-        bordered = np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None)
+        lower, upper = bounds_of(domain)
+        bounded = np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None)
         values = {
             "domain_half_width": numbers(domain.half_width),
-            "border_unit": numbers(border_units(domain)),
-            "bordered": flags(bordered),
+            "boundary_unit": numbers(boundary_units(domain)),
+            "bounded": flags(bounded),
             "law_mem": "0",
             "law_now": "state->law[i]",
             "middle": "centre",
@@ -71,8 +71,8 @@ class ChartSource:
         everything = {**known, **values}
         return {
             **values,
-            "border_tables": filled("border_tables.c", everything),
-            "border_c": filled("border_of_box.c", everything),
+            "boundary_tables": filled("boundary_tables.c", everything),
+            "boundary_c": filled("boundary_of_box.c", everything),
         }
 
     def graph(self, graph: ca.Function) -> ca.Function:

@@ -12,7 +12,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.control.controller import Controller
 from orthocas.robots.kinematics import TipTurn
-from orthocas.tasks.domains import Domain, borders
+from orthocas.tasks.domains import Domain, bounds_of
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array
 
@@ -92,8 +92,8 @@ def chart_values(chart: Chart) -> dict[str, str]:
 
 
 def domain_lines(domain: Domain, names: list[str]) -> str:
-    """The borders of a domain, joint by joint, and its condition on singular values."""
-    return _border_lines(names, *borders(domain)) + clear_line(domain)
+    """The boundaries of a domain, joint by joint, and its condition on singular values."""
+    return _boundary_lines(names, *bounds_of(domain)) + clear_line(domain)
 
 
 def _angles(chart: Chart) -> str:
@@ -131,7 +131,7 @@ def _certificate(chart: Chart) -> str:
     return "none" if known is None else f"{known.heading} ({known.method}, chart {known.fingerprint[:16]})"
 
 
-def _border_lines(names: list[str], lower: Array, upper: Array) -> str:
+def _boundary_lines(names: list[str], lower: Array, upper: Array) -> str:
     if np.isinf(lower).all():
         return " *   all joint positions"
     ranges = [

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.codegen.boundary import BorderCondition, Source, border_condition
+from orthocas.codegen.boundary import BoundaryCondition, Source, boundary_condition
 from orthocas.codegen.description import control_values, description_values, filled, flags, numbers, words
 from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.precision import Precision, check_values
@@ -19,7 +19,7 @@ _VELOCITY = """It stops the arm and holds it."""
 _MAX_EVALUATIONS = 100  # largest number of chart evaluations in one call of the inverse map
 
 
-def supervision_kernels(controller: Controller, condition: BorderCondition | None) -> list[ca.Function]:
+def supervision_kernels(controller: Controller, condition: BoundaryCondition | None) -> list[ca.Function]:
     """Fallback(q, gains) -> command, and deviation(q, reference) -> quantities, reference - quantities."""
     n, k = controller.problem.n, len(controller.labels)
     fallback, q, reference = controller.fallback, ca.MX.sym("q", n), ca.MX.sym("reference", k)
@@ -35,7 +35,7 @@ def supervision_kernels(controller: Controller, condition: BorderCondition | Non
     return found if condition is None else [*found, *condition.kernels]
 
 
-def supervision_values(controller: Controller, safety: Safety, condition: BorderCondition | None) -> dict[str, str]:
+def supervision_values(controller: Controller, safety: Safety, condition: BoundaryCondition | None) -> dict[str, str]:
     """Values of the placeholders in the templates of the supervised law.
 
     Args:
@@ -56,14 +56,14 @@ def supervision_values(controller: Controller, safety: Safety, condition: Border
     }
 
 
-def _clearance_values(condition: BorderCondition | None) -> dict[str, str]:
-    """The condition of the domain as a part of the border."""
+def _clearance_values(condition: BoundaryCondition | None) -> dict[str, str]:
+    """The condition of the domain as a part of the boundary."""
     if condition is None:
-        return {"nearest": "1.0", "clearance_too": " in half-widths", "border_told": "", "inwards": ""}
+        return {"nearest": "1.0", "clearance_too": " in half-widths", "boundary_told": "", "inwards": ""}
     return {
         "nearest": "clearance_ahead(q, dq, time)",
         "clearance_too": " in half-widths, or the clearance",
-        "border_told": f" {condition.meaning}",
+        "boundary_told": f" {condition.meaning}",
         "inwards": condition.inwards,
         **condition.values,
     }
@@ -115,7 +115,7 @@ def template_values(
     }
     values |= source.values(values, precision)
     if controller is not None and safety is not None:
-        condition = border_condition(source, controller)
+        condition = boundary_condition(source, controller)
         values |= control_values(controller) | supervision_values(controller, safety, condition)
         values["clearance_c"] = "" if condition is None else _clearance(condition, values)
         values |= source.law_values(controller, values)
@@ -125,9 +125,9 @@ def template_values(
     return values
 
 
-def _clearance(condition: BorderCondition, values: dict[str, str]) -> str:
+def _clearance(condition: BoundaryCondition, values: dict[str, str]) -> str:
     """Code that tells how far a position is inside the condition of the domain, here and after a time."""
-    return filled("clearance.c", {**values, "condition_border": filled(condition.template, values)})
+    return filled("clearance.c", {**values, "condition_boundary": filled(condition.template, values)})
 
 
 def _sizes(chart: Chart) -> dict[str, str]:

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.codegen.boundary import Source, border_condition
+from orthocas.codegen.boundary import Source, boundary_condition
 from orthocas.codegen.description import filled
 from orthocas.codegen.interface import supervision_kernels, template_values
 from orthocas.codegen.kernels import Kernels, generate_kernels
@@ -87,8 +87,8 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
     if controller is not None:
         graph = source.graph(precision.graph(controller))
         inputs = graph.mx_in()
-        border = border_condition(source, controller)
-        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, border)]
+        boundary = boundary_condition(source, controller)
+        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, boundary)]
     return found
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.codegen.description import numbers
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, with_smallest_volume
-from orthocas.tasks.domains import Domain, borders, reach
+from orthocas.tasks.domains import Domain, bounds_of, reach
 from orthocas.tools.checks import Array
 
 _EXPONENT = re.compile(r"e\+?(-?)0*")  # 1e+06 becomes 1e6, and 1e-05 1e-5
@@ -130,8 +130,8 @@ def _in_single_precision(token: re.Match[str]) -> str:
 def bounds_inside(domain: Domain, precision: Precision) -> tuple[Array, Array]:
     """Lower and upper bounds in a precision, (n,) each, that belong to the domain in Python and in C."""
     centre, found = precision.rounded(domain.centre), []
-    for border in borders(domain):
-        bound = precision.rounded(border)
+    for boundary in bounds_of(domain):
+        bound = precision.rounded(boundary)
         while (beyond := _is_beyond(domain, bound, precision)).any():
             inwards = np.nextafter(bound.astype(precision.scalar), centre.astype(precision.scalar))
             bound = np.where(beyond, inwards, bound)

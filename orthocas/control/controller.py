@@ -36,7 +36,7 @@ class ControlStatus(IntEnum):
     SINGULAR = 2
     NOT_FINITE = 3
     SATURATED = 4
-    NEAR_BORDER = 5  #: this and the following ones come from the supervised law in C
+    NEAR_BOUNDARY = 5  #: this and the following ones come from the supervised law in C
     CAUGHT = 6
     RETURNING = 7
     BAD_INPUT = 8
@@ -45,12 +45,12 @@ class ControlStatus(IntEnum):
 
     @property
     def words(self) -> str:
-        """For example 'near border'."""
+        """For example 'near boundary'."""
         return self.name.lower().replace("_", " ")
 
 
 #: statuses of commands that are not the fallback
-FROM_THE_LAW = (ControlStatus.OK, ControlStatus.SATURATED, ControlStatus.NEAR_BORDER)
+FROM_THE_LAW = (ControlStatus.OK, ControlStatus.SATURATED, ControlStatus.NEAR_BOUNDARY)
 
 
 def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> ca.Function:
@@ -102,14 +102,14 @@ def _cut(command: ca.SX, limit: ca.SX, keep_direction: bool) -> ca.SX:
 
 
 def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
-    """Whether q (n, 1) lies in the domain: between its borders, and where its condition holds, if it has one."""
+    """Whether q (n, 1) lies in the domain: between its boundaries, and where its condition holds, if it has one."""
     condition = None if domain is None else domain.condition
     clear = ca.SX(1) if condition is None else _all(condition.pivots(q) > 0)
-    return ca.logic_and(_is_between_borders(domain, q), clear)
+    return ca.logic_and(_is_between_boundaries(domain, q), clear)
 
 
-def _is_between_borders(domain: Domain | None, q: ca.SX) -> ca.SX:
-    """Whether q (n, 1) lies in the box; always true for joints without borders, such as the angles of a torus."""
+def _is_between_boundaries(domain: Domain | None, q: ca.SX) -> ca.SX:
+    """Whether q (n, 1) lies in the box; always true for joints without boundaries, such as the angles of a torus."""
     widths = np.full(q.shape[0], np.inf) if domain is None else reach(domain)
     bounded = np.flatnonzero(np.isfinite(widths)).tolist()
     if domain is None or not bounded:
@@ -281,7 +281,7 @@ def with_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:
     return ca.Function(graph.name(), inputs, list(outputs), graph.name_in(), graph.name_out())
 
 
-def without_border(graph: ca.Function, inside: Array) -> ca.Function:
+def without_boundary(graph: ca.Function, inside: Array) -> ca.Function:
     """The same graph of a controller, whose guard sees a position inside the domain, (n,), whatever q is."""
     inputs, call = _guard_call(graph)
     if call is None:

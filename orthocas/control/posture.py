@@ -8,7 +8,7 @@ from orthocas.charts.self_motion import too_far
 from orthocas.charts.solutions import Tracker, TrackerStatus
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError
-from orthocas.tasks.domains import borders, contains
+from orthocas.tasks.domains import bounds_of, contains
 from orthocas.tools.checks import Array, as_point, require_kind
 
 
@@ -77,7 +77,7 @@ def _outside(chart: Chart, q: Array) -> str:
     domain = chart.problem.domain
     if domain.condition is not None and not np.all(np.asarray(domain.condition.pivots(q)) > 0):
         return domain.told(q)
-    low, high = borders(domain)
+    low, high = bounds_of(domain)
     i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))
     low, high = low[i], high[i]
     return f"joint '{chart.problem.robot.joint_names[i]}' at {q[i]:.4g}, expected within [{low:.4g}, {high:.4g}]"

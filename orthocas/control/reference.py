@@ -159,7 +159,7 @@ class Reference(Shown):
         return float(self.times[-1])
 
     def segment(self, times: Array) -> Array:
-        """Index of the segment that contains each time; a time on a border belongs to the later segment."""
+        """Index of the segment that contains each time; a time on a boundary belongs to the later segment."""
         return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.parameters) - 1)
 
     def sample(self, times: ArrayLike) -> tuple[Array, Array, Array]:
@@ -201,7 +201,7 @@ def _pairs(changes: Sequence[Change]) -> Sequence[Change]:
 
 
 def _stairs(labels: tuple[str, ...], start: Array, changes: Sequence[Change], duration: float) -> tuple[Array, Array]:
-    """Segment borders (S + 1,) and targets (S, k)."""
+    """Segment boundaries (S + 1,) and targets (S, k)."""
     times, targets = [0.0], [start]
     for time, moves in _pairs(changes):
         at = _require_number("time of a step", time)

@@ -1,4 +1,4 @@
-"""Settings of the supervised law in generated C: border, catcher, limits, bad input (ours)."""
+"""Settings of the supervised law in generated C: boundary, catcher, limits, bad input (ours)."""
 
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Self, get_args
@@ -27,16 +27,16 @@ _ZONE = 0.05  # [rad] or [m], at most this share of the range of a joint
 class Safety:
     """Settings of the supervised law; `Safety.of(controller)` gives the default ones.
 
-    Margins are distances to the border in half-widths of the domain. On a `ClearBox`, the bound on the relative
-    singular value s is a border too, at the distance (s - bound) / (s at the centre - bound). In a `Corridor`, the path
-    is 1 and the border 0, and the other borders of its joints count in radii as well. Lists hold one number per joint
-    (n,), or per controlled quantity (k,) where that is said. The meanings are those of the generated header.
+    Margins are distances to the boundary in half-widths of the domain. On a `ClearBox`, the bound on the relative
+    singular value s is a boundary too, at the distance (s - bound) / (s at the centre - bound). In a `Corridor`, the
+    path is 1 and the boundary 0, and the other boundaries of its joints count in radii as well. Lists hold one number
+    per joint (n,), or per controlled quantity (k,) where that is said. The meanings are those of the generated header.
     """
 
     command_rate: Annotated[Array, "largest change of the command [N m/s], [rad/s^2]; in a tick: times its period"]
     speed_limit: Annotated[Array, "joint speed at which the catcher takes over; 30 times that is a bad one [rad/s]"]
     rest_speed: Annotated[Array, "joint speed below which the arm counts as slow [rad/s]"]
-    near_margin: Annotated[float, "distance to the border at which NEAR_BORDER and additional damping begin"]
+    near_margin: Annotated[float, "distance to the boundary at which NEAR_BOUNDARY and additional damping begin"]
     catch_margin: Annotated[float, "where the catcher takes over, also if the arm gets there while the law fades out"]
     return_margin: Annotated[float, "where the arm must be before the law takes over again"]
     fade_in: Annotated[float, "time in which the law takes over [s]"]

@@ -27,8 +27,8 @@ from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.progress import Monitor, Progress, silent
 
 JUDGES = 30_000  #: samples that judge the fit
-_START, _STEP = 0.5, 1.6  # first scale of the box, and factor to the next while the border is unknown
-_CLOSE = 1.06  # the border is found within this factor
+_START, _STEP = 0.5, 1.6  # first scale of the box, and factor to the next while the boundary is unknown
+_CLOSE = 1.06  # the boundary is found within this factor
 _SMALLEST = 1e-3  # scale of a box that is too small to be of use
 _ROUNDS = 2  # exchanges of width between joints
 _WIDER = 1.2  # factor by which one joint alone is widened
@@ -136,7 +136,7 @@ class WidestBox:
     """Search for the half-widths with the largest product that keep the bounds.
 
     From a common scale, rounds of exchange follow: joints whose widening costs little become wider, the others
-    narrower, and the scale returns to the border of the bounds. At the optimum all joints that are free cost the same.
+    narrower, and the scale returns to the bounds. At the optimum all joints that are free cost the same.
 
     Args:
         prober: fits and judges trial boxes.
@@ -168,9 +168,9 @@ class WidestBox:
         """
         if not self.free:
             return self.room.copy(), {}
-        widths = self._to_border(unit, _START)
+        widths = self._to_boundary(unit, _START)
         for _ in range(_ROUNDS):
-            trial = self._to_border(widths * np.exp(-self._exchange(widths)), 1.0)
+            trial = self._to_boundary(widths * np.exp(-self._exchange(widths)), 1.0)
             if np.log(trial[self.free]).sum() <= np.log(widths[self.free]).sum():
                 break
             widths = trial
@@ -201,7 +201,7 @@ class WidestBox:
             f"{widths[self.free].max():.1g} {found.told(miss, self.bounds)}; {REMEDIES}"
         )
 
-    def _to_border(self, unit: Array, scale: float) -> Array:
+    def _to_boundary(self, unit: Array, scale: float) -> Array:
         """The widest multiple of half-widths that keeps the bounds."""
         low, high = 0.0, np.inf
         while high > _CLOSE * low:

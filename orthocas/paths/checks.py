@@ -13,7 +13,7 @@ from orthocas.paths.joint_motion import Margins
 from orthocas.paths.plan import Plan
 from orthocas.robots.obstacles import LinkDistances
 from orthocas.tasks.clear_box import row_scale
-from orthocas.tasks.domains import borders, contains, sample_uniform
+from orthocas.tasks.domains import bounds_of, contains, sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import BlockedFunction
@@ -107,7 +107,7 @@ class Limits:
 
     def margins(self, q: Array, dq: Array, ddq: Array) -> Margins:
         """What a motion leaves, at its time stamps."""
-        low, high = borders(self.chart.problem.domain)
+        low, high = bounds_of(self.chart.problem.domain)
         room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width
         worst = int(np.argmin(room.min(axis=0)))
         bounded = bool(np.isfinite(room).any())

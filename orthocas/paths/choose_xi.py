@@ -11,7 +11,7 @@ from orthocas.charts.phi import counted_on
 from orthocas.paths.checks import Limits
 from orthocas.paths.joint_curve import Solver
 from orthocas.paths.plan import Plan
-from orthocas.tasks.domains import borders
+from orthocas.tasks.domains import bounds_of
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
@@ -46,16 +46,16 @@ class Costs:
 
     def __call__(self, q: Array) -> tuple[Array, Array]:
         """Residuals (P, k) and gradients (P, k, n) at joint positions (P, n)."""
-        parts = [self._of_borders(q), self._of_task(q)]
+        parts = [self._of_boundaries(q), self._of_task(q)]
         if self.limits.distances.obstacles:
             values, gradients = self.limits.distances.with_gradients(q)
             residuals, slopes = _inverse(values - self.limits.clearance, _AWAY, _TOO_NEAR)
             parts.append((residuals, slopes[..., None] * gradients))
         return np.concatenate([part[0] for part in parts], axis=1), np.concatenate([part[1] for part in parts], axis=1)
 
-    def _of_borders(self, q: Array) -> tuple[Array, Array]:
+    def _of_boundaries(self, q: Array) -> tuple[Array, Array]:
         domain = self.limits.chart.problem.domain
-        bounded = np.flatnonzero(np.isfinite(borders(domain)[0]))
+        bounded = np.flatnonzero(np.isfinite(bounds_of(domain)[0]))
         u = ((q - domain.centre) / domain.half_width)[:, bounded]
         near = np.clip(u, -_INSIDE, _INSIDE)
         slopes = (1 - near**2) ** -1.5

@@ -48,7 +48,7 @@ def follow(
         chart: a fitted chart.
         tool_path: task values of waypoints (N, m), or a function of s in [0, 1] that returns task values (m,).
         xi: "hold" keeps the coordinates of `q_start`. An array (N, r) gives them at the waypoints, a function of s in
-            [0, 1] along the path. "objective" chooses them: away from the border of the domain, from positions where
+            [0, 1] along the path. "objective" chooses them: away from the boundary of the domain, from positions where
             the task is near-singular, and from obstacles, and with little motion. Circle-valued coordinates go from
             each waypoint to the next by the shorter way, and count on beyond pi.
         q_start: a joint position (n,) near the start of the path. Default: the centre of the domain.

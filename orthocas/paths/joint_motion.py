@@ -23,8 +23,8 @@ _HEAD = "time_s"  # first column of our files
 class Margins:
     """How far a motion stays from its limits, at its time stamps."""
 
-    border: float  #: smallest distance of a joint to the border of the domain, in half-widths
-    border_joint: str  #: the joint that comes closest, or ""
+    boundary: float  #: smallest distance of a joint to the boundary of the domain, in half-widths
+    boundary_joint: str  #: the joint that comes closest, or ""
     velocity: float  #: largest share of a velocity limit that is used, at most 1
     acceleration: float  #: largest share of an acceleration limit that is used, at most 1
     singular_value: float  #: smallest relative singular value of the task, see `orthocas.ClearBox`
@@ -69,11 +69,11 @@ class JointMotion(Shown):
         kept, r = self.margins, self.xi.shape[1]
         ranges = zip(self.labels[-r:], self.xi.min(axis=0), self.xi.max(axis=0), strict=True)
         kind = "closed" if self.closed else "open"
-        near = f" (joint '{kept.border_joint}')" if kept.border_joint else ""
+        near = f" (joint '{kept.boundary_joint}')" if kept.boundary_joint else ""
         return {
             "motion": f"{self.duration:.4g} s in {len(self.times)} time stamps, {kind} path",
             "coordinates": listed(f"{label} from {low:.4g} to {high:.4g}" for label, low, high in ranges),
-            "border": f"{kept.border:.3g} half-widths away{near}",
+            "boundary": f"{kept.boundary:.3g} half-widths away{near}",
             "speed": f"{100 * kept.velocity:.3g} % of the limits, acceleration {100 * kept.acceleration:.3g} %",
             "task": f"relative singular value at least {kept.singular_value:.3g}",
             **({"obstacles": f"{kept.distance:.3g} m away: {kept.distance_pair}"} if kept.distance_pair else {}),

@@ -147,9 +147,9 @@ def _continuous_by_cvodes(loop: ClosedLoop, reference: Reference, tolerance: flo
 def _pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> Iterator[tuple[float, float]]:
     """Intervals of at most the given length, without a step of the reference or a change of load inside."""
     edges = np.array([*reference.times, *(t for push in pushes for t in (push.start, push.end))])
-    borders = np.unique(edges[edges <= reference.duration])
-    borders = borders[np.diff(borders, prepend=-1.0) > _SAME]
-    for begin, end in pairwise(borders):
+    boundaries = np.unique(edges[edges <= reference.duration])
+    boundaries = boundaries[np.diff(boundaries, prepend=-1.0) > _SAME]
+    for begin, end in pairwise(boundaries):
         count = max(1, int(np.ceil((end - begin) / longest - 1e-9)))
         cuts = np.linspace(begin, end, count + 1)
         yield from pairwise(cuts)

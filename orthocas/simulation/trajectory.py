@@ -138,7 +138,7 @@ class Trajectory(Shown):
 
     @property
     def catches(self) -> tuple[tuple[float, ControlStatus], ...]:
-        """When the catcher of a supervised law took over [s], and why; OK: the run began too near the border."""
+        """When the catcher of a supervised law took over [s], and why; OK: the run began too near the boundary."""
         caught = self.status == ControlStatus.CAUGHT
         first = np.flatnonzero(caught & ~np.concatenate([[False], caught[:-1]]))
         return tuple((float(self.times[i]), ControlStatus(int(self.cause[i]))) for i in first)

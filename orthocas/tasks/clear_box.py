@@ -63,7 +63,7 @@ class ClearBox(Box):
     `Problem(..., least_singular_value=bound)` builds it.
 
     Args:
-        box: the borders.
+        box: the boundaries.
         task: the task.
         least_singular_value: the bound, > 0.
         scale: the diagonal of D, (m,) > 0, in m and rad per rad. Default: from 256 samples of the box.
@@ -207,7 +207,7 @@ class ClearBox(Box):
     @cached_property
     def share(self) -> float:
         """Share of the box that is clear, from 20,000 samples."""
-        return float(self.is_clear(sample_evenly(_borders(self), _SHARE_SAMPLES, _SEED)).mean())
+        return float(self.is_clear(sample_evenly(_boundaries(self), _SHARE_SAMPLES, _SEED)).mean())
 
     @cached_property
     def gram(self) -> ca.Function:
@@ -240,7 +240,7 @@ class ClearBox(Box):
 
     def _row_sizes(self) -> Array:
         """The scale of the rows at samples of the box, without those where they are not finite, (m,)."""
-        J = self._jacobians(sample_uniform(_borders(self), _SAMPLES, _SEED))
+        J = self._jacobians(sample_uniform(_boundaries(self), _SAMPLES, _SEED))
         known = np.isfinite(J).all(axis=(1, 2))
         if not known.any():
             raise SingularTaskError(
@@ -265,7 +265,7 @@ def clear_domain(domain: Domain, task: Task, least_singular_value: float | None)
     return domain
 
 
-def _borders(box: Box) -> Box:
+def _boundaries(box: Box) -> Box:
     """The whole box, also of a ClearBox."""
     return Box(box.centre, box.half_width)
 

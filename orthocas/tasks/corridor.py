@@ -135,7 +135,7 @@ class Corridor(Box):
         return dense_function("pivots", [q], [1 - ca.mmin(ca.vertcat(*squares))])
 
     def draw(self, rng: np.random.Generator, count: int, power: float) -> Array:
-        """At most `count` points (M, n): uniform for power 1, nearer to the border for smaller powers.
+        """At most `count` points (M, n): uniform for power 1, nearer to the boundary for smaller powers.
 
         Points are drawn in cylinders around lines, in proportion to their volumes. Those in the corridor are kept with
         probability 1 / k if k cylinders hold them.

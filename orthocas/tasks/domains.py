@@ -49,7 +49,7 @@ class Domain(ABC):
     half_width: Array  #: half of the edge lengths of that box, (n,), > 0
     unbounded: tuple[int, ...] = ()  #: joints whose every position lies inside
     full_turns: bool = False  #: whether all joints turn without end and positions repeat after a turn
-    is_box: bool = False  #: whether all of the box between its borders lies inside
+    is_box: bool = False  #: whether all of the box between its boundaries lies inside
     draws_itself: bool = False  #: whether it is a small part of its box, so that `draw` does not try the whole box
 
     @abstractmethod
@@ -88,7 +88,7 @@ class Domain(ABC):
     def draw(self, rng: np.random.Generator, count: int, power: float) -> Array:
         """At most `count` points (M, n), of which those in the domain count: |u|^power half-widths from the centre.
 
-        With power 1 they are uniform, with smaller ones nearer to the borders.
+        With power 1 they are uniform, with smaller ones nearer to the boundaries.
         """
         u = rng.uniform(-1.0, 1.0, (count, len(self.centre)))
         return _scaled(self, u if power == 1 else np.sign(u) * np.abs(u) ** power)
@@ -320,7 +320,7 @@ class Box(Domain):
 
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie in the box: a bool, or (N,)."""
-        return _between_borders(self, q)
+        return _between_boundaries(self, q)
 
     def within(self, box: "Box") -> "Box":
         """The other box."""
@@ -363,7 +363,7 @@ class Torus(Domain):
 
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie on the torus: a bool, or (N,). All finite angles do."""
-        return _between_borders(self, q)
+        return _between_boundaries(self, q)
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Nothing: a torus is known by its number of joints."""
@@ -438,7 +438,7 @@ def require_domain(domain: Domain) -> None:
         raise InvalidValueError("domain", f"a {type(domain).__name__}", "a Box, a Torus or another Domain")
 
 
-def borders(domain: Domain) -> tuple[Array, Array]:
+def bounds_of(domain: Domain) -> tuple[Array, Array]:
     """Lowest and highest joint positions, (n,) each. They are infinite for unbounded joints, and for a torus."""
     half_width = domain.half_width.copy()
     half_width[slice(None) if domain.full_turns else list(domain.unbounded)] = np.inf
@@ -446,14 +446,14 @@ def borders(domain: Domain) -> tuple[Array, Array]:
 
 
 def reach(domain: Domain) -> Array:
-    """Largest distance from the centre that counts as inside, (n,), with slack for rounding at the borders."""
-    lower, upper = borders(domain)
+    """Largest distance from the centre that counts as inside, (n,), with slack for rounding at the boundaries."""
+    lower, upper = bounds_of(domain)
     values: Array = (upper - lower) / 2 + slack(domain)
     return values
 
 
 def slack(domain: Domain) -> Array:
-    """What the borders of a domain give for rounding, (n,)."""
+    """What the boundaries of a domain give for rounding, (n,)."""
     values: Array = 1e-12 * domain.half_width + 4 * np.finfo(float).eps * np.abs(domain.centre)
     return values
 
@@ -502,15 +502,15 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
         raise DomainError(f"joint '{name}' is prismatic, expected a Box domain instead of a Torus")
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
     if not domain.full_turns:
-        low, high = borders(domain)
+        low, high = bounds_of(domain)
     slack = 1e-9 * domain.half_width  # limits in a URDF are decimal, so sums are not exact
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
     if outside.size:
         _raise_outside(robot, int(outside[0]), low, high)
 
 
-def _between_borders(domain: Domain, q: ArrayLike) -> Any:
-    """Whether points (n,) or (N, n) lie between the borders of a domain: a bool, or (N,)."""
+def _between_boundaries(domain: Domain, q: ArrayLike) -> Any:
+    """Whether points (n,) or (N, n) lie between the boundaries of a domain: a bool, or (N,)."""
     points, single = as_point_set("q", q, len(domain.centre))
     inside = np.all(np.abs(points - domain.centre) <= reach(domain), axis=1)
     return inside[0] if single else inside

@@ -9,7 +9,7 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.robots.robot import Robot
-from orthocas.tasks.domains import borders
+from orthocas.tasks.domains import bounds_of
 from orthocas.tools.checks import Array
 from orthocas.viewer.motion import Motion
 
@@ -41,8 +41,8 @@ class Readings:
     drift: float  #: largest |x - held x| of a component, in the units of the task
     leak_deg: Array  #: (r,) leak of each coordinate [deg]
     conditioning: float  #: 1 perfect, 0 singular
-    border: float  #: distance to the border of the domain [rad] or [m]
-    inside: Array  #: (n,) place of each joint in the domain: -1 and 1 are its borders, 0 its middle
+    boundary: float  #: distance to the boundary of the domain [rad] or [m]
+    inside: Array  #: (n,) place of each joint in the domain: -1 and 1 are its boundaries, 0 its middle
     stop: str = ""  #: what stopped the last motion, or ""
 
 
@@ -52,7 +52,7 @@ class Readers:
     def __init__(self, chart: Chart) -> None:
         self._chart = chart
         domain = chart.problem.domain
-        low, high = borders(domain)
+        low, high = bounds_of(domain)
         self._free = ~np.isfinite(low) | ~np.isfinite(high)
         self._middle, self._half_width = domain.centre, domain.half_width
 
@@ -69,7 +69,7 @@ class Readers:
             drift=float(np.abs(phi[: chart.m] - held).max()),
             leak_deg=quality.leak_deg,
             conditioning=float(quality.conditioning),
-            border=float(quality.border_distance),
+            boundary=float(quality.boundary_distance),
             inside=np.where(self._free, (inside + 1) % 2 - 1, inside),
             stop=stop,
         )
@@ -82,7 +82,7 @@ class ChartPanel:
         self.chart = chart
         problem = chart.problem
         robot, domain = problem.robot, problem.domain
-        self._joints = JointBars(robot.joint_names, robot.tree.prismatic, robot.lower, robot.upper, *borders(domain))
+        self._joints = JointBars(robot.joint_names, robot.tree.prismatic, robot.lower, robot.upper, *bounds_of(domain))
         self._labels, self._units = chart.labels, problem.task.units
         self._half_width = float(domain.half_width.min())
         task = ", ".join(map(escape, chart.labels[: chart.m]))
@@ -100,9 +100,9 @@ class ChartPanel:
             bar(label, degrees / 15, f"{degrees:.2f}°", grade(-degrees, -2, -6), value=degrees)
             for label, degrees in zip(self._labels[m:], readings.leak_deg.tolist(), strict=True)
         ]
-        border = bar(
-            "border", readings.border / self._half_width, f"{readings.border:.3f}", value=readings.border,
-            colour=grade(readings.border / self._half_width, 0.15, 0.04),
+        boundary = bar(
+            "boundary", readings.boundary / self._half_width, f"{readings.boundary:.3f}", value=readings.boundary,
+            colour=grade(readings.boundary / self._half_width, 0.15, 0.04),
         )  # fmt: skip
         level = readings.conditioning
         conditioning = bar("conditioning", level, f"{level:.3f}", grade(level, 0.4, 0.15), value=level)
@@ -110,7 +110,7 @@ class ChartPanel:
         parts = [
             STYLE, '<div class="oc">', self._head, f'<div class="held"><span>task moved by</span>{drift}</div>',
             stop, "<h4>leak of the coordinates</h4>", *leaks,
-            "<h4>chart</h4>", conditioning, border,
+            "<h4>chart</h4>", conditioning, boundary,
             "<h4>joints</h4>", self._joints.html(readings.q), "</div>",
         ]  # fmt: skip
         return "".join(parts)

@@ -22,7 +22,7 @@ _EDGE = 0.8  # cosine between a triangle and the average at a vertex, below whic
 _SKY, _GROUND = 0.46, 0.26  # ambient light from above and below
 _SHINE = 0.22  # strength of highlights
 _FRONT = 1e9  # more than any 1 / depth [1/m]
-_SHADOW, _SOFT = 0.30, 0.008  # strength, and width of the border as a share of the height
+_SHADOW, _SOFT = 0.30, 0.008  # strength, and width of the boundary as a share of the height
 GHOSTS = 7
 _SEEN_FROM = np.array([0.62, -0.68, 0.38])
 _ANGLE = 22.0  # of view [deg]
@@ -39,7 +39,7 @@ class Camera:
 
     eye: tuple[float, float, float]  #: where it stands [m]
     target: tuple[float, float, float]  #: what is in the middle of the picture [m]
-    angle: float = 24.0  #: from the lower to the upper border of the picture [deg]
+    angle: float = 24.0  #: from the lower to the upper boundary of the picture [deg]
 
     def axes(self) -> Array:
         """Unit vectors to the right, down, and ahead, rows (3, 3)."""

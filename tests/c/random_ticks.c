@@ -16,7 +16,7 @@
 #endif
 #define IS_DOUBLE (sizeof(NUMBER) == sizeof(double))
 #define LARGEST (IS_DOUBLE ? 1e100 : (double)1e15f)
-#define EDGE (IS_DOUBLE ? 0.0 : 1e-6) /* so near to a border, either status is right */
+#define EDGE (IS_DOUBLE ? 0.0 : 1e-6) /* so near to a boundary, either status is right */
 
 static const NUMBER singular[N] = {SINGULAR};
 static uint64_t seed = 88172645463325252ULL;

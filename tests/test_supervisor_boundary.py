@@ -1,4 +1,4 @@
-"""Borders of domains with a condition: damped before them, caught in time, brought back."""
+"""Boundaries of domains with a condition: damped before them, caught in time, brought back."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ pytestmark = needs_c
 
 
 @pytest.mark.slow
-def test_the_bound_on_singular_values_is_a_border_with_a_zone_before_it(tmp_path: Path) -> None:
+def test_the_bound_on_singular_values_is_a_boundary_with_a_zone_before_it(tmp_path: Path) -> None:
     """Led slowly towards a straight arm: damped, caught before the bound, brought back; torques change smoothly."""
     robot = oc.Robot.planar([1.0, 1.0, 1.0], [3.0, 3.0, 3.0])
     box = oc.Box([0.6, 0.8, 0.8], [0.8, 1.2, 1.2])
@@ -40,10 +40,10 @@ def test_the_bound_on_singular_values_is_a_border_with_a_zone_before_it(tmp_path
         statuses.append(status)
         commands.append(command)
         sizes.append(clear.singular_values(arm.q))
-    first = [statuses.index(status) for status in (ControlStatus.NEAR_BORDER, ControlStatus.CAUGHT)]
+    first = [statuses.index(status) for status in (ControlStatus.NEAR_BOUNDARY, ControlStatus.CAUGHT)]
     assert [set(part) for part in np.split(np.array(statuses), first)] == [
         {ControlStatus.OK},
-        {ControlStatus.NEAR_BORDER},
+        {ControlStatus.NEAR_BOUNDARY},
         {ControlStatus.CAUGHT},
     ]
     assert first[1] - first[0] > 10
@@ -81,7 +81,7 @@ def from_path(q: Array) -> tuple[float, Array]:
     return float(np.linalg.norm((q - nearest)[1:])) / RADIUS, np.asarray(nearest)
 
 
-def test_the_distance_to_the_path_of_a_corridor_is_a_border_with_a_zone_before_it(
+def test_the_distance_to_the_path_of_a_corridor_is_a_boundary_with_a_zone_before_it(
     in_corridor: tuple[PDPlus, CompiledLibrary],
 ) -> None:
     """Led off the path: damped in the last 6 % of the radius, caught in the last 1 %, as far as it gets in 30 ms."""
@@ -104,7 +104,7 @@ def test_the_distance_to_the_path_of_a_corridor_is_a_border_with_a_zone_before_i
             ahead = 1 - from_path(q + 0.03 * speed)[0]
             assert ahead < 0.01 < room + 1e-6
             break
-        assert status is (ControlStatus.NEAR_BORDER if room < 0.06 else ControlStatus.OK)
+        assert status is (ControlStatus.NEAR_BOUNDARY if room < 0.06 else ControlStatus.OK)
         if room < 0.059:
             alone = law.function(q, speed, *np.split(reference, 3), *law.gains.values())[0].full().ravel()
             drag = 12.0 * (0.06 - room) / 0.05 * law.problem.robot.mass_matrix(q) @ speed
