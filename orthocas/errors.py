@@ -72,6 +72,10 @@ class InvalidValueError(OrthocasError, ValueError):
         super().__init__(f"{name} is {' '.join(str(got).split())}, expected {want}")
 
 
+class OptionError(OrthocasError, ValueError):
+    """Options of a command do not go together. The message says what to give, or to leave out."""
+
+
 class UnknownNameError(OrthocasError, ValueError):
     """A name does not exist. The message lists the known names; of many, the most similar come first."""
 

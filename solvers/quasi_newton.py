@@ -1,4 +1,4 @@
-"""L-BFGS that starts from the Gauss-Newton matrix, for losses whose matrix costs more than many gradients (ours)."""
+"""L-BFGS that starts from the Gauss-Newton matrix, for losses whose matrix costs more than many gradients."""
 
 from dataclasses import dataclass, replace
 

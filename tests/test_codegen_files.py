@@ -192,8 +192,8 @@ def test_command_writes_checks_and_refuses(planar_fit: Fit, run: Run) -> None:
     assert code == 0
     assert "lines of C99" in out
     for words, message in (
-        (["--controller", "none", "--limit", "3"], "a controller, because a controller option was given"),
-        (["--controller", "kinematic", "--stiffness", "3"], "no --stiffness with kinematic"),
+        (["--controller", "none", "--limit", "3"], "settings of a controller require a controller"),
+        (["--controller", "kinematic", "--stiffness", "3"], "kinematic has no --stiffness"),
         (["--controller", "spring"], "unknown controller 'spring'"),
         (["--controller", "pd_plus", "--name", "a b"], "a C identifier"),
     ):

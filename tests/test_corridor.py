@@ -191,8 +191,8 @@ def test_command_line_fits_along_postures(run: Run) -> None:
     assert domain.radius.tolist() == [np.inf, 0.25, 0.25]
     assert domain.contains(PATH).all()
     for others, word in (
-        (("--half-width", "0.4"), "none with --corridor"),
-        (("--domain", "auto"), "none with --corridor"),
+        (("--half-width", "0.4"), "--corridor is a domain: leave out"),
+        (("--domain", "auto"), "--corridor is a domain: leave out"),
         (("--radius", "-1"), "radius"),
     ):
         code, out, err = run(*words, "--force", *others)
@@ -200,4 +200,4 @@ def test_command_line_fits_along_postures(run: Run) -> None:
         assert word in err
     code, _, err = run("fit", "planar_3r_xy", "--radius", "0.2")
     assert code == 2
-    assert "--corridor with it" in err
+    assert "--radius requires --corridor" in err

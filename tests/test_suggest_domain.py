@@ -195,9 +195,9 @@ def test_fit_with_automatic_domain(run: Run) -> None:
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("--domain", "auto", "--half-width", "0.3"), "--half-width is 0.3, expected none with --domain auto"),
+        (("--domain", "auto", "--half-width", "0.3"), "--domain auto finds the half-width: leave out --half-width"),
         (("--domain", "wide"), "--domain is 'wide', expected auto"),
-        (("--leak-deg", "3"), "--leak-deg is 3.0, expected --domain auto with it"),
+        (("--leak-deg", "3"), "--leak-deg requires --domain auto"),
         (("--domain", "auto", "--leak-deg", "120"), "leak_deg is 120.0, expected an angle between 0 and 90"),
         (("--domain", "auto", "--centre", "0,0,0"), "a larger leak_deg (--leak-deg)"),
     ],

@@ -1,4 +1,4 @@
-"""Atlases: many charts that cover the joint range of a robot (ours). A plug-in: nothing in the core imports it.
+"""Atlases: many charts that cover the joint range of a robot. A plug-in: nothing in the core imports it.
 
 - `plan` holds what the boxes share, `lattice` cuts the range into tiles, of which many are images of others.
 - `box_fit` fits and judges the chart of one box; `build` runs such jobs and appends results to the `atlas_file`.

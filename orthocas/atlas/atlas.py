@@ -1,4 +1,4 @@
-"""Atlases, many charts that cover the joint range of a robot in one file, and parts of them (ours)."""
+"""Atlases, many charts that cover the joint range of a robot in one file, and parts of them."""
 
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Files of atlases: the plan in the header, then blocks of cells with their charts, and one of turns (ours).
+"""Files of atlases: the plan in the header, then blocks of cells with their charts, and one of turns.
 
 Blocks `CELL`: the head has one record for each cell, the body the numbers of the charts among them. A block `TURN`
 has an order, signs and constants of the coordinates of all charts; the last one counts.

@@ -1,4 +1,4 @@
-"""Fits and judges the chart of one box, with a basis that all boxes share (ours)."""
+"""Fits and judges the chart of one box, with a basis that all boxes share."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Builds an atlas: jobs for any executor, boxes that are split, results appended to the file (ours)."""
+"""Builds an atlas: jobs for any executor, boxes that are split, results appended to the file."""
 
 import hashlib
 import os

@@ -1,4 +1,4 @@
-"""`build_atlas`, and the alignment of neighbouring charts (ours)."""
+"""`build_atlas`, and the alignment of neighbouring charts."""
 
 import time
 from concurrent.futures import Executor

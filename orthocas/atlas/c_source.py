@@ -1,4 +1,4 @@
-"""Generated C of an atlas, or of a part of it: tables of charts with one code for all (ours)."""
+"""Generated C of an atlas, or of a part of it: tables of charts with one code for all."""
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence

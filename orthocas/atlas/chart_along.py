@@ -1,4 +1,4 @@
-"""Charts along paths: one for a corridor, or the charts of an atlas, one after the other (ours)."""
+"""Charts along paths: one for a corridor, or the charts of an atlas, one after the other."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""From numbers in an atlas to boxes and charts as the rest of orthocas knows them (ours)."""
+"""From numbers in an atlas to boxes and charts as the rest of orthocas knows them."""
 
 from collections.abc import Sequence
 from functools import reduce

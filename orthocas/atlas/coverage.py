@@ -1,4 +1,4 @@
-"""How much of the reachable space an atlas covers, in numbers and pictures (ours)."""
+"""How much of the reachable space an atlas covers, in numbers and pictures."""
 
 from dataclasses import dataclass
 from pathlib import Path

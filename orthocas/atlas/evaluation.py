@@ -1,4 +1,4 @@
-"""Values of many charts of an atlas at once, and blends of neighbours (ours)."""
+"""Values of many charts of an atlas at once, and blends of neighbours."""
 
 from dataclasses import dataclass, field
 from threading import Lock

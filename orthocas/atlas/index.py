@@ -1,4 +1,4 @@
-"""The search for the chart of a joint position: tiles, then halvings, then neighbours that reach across (ours)."""
+"""The search for the chart of a joint position: tiles, then halvings, then neighbours that reach across."""
 
 from dataclasses import dataclass
 from typing import Any

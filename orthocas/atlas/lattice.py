@@ -1,4 +1,4 @@
-"""The tiles of an atlas: a lattice in the joints that boxes divide, its symmetries, and outcomes of cells (ours)."""
+"""The tiles of an atlas: a lattice in the joints that boxes divide, its symmetries, and outcomes of cells."""
 
 from dataclasses import dataclass
 from enum import IntEnum

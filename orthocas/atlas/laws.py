@@ -1,4 +1,4 @@
-"""Control across the charts of an atlas: the posture asked for, and laws that are handed over (ours)."""
+"""Control across the charts of an atlas: the posture asked for, and laws that are handed over."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

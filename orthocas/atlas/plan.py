@@ -1,4 +1,4 @@
-"""What the boxes of an atlas share: problem, tiles, symmetries, and what is asked for (ours)."""
+"""What the boxes of an atlas share: problem, tiles, symmetries, and what is asked for."""
 
 from dataclasses import dataclass
 from typing import Self

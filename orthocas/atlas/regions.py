@@ -1,4 +1,4 @@
-"""Regions of joint space that an atlas covers: the joint range, or the neighbourhood of some postures (ours)."""
+"""Regions of joint space that an atlas covers: the joint range, or the neighbourhood of some postures."""
 
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,4 +1,4 @@
-"""Simulation of laws across the charts of an atlas in MuJoCo (ours)."""
+"""Simulation of laws across the charts of an atlas in MuJoCo."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

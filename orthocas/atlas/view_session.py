@@ -1,4 +1,4 @@
-"""What a user does to an atlas in a view: a session that goes on in the next chart (ours)."""
+"""What a user does to an atlas in a view: a session that goes on in the next chart."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Certify charts: prove with rigorous arithmetic that they do not fold, and where they are one-to-one (ours)."""
+"""Certify charts: prove with rigorous arithmetic that they do not fold, and where they are one-to-one."""
 
 import time
 from collections.abc import Callable, Sequence

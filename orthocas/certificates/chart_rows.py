@@ -1,4 +1,4 @@
-"""Rows of the Jacobian of phi as Taylor models: polynomials, networks, and tasks (ours)."""
+"""Rows of the Jacobian of phi as Taylor models: polynomials, networks, and tasks."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

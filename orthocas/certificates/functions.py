@@ -1,4 +1,4 @@
-"""Sine, cosine, roots and other functions of Taylor models (ours)."""
+"""Sine, cosine, roots and other functions of Taylor models."""
 
 from collections.abc import Callable
 from math import factorial

@@ -1,4 +1,4 @@
-"""Expressions as graphs, their values and their derivatives as Taylor models (ours)."""
+"""Expressions as graphs, their values and their derivatives as Taylor models."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Jets: derivatives of the tip's position and of products with bounds of the next order (ours)."""
+"""Jets: derivatives of the tip's position and of products with bounds of the next order."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

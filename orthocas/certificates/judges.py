@@ -1,4 +1,4 @@
-"""Judges of boxes: det J by elimination of Taylor rows, and bounds of its volume (ours)."""
+"""Judges of boxes: det J by elimination of Taylor rows, and bounds of its volume."""
 
 from dataclasses import dataclass
 from functools import reduce

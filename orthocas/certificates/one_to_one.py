@@ -1,4 +1,4 @@
-"""Proofs that phi is one-to-one on a box (ours).
+"""Proofs that phi is one-to-one on a box.
 
 Two points q = c + d and p = c - d of the box have phi(q) - phi(p) = 2 Jm(c, d) d, see `orthocas.certificates.jets`. So
 phi is one-to-one if Jm(c, d) is nonsingular for all of them. Near the faces of the box, middles c leave little room for

@@ -1,4 +1,4 @@
-"""What a proof must know beyond the box: parts of a domain, endless joints (ours)."""
+"""What a proof must know beyond the box: parts of a domain, endless joints."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass

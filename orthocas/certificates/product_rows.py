@@ -1,4 +1,4 @@
-"""Gradients of coordinates in a product basis, as Taylor models: the basis is closed under differentiation (ours).
+"""Gradients of coordinates in a product basis, as Taylor models: the basis is closed under differentiation.
 
 At the centre c of a box, d^a xi(c) = C_a (1, psi)(c) for every multi-index a, with tables C_a made once. The Taylor
 polynomial of J_xi to degree 3 needs the tables up to order 4; those of order 5 bound its rest by Lagrange's formula.

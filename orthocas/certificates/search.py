@@ -1,4 +1,4 @@
-"""Branch and bound: judge boxes, and halve those on which nothing is proved, the largest first (ours)."""
+"""Branch and bound: judge boxes, and halve those on which nothing is proved, the largest first."""
 
 import heapq
 import time

@@ -3,7 +3,7 @@
 Multiplying the rows from the left by a matrix that is never singular changes neither whether J is, nor the sign of its
 determinant if that matrix has a positive one. So rows of a tip task become those of the frame Jacobian: the velocity of
 the tip and its angular velocity. In the axes of a body in the middle of the chain, each entry depends on fewer joints
-than in the axes of the world, so boxes can be larger (ours). Half a turn of the tool away from the reference, where the
+than in the axes of the world, so boxes can be larger. Half a turn of the tool away from the reference, where the
 components of x lose rank though the arm does not, these rows are as regular as anywhere.
 
 The stored rotations of a robot are rotations up to rounding only. Each of the at most n factors then changes an entry

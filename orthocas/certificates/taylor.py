@@ -1,4 +1,4 @@
-"""Taylor models: polynomials with a remainder that covers truncation and rounding (ours)."""
+"""Taylor models: polynomials with a remainder that covers truncation and rounding."""
 
 from dataclasses import dataclass, replace
 from functools import cache

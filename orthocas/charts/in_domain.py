@@ -1,4 +1,4 @@
-"""The search of a whole domain for solutions of phi(q) = phi, by cells that may hold one (ours)."""
+"""The search of a whole domain for solutions of phi(q) = phi, by cells that may hold one."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

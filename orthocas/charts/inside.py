@@ -1,4 +1,4 @@
-"""Points inside the domain where there is no solution: the nearest ones in phi and in xi (ours)."""
+"""Points inside the domain where there is no solution: the nearest ones in phi and in xi."""
 
 from dataclasses import dataclass
 from threading import Lock

@@ -249,7 +249,7 @@ class InverseMethods(PhiFunctions):
             f"joint '{self.problem.robot.joint_names[j]}' at {q[j]:.4g}, expected within [{low[j]:.4g}, {high[j]:.4g}]"
         )
         if not domain.is_box and low[j] <= q[j] <= high[j]:
-            reason = domain.told(q)
+            reason = domain.explained(q)
         return InverseError(
             f"q with phi(q) = phi lies outside the domain for {found.named(beyond)}: {reason}. "
             "`error.nearest` has joint positions inside; outside=True accepts those outside",

@@ -1,4 +1,4 @@
-"""The quality of a chart on its domain: angles and conditioning ([AS2023] Figs. 20 and 27), leaks and folds (ours)."""
+"""The quality of a chart on its domain: angles and conditioning ([AS2023] Figs. 20 and 27), leaks and folds."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -246,7 +246,7 @@ class Report(Shown):
             "problem": f"n = {self.n} joints, m = {self.m} task, r = {self.r} extra, metric {self.metric}",
             **self._angles(),
             "conditioning": f"mean {values.mean:.3f}, 1 % quantile {values.p01:.3f}, min {values.min:.3g}",
-            **({} if self.worst is None else {"searched": f"least conditioning {self.worst.told}"}),
+            **({} if self.worst is None else {"searched": f"least conditioning {self.worst.explained}"}),
             **self._faults(),
             "lengths": f"of gradients differ by a factor of {self.length_ratio:.3g} (99 % to 1 % quantile)",
             "samples": f"{self.samples} given" if self.seed is None else f"{self.samples} held out, seed {self.seed}",

@@ -1,4 +1,4 @@
-"""What can move at a task value: ranges of the coordinates, curves, and self-motions (ours)."""
+"""What can move at a task value: ranges of the coordinates, curves, and self-motions."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The worst points of a chart: a search of the domain for the least conditioning and for folds (ours)."""
+"""The worst points of a chart: a search of the domain for the least conditioning and for folds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class WorstPoints:
         return float(self.conditioning[0]) if len(self.conditioning) else float("nan")
 
     @property
-    def told(self) -> str:
+    def explained(self) -> str:
         """The least conditioning and how it was searched."""
         found = f"{self.least:.3f}" if self.least >= 0 else "0, the chart FOLDS OVER"
         return f"{found} ({len(self.points)} descents from {CANDIDATES} points, many in corners)"

@@ -7,7 +7,7 @@ import typer
 
 from orthocas.charts.ready import Card, card, load, names
 from orthocas.cli.output import AsJson, Force, print_json, print_rows, print_table
-from orthocas.errors import InvalidValueError
+from orthocas.errors import OptionError
 
 
 def charts(
@@ -21,7 +21,7 @@ def charts(
     """List the ready charts of known arms, show the card of one, or write it to a file."""
     if name is None:
         if out is not None:
-            raise InvalidValueError("--out", str(out), "the name of a ready chart with it")
+            raise OptionError("--out requires the name of a ready chart")
         _list([card(known) for known in names()], json)
         return
     found = card(name)

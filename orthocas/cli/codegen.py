@@ -17,7 +17,7 @@ from orthocas.cli.output import AsJson, Force, note, number, print_json, print_r
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import GeneratedC
 from orthocas.codegen.proof import Proof, check_c
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, OptionError
 from orthocas.robots.homes import read_postures
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.plugins import opened
@@ -54,7 +54,7 @@ def codegen(
     if controller != _NONE:
         require_settings(controller, settings)
     elif settings or limit is not None:
-        raise InvalidValueError("--controller", _NONE, "a controller, because a controller option was given")
+        raise OptionError("settings of a controller require a controller: --controller is none")
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         shown, loaded = _opened(chart, along, radius)
         loaded.function("xi")  # raises for grown charts
@@ -81,7 +81,7 @@ def _opened(path: Path, along: Path | None, radius: float | None) -> tuple[Any, 
         chart = Chart.load(path)
         return chart, chart
     if along is None and radius is not None:
-        raise InvalidValueError("--radius", radius, "--along, because it is a distance from postures")
+        raise OptionError("--radius requires --along: it is a distance from postures")
     part = several.part(None if along is None else read_postures(along, several.problem.robot), radius or 0.0)
     return part, part.first_chart
 

@@ -11,7 +11,7 @@ from orthocas.cli.problem_argument import parse_numbers
 from orthocas.control.controller import Controller
 from orthocas.control.gains import Setting
 from orthocas.control.registry import law_names, law_of
-from orthocas.errors import InvalidValueError
+from orthocas.errors import OptionError
 from orthocas.tools.checks import Array
 
 CONTROLLERS = law_names()
@@ -46,20 +46,20 @@ def require_settings(name: str, settings: Mapping[str, str]) -> None:
 
     Raises:
         UnknownNameError: if there is no such controller.
-        InvalidValueError: for a setting that the controller would ignore.
+        OptionError: for a setting that the controller would ignore.
     """
     law = law_of(name)
-    for field, text in settings.items():
+    for field in settings:
         if field not in law.options:
-            raise InvalidValueError(_option(field), text, _belongs(field, name, _takers(field)))
+            raise OptionError(_belongs(field, name, _takers(field)))
 
 
 def require_torques(name: str, **words: Any) -> None:
-    """Raise InvalidValueError for conditions of the plant that matter only to laws that command torques."""
+    """Raise OptionError for conditions of the plant that matter only to laws that command torques."""
     for field, value in words.items():
         if value is not None and law_of(name).command != "torque":
             takers = [other for other in law_names() if law_of(other).command == "torque"]
-            raise InvalidValueError(_option(field), value, _belongs(field, name, takers))
+            raise OptionError(_belongs(field, name, takers))
 
 
 def build_controller(name: str, chart: Chart, settings: Mapping[str, str], limit: str | None = None) -> Controller:
@@ -90,7 +90,7 @@ def _takers(name: str) -> list[str]:
 
 
 def _belongs(field: str, name: str, takers: list[str]) -> str:
-    return f"no {_option(field)} with {name}, because it belongs to {', '.join(takers)}"
+    return f"{name} has no {_option(field)}, which belongs to {', '.join(takers)}"
 
 
 def _one_or_all(option: str, text: str) -> Array:

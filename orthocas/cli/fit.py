@@ -30,7 +30,7 @@ from orthocas.cli.problem_argument import (
     with_options,
 )
 from orthocas.cli.progress import terminal_monitor
-from orthocas.errors import Interrupted, InvalidValueError
+from orthocas.errors import Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
 from orthocas.fitting.probe import Bounds
@@ -161,12 +161,12 @@ def _bounds(
 ) -> Bounds | None:
     """What --domain auto asks for; None without it."""
     if domain is not None and corridor is not None:
-        raise InvalidValueError("--domain", repr(domain), "none with --corridor, which is the domain")
+        raise OptionError("--corridor is a domain: leave out --domain")
     given = {"--leak-deg": leak_deg, "--conditioning": conditioning}
     if domain is None:
         for option, value in given.items():
             if value is not None:
-                raise InvalidValueError(option, value, "--domain auto with it")
+                raise OptionError(f"{option} requires --domain auto")
         return None
     if domain != "auto":
         raise InvalidValueError("--domain", repr(domain), "auto, or --centre and --half-width for a box of your own")

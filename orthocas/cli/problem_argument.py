@@ -11,7 +11,7 @@ import typer
 from orthocas import problems
 from orthocas.bases.family import Parametrisation
 from orthocas.cli.output import number, spread, whole_number
-from orthocas.errors import InvalidValueError, UnknownNameError
+from orthocas.errors import InvalidValueError, OptionError, UnknownNameError
 from orthocas.fitting.corridor_problem import RADIUS, corridor_problem
 from orthocas.fitting.probe import Bounds
 from orthocas.fitting.suggest_domain import DomainSuggestion, suggest_domain
@@ -99,10 +99,10 @@ class ProblemOptions:
         return any(value not in (None, ()) for value in astuple(self))
 
     def require_no_robot(self, owner: str) -> None:
-        """Raise InvalidValueError if an option describes a robot, because `owner` has its own."""
+        """Raise OptionError if an option describes a robot, because `owner` has its own."""
         for option, value in (("tip", self.tip), ("lock", ", ".join(self.lock) or None), ("tool", self.tool)):
             if value is not None:
-                raise InvalidValueError(f"--{option}", value, f"no {option} for {owner}, which has its own robot")
+                raise OptionError(f"{owner} has its own robot: leave out --{option}")
 
 
 def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -174,7 +174,7 @@ def chosen_centre(robot: Robot, options: ProblemOptions) -> Array | None:
     if options.home is None:
         return None if options.centre is None else parse_numbers("--centre", options.centre)
     if options.centre is not None:
-        raise InvalidValueError("--home", options.home, "either --home or --centre, not both")
+        raise OptionError("--home and --centre both give the centre of the domain: leave out one")
     return robot.home(options.home)
 
 
@@ -247,10 +247,9 @@ def suggested(
         OrthocasError: if anything does not fit together.
     """
     if options.half_width is not None:
-        raise InvalidValueError("--half-width", options.half_width, "none with --domain auto, which finds it")
+        raise OptionError("--domain auto finds the half-width: leave out --half-width")
     if options.least_singular_value is not None:
-        given = options.least_singular_value
-        raise InvalidValueError("--least-singular-value", given, "none with --domain auto, which stays clear by itself")
+        raise OptionError("--domain auto stays clear of singular postures: leave out --least-singular-value")
     base = None if is_robot_file(name) else build_problem(name, options)
     robot = build_robot(name, options) if base is None else base.robot
     task = Task.named(robot, options.task or "position") if base is None else base.task
@@ -294,11 +293,11 @@ def corridor_or_box(name: str, options: ProblemOptions, path: Path | None, radiu
     """
     if path is None:
         if radius is not None:
-            raise InvalidValueError("--radius", radius, "--corridor with it")
+            raise OptionError("--radius requires --corridor")
         return build_problem(name, options)
     for option in ("centre", "home", "half_width", "least_singular_value"):
         value = getattr(options, option)
         if value is not None:
-            raise InvalidValueError(f"--{option.replace('_', '-')}", value, "none with --corridor, which is the domain")
+            raise OptionError(f"--corridor is a domain: leave out --{option.replace('_', '-')}")
     known = build_problem(name, options)
     return corridor_problem(known, read_postures(path, known.robot), RADIUS if radius is None else radius)

@@ -25,7 +25,7 @@ from orthocas.control.controller import Controller
 from orthocas.control.posture import posture_reference
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
-from orthocas.errors import ArchiveError, Interrupted, InvalidValueError
+from orthocas.errors import ArchiveError, Interrupted, InvalidValueError, OptionError
 from orthocas.robots.robot import Robot
 from orthocas.simulation.animation import FORMATS, require_format, save_animation
 from orthocas.simulation.disturbances import Friction, Noise
@@ -144,9 +144,9 @@ def _require_plant(plant: str, rate: float | None, supervised: bool) -> None:
     """Raise UnknownNameError for other plants, and InvalidValueError where a sampled controller is missing."""
     require_known("plant", plant, (CVODES, MUJOCO))
     if plant == MUJOCO and rate is None:
-        raise InvalidValueError("--plant", plant, "--rate as well, because MuJoCo runs with a sampled controller")
+        raise OptionError("--plant mujoco requires --rate: MuJoCo runs with a sampled controller")
     if supervised and rate is None:
-        raise InvalidValueError("--supervised", "given", "--rate as well, because a supervised law runs tick by tick")
+        raise OptionError("--supervised requires --rate: a supervised law runs tick by tick")
 
 
 def _plant(plant: str, model: Robot, mass_factor: float | None) -> Robot | MuJoCo | None:
@@ -167,10 +167,10 @@ def _noise(law: Controller, text: str | None, seed: int | None, rate: float | No
     """The noise of the sensors; raises InvalidValueError for an option that would be ignored."""
     if text is None:
         if seed is not None:
-            raise InvalidValueError("--seed", seed, "no seed without --noise, because nothing else is random")
+            raise OptionError("--seed requires --noise: nothing else is random")
         return None
     if rate is None:
-        raise InvalidValueError("--noise", text, "no noise without --rate, because white noise needs control ticks")
+        raise OptionError("--noise requires --rate: white noise needs control ticks")
     position, velocity = _pair("--noise", text)
     if law.command == "velocity" and velocity != 0:
         raise InvalidValueError("--noise", text, f"a velocity deviation of 0, because {law.name} measures no velocity")

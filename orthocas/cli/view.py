@@ -11,7 +11,7 @@ from orthocas import problems
 from orthocas.charts.chart import Chart
 from orthocas.cli.output import AsJson, Force, note, print_json, print_rows, whole_number
 from orthocas.cli.problem_argument import ROBOT, ProblemOptions, build_robot, is_robot_file, locked_joints, with_options
-from orthocas.errors import InvalidValueError
+from orthocas.errors import OptionError
 from orthocas.paths.plan import read_path
 from orthocas.robots.robot import Robot
 from orthocas.tools.interrupts import deferred
@@ -72,7 +72,7 @@ def view(
     else:
         require_page(export, force)
     if not compare and path is not None:
-        raise InvalidValueError("--path", path, "--compare as well, which follows the path")
+        raise OptionError("--path requires --compare, which follows the path")
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         asked = _asked(target, chart, robot, words)
     if compare:
@@ -100,7 +100,7 @@ def _asked(target: str, chart: Path | None, meshes: Path | None, words: ProblemO
         motion = read_joint_motion(file, arm) if file.suffix.lower() == ".csv" else read_run(file, arm)
         return _Asked(motion, owner, meshes, locked)
     if chart is not None:
-        raise InvalidValueError("--chart", chart, f"no chart beside the chart {target}")
+        raise OptionError(f"{target} is a chart: leave out --chart")
     return _Asked(opened(place) or Chart.load(place), None, meshes, locked)
 
 
@@ -109,7 +109,7 @@ def _owner(chart: Path | None, meshes: Path | None, words: ProblemOptions) -> Ro
     if chart is not None:
         return Chart.load(chart)
     if meshes is None:
-        raise InvalidValueError("--chart", "missing", "--chart or --robot, because files of motions hold no robot")
+        raise OptionError("files of motions hold no robot: give --chart or --robot")
     return build_robot(str(meshes), words)
 
 
@@ -117,7 +117,7 @@ def _compared(asked: _Asked, path: Path | None, cycles: int) -> _Asked:
     """Motions along a closed path instead of a chart."""
     chart = asked.shown
     if not isinstance(chart, Chart):
-        raise InvalidValueError("--compare", "given", "a chart file, whose coordinates are compared")
+        raise OptionError("--compare requires a chart file, whose coordinates are compared")
     points = None if path is None else read_path(path, chart)[0]
     return _Asked(cyclic_motions(chart, points, cycles), chart, asked.meshes, asked.locked)
 

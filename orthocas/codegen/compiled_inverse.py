@@ -1,4 +1,4 @@
-"""The inverse map of a chart in compiled C, for large batches on machines with a compiler (ours)."""
+"""The inverse map of a chart in compiled C, for large batches on machines with a compiler."""
 
 import ctypes
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a law learns of the robot at run time: payload, contact forces, extra torque, or the model itself (ours)."""
+"""What a law learns of the robot at run time: payload, contact forces, extra torque, or the model itself."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Settings of the supervised law in generated C: boundary, catcher, limits, bad input (ours)."""
+"""Settings of the supervised law in generated C: boundary, catcher, limits, bad input."""
 
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Self, get_args

@@ -1,4 +1,4 @@
-"""Whole turns of joints that turn without end: they change the coordinates, but not the posture (ours)."""
+"""Whole turns of joints that turn without end: they change the coordinates, but not the posture."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The loss of a family whose coordinate gradients NumPy computes, in double or single precision (ours)."""
+"""The loss of a family whose coordinate gradients NumPy computes, in double or single precision."""
 
 from collections.abc import Iterator, Mapping
 from copy import copy

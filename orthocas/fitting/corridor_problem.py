@@ -1,4 +1,4 @@
-"""The problem of one chart for a whole path of postures (ours)."""
+"""The problem of one chart for a whole path of postures."""
 
 import numpy as np
 from numpy.typing import ArrayLike

@@ -61,7 +61,7 @@ class ClearPart:
     share: float  #: of the box that is left
 
     @property
-    def told(self) -> str:
+    def explained(self) -> str:
         """The offer in words."""
         return f"least singular value {self.least_singular_value:g} stays clear, on {self.share:.1%} of the box"
 
@@ -310,10 +310,10 @@ class Fit(Shown):
             "loss": listed(stages) or "nothing to minimise",
             "samples": str(self.chart.notes.get("samples", "")),
             "idle joints": listed(self.idle_joints) or "none",
-            "least conditioning": "not searched" if self.worst is None else self.worst.told,
+            "least conditioning": "not searched" if self.worst is None else self.worst.explained,
             **({"cyclic joints": listed(self.cyclic_joints)} if self.cyclic_joints else {}),
             "near singular": f"{self.problem_check.singular_share:.3%} of the domain",
-            **({"offer": f"a {self.clear_part.told}"} if self.clear_part else {}),
+            **({"offer": f"a {self.clear_part.explained}"} if self.clear_part else {}),
         }
 
 

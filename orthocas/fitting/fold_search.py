@@ -1,4 +1,4 @@
-"""Fits without folds: the worst points of each stage join the loss of the next one (ours)."""
+"""Fits without folds: the worst points of each stage join the loss of the next one."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Quick fits on trial boxes: the leak and the conditioning that a chart would have there (ours)."""
+"""Quick fits on trial boxes: the leak and the conditioning that a chart would have there."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -72,7 +72,7 @@ class Verdict:
         }
         return dict(sorted(ratios.items(), key=lambda pair: -pair[1]))
 
-    def told(self, miss: Miss, bounds: Bounds) -> str:
+    def explained(self, miss: Miss, bounds: Bounds) -> str:
         """The value that misses a bound, and the bound, in words."""
         trial, most, least = "a trial chart has a", bounds.leak_deg, bounds.conditioning
         words: dict[Miss, str] = {

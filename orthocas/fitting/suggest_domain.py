@@ -1,4 +1,4 @@
-"""`suggest_domain`: the widest box around a posture on which a chart has the quality that is asked (ours)."""
+"""`suggest_domain`: the widest box around a posture on which a chart has the quality that is asked."""
 
 import time
 from collections.abc import Mapping
@@ -198,7 +198,7 @@ class WidestBox:
         miss = next(iter(found.excess(self.bounds)))
         return DomainError(
             f"no box around the home {np.round(self.home, 4).tolist()} keeps the bounds: with half-widths of "
-            f"{widths[self.free].max():.1g} {found.told(miss, self.bounds)}; {REMEDIES}"
+            f"{widths[self.free].max():.1g} {found.explained(miss, self.bounds)}; {REMEDIES}"
         )
 
     def _to_boundary(self, unit: Array, scale: float) -> Array:

@@ -75,7 +75,7 @@ class Limits:
         last = max(k - 1, 0)
         if not np.isfinite(q[k]).all():
             return self.lost(plan, Lost(s[:k], q[:k], float(s[k])))
-        where = plan.told(float(s[k]), self.chart.labels)
+        where = plan.explained(float(s[k]), self.chart.labels)
         if not contains(self.chart.problem.domain, q[k]):
             reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
             return PathError(f"the path cannot be followed {where}: {reason}{self._reach(q[last])}")
@@ -90,7 +90,7 @@ class Limits:
 
     def lost(self, plan: Plan, end: Lost) -> PathError:
         """The error for a path that ends before s = 1."""
-        where = plan.told(end.beyond, self.chart.labels)
+        where = plan.explained(end.beyond, self.chart.labels)
         return PathError(
             f"the path cannot be reached {where}: no joint position near the one before it has this x and xi, "
             f"so x is out of reach or the chart is singular{self._reach(end.q[-1]) if len(end.q) else ''}"

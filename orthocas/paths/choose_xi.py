@@ -1,4 +1,4 @@
-"""The choice of xi along a tool path: a small optimal control problem in xi alone (ours)."""
+"""The choice of xi along a tool path: a small optimal control problem in xi alone."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING

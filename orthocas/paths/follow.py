@@ -1,4 +1,4 @@
-"""From a tool path to a motion of the joints (ours)."""
+"""From a tool path to a motion of the joints."""
 
 from collections.abc import Sequence
 from typing import Any

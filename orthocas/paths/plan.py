@@ -128,7 +128,7 @@ class Plan:
         """Parameters (P,) at which the path is checked: the waypoints, and between them."""
         return np.union1d(self.s, np.linspace(0.0, 1.0, 1001))
 
-    def told(self, s: float, labels: tuple[str, ...]) -> str:
+    def explained(self, s: float, labels: tuple[str, ...]) -> str:
         """A place on the path in words."""
         x = ", ".join(f"{label} = {value:.4g}" for label, value in zip(labels, self.x(s), strict=False))
         if self.is_function:

@@ -1,4 +1,4 @@
-"""The part of a box that stays clear of near-singular positions of a task (ours)."""
+"""The part of a box that stays clear of near-singular positions of a task."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -172,7 +172,7 @@ class ClearBox(Box):
         """q (n, 1) -> J (m, n), the rows that count."""
         return self.task.jacobian_function if self.rows == "x" else self.task.frame_jacobian_function
 
-    def told(self, q: Array) -> str:
+    def explained(self, q: Array) -> str:
         """What is wrong with a position (n,) that is not clear."""
         return f"the task {self._value_told(q)}"
 

@@ -1,4 +1,4 @@
-"""The surroundings of a path of postures: the domain of one chart for a long motion (ours)."""
+"""The surroundings of a path of postures: the domain of one chart for a long motion."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -110,7 +110,7 @@ class Corridor(Box):
         wider = box.half_width > self.half_width * (1 + 1e-9)
         return type(self)(box, self.postures, np.where(wider, np.inf, self.radius))
 
-    def told(self, q: Array) -> str:
+    def explained(self, q: Array) -> str:
         """What is wrong with a position (n,) that is too far from the path."""
         distance = float(np.sqrt(1 - float(self.pivots(q))))
         return f"the position is {distance:.3g} radii away from the path of the corridor, expected at most 1"

@@ -97,7 +97,7 @@ class Domain(ABC):
         """The same condition on another box."""
         raise DomainError(f"a domain of kind '{self.name}' has no other size, expected a box")
 
-    def told(self, q: Array) -> str:
+    def explained(self, q: Array) -> str:
         """What is wrong with a position (n,) of the box that lies outside the domain."""
         return f"the position {np.round(q, 4).tolist()} lies outside the {self.name}"
 

@@ -1,4 +1,4 @@
-"""Shaded pictures of arms by a depth buffer in NumPy, without a graphics card or a display (ours)."""
+"""Shaded pictures of arms by a depth buffer in NumPy, without a graphics card or a display."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

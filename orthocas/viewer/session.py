@@ -1,4 +1,4 @@
-"""What a user does to a chart in a view, without any window: wishes, steps of the inverse, home and undo (ours)."""
+"""What a user does to a chart in a view, without any window: wishes, steps of the inverse, home and undo."""
 
 from collections.abc import Mapping
 
