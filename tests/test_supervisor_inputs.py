@@ -292,7 +292,7 @@ def test_a_million_hostile_ticks_stay_bounded_with_the_right_status(supervised_c
     assert done.returncode == 0, f"{done.returncode}: {done.stderr}"
     counts = [int(word) for word in done.stdout.split()]
     assert sum(counts) == 1_000_000
-    for status in ("OK", "SATURATED", "NEAR_BORDER", "CAUGHT", "RETURNING", "BAD_INPUT"):
+    for status in ("OK", "SATURATED", "NEAR_BOUNDARY", "CAUGHT", "RETURNING", "BAD_INPUT"):
         assert counts[ControlStatus[status]] > 50, (status, counts)  # each is met
 
 

@@ -89,7 +89,7 @@ def findings(log: Log, chart: oc.Chart) -> dict[str, float]:
         wall_N: largest force on the wall [N].
     """
     time, domain = log.time, chart.problem.domain
-    law = np.isin(log.status, (ControlStatus.OK, ControlStatus.SATURATED, ControlStatus.NEAR_BORDER))
+    law = np.isin(log.status, (ControlStatus.OK, ControlStatus.SATURATED, ControlStatus.NEAR_BOUNDARY))
     first_caught = int(np.argmax((log.status == ControlStatus.CAUGHT) & (time >= PUSH_START)))
     back = first_caught + int(np.argmax(law[first_caught:]))
     fast = time[(log.speed > 2.0) & (time < time[back])]

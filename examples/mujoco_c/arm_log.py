@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from orthocas.control import ControlStatus
 
 _SHADES = {
-    ControlStatus.NEAR_BORDER: "#fff2b3",
+    ControlStatus.NEAR_BOUNDARY: "#fff2b3",
     ControlStatus.CAUGHT: "#f6c6c3",
     ControlStatus.RETURNING: "#cfe3f5",
     ControlStatus.BAD_INPUT: "#d9c6e8",

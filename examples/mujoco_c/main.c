@@ -169,7 +169,7 @@ static void answer(plan *wanted, arm_state *state, arm_status status, const doub
       wanted->quiet = fastest(dq) < QUIET ? wanted->quiet + 1 : 0;
       if (wanted->quiet == PATIENCE) arm_resume(state);
       break;
-    case ARM_NEAR_BORDER: /* go no further */
+    case ARM_NEAR_BOUNDARY: /* go no further */
       memcpy(wanted->target, wanted->reference.value, sizeof wanted->target);
       break;
     case ARM_BAD_INPUT: /* the law keeps the arm safe; a program for a robot reports this, and ends if it stays */

@@ -64,7 +64,7 @@ static int status_is_right(int status, const arm_state *state, int measured, int
   if (state->mode == ARM_CATCHER) return status == ARM_CAUGHT || status == ARM_BAD_INPUT;
   if (state->mode == ARM_RETURN) return status == ARM_RETURNING || status == ARM_BAD_INPUT;
   if (!referred) return status == ARM_BAD_INPUT;
-  return status == ARM_OK || status == ARM_SATURATED || status == ARM_NEAR_BORDER || status == ARM_BAD_INPUT;
+  return status == ARM_OK || status == ARM_SATURATED || status == ARM_NEAR_BOUNDARY || status == ARM_BAD_INPUT;
 }
 
 /* Targets around a reference, some of which cannot be used: it stays finite, and good ones are followed again. */
