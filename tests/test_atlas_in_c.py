@@ -151,7 +151,7 @@ def test_command_writes_the_charts_along_postures(way_atlas: oc.Atlas, run: Run,
     code, _, err = run(*words, "--radius", "0.1")
     assert (code, err) == (
         2,
-        "orthocas: --radius is 0.1, expected --along, because it is a distance from postures\n",
+        "orthocas: --radius requires --along: it is a distance from postures\n",
     )
 
 

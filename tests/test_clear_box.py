@@ -26,7 +26,9 @@ from orthocas.tasks.domains import sample_evenly, sample_heavily, sample_uniform
 
 Numbers = NDArray[np.float64]
 BOUND = 0.2
-WIDE = oc.Box([0.6, 0.8, 0.8], [0.8, 1.2, 1.2])  # reaches beyond the straight arm, q2 = q3 = 0
+WIDE = oc.Box(
+    [0.6, 0.8, 0.8], [0.8, 1.15, 1.15]
+)  # reaches beyond the straight arm, q2 = q3 = 0, to no clear position there
 STRAIGHT = [0.6, 0.02, 0.01]
 
 
