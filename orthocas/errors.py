@@ -43,7 +43,7 @@ class Interrupted(KeyboardInterrupt):
         except oc.errors.Interrupted as stop:
             fit = stop.result
 
-    In an interactive session `sys.last_value.result` has it afterwards.
+    In an interactive session `sys.last_value.result` holds it afterwards.
     """
 
     def __init__(self, result: Any) -> None:

@@ -63,7 +63,7 @@ class ArrayNode(ca.Callback):
         return True
 
     def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
-        """Evaluate the outputs; the return value 1 tells CasADi that the evaluation failed."""
+        """Evaluate the outputs; the return value 1 means to CasADi that the evaluation failed."""
         if self.error is not None:
             return 1
         try:

@@ -173,7 +173,7 @@ class BestPoint:
         return bool(np.isfinite(self.value))
 
     def offer(self, theta: Array, value: float) -> bool:
-        """Take a point if it is better, and tell whether it was."""
+        """Take a point if it is better; returns whether it was."""
         better = value < self.value
         if better:
             self.theta, self.value = np.array(theta), float(value)

@@ -311,7 +311,7 @@ class Atlas(Shown):
 
         Args:
             number: the number of the chart.
-            near: a joint position (n,). Boxes repeat every full turn of joints that can turn so far; this tells which.
+            near: a joint position (n,). Boxes repeat every full turn of joints that can turn so far; this selects one.
 
         Raises:
             InvalidValueError: if there is no such chart.

@@ -47,7 +47,7 @@ def align(index: Index) -> Alignment:
     Coordinates of neighbours a and b are compared where the face of one box meets the other: M_ij is the cosine between
     gradients of xi_i of a and xi_j of b. The pairs form a graph. The walk follows a spanning tree of it with the
     greatest sum of |M_ij| over matched coordinates. Around a loop of charts the turns need not close; `consistent`
-    tells how often they do.
+    counts how often they do.
     """
     raw = Evaluation(index, None)
     q, first, second = _meetings(index)

@@ -265,7 +265,7 @@ def _integers(values: Iterable[Any]) -> str:
 
 
 def _rows(table: Array | Sequence[Sequence[int]]) -> str:
-    """A matrix as C has it."""
+    """A matrix in C, column by column."""
     kind = _integers if np.asarray(table).dtype.kind == "i" else numbers
     return ",\n".join(f"{{{kind(row)}}}" for row in np.asarray(table))
 

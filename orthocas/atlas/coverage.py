@@ -74,7 +74,7 @@ class Coverage(Shown):
         return edges, counts / np.maximum(all_counts, 1)
 
     def facts(self) -> dict[str, str]:
-        """Shares and quality."""
+        """What `str` shows: the share of samples that have a chart, leak and conditioning there."""
         data = self.as_dict()
         leak, conditioning = data["leak_deg"], data["conditioning"]
         return {

@@ -171,7 +171,7 @@ def leaves_stay(problem: Problem, joint: int) -> bool:
 
 
 def _moves_the_task(task: Task, joint: int) -> bool:
-    """Whether the kinematics tell that h(q + t e_k) = g_t(h(q))."""
+    """Whether the kinematics show that h(q + t e_k) = g_t(h(q))."""
     tree, kind = task.robot.tree, task.recipe["kind"]
     turn = TipTurn.of_kind(kind)
     if turn is not None and turn.whole and joint == tree.tip_parent:
@@ -180,7 +180,7 @@ def _moves_the_task(task: Task, joint: int) -> bool:
 
 
 def _is_no_part_of_gradients(task: Task, joint: int) -> bool:
-    """Whether the steps of h tell that J_x does not depend on a joint."""
+    """Whether the steps of h show that J_x does not depend on a joint."""
     return all(joint not in joints for row in gradient_dependences(to_tape(task.function)) for joints in row.values())
 
 

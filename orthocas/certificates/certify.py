@@ -61,7 +61,7 @@ def certify(
         resume: an unfinished certificate of the same chart and bound, to go on from.
 
     Returns:
-        What is proved and what is not. `certificate.proved` tells whether it is everything.
+        What is proved and what is not. `certificate.proved` is True if everything is.
 
     Raises:
         CertifyError: if the chart is grown, uses operations without proven bounds, or `resume` belongs to another one.

@@ -47,7 +47,7 @@ class Search:
     failed: float = np.inf  #: least rank of the boxes too small to halve
     dead: int = 0  #: number of boxes too small to halve
     conditioning: float = np.inf  #: least of the lower bounds on proved boxes
-    signs: dict[int, Array] = field(default_factory=dict)  #: sign of det J -> a point that has it
+    signs: dict[int, Array] = field(default_factory=dict)  #: sign of det J -> a point with that sign
     _codes: list[int] = field(default_factory=list)
     _children: list[int] = field(default_factory=list)  #: place of the lower half; the upper half follows
     _waiting: list[tuple[float, int, Array, Array]] = field(default_factory=list)  #: a heap

@@ -1,6 +1,6 @@
 """Ready charts of known arms, fitted and certified, each with a card of its quality.
 
-`names` lists them, `load` gives a chart, and `card` tells how good it is, where it holds, and how it was made.
+`names` lists them, `load` gives a chart, and `card` describes how good it is, where it holds, and how it was made.
 `make charts` makes them again; docs/charts.md shows all.
 """
 

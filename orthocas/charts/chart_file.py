@@ -211,7 +211,7 @@ def _require_finite(problem: Problem, coordinates: CoordinateMap) -> None:
 
 
 def _surely_finite(coordinates: Coordinates) -> bool:
-    """Whether coordinates are finite on their domain because all their numbers are moderate. That is quick to tell."""
+    """Whether coordinates are finite on their domain because all their numbers are moderate. That is a quick check."""
     sizes = [np.abs(values) for values in (coordinates.theta, coordinates.offset, coordinates.scale)]
     widths = coordinates.space.half_width
     moderate = all((size < _MODERATE).all() for size in (*sizes, widths, 1 / widths))

@@ -56,7 +56,7 @@ def grow(
 
     Returns:
         The chart. Its values are NaN where a flow runs into a singularity or ends outside the chart of the leaf;
-        `chart.coordinates.pull(points).status` tells which.
+        `chart.coordinates.pull(points).status` says where.
 
     Raises:
         NotInvolutiveError: if m >= 2 and the task gradients are not involutive, so that the result would depend on

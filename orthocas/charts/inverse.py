@@ -83,7 +83,7 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Inverse:
-    """Solves phi(q) = phi, and tells for each row how the search ended."""
+    """Solves phi(q) = phi, and reports for each row how the search ended."""
 
     problem: Problem
     phi_map: PhiMap

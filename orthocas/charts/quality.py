@@ -27,7 +27,7 @@ _BIN = 0.1  # [deg]; the middle angle lies in the middle of its bin
 _PIECE = 2**13  # samples that a thread takes at once
 DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
 SAMPLES, SEED = 100_000, 1  #: of an evaluation by default
-_TELLING = 200  # samples that tell idle joints from others
+_TELLING = 200  # samples by which idle joints are found
 _ALONE = 1e-10  # share of a gradient that counts as zero
 
 

@@ -21,7 +21,7 @@ class Model:
     robot: str  #: maker and type
     file: str  #: the robot file
     package: str  #: what the file was taken from, with its version
-    upstream: str  #: where that has it from
+    upstream: str  #: its origin before that
     licence: str  #: its SPDX identifier; the text is in orthocas/charts/licences
     holder: str  #: who holds the copyright
 

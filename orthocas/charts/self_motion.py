@@ -152,7 +152,7 @@ class LevelCurve:
         Args:
             q: the start, inside the domain.
             direction: (n,), not perpendicular to the curve.
-            signs: tells folds; None: they do not end the curve.
+            signs: sign of det J, to notice folds; None: they do not end the curve.
         """
         t = self.tangent(q, direction)
         if t is None:

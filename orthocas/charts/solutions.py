@@ -133,7 +133,7 @@ class Tracker(Shown):
 
     A call takes chord steps with the Jacobian of an earlier call, and evaluates a new one only where they do not
     converge. If the new q would be too far from the last one or outside the domain, or if there is none, `step` returns
-    the last q again, and `status` tells why. `Chart.tracker` makes trackers; each belongs to one thread.
+    the last q again, and `status` says why. `Chart.tracker` makes trackers; each belongs to one thread.
 
     Example:
         >>> import numpy as np
@@ -231,7 +231,7 @@ class Tracker(Shown):
         return solver.q.copy()
 
     def _advance(self) -> TrackerStatus:
-        """Move to the solution and tell whether that is allowed."""
+        """Move to the solution; returns whether that is allowed."""
         solver, fresh = self._solver, False
         for _ in range(REFRESHES):
             falls, error = solver.step(), solver.errors[-1]

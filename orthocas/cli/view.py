@@ -84,7 +84,7 @@ def view(
 
 
 def _asked(target: str, chart: Path | None, meshes: Path | None, words: ProblemOptions) -> _Asked:
-    """What the target is: its suffix tells, or it is a folder of a run or the name of a problem."""
+    """What the target is: by its suffix, or a folder of a run, or the name of a problem."""
     place = Path(target)
     locked = locked_joints(words.lock)
     if is_robot_file(target):

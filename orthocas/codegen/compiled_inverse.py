@@ -34,7 +34,7 @@ class CompiledInverse(Shown):
     library: Path  #: the shared library
 
     def facts(self) -> dict[str, str]:
-        """Chart and library."""
+        """What `str` shows: the chart's problem and the file of the library."""
         return {"inverse": f"compiled, of the chart of {self.chart.problem.name}", "library": str(self.library)}
 
     def solve(
@@ -44,7 +44,7 @@ class CompiledInverse(Shown):
         return self.chart.solve(phi, q_start, tolerance=tolerance, inside=inside, local=self._local)
 
     def _local(self, targets: Array, starts: Array) -> Attempt:
-        """Search from starts (N, n); where C finds nothing, NumPy tells how near one can get."""
+        """Search from starts (N, n); where C finds nothing, NumPy finds how near one can get."""
         attempt, condition = Attempt.empty(*targets.shape), np.empty(len(targets))
         given = np.ascontiguousarray(targets), np.ascontiguousarray(starts)
 

@@ -126,7 +126,7 @@ def template_values(
 
 
 def _clearance(condition: BoundaryCondition, values: dict[str, str]) -> str:
-    """Code that tells how far a position is inside the condition of the domain, here and after a time."""
+    """Code for how far a position is inside the condition of the domain, here and after a time."""
     return filled("clearance.c", {**values, "condition_boundary": filled(condition.template, values)})
 
 

@@ -98,7 +98,7 @@ def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY, fastest
     its modes are the eigenvalues of K^1/2 J M^-1 J^T K^1/2. K minimises the mean over the domain of
     sum_i log^2(lambda_i / omega^2) + 3000 sum_i max(0, log(lambda_i / fastest^2))^2. As long as no mode comes near
     `fastest`, the geometric mean of all modes is omega. Single modes lie on both sides of it, because M_phi is not
-    diagonal and varies; `modes` of a law tells where. Delays make fast modes unstable, so `fastest` takes stiffness
+    diagonal and varies; `modes` of a law lists them. Delays make fast modes unstable, so `fastest` takes stiffness
     from the coordinates that move light wrists.
 
     Args:

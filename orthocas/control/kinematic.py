@@ -83,7 +83,7 @@ class Kinematic(Shown):
 
     @property
     def gains(self) -> dict[str, Array]:
-        """Feedback and limit."""
+        """Inputs of the law besides state and targets: the feedback gain [1/s] and the limit of the task speed."""
         return {"feedback": self.feedback, "limit": self.limit}
 
     @property

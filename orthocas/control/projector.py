@@ -137,7 +137,7 @@ class KinematicProjector(TwoTaskLaw):
 
     @property
     def gains(self) -> dict[str, Array]:
-        """Feedback and limit."""
+        """Inputs of the law besides state and targets: the feedback gain [1/s] and the limit of the task speed."""
         return {"feedback": self.feedback, "limit": self.limit}
 
     @cached_property
@@ -182,8 +182,8 @@ class Projector(TwoTaskLaw):
         limit: largest torque of each joint, (n,) or one number; default the effort limits of the robot.
         second: x_2. A `Task` of the same robot, or a `Chart` of the same task for its xi ("projected coordinates").
             Default: the joints, x_2 = q. The law has the domain of the chart, and otherwise none.
-        second_force: f_2, (k_2,) or one number. If it is given, the law has it as an input of that name, with this
-            value as the default, as [AS2023] eq. (3b) has it; with a `posture_stiffness` of 0 it acts alone.
+        second_force: f_2, (k_2,) or one number. If it is given, the law takes an input of that name, with this
+            value as the default, as in [AS2023] eq. (3b); with a `posture_stiffness` of 0 it acts alone.
         feed_forward: whether to follow moving references, as operational space control does: the forces in x and in x_2
             also get the desired acceleration, what Coriolis terms and dJ/dt take away, and D times the desired
             velocity. With A = M, the task then obeys M_x dd_e + D_x d_e + K_x e = 0, e = x - x_d, exactly, whatever the

@@ -22,7 +22,7 @@ class GrownCoordinates:
 
     J_xi = Dxi0(q_hat) dq_hat/dq, with the derivative of the flow from forward sensitivities. ([AS2023] Sec. 6 names the
     missing Jacobian as a drawback of growing.) Values are NaN where the flow runs into a singularity or ends outside
-    the chart of the leaf; `pull` tells which.
+    the chart of the leaf; `pull` reports them.
     """
 
     problem: Problem = field(repr=False)

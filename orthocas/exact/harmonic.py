@@ -98,7 +98,7 @@ class _Sheet:
         return moved
 
     def _newton(self, start: Array) -> tuple[Array, Mask]:
-        """Take Newton steps along the free part of the gradient; tell which vertices fail or move more than a cell."""
+        """Take Newton steps along the free part of the gradient; return vertices that fail or move more than a cell."""
         points, moving = start.copy(), np.arange(len(start))
         for _ in range(_NEWTON_STEPS):
             gap = self._gap(points[moving])

@@ -189,7 +189,7 @@ class BoxGradients(BasisGradients):
 class SparseGradients(BasisGradients):
     """X holds d psi_k / dq_i for the functions that depend on joint i, a group for each joint.
 
-    CasADi's sparsity pattern of the Jacobian tells which entries are not zero.
+    CasADi's sparsity pattern of the Jacobian lists the entries that are not zero.
     """
 
     @property

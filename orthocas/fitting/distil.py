@@ -43,7 +43,7 @@ class Distilled(Shown):
     left_out: float  #: share of training samples where the grown chart has no value
 
     def facts(self) -> dict[str, str]:
-        """Parametrisation and errors."""
+        """What `str` shows: the fitted parametrisation, and its errors of values and gradients on held-out samples."""
         before, after = self.grown.task_angle, self.distilled.task_angle
         return {
             "distilled": f"{self.chart.coordinates.label} for {self.chart.notes['distilled from']} coordinates",

@@ -79,7 +79,7 @@ class _Sum:
         self._loss, self._penalty = loss, penalty
 
     def value(self, theta: Array) -> float:
-        """Loss and penalty."""
+        """Loss plus the penalty of points that fold, at theta (p,)."""
         return self._loss.value(theta) + self._penalty.value(theta)
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:

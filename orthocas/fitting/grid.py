@@ -240,7 +240,7 @@ def _run_stored(file: Path) -> CellResult:
 
 
 def _begin(stop: Event, parent: int) -> None:
-    """Initialise a worker process: it ignores Ctrl-C, the parent tells it when to stop, and it ends with the parent."""
+    """Initialise a worker process: it ignores Ctrl-C, the parent stops it, and it ends with the parent."""
     begin_worker(parent)
     _stops.append(stop)
 

@@ -37,7 +37,7 @@ class Loss:
 
     @cached_property
     def terms(self) -> tuple[tuple[LossTerm, float], ...]:
-        """Terms and weights."""
+        """Loss terms with their weights, smooth ones first."""
         known = [(term_of(name), weight) for name, weight in self.weights]
         return tuple(sorted(known, key=lambda pair: pair[0].hinge))
 

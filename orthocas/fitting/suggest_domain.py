@@ -44,7 +44,7 @@ LEAK_DEG, CONDITIONING = 8.0, 0.2  #: what is asked by default
 _MARGIN = 1.25  # trial charts keep a higher conditioning, since a fit is judged at more points
 _FARTHEST = np.pi  # largest half-width of a revolute joint [rad]: a full turn
 _LONGEST = 1.0  # largest half-width of a prismatic joint without limits [m]
-_CHECKED = 200  # samples that tell whether the task can be regular at all, and which joints are idle
+_CHECKED = 200  # samples for whether the task can be regular at all, and which joints are idle
 _SHRINK, _TRIES = 0.92, 8  # after a fit that misses a bound
 
 Reason = Literal["joint limit", "unlimited", "idle", "cyclic", "leak", "conditioning", "singularity", "half a turn"]
@@ -262,7 +262,7 @@ def suggest_domain(
 ) -> DomainSuggestion:
     """The widest box around a posture, inside the joint limits, on which a chart has the quality that is asked.
 
-    Quadratic charts on trial boxes tell leak and conditioning in a fraction of a second. A search over the half-widths
+    Quadratic charts on trial boxes give leak and conditioning in a fraction of a second. A search over the half-widths
     of the joints takes the box with the largest volume that keeps both bounds, and a fit confirms it: if the fit misses
     a bound, the box shrinks by 8 %. Idle and cyclic joints take their whole range. The result is deterministic.
 

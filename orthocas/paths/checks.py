@@ -36,7 +36,7 @@ class Limits:
 
     @property
     def rows(self) -> ca.Function:
-        """q (n, 1) -> the rows J (m, n) that tell how near to a singular position the robot is."""
+        """q (n, 1) -> the rows J (m, n) whose singular values measure the distance to singular positions."""
         clear, task = self.chart.problem.domain.singular_bound, self.chart.problem.task
         return task.frame_jacobian_function if clear is None else clear.jacobian_function
 

@@ -19,7 +19,7 @@ __all__ = ["Capsule", "LinkDistances", "Obstacle", "Plane", "Sphere"]
 
 _TINY = 1e-18  # [m^2], keeps square roots differentiable
 _FARTHEST = 1e6  # [m]
-_POSTURES, _MOVES = 20, 1e-9  # postures that tell which links move, and how far they do [m]
+_POSTURES, _MOVES = 20, 1e-9  # postures by which moving links are found, and the least move [m]
 
 
 @runtime_checkable
@@ -59,7 +59,7 @@ class Sphere:
 
     @property
     def heading(self) -> str:
-        """Radius and centre."""
+        """One line: radius [m] and centre [m] in the base frame."""
         return f"sphere of radius {self.radius:.4g} at {_point(self.centre)}"
 
     def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
@@ -88,7 +88,7 @@ class Capsule:
 
     @property
     def heading(self) -> str:
-        """Radius and ends."""
+        """One line: radius [m] and the ends of the axis [m] in the base frame."""
         return f"capsule of radius {self.radius:.4g} from {_point(self.start)} to {_point(self.end)}"
 
     def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
@@ -119,7 +119,7 @@ class Plane:
 
     @property
     def heading(self) -> str:
-        """Point and normal."""
+        """One line: a point [m] and the unit normal in the base frame."""
         return f"plane through {_point(self.point)} with normal {_point(self.normal)}"
 
     def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:

@@ -242,7 +242,7 @@ def _write_mp4(path: Path, pictures: Iterator[Picture], size: tuple[int, int]) -
     with tempfile.TemporaryFile() as said:
         ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said, stderr=said)
         try:
-            with suppress(BrokenPipeError), ffmpeg:  # if ffmpeg gives up, its messages tell why
+            with suppress(BrokenPipeError), ffmpeg:  # if ffmpeg gives up, its messages say why
                 assert ffmpeg.stdin is not None
                 for picture in pictures:
                     ffmpeg.stdin.write(picture.tobytes())

@@ -105,7 +105,7 @@ def run_supervised(
 
     def tick(k: int) -> Array:
         nonlocal state, sent
-        dq = state[n:] if loop.torque else sent[:n]  # a velocity controller's robot does what it was told
+        dq = state[n:] if loop.torque else sent[:n]  # a velocity controller's robot follows its command
         sent = law.tick(state[:n] + errors[k, :n], dq + errors[k, n:], wanted[k])
         state = run_compiled(plant, x0=ca.DM(state), p=ca.DM(np.concatenate([sent[:n], loads[k]])))["xf"].full().ravel()
         return np.concatenate([state, sent])

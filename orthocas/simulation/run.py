@@ -339,7 +339,7 @@ def simulate(
         noise: noise on the measurements of a sampled controller.
         safety: run the supervised law of the generated C with these settings, for example
             `oc.control.Safety.of(controller)`, in place of the law alone. Needs a law on a chart, a `control_rate` and
-            a C compiler. The run begins as on the robot, with NAME_start; its `status` and `cause` tell what happened.
+            a C compiler. The run begins as on the robot, with NAME_start; its `status` and `cause` say what happened.
         resume_after: with `safety`, time from a catch until the law is asked for again [s]; infinite: never.
         must_be_reachable: whether to raise an error, before the run, if the reference leaves the domain.
         tolerance: relative and absolute tolerance of the integrator.
@@ -349,7 +349,7 @@ def simulate(
         monitor: called with progress.
 
     Returns:
-        The trajectory. Its outcome tells whether it ended early because the integrator gave up.
+        The trajectory. Its outcome says whether it ended early because the integrator gave up.
 
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.

@@ -92,7 +92,7 @@ class Corridor(Box):
         return {"corridor": self.heading}
 
     def identity(self) -> list[Array]:
-        """Path and radius."""
+        """What identifies a corridor: the postures of its path, and its radius."""
         return [self.postures, self.radius]
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:

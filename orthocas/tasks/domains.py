@@ -110,7 +110,7 @@ class Domain(ABC):
         return {}
 
     def identity(self) -> list[Array]:
-        """Numbers by which a checkpoint knows the domain, beside samples of it."""
+        """Numbers that identify the domain in a checkpoint, beside samples of it."""
         return []
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:

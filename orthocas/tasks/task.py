@@ -238,7 +238,7 @@ class Task(Shown):
 
     @cached_property
     def frame_jacobian_function(self) -> ca.Function:
-        """q (n, 1) -> rows (m, n) that tell how near to a singular position the robot is, in whatever coordinates x.
+        """q (n, 1) -> rows (m, n) whose singular values measure how near a singular position is, in any x.
 
         For orientation, pose and axis tasks they are the velocity [m/s] and the angular velocity [rad/s] of the tip in
         its own axes, per unit joint velocity: rows of the geometric Jacobian, of which an axis task takes the two

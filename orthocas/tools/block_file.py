@@ -137,7 +137,7 @@ def owned(path: Path, kind: BlockKind) -> Iterator[None]:
     """Be the only process that appends to a file. The system ends this with the process, however it dies.
 
     Raises:
-        ArchiveError: the kind's own, if another process has it, or it cannot be opened.
+        ArchiveError: the kind's own, if another process uses the file, or it cannot be opened.
     """
     try:
         stream = path.open("r+b")

@@ -144,7 +144,7 @@ def require_finite(name: str, array: Array) -> None:
 
 
 def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
-    """Convert one point or a set of points to a set (N, n), and tell whether it was one point.
+    """Convert one point or a set of points to a set (N, n), and whether it was one point.
 
     A point is (n,), or a column (n, 1), such as a `casadi.DM`; for n = 1 a column is a set.
 

@@ -68,7 +68,7 @@ def check() -> None:
 def ended_in_order() -> Iterator[None]:
     """Turn SIGTERM and SIGHUP into SystemExit with 128 + their number, so that drafts go away; for command lines.
 
-    What the program was told to ignore stays ignored, as by nohup.
+    Signals that the program ignores stay ignored, as under nohup.
     """
     before = {number: signal.getsignal(number) for number in _ENDING}
     for number, handler in before.items():
@@ -83,9 +83,9 @@ def ended_in_order() -> Iterator[None]:
 
 @contextmanager
 def remembered() -> Iterator[Callable[[], bool]]:
-    """A function that tells whether Ctrl-C has come during the block, even if its exception got lost.
+    """A function that returns whether Ctrl-C has come during the block, even if its exception got lost.
 
-    Where something other than Python's own handler is in charge, it tells what compiled code held back only. Other
+    Where something other than Python's own handler is in charge, it reports only what compiled code held back. Other
     threads than the main one get no signals.
     """
     if threading.current_thread() is not threading.main_thread():

@@ -25,7 +25,7 @@ Scene = Callable[
 
 
 def recorded(build: Scene) -> str:
-    """The HTML of a scene and its motion. It is built on a server that nobody is told of."""
+    """The HTML of a scene and its motion. It is built on a server whose address is given to nobody."""
     server, _ = open_window(LOCAL, 0, "orthocas")
     try:
         duration, show = build(server)

@@ -55,7 +55,7 @@ class Session:
 
     @property
     def readings(self) -> Readings:
-        """What there is to tell about q; the task should have the value that was last wished for."""
+        """What the page shows about q; the task should have the value that was last wished for."""
         return self._readers.at(self.q, self._wished[: self.chart.m], self.stop)
 
     @property
@@ -121,7 +121,7 @@ class Session:
         return False
 
     def _give_up(self, here: Array) -> None:
-        """Wish for what there is in place of what cannot be, and tell what is in the way."""
+        """Wish for what there is in place of what cannot be, and say what is in the way."""
         self.stop = self._reason()
         self._wished = np.where(self._far(here), here, self._wished)
 

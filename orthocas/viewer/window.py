@@ -49,7 +49,7 @@ class Loop:
 
     Args:
         settle: what to do when nothing was asked for during a quarter of a second.
-        failed: told of an error in a job.
+        failed: called with an error in a job.
     """
 
     def __init__(self, settle: Job, failed: Callable[[Exception], None]) -> None:
@@ -117,7 +117,7 @@ class Loop:
     def _do(self, job: Job) -> None:
         try:
             job()
-        except Exception as error:  # a page goes on after an error, and tells it
+        except Exception as error:  # a page shows an error and goes on
             _log.debug("a job of the view failed", exc_info=True)
             self._failed(error)
 
@@ -131,7 +131,7 @@ class Guard:
 
     A browser sets both headers, and no page can change them. `Host` is the address that the browser asked; a name of
     somebody else there means that his name leads here (DNS rebinding). `Origin` is the page that asks; it must be one
-    of this server's own. The path begins with a random token, so who has not been told the address gets nothing, not
+    of this server's own. The path begins with a random token, so without the address nobody gets anything, not
     even viser's own page, which an address could make connect to another server.
     """
 
