@@ -101,10 +101,12 @@ def test_there_are_sources_to_check() -> None:
     assert {package(name) for name in MODULES if name not in (*FACES, "orthocas")} == set(ORDER)
 
 
+@pytest.mark.slow
 def test_files_import_in_no_circle() -> None:
     assert circle() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("types", [False, True])
 def test_packages_import_in_one_order(types: bool) -> None:
     """Imports in functions and modules named by strings count, too, and with `types` those that only types need."""
@@ -115,6 +117,7 @@ def test_packages_import_in_one_order(types: bool) -> None:
             assert not up, f"{name} imports {up}, which stand above it"
 
 
+@pytest.mark.slow
 def test_picture_of_the_packages_is_the_code() -> None:
     """Drawn by tools/packages.py: its arrows lead just where imports do, and its files are all there are."""
     page = (ROOT / "CONTRIBUTING.md").read_text()
@@ -164,6 +167,7 @@ def test_modules_are_not_named_by_strings() -> None:
     assert (named, computed) == (set(), {"orthocas.__init__", "orthocas.cli.commands"})
 
 
+@pytest.mark.slow
 def test_imports_in_functions_say_why() -> None:
     """They are for heavy libraries that few calls need: at the top of the function, the first with its reason."""
     for path in SOURCES.values():

@@ -51,6 +51,7 @@ def bends(run: AtlasRun) -> Array:
     return np.asarray(np.abs(run.torque[k] - 2 * run.torque[k - 1] + run.torque[k - 2]))
 
 
+@pytest.mark.slow
 def test_weights_are_those_of_all_boxes_that_hold_the_position_and_add_up_to_one(
     atlas: oc.Atlas, points: Array
 ) -> None:
@@ -67,6 +68,7 @@ def test_weights_are_those_of_all_boxes_that_hold_the_position_and_add_up_to_one
     assert {1, 2} <= counts
 
 
+@pytest.mark.slow
 def test_blended_potential_has_the_force_that_the_law_applies(atlas: oc.Atlas, points: Array) -> None:
     law, h = BlendedImpedance(atlas, STIFFNESS), 1e-6
     for q in points[:20]:
@@ -77,6 +79,7 @@ def test_blended_potential_has_the_force_that_the_law_applies(atlas: oc.Atlas, p
         assert np.linalg.eigvalsh(S).min() > 0
 
 
+@pytest.mark.slow
 def test_energy_of_the_blended_impedance_falls_across_charts(atlas: oc.Atlas) -> None:
     plant = MuJoCoPlant(atlas.problem.robot, effort_limits=False)
     rest = there_and_back(atlas, np.zeros(2), 0.6)
@@ -98,6 +101,7 @@ def test_energy_of_the_blended_impedance_falls_across_charts(atlas: oc.Atlas) ->
     )  # the torque is held for a tick: the books close with the first power of it
 
 
+@pytest.mark.slow
 def test_posture_asked_for_and_torque_do_not_jump_at_hand_overs(atlas: oc.Atlas) -> None:
     law = HandedOver(atlas, lambda chart: PDPlus(chart, STIFFNESS))
     run = simulate_in_atlas(
@@ -113,6 +117,7 @@ def test_posture_asked_for_and_torque_do_not_jump_at_hand_overs(atlas: oc.Atlas)
     assert not run.fell_back.any()
 
 
+@pytest.mark.slow
 def test_torque_fades_from_one_chart_to_the_next_with_a_wrong_model(atlas: oc.Atlas) -> None:
     law = HandedOver(atlas, lambda chart: PDPlus(chart, STIFFNESS))
     plant = MuJoCoPlant(atlas.problem.robot.with_scaled_masses(1.2))

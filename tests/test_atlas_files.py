@@ -28,6 +28,7 @@ from orthocas.tools.block_file import create, owned, sealed
 from orthocas.tools.checks import Array
 
 
+@pytest.mark.slow
 def test_file_holds_the_same_atlas(planar_atlas: oc.Atlas, covered: Array) -> None:
     again = oc.Atlas.load(planar_atlas.path)
     assert np.array_equal(again.xi(covered), planar_atlas.xi(covered))
@@ -42,6 +43,7 @@ def test_build_in_parts_gives_the_same_cells(planar_atlas: oc.Atlas, tmp_path: P
     assert cells_of(again.stock) == cells_of(planar_atlas.stock)
 
 
+@pytest.mark.slow
 def test_build_goes_on_after_a_process_died_while_it_wrote(planar_atlas: oc.Atlas, tmp_path: Path) -> None:
     content = planar_atlas.path.read_bytes()
     path = tmp_path / "arm.orthocas-atlas"
@@ -74,6 +76,7 @@ def turned(content: bytes, byte: int, bit: int) -> bytes:
     return content[:byte] + bytes([content[byte] ^ 1 << bit]) + content[byte + 1 :]
 
 
+@pytest.mark.slow
 def test_every_bit_of_every_header_is_guarded(grown: Stock, tmp_path: Path) -> None:
     content, blocks = grown.path.read_bytes(), grown.contents.blocks
     headers = [range(block.body - len(block.head) - 28, block.body - len(block.head)) for block in blocks]
@@ -89,6 +92,7 @@ def test_every_bit_of_every_header_is_guarded(grown: Stock, tmp_path: Path) -> N
         assert path.read_bytes() == turned(content, byte, bit)
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_of_a_file_of_version_1_with_a_turned_bit(grown: Stock, tmp_path: Path) -> None:
     content = of_version_1(grown.path.read_bytes(), grown)
     path, rest = tmp_path / "arm.orthocas-atlas", tmp_path / "arm.orthocas-atlas.rest"
@@ -178,6 +182,7 @@ def test_file_of_other_settings_is_not_gone_on_with(planar_atlas: oc.Atlas) -> N
         oc.build_atlas(planar(), planar_atlas.path, oc.AtlasSettings())
 
 
+@pytest.mark.slow
 def test_two_processes_never_build_one_file(tmp_path: Path) -> None:
     path = tmp_path / "arm.orthocas-atlas"
     built(path, share=0.3)

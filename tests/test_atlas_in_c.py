@@ -51,6 +51,7 @@ def holds(way_atlas: oc.Atlas, number: int, q: Array) -> bool:
     return bool((np.abs(q - box.centre) <= box.half_width * (1 + 1e-9)).all())
 
 
+@pytest.mark.slow
 def test_chart_in_c_is_the_one_that_python_finds(
     way_atlas: oc.Atlas, library: CompiledLibrary, positions: Array
 ) -> None:
@@ -68,6 +69,7 @@ def test_chart_in_c_is_the_one_that_python_finds(
     assert (wanted[:2500] < 0).sum() > 100
 
 
+@pytest.mark.slow
 def test_values_in_c_are_those_of_python(way_atlas: oc.Atlas, library: CompiledLibrary, positions: Array) -> None:
     charts = way_atlas.chart_at(positions)
     q, charts = positions[charts >= 0], charts[charts >= 0]
@@ -155,6 +157,7 @@ def test_command_writes_the_charts_along_postures(way_atlas: oc.Atlas, run: Run,
     )
 
 
+@pytest.mark.slow
 def test_proof_finds_a_wrong_coefficient(way_atlas: oc.Atlas, tmp_path: Path) -> None:
     part = oc.AtlasPart.along(way_atlas, WAY[:10])
     generated = oc.generate_c(part, tmp_path, name="arm")

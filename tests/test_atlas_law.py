@@ -56,6 +56,7 @@ def moving(way_atlas: oc.Atlas, tmp_path_factory: pytest.TempPathFactory) -> tup
     return law, CompiledLibrary(compile_shared(generated, folder, ("-O0",)), "arm", 3, r=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["torque", "velocity"])
 def test_law_of_each_chart_is_that_of_python(
     way_atlas: oc.Atlas, command: str, law: Controller, library: CompiledLibrary, request: pytest.FixtureRequest
@@ -81,6 +82,7 @@ def test_law_of_each_chart_is_that_of_python(
     assert seen & {ControlStatus.OK, ControlStatus.SATURATED}
 
 
+@pytest.mark.slow
 def test_hand_over_asks_for_the_same_posture_velocity_and_acceleration(
     way_atlas: oc.Atlas, library: CompiledLibrary
 ) -> None:

@@ -67,6 +67,7 @@ def wrist(tmp_path_factory: pytest.TempPathFactory) -> oc.Atlas:
         return oc.build_atlas(problem, path, oc.AtlasSettings(2, 10.0, half_width=0.8), executor=executor)
 
 
+@pytest.mark.slow
 def test_first_and_last_joint_of_an_orientation_task_are_not_divided(wrist: oc.Atlas) -> None:
     assert [wrist.problem.robot.joint_names[i] for i in wrist.plan.cyclic] == ["panda_joint4", "panda_joint7"]
     assert oc.cyclic_joints(wrist.problem) == ()  # its coordinates are singular half a turn away
@@ -146,6 +147,7 @@ def test_sessions_begin_in_the_middle_of_the_joint_range(planar_atlas: oc.Atlas)
         export_page(planar_atlas, planar_atlas.path.with_name("page.html"))
 
 
+@pytest.mark.slow
 def test_one_chart_along_a_motion_closes_loops_that_cross_charts() -> None:
     found = atlas_loops.main(quick=True)
     assert found["hand_overs"] >= 2

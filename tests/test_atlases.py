@@ -83,6 +83,7 @@ def test_jacobian_is_the_derivative_of_xi_in_the_same_chart(planar_atlas: oc.Atl
     assert np.abs(np.stack(steps, axis=-1) - planar_atlas.jacobian(covered, numbers)).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_charts_are_as_good_as_asked_for(planar_atlas: oc.Atlas) -> None:
     """With the judge of single charts, at other samples."""
     for number in range(0, len(planar_atlas), 12):
@@ -133,6 +134,7 @@ def test_surroundings_of_postures_are_covered_and_little_else(tmp_path: Path) ->
     assert oc.evaluate_atlas(found, 2000).share == 1.0
 
 
+@pytest.mark.slow
 def test_charts_are_certified_if_asked_for(tmp_path: Path) -> None:
     asked = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.2, certify_seconds=20.0)
     with ThreadPoolExecutor(1) as executor:
@@ -167,6 +169,7 @@ def test_bad_arguments_are_named(tmp_path: Path) -> None:
     assert not path.exists()
 
 
+@pytest.mark.slow
 def test_command_line_builds_shows_and_evaluates(run: Run) -> None:
     Path("path.csv").write_text("time,q3,q2,q1\n0,0.8,0.9,0\n1,0.8,1.1,0\n")
     words = ("--region", "path.csv", "--radius", "0.1", "--workers", "1", "--half-width", "0.8", "--degree", "2")

@@ -20,6 +20,7 @@ from orthocas.errors import CertifyError, ChartFileError, Interrupted, InvalidVa
 from orthocas.tools.progress import Progress
 
 
+@pytest.mark.slow
 def test_a_certificate_is_void_when_one_coefficient_changes(tmp_path: Path) -> None:
     known = replace(chart(), certificate=certified())
     coordinates = known.coordinates
@@ -35,6 +36,7 @@ def test_a_certificate_is_void_when_one_coefficient_changes(tmp_path: Path) -> N
     assert oc.load(tmp_path / "a.chart").certificate is not None
 
 
+@pytest.mark.slow
 def test_files_keep_certificates(tmp_path: Path) -> None:
     replace(chart(), certificate=certified()).save(tmp_path / "a.chart")
     again = oc.load(tmp_path / "a.chart")
@@ -43,6 +45,7 @@ def test_files_keep_certificates(tmp_path: Path) -> None:
     assert oc.check_certificate(again)
 
 
+@pytest.mark.slow
 def test_a_forged_certificate_does_not_hold() -> None:
     known = certified()
     whole = Subdivision(known.regular.low, known.regular.high, np.array([PROVED], dtype=np.uint8))
@@ -129,6 +132,7 @@ def test_parts_cover_the_box_exactly() -> None:
     assert tree.leaves(OPEN)[1].tolist() == [[1.0, 0.5]]
 
 
+@pytest.mark.slow
 def test_an_unfinished_proof_is_resumed() -> None:
     wide = chart(0.3)
     begun = oc.certify(wide, time_limit=0)
@@ -139,6 +143,7 @@ def test_an_unfinished_proof_is_resumed() -> None:
         oc.certify(wide, 0.1, resume=begun)
 
 
+@pytest.mark.slow
 def test_ctrl_c_returns_what_is_proved_so_far() -> None:
     def stop(progress: Progress) -> None:
         raise KeyboardInterrupt
@@ -161,6 +166,7 @@ def command(*words: Any) -> Any:
     return CliRunner().invoke(app_for(list(map(str, words))), [str(word) for word in words])
 
 
+@pytest.mark.slow
 def test_the_command_certifies_checks_and_shows(tmp_path: Path) -> None:
     path = tmp_path / "a.chart"
     chart().save(path)

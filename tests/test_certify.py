@@ -15,6 +15,7 @@ from orthocas.charts.worst_points import worst_points
 from orthocas.errors import CertifyError, InvalidValueError
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [chart, network, given, fourier, lambda: fitted().chart])
 def test_regular_charts_are_certified_and_checked(build: Callable[[], oc.Chart]) -> None:
     known = build()
@@ -24,6 +25,7 @@ def test_regular_charts_are_certified_and_checked(build: Callable[[], oc.Chart])
     assert oc.check_certificate(known, certificate)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("build", "rounds"), [(lambda: fitted().chart, 10), (lambda: chart(0.4), 1)])
 def test_a_million_points_near_the_worst_corners_do_not_refute_a_proof(
     build: Callable[[], oc.Chart], rounds: int
@@ -44,6 +46,7 @@ def test_a_million_points_near_the_worst_corners_do_not_refute_a_proof(
         assert (np.linalg.det(known.jacobian(near)) * sign > 0).all()
 
 
+@pytest.mark.slow
 def test_a_chart_of_the_arm_that_folds_is_never_certified() -> None:
     arm = problems.get("iiwa")
     wide = oc.Problem(arm.robot, arm.task, domain=oc.Box(arm.domain.centre, 1.04))
@@ -68,6 +71,7 @@ def dipped(depth: float, width: float = 1e-8) -> oc.Chart:
     return oc.fit(arm, oc.Given.from_function("dip", 3, xi)).chart
 
 
+@pytest.mark.slow
 def test_a_fold_smaller_than_any_sampling_sees_is_never_certified() -> None:
     folding = dipped(30.0)
     q = folding.problem.domain.centre + np.array([0, 0, 0.1234567])
@@ -77,6 +81,7 @@ def test_a_fold_smaller_than_any_sampling_sees_is_never_certified() -> None:
     assert not oc.certify(folding, time_limit=1).proved
 
 
+@pytest.mark.slow
 def test_a_dip_that_is_no_fold_is_certified() -> None:
     assert oc.certify(dipped(0.1, 0.1)).proved
 
@@ -90,6 +95,7 @@ def test_a_chart_for_all_positions_of_a_cyclic_joint_is_certified() -> None:
     assert certificate.boxes < 500  # A1 is never halved: J does not depend on it
 
 
+@pytest.mark.slow
 def test_a_certified_box_of_a_folding_chart_holds_no_fold() -> None:
     arm = problems.get("planar_3r_xy")
     domain = oc.Box([0.6, 0.8, 0.8], 0.9)
@@ -102,6 +108,7 @@ def test_a_certified_box_of_a_folding_chart_holds_no_fold() -> None:
     assert len(np.unique(signs)) == 1
 
 
+@pytest.mark.slow
 def test_a_bound_of_the_conditioning_is_proved_below_the_sampled_minimum() -> None:
     certificate = oc.certify(chart(), 0.5)
     assert certificate.proved

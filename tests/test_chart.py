@@ -8,6 +8,7 @@ from orthocas.errors import InvalidValueError, InverseError, ShapeError, Unknown
 from orthocas.fitting.fit import Fit
 
 
+@pytest.mark.slow
 def test_shapes_of_single_and_batched_calls(iiwa_fit: Fit) -> None:
     chart, q = iiwa_fit.chart, np.zeros((5, 7))
     assert (chart.xi(q).shape, chart.xi(q[0]).shape) == ((5, 4), (4,))
@@ -35,6 +36,7 @@ def test_casadi_functions_agree_with_batched_numpy(planar_x: oc.Problem, paramet
     assert chart.function("xi").size_out(0) == (2, 1)
 
 
+@pytest.mark.slow
 def test_task_rows_come_first(iiwa_fit: Fit) -> None:
     chart, q = iiwa_fit.chart, np.full(7, 0.1)
     np.testing.assert_allclose(chart.phi(q)[:3], chart.problem.robot.tip_position(q), atol=1e-14)

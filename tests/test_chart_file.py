@@ -31,6 +31,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["orientation", "pose:z", "axis:x", "position+axis:z"])
 def test_tasks_with_a_reference_come_back_with_it(kind: str, iiwa: oc.Problem, tmp_path: Path) -> None:
     problem = oc.Problem(iiwa.robot, oc.Task.named(iiwa.robot, kind), domain=iiwa.domain)
@@ -69,6 +70,7 @@ def test_limits_of_effort_come_back_and_are_unknown_to_older_files(tmp_path: Pat
     assert np.isinf([older.effort_limits, older.velocity_limits]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_chart_comes_back_the_same(kind: str, tmp_path: Path) -> None:
     robot = oc.Robot.planar([1.0, 0.9, 0.8], [3.0, 2.0, 1.0])
@@ -137,6 +139,7 @@ def test_custom_operation_that_files_cannot_hold_fails_at_saving_only(tmp_path: 
         chart.save(tmp_path / "odder")
 
 
+@pytest.mark.slow
 def test_pose_and_torus_come_back(tmp_path: Path, iiwa: oc.Problem) -> None:
     task = oc.Task.named(iiwa.robot, "pose", iiwa.domain.centre)
     chart = oc.fit(oc.Problem(iiwa.robot, task, domain=iiwa.domain), oc.Polynomial(1), samples=100).chart

@@ -86,6 +86,7 @@ def test_finished_fit_is_not_run_again(planar_x: oc.Problem, tmp_path: Path) -> 
     np.testing.assert_array_equal(again.chart.coordinates.theta, first.chart.coordinates.theta)
 
 
+@pytest.mark.slow
 def test_interrupted_fit_can_go_on(planar_x: oc.Problem, tmp_path: Path) -> None:
     file = tmp_path / "run.checkpoint"
 

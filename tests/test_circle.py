@@ -121,6 +121,7 @@ def test_self_motion_counts_on_across_the_cut(around: oc.Chart) -> None:
     assert np.ptp(motion.xi[:, 0]) > 6
 
 
+@pytest.mark.slow
 def test_grown_circle_is_distilled_across_its_cut() -> None:
     """cos xi and sin xi are smooth where xi jumps; here xi is the angle of joint 1 itself."""
     grown = oc.grow(ring(), leaf="circle")
@@ -141,6 +142,7 @@ def test_chart_file_keeps_the_circle(around: oc.Chart, tmp_path: Path) -> None:
     assert again.turns.tolist() == around.turns.tolist()
 
 
+@pytest.mark.slow
 def test_c_equals_python_and_its_inverse_crosses_the_cut(around: oc.Chart, tmp_path: Path) -> None:
     law = Kinematic(around, 5.0)
     generated = oc.generate_c(around, tmp_path / "c", law, name="ring")
@@ -159,6 +161,7 @@ def bounded(chart: oc.Chart, half_width: float) -> oc.Chart:
     return replace(chart, problem=oc.Problem(whole.robot, whole.task, whole.metric, box))
 
 
+@pytest.mark.slow
 def test_certificate_of_a_ring_ends_one_to_one_before_a_whole_turn(around: oc.Chart) -> None:
     """The whole ring has no fold; but its ends share phi, so it is one-to-one on less than a turn only."""
     whole = bounded(around, np.pi)

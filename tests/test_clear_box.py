@@ -71,6 +71,7 @@ def by_hand(task: oc.Task, domain: oc.Box, q: Numbers, rows: str = "frame") -> N
     return values
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["position:xy", "pose", "polar", "position+axis"])
 def test_points_are_inside_just_where_the_smallest_singular_value_is_large_enough(kind: str) -> None:
     known = oc.problems.get("planar_3r_xy" if kind in ("position:xy", "polar") else "iiwa")
@@ -220,6 +221,7 @@ def test_cyclic_joints_keep_the_condition(problem: oc.Problem) -> None:
     assert not wider.contains([50.0, *STRAIGHT[1:]])
 
 
+@pytest.mark.slow
 def test_the_bound_takes_the_folds_out_of_a_box_with_singular_positions(problem: oc.Problem, chart: oc.Chart) -> None:
     whole = oc.fit(oc.Problem(problem.robot, problem.task, domain=WIDE), oc.Polynomial(3))
     assert whole.worst is not None
@@ -241,6 +243,7 @@ def test_the_search_for_worst_points_stays_inside(problem: oc.Problem, chart: oc
     assert values.min() < 1.1 * BOUND  # but it goes up to the boundary
 
 
+@pytest.mark.slow
 def test_fits_offer_the_bound_that_helps() -> None:
     arm = oc.problems.get("iiwa")
     box = oc.Box(arm.domain.centre, 1.0)
@@ -266,6 +269,7 @@ def test_nothing_is_offered_where_the_centre_is_singular() -> None:
     assert clear_part(straight, found, None) is None
 
 
+@pytest.mark.slow
 def test_a_fit_says_which_option_helps(run: Run) -> None:
     task = ("--half-width", "0.8,1.2,1.2", "--metric", "euclidean")
     words = ("fit", "planar_3r_xy", *task, "--param", "polynomial:3")
@@ -357,6 +361,7 @@ def test_the_boundary_distance_is_not_positive_outside(chart: oc.Chart) -> None:
     assert quality.boundary_distance[1] <= 0
 
 
+@pytest.mark.slow
 @needs_c
 def test_c_has_the_same_inside(chart: oc.Chart, tmp_path: Path) -> None:
     law = control.PDPlus(chart, 50.0, coupling="decoupled")
@@ -376,6 +381,7 @@ def test_c_has_the_same_inside(chart: oc.Chart, tmp_path: Path) -> None:
     np.testing.assert_allclose(q, STRAIGHT, atol=1e-6)
 
 
+@pytest.mark.slow
 @needs_c
 def test_c_of_a_pose_task_has_the_same_inside(tmp_path: Path) -> None:
     arm = oc.problems.get("iiwa")
@@ -387,6 +393,7 @@ def test_c_of_a_pose_task_has_the_same_inside(tmp_path: Path) -> None:
     assert check_c(oc.generate_c(chart, tmp_path), chart, states=200).differences["phi"] < 1e-12
 
 
+@pytest.mark.slow
 def test_certificates_cover_the_clear_part(problem: oc.Problem) -> None:
     wider = oc.Problem(problem.robot, problem.task, domain=WIDE, least_singular_value=0.25)  # at 0.2 some fits fold
     chart = oc.fit(wider, oc.Polynomial(3)).chart

@@ -26,6 +26,7 @@ def saved(iiwa_fit: Fit, tmp_path: Path) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 def test_fit_writes_a_chart_and_prints_its_quality(run: Run, tmp_path: Path) -> None:
     code, out, err = run("fit", "planar_3r_x", "--param", "polynomial:3", "--out", "a.orthocas")
     assert (code, err) == (0, "")
@@ -34,6 +35,7 @@ def test_fit_writes_a_chart_and_prints_its_quality(run: Run, tmp_path: Path) -> 
     assert oc.load(tmp_path / "a.orthocas").r == 2
 
 
+@pytest.mark.slow
 def test_fit_json_is_one_object(run: Run) -> None:
     code, out, err = run("fit", "planar_3r_xy", "--param", "linear", "--json")
     data = json.loads(out)
@@ -43,6 +45,7 @@ def test_fit_json_is_one_object(run: Run) -> None:
     assert data["task_angle_deg"]["std"] > 0
 
 
+@pytest.mark.slow
 def test_precision_reaches_the_fit(run: Run) -> None:
     """The same loss up to the seventh digit, but not the same digits; see tests/test_single_precision.py for more."""
     words = ("planar_3r_xy", "--param", "polynomial:2", "--samples", "100", "--json")
@@ -52,6 +55,7 @@ def test_precision_reaches_the_fit(run: Run) -> None:
     assert single == pytest.approx(double, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_evaluate_json_has_the_promised_keys(run: Run, saved: str) -> None:
     code, out, err = run("evaluate", saved, "--samples", "500", "--seed", "3", "--json")
     data = json.loads(out)
@@ -66,6 +70,7 @@ def test_evaluate_json_has_the_promised_keys(run: Run, saved: str) -> None:
     assert data == json.loads(json.dumps(want))
 
 
+@pytest.mark.slow
 def test_info_shows_charts_problems_and_robots(run: Run, saved: str) -> None:
     assert "polynomial:3" in run("info", saved)[1]
     chart, told = oc.load(saved), json.loads(run("info", saved, "--json")[1])

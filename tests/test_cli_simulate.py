@@ -114,6 +114,7 @@ def test_springs_that_are_not_given_are_matched(chart: oc.Chart) -> None:
     assert projector[0] == stiffness[0]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_pictures")
 def test_gains_and_limits_are_those_given(run_simulate: Run, chart: oc.Chart) -> None:
     words = ("--stiffness", "100,2000,3000", "--damping-ratio", "0.9", "--limit", "400", "--coupling", "decoupled")
@@ -154,6 +155,7 @@ def test_compiled_runs_are_the_same(run_simulate: Run) -> None:
         assert compiled[name] == pytest.approx(plain[name], rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_pictures")
 def test_points_and_pushes(run_simulate: Run) -> None:
     points = {"points": [{"time": 1, "move": {"x": 0.1}}, {"time": 2, "move": {"xi1": 0.05}}]}
@@ -187,6 +189,7 @@ def test_mujoco_is_another_plant(run_simulate: Run) -> None:
     assert ours["tracking_error"]["x"] > still + 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_pictures")
 def test_a_run_that_diverges_is_written_and_said(run_simulate: Run) -> None:
     code, out, err = run_simulate("impedance", "--stiffness", "1e14", "--animation", "none")

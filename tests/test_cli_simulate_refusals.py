@@ -87,6 +87,7 @@ def test_a_reference_that_leaves_the_domain_is_reported_before_the_run(run_simul
     assert not Path("out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pd_plus", "kinematic_projector"])
 def test_grown_charts_are_refused(run_simulate: Run, name: str, planar_x: oc.Problem) -> None:
     oc.grow(planar_x, leaf="linear").save("grown.orthocas")
@@ -127,6 +128,7 @@ def test_ctrl_c_in_the_run_keeps_what_was_simulated(run_simulate: Run, monkeypat
     assert Trajectory.load("out/trajectory.npz").times[-1] == report["duration"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_pictures")
 def test_files_of_others_stay_unless_forced(run_simulate: Run) -> None:
     Path("out").mkdir()
@@ -143,6 +145,7 @@ def test_files_of_others_stay_unless_forced(run_simulate: Run) -> None:
     assert "cannot write out/report.json: orthocas did not write the file" in err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_pictures")
 def test_ctrl_c_in_the_animation_leaves_no_half_of_it(run_simulate: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "terminal_monitor", interrupting("draw"))

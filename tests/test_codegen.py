@@ -46,6 +46,7 @@ def test_every_controller_equals_its_python(planar_chart: oc.Chart, tmp_path: Pa
         assert generated.stack_bytes < 20_000
 
 
+@pytest.mark.slow
 @needs_c
 def test_law_of_a_weak_arm_is_compared_beyond_its_limits(planar_chart: oc.Chart, tmp_path: Path) -> None:
     """At random states and default gains its limit cuts every command."""
@@ -56,6 +57,7 @@ def test_law_of_a_weak_arm_is_compared_beyond_its_limits(planar_chart: oc.Chart,
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parametrisation", [oc.Linear(), oc.Fourier(2), oc.MLP((5, 4))], ids=lambda p: p.label)
 def test_every_family_equals_its_python(planar_xy: oc.Problem, parametrisation: Any, tmp_path: Path) -> None:
     chart = oc.fit(planar_xy, parametrisation, samples=300).chart
@@ -70,6 +72,7 @@ def test_seven_joints_with_an_idle_one(iiwa: oc.Problem, tmp_path: Path) -> None
     assert check_c(oc.generate_c(chart, tmp_path, law), chart, law, states=200).differences["control"] < 1e-10
 
 
+@pytest.mark.slow
 def test_chart_on_the_torus_has_no_outside(tmp_path: Path) -> None:
     chart = linear_on_the_torus()
     generated = oc.generate_c(chart, tmp_path, None, "free_arm")
@@ -106,6 +109,7 @@ def test_check_finds_what_is_wrong(planar_chart: oc.Chart, tmp_path: Path, old: 
         check_c(generated, planar_chart, law, states=100)
 
 
+@pytest.mark.slow
 def test_check_compares_with_the_gains_of_the_controller(planar_chart: oc.Chart, tmp_path: Path) -> None:
     generated = oc.generate_c(planar_chart, tmp_path, laws(planar_chart)[0], "arm")
     with pytest.raises(ProofError, match="default gains"):
@@ -180,6 +184,7 @@ def law_of_chain(n: int) -> PDPlus:
     return PDPlus(oc.fit(problem, oc.Linear()).chart, 50.0, coupling="decoupled")
 
 
+@pytest.mark.slow
 @needs_c
 def test_c_of_robots_with_many_joints_is_short_and_right(tmp_path: Path) -> None:
     """Inverses of large matrices have code of their own."""

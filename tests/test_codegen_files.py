@@ -80,6 +80,7 @@ def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: tuple[Genera
     assert not list((tmp_path / "installed").rglob("*arm*"))
 
 
+@pytest.mark.slow
 def test_words_of_others_do_not_become_code(tmp_path: Path) -> None:
     evil = "a */ int evil; /* @x@ b /* ω"
     robot = oc.Robot.planar([1, 1, 1], [3, 3, 3])
@@ -107,6 +108,7 @@ HOSTILE = (
 )
 
 
+@pytest.mark.slow
 def test_names_from_robot_files_stay_in_comments(tmp_path: Path) -> None:
     """Keywords, quotes, trigraphs, bidi characters and backslashes at ends of lines, with trigraphs switched on too."""
     robot = oc.Robot.planar([0.5] * len(HOSTILE), [1.0] * len(HOSTILE))
@@ -129,6 +131,7 @@ def test_names_from_robot_files_stay_in_comments(tmp_path: Path) -> None:
     assert check_c(generated, chart, None, states=20).differences["phi"] < 1e-10
 
 
+@pytest.mark.slow
 def test_files_of_the_user_stay(planar_chart: oc.Chart, tmp_path: Path) -> None:
     (tmp_path / "README.md").write_text("# My robot\n")
     with pytest.raises(InvalidValueError, match=r"a folder with a README\.md that orthocas did not write"):

@@ -91,6 +91,7 @@ def grid(planar_x: oc.Problem, tmp_path_factory: pytest.TempPathFactory) -> tupl
     return found, folder
 
 
+@pytest.mark.slow
 def test_grid_holds_every_cell_once_and_in_order(grid: tuple[Comparison, Path]) -> None:
     found, _ = grid
     cells = [(r.parametrisation, r.solver, r.seed) for r in found.results]
@@ -101,6 +102,7 @@ def test_grid_holds_every_cell_once_and_in_order(grid: tuple[Comparison, Path]) 
     ]
 
 
+@pytest.mark.slow
 def test_failing_cells_are_reported_and_the_others_go_on(grid: tuple[Comparison, Path]) -> None:
     found, _ = grid
     failed = [r for r in found.results if r.failed]
@@ -206,6 +208,7 @@ def test_pictures_show_every_good_fit(grid: tuple[Comparison, Path]) -> None:
     assert len(curves) == len(wanted)
 
 
+@pytest.mark.slow
 def test_front_of_one_coordinate_shows_the_conditioning(planar_xy: oc.Problem) -> None:
     found = oc.compare(planar_xy, [oc.Linear(), oc.Polynomial(2)], executor=InThisThread(), **QUICK)
     (axes,) = front_figure(found).axes
@@ -265,6 +268,7 @@ def test_full_shared_memory_is_named(planar_x: oc.Problem, monkeypatch: pytest.M
         oc.compare(planar_x, [oc.Linear()], samples=30, held_out=50)
 
 
+@pytest.mark.slow
 def test_any_executor_does(planar_x: oc.Problem) -> None:
     with ThreadPoolExecutor(2) as pool:
         found = oc.compare(planar_x, [oc.Polynomial(1), oc.Polynomial(2)], executor=pool, **QUICK)
@@ -282,6 +286,7 @@ def test_executor_that_loses_a_cell_is_reported(planar_x: oc.Problem) -> None:
     assert result.error == "ConnectionError: worker is gone"
 
 
+@pytest.mark.slow
 def test_ctrl_c_raises_with_what_is_done(planar_x: oc.Problem) -> None:
     def press(progress: Progress) -> None:
         if progress.fraction > 0.5:
@@ -294,6 +299,7 @@ def test_ctrl_c_raises_with_what_is_done(planar_x: oc.Problem) -> None:
     assert len(found.results) == 1
 
 
+@pytest.mark.slow
 def test_same_cell_same_result(planar_x: oc.Problem) -> None:
     cell = Cell(
         planar_x, oc.Polynomial(2), solvers.GaussNewton(), 3, Weights.of((1000.0, 30.0)), 150, "double", 500, None

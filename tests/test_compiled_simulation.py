@@ -62,6 +62,7 @@ def reference(planar_fit: Fit) -> Reference:
     return Reference.steps(chart.labels, phi, changes, 1.2)
 
 
+@pytest.mark.slow
 def test_continuous_runs_are_those_of_cvodes(law: PDPlus, reference: Reference) -> None:
     """With pushes, viscous friction and a heavier robot."""
     q0, robot = law.problem.domain.centre, law.problem.robot
@@ -76,6 +77,7 @@ def test_continuous_runs_are_those_of_cvodes(law: PDPlus, reference: Reference) 
     np.testing.assert_allclose(coarse.q[-1], fine.q[-1], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_coulomb_friction_and_stops_are_those_of_cvodes(law: PDPlus, reference: Reference) -> None:
     runs = both(law, reference, law.problem.domain.centre, friction=Friction(0.1, 2.0), stops=Stops(), tolerance=1e-9)
     require_same(runs, 1e-6)
@@ -94,6 +96,7 @@ def test_sampled_runs_are_those_of_cvodes(law: PDPlus, reference: Reference, rat
     assert (outside[1].status[:3] == ControlStatus.OUTSIDE_DOMAIN).all()
 
 
+@pytest.mark.slow
 def test_velocity_laws_and_laws_without_a_chart_run_in_c(planar_fit: Fit, reference: Reference) -> None:
     chart = planar_fit.chart
     q0 = chart.problem.domain.centre
@@ -134,6 +137,7 @@ def test_runs_that_differ_in_numbers_share_libraries(law: PDPlus, reference: Ref
     assert [report.fraction for report in seen] == pytest.approx([1 / 3, 2 / 3, 1.0])
 
 
+@pytest.mark.slow
 def test_many_runs_keep_their_order_on_any_executor(monkeypatch: pytest.MonkeyPatch) -> None:
     law, reference = impedance(), steps()
     starts = [planar().domain.centre + shift for shift in (0.0, 0.01, -0.01, 0.02)]

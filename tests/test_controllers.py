@@ -94,6 +94,7 @@ def by_hand(chart: oc.Chart, s: State, K: Array, Z: Array, blocks: list[slice], 
     return np.asarray(J.T @ force + s.g)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["coupled", "decoupled"])
 @pytest.mark.parametrize("law", [Impedance, PDPlus])
 def test_laws_equal_the_paper_written_out(arm_chart: oc.Chart, model: pin.Model, law: Any, coupling: Any) -> None:
@@ -152,6 +153,7 @@ def test_damping_check_finds_indefinite_designs(planar_xy: oc.Problem) -> None:
     assert Impedance(chart, [1.0, 1e4, 1.0], 0.7).check_damping(500).indefinite_share == 0
 
 
+@pytest.mark.slow
 def test_kinematic_control_inverts_the_jacobian(arm_chart: oc.Chart, model: pin.Model) -> None:
     feedback = np.linspace(0, 3, 7)
     for _ in range(5):
@@ -161,6 +163,7 @@ def test_kinematic_control_inverts_the_jacobian(arm_chart: oc.Chart, model: pin.
         np.testing.assert_allclose(called(Kinematic(arm_chart, feedback), s), want, rtol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
 def test_projector_equals_equations_2_and_3(model: pin.Model, metric: str) -> None:
     base = oc.problems.get("iiwa")
@@ -235,6 +238,7 @@ def test_grown_charts_are_refused_with_a_way_out(planar_x: oc.Problem) -> None:
             law()
 
 
+@pytest.mark.slow
 def test_networks_can_be_controlled_too(planar_xy: oc.Problem) -> None:
     """Their functions hold matrices, and stay as they are."""
     chart = oc.fit(planar_xy, oc.MLP((6, 6)), samples=300).chart

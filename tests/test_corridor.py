@@ -105,6 +105,7 @@ def test_loop_closes_where_the_pseudo_inverse_drifts(loop: tuple[oc.Problem, Arr
     assert oc.evaluate(chart, 1000).conditioning.min > 0.5
 
 
+@pytest.mark.slow
 def test_certificate_covers_the_corridor_and_leaves_out_nothing_of_it(chart: oc.Chart) -> None:
     domain = chart.problem.domain
     certificate = oc.certify(chart)
@@ -121,6 +122,7 @@ def test_certificate_covers_the_corridor_and_leaves_out_nothing_of_it(chart: oc.
         assert not domain.contains(rng.uniform(low, high, (200, 3))).any()
 
 
+@pytest.mark.slow
 def test_laws_and_generated_c_fall_back_outside(
     loop: tuple[oc.Problem, Array, Array], chart: oc.Chart, tmp_path: Path
 ) -> None:
@@ -180,6 +182,7 @@ def test_wrong_corridors_are_refused() -> None:
         oc.corridor_problem(iiwa, iiwa.domain.centre[None] + 10.0)
 
 
+@pytest.mark.slow
 def test_command_line_fits_along_postures(run: Run) -> None:
     np.savetxt("path.csv", PATH, delimiter=",", header="q1,q2,q3", comments="")
     words = ("fit", "planar_3r_xy", "--corridor", "path.csv", "--samples", "200", "--out", "a.orthocas", "--json")

@@ -43,6 +43,7 @@ def test_inertia_metric_and_meshes_distil_too() -> None:
     assert on_mesh.value_rms.max() < 0.01
 
 
+@pytest.mark.slow
 def test_networks_and_fourier_series_distil() -> None:
     chart = grown(half_width=0.2)
     for parametrisation, solver in ((oc.MLP((8,)), solvers.LBFGS(max_iterations=150)), (oc.Fourier(2), None)):

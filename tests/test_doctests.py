@@ -64,6 +64,7 @@ def test_at_least_twenty_public_names_have_an_example() -> None:
     assert len({test.name for test in examples()}) >= FEWEST_EXAMPLES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("example", examples(), ids=lambda test: test.name)
 def test_example_runs_as_it_stands(example: doctest.DocTest, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(families, "_REGISTERED", dict(families._REGISTERED))  # examples register names of their own

@@ -50,12 +50,14 @@ def test_demo_saves_chart_and_pictures(tmp_path: Path) -> None:
         assert (tmp_path / name).stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_fit_benchmark_prints_rows() -> None:
     rows = fits.main(quick=True)
     assert len(rows) == 2
     assert rows[0].startswith("| iiwa | polynomial:2 |")
 
 
+@pytest.mark.slow
 def test_fold_benchmark_finds_none() -> None:
     (line,) = folds.main(quick=True)
     *_, searched, uniform, heavy, count = (float(word) for word in line.strip("| ").split("|")[1:])
@@ -83,21 +85,25 @@ def test_path_past_a_post(tmp_path: Path) -> None:
         assert picture.size[0] > 1000
 
 
+@pytest.mark.slow
 def test_quality_and_time_are_drawn_for_two_degrees(tmp_path: Path) -> None:
     low, high = quality_and_time.main(tmp_path, quick=True)
     assert high.task < low.task
     assert (tmp_path / "front_seconds.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_certificate_benchmark_proves_its_box() -> None:
     (line,) = certificates.main(quick=True)
     assert "| 100% |" in line
 
 
+@pytest.mark.slow
 def test_scaling_benchmark_prints_rows() -> None:
     assert len(scaling.main(quick=True)) == 2
 
 
+@pytest.mark.slow
 def test_loss_in_the_metric_moves_the_task_less_in_closed_loop() -> None:
     """One arm, place, seed and goal: the direction, not the size, of what the whole study shows."""
     ratios = metric_loss.main(quick=True)

@@ -17,6 +17,7 @@ def run(folder: Path, *blocks: str) -> list[list[float]]:
     return [[float(word) for word in line.split()] for line in lines]
 
 
+@pytest.mark.slow
 def test_basis_fits_saves_loads_distils_and_compares(tmp_path: Path) -> None:
     more = """
 from concurrent.futures import ThreadPoolExecutor
@@ -42,6 +43,7 @@ print(sum(result.failed for result in found.results), len(found.results))
     assert grid == [0, 2]
 
 
+@pytest.mark.slow
 def test_unregistered_basis_is_known_not_to_be_savable_before_the_fit(tmp_path: Path) -> None:
     unregistered = re.sub(r"oc\.register_parametrisation.*", "", BASIS, count=1).split("fit = ")[0]
     more = """
@@ -65,6 +67,7 @@ except InvalidValueError as error:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_loss_term_acts_and_its_gauss_newton_matrix_and_hessian_are_right(tmp_path: Path) -> None:
     more = """
 from orthocas.fitting.basis_objective import BasisObjective
@@ -97,11 +100,13 @@ assert fast.value(theta) > without.value(theta)
     assert hessian < 1e-12
 
 
+@pytest.mark.slow
 def test_symbolic_loss_is_minimised_by_ipopt(tmp_path: Path) -> None:
     _, (found, start) = run(tmp_path, TERM, LOSS)
     assert found < 0.1 * start
 
 
+@pytest.mark.slow
 @needs_c
 def test_law_brakes_and_becomes_c(tmp_path: Path) -> None:
     more = """
@@ -131,11 +136,13 @@ with open("run/report.json") as file:
     assert "drag[3]; /* N m s/rad, >= 0 */" in header
 
 
+@pytest.mark.slow
 def test_task_and_metric_keep_names_and_units_in_files(tmp_path: Path) -> None:
     out = python("\n".join([BLOCKS[0], TASK, "print(oc.load('own.orthocas').problem.task.units)"]), tmp_path)
     assert out.splitlines() == ["friction", "('m',)"]
 
 
+@pytest.mark.slow
 def test_domain_of_a_user_does_what_the_package_s_own_do(tmp_path: Path) -> None:
     more = """
 import copy, pickle
@@ -173,6 +180,7 @@ for call in (oc.certify, lambda chart: oc.generate_c(chart, "ball")):
     assert 0 < angle < 3
 
 
+@pytest.mark.slow
 def test_solver_minimises(tmp_path: Path) -> None:
     out = python("\n".join([BLOCKS[0], SOLVER, "print(slow.stages[-1].result.value)"]), tmp_path).splitlines()
     assert out[0].startswith("Status.")
@@ -186,6 +194,7 @@ TAKEN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", TAKEN)
 def test_names_are_taken_once(kind: str) -> None:
     code = f"""

@@ -104,6 +104,7 @@ def test_linear_coordinates_are_exact_at_their_base_only(planar_x: oc.Problem) -
     assert np.abs(away[:1] @ B @ away[1:].T).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parametrisation", "solver"),
     [
@@ -162,6 +163,7 @@ def test_joint_that_the_metric_depends_on_is_not_split_off() -> None:
     assert oc.evaluate(fit.chart, 2000).task_angle.std < 0.2
 
 
+@pytest.mark.slow
 def test_inertia_couples_joints_so_none_is_idle(iiwa: oc.Problem) -> None:
     problem = with_metric(iiwa, "inertia")
     assert oc.fit(problem, oc.Polynomial(1), samples=300).idle_joints == ()

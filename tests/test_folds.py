@@ -79,6 +79,7 @@ def test_the_loss_of_components_is_that_of_the_coordinates_made_of_them() -> Non
     assert float(sample_loss(components)(J, *data)) == pytest.approx(float(sample_loss(coordinates)(turned, *data)))
 
 
+@pytest.mark.slow
 def test_no_fold_is_left_where_other_samples_look_for_one(iiwa_fit: Fit) -> None:
     """200,000 samples near corners and faces with another seed, and a search with another seed."""
     chart = iiwa_fit.chart
@@ -120,6 +121,7 @@ def test_fold_term_acts_at_collected_points_with_its_exact_gradient(iiwa: oc.Pro
     assert folds.added_to(plain) is plain
 
 
+@pytest.mark.slow
 def test_domains_that_force_folds_are_fitted_without_the_term(planar_xy: oc.Problem) -> None:
     """The box around the stretched arm holds singular positions of the task: folds stay, and the fit says so."""
     wide = replace(planar_xy, domain=oc.Box([0.6, 0.0, 0.0], 1.2))
@@ -130,6 +132,7 @@ def test_domains_that_force_folds_are_fitted_without_the_term(planar_xy: oc.Prob
     assert "FOLDS" in fit.facts()["least conditioning"]
 
 
+@pytest.mark.slow
 def test_thorough_descents_find_what_samples_and_short_ones_miss() -> None:
     """L-BFGS-B with differences, from 60 starts, found 0.298 on the PR2's chart, whose card said 0.336."""
     chart = oc.charts.load("pr2-left-position")

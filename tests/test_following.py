@@ -280,6 +280,7 @@ def test_pose_paths() -> None:
     np.testing.assert_allclose(found.xi, 0 * found.xi + chart.xi(problem.domain.centre), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_paths_that_leave_the_reach_are_told_where_and_why() -> None:
     chart = planar()
     with pytest.raises(PathError) as caught:

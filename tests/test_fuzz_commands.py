@@ -10,6 +10,7 @@ from programs import Run
 from orthocas.cli.output import note, print_rows, print_table
 
 
+@pytest.mark.slow
 def test_command_lines_end_with_a_result_or_one_line() -> None:
     assert commands(20) == []
 

@@ -17,6 +17,7 @@ from orthocas.tasks.domains import sample_uniform
 from orthocas.tools.checks import Array
 
 
+@pytest.mark.slow
 def test_matched_stiffness_has_its_modes_around_the_frequency(planar_chart: oc.Chart, arm_chart: oc.Chart) -> None:
     """The geometric mean of the generalised eigenvalues of (K, M_phi) is omega^2, and no other K has less spread."""
     for chart in (planar_chart, arm_chart):
@@ -107,6 +108,7 @@ def test_a_mode_is_unstable_beyond_its_delay(planar_chart: oc.Chart) -> None:
         assert largest_real_part(0.98 * delay) < 0 < largest_real_part(1.02 * delay)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["position", "pose:z"])
 def test_default_gains_hold_an_arm_whose_masses_are_off(kind: str) -> None:
     """Static solution of J^T K e = 0.2 g on the plant with 1.2 times the mass: sag up to 20 mm, inside the domain."""
@@ -133,6 +135,7 @@ def _inertias(chart: oc.Chart) -> Array:
     return np.asarray(half.transpose(0, 2, 1) @ M @ half)
 
 
+@pytest.mark.slow
 def test_the_fastest_mode_of_a_law_is_the_fastest_on_a_grid_of_its_domain(planar_chart: oc.Chart) -> None:
     """The modes are omega^2 = eig(J M^-1 J^T K), by a solver for any matrix, on 40^3 points with all corners."""
     law, domain = PDPlus.on_chart(planar_chart), planar_chart.problem.domain

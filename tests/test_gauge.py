@@ -21,6 +21,7 @@ def parallel(a: oc.Chart, b: oc.Chart) -> Array:
     return np.einsum("sin,sjn->ij", J, K) / len(points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "degree", "least"), [("iiwa", 3, 0.97), ("planar_x", 4, 0.99), ("planar_xy", 3, 0.99)]
 )
@@ -40,6 +41,7 @@ def test_order_and_sign_follow_the_gradients_at_the_centre(iiwa_fit: oc.Fit, iiw
     assert (np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1) > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parametrisation", [oc.Polynomial(2), oc.MLP((5, 4))], ids=lambda p: p.label)
 def test_gauge_does_not_depend_on_how_coordinates_came(planar_x: oc.Problem, parametrisation: object) -> None:
     fit = oc.fit(planar_x, parametrisation, samples=200)

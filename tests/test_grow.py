@@ -334,6 +334,7 @@ def test_damaged_files_of_grown_charts_are_refused(tmp_path: Path) -> None:
         oc.load(tmp_path / "short.orthocas")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("leaf", "name", "change"),
     [

@@ -76,6 +76,7 @@ def test_all_flows_agree(metric: object) -> None:
     np.testing.assert_allclose(papers.points[both], ours.points[both], atol=1e-4)  # its rule stops about 1e-6 short
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", ["euclidean", "inertia", STIFFNESS], ids=["I", "M", "custom"])
 def test_derivative_agrees_with_finite_differences(metric: object) -> None:
     problem = planar(metric)

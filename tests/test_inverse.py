@@ -72,6 +72,7 @@ def test_a_solution_lies_near_its_start(planar_arm: oc.Chart) -> None:
     assert planar_arm.solve(planar_arm.phi(q)).found.sum() >= inside.sum()
 
 
+@pytest.mark.slow
 def test_what_is_found_lies_inside_and_solves(planar_arm: oc.Chart) -> None:
     wide = planar_arm.phi(beyond_domain(planar_arm, 1000, 1.5))
     solutions = planar_arm.solve(wide)
@@ -135,6 +136,7 @@ def test_all_solutions_of_a_folded_chart_are_found() -> None:
         np.testing.assert_allclose(chart.phi(found), np.tile(chart.phi(q), (len(found), 1)), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "inside"), [("ur10-position", False), ("iiwa7-position", True)])
 def test_corner_heavy_round_trips_of_a_ready_chart_are_found(name: str, inside: bool) -> None:
     """Restarts near stored samples missed 157 of 2,000 points near faces and in corners of the first chart."""
@@ -150,6 +152,7 @@ def test_corner_heavy_round_trips_of_a_ready_chart_are_found(name: str, inside: 
     assert oc.contains(domain, solutions.q).all()
 
 
+@pytest.mark.slow
 def test_a_certified_chart_has_all_the_solutions_that_newton_finds() -> None:
     """No fold is not one solution: Newton's method from 3,000 points finds several, and no more than `solutions`."""
     chart = oc.charts.load("ur5-position")

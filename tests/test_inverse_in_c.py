@@ -16,6 +16,7 @@ from orthocas.fitting.fit import Fit
 FOUND = oc.InverseStatus.FOUND
 
 
+@pytest.mark.slow
 @needs_c
 def test_compiled_c_gives_the_same_solutions(iiwa_fit: Fit, tmp_path: Path) -> None:
     """Of all kinds: found, outside, out of reach and without numbers, with starts and without."""
@@ -33,6 +34,7 @@ def test_compiled_c_gives_the_same_solutions(iiwa_fit: Fit, tmp_path: Path) -> N
         assert theirs.error[theirs.found].max() <= 1e-9
 
 
+@pytest.mark.slow
 @needs_c
 def test_a_library_is_compiled_once(planar_arm: oc.Chart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -57,6 +59,7 @@ def test_singular_solutions_of_compiled_c_are_named(tmp_path: Path) -> None:
     assert solutions.statuses == (oc.InverseStatus.SINGULAR, FOUND)
 
 
+@pytest.mark.slow
 @needs_c
 def test_a_damaged_library_and_grown_charts_are_refused(planar_arm: oc.Chart, tmp_path: Path) -> None:
     compiled = oc.compile_inverse(planar_arm, tmp_path)

@@ -128,6 +128,7 @@ def test_expected_angle_of_contact_distribution_has_its_closed_form() -> None:
     np.testing.assert_allclose(oc.involutivity(problem).expected_angle_deg, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_expected_angle_is_reached_by_quadratic_coordinates_and_undercut_by_the_torsion_of_a_square() -> None:
     # With A nearly I the task planes cut the box in squares of edge a. Quadratic coordinates leave the polar moment
     # a^4 / 6 of the square, the best ones its torsion constant 0.14058 a^4, as in a twisted bar. What is left is of

@@ -34,6 +34,7 @@ def charts(iiwa_fit: Fit, planar_fit: Fit, planar_xy: oc.Problem) -> dict[str, o
     return {"iiwa": iiwa_fit.chart, "iiwa, A = M": in_metric, "planar_x": planar_fit.chart, "planar_xy": plane}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["iiwa", "iiwa, A = M", "planar_x", "planar_xy"])
 def test_leaks_are_those_of_a_least_squares_projection(charts: dict[str, oc.Chart], name: str) -> None:
     chart = charts[name]
@@ -50,6 +51,7 @@ def test_leaks_are_those_of_a_least_squares_projection(charts: dict[str, oc.Char
     assert leak.histogram[round(10 * want.max())] >= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["iiwa", "iiwa, A = M", "planar_x", "planar_xy"])
 def test_formulas_of_one_sample_agree_with_lapack(charts: dict[str, oc.Chart], name: str) -> None:
     chart = charts[name]
@@ -60,6 +62,7 @@ def test_formulas_of_one_sample_agree_with_lapack(charts: dict[str, oc.Chart], n
         np.testing.assert_allclose(values, wanted[key], rtol=0, atol=1e-11, err_msg=key)
 
 
+@pytest.mark.slow
 def test_leak_does_not_depend_on_task_coordinates_but_the_papers_angle_does(planar_xy: oc.Problem) -> None:
     robot, chart = planar_xy.robot, oc.fit(planar_xy, oc.Polynomial(2), samples=300).chart
     mixed = oc.Task.custom(robot, "mixed", lambda q: ca.DM([[1.0, 0.9], [0.0, 0.1]]) @ robot.tip_position(q)[:2])
@@ -82,6 +85,7 @@ def test_for_one_task_component_and_identity_metric_the_leak_is_the_papers_angle
     )
 
 
+@pytest.mark.slow
 def test_the_papers_angle_hides_the_leak_for_the_inertia_metric(charts: dict[str, oc.Chart]) -> None:
     hidden, shown = (oc.evaluate(charts[name], 5000) for name in ("iiwa, A = M", "planar_x"))
     assert hidden.leak.rms > 3 * hidden.task_angle.std
@@ -173,6 +177,7 @@ def test_quality_is_nan_where_gradients_overflow(planar_fit: Fit) -> None:
         assert quality.boundary_distance < -0.9 * far
 
 
+@pytest.mark.slow
 def test_prediction_of_info_and_report_of_evaluate_agree_on_small_boxes(planar_xy: oc.Problem) -> None:
     """To first order in the size of the box: what is left shrinks with it, and the paper's angle does not agree."""
     ratios = []
@@ -186,6 +191,7 @@ def test_prediction_of_info_and_report_of_evaluate_agree_on_small_boxes(planar_x
     np.testing.assert_allclose(ratios[1:], 1, atol=0.015)
 
 
+@pytest.mark.slow
 def test_commands_print_the_papers_angle_and_the_leak_by_name(run: Run, planar_fit: Fit) -> None:
     planar_fit.chart.save("a.orthocas")
     _, out, _ = run("evaluate", "a.orthocas", "--samples", "500")

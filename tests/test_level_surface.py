@@ -158,6 +158,7 @@ def test_meshes_that_are_nearly_disks_are_refused() -> None:
             require_disk(mesh)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [12, 20, 33, 50])
 @pytest.mark.parametrize("level", [0.0, 0.3])
 def test_triangles_are_round_and_delaunay(cells: int, level: float) -> None:

@@ -55,6 +55,7 @@ def mixed(problem: oc.Problem) -> oc.Problem:
     return oc.Problem(robot, task, "inertia", problem.domain, "mixed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parametrisation", "solver"),
     [(oc.Polynomial(3), None), (oc.MLP((5,)), solvers.LBFGS(max_iterations=30))],
@@ -76,6 +77,7 @@ def test_fit_does_not_depend_on_task_coordinates(
     assert np.abs(second - first).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_it_lowers_the_leak_and_the_paper_s_loss_the_paper_s_angle(planar_xy: oc.Problem) -> None:
     paper, metric = (
         oc.evaluate(oc.fit(planar_xy, oc.Polynomial(4), weights=Weights(angles=angles)).chart, 5000)
@@ -85,6 +87,7 @@ def test_it_lowers_the_leak_and_the_paper_s_loss_the_paper_s_angle(planar_xy: oc
     assert paper.task_angle.std < 0.7 * metric.task_angle.std
 
 
+@pytest.mark.slow
 def test_default_is_the_metric_for_the_mass_matrix_only(planar_x: oc.Problem) -> None:
     custom = lambda q: ca.diag(2 + ca.cos(q))  # noqa: E731
     for metric, angles in (
@@ -126,6 +129,7 @@ def test_unknown_angles_are_refused_in_python_and_on_the_command_line(run: Run) 
     assert not Path("a.orthocas").exists()
 
 
+@pytest.mark.slow
 def test_command_line_fits_with_the_paper_s_angles(run: Run) -> None:
     words = ("fit", "planar_3r_x", "--param", "polynomial:2", "--samples", "100", "--force", "--out", "a.orthocas")
     for more, angles in (((), "metric"), (("--angles", "paper"), "paper")):

@@ -62,6 +62,7 @@ def test_wrong_shape_and_unknown_name_are_refused() -> None:
         problem("mass")
 
 
+@pytest.mark.slow
 def test_named_metric_shows_its_name_in_reports_and_after_loading(tmp_path: Path) -> None:
     robot = oc.Robot.planar([1.0, 1.0], [3.0, 3.0])
     stiffness = Metric.custom(robot, "stiffness", lambda q: ca.diag(ca.vertcat(1 + q[0] ** 2, 2)))

@@ -141,6 +141,7 @@ def test_stiff_gears_are_rigid_ones_with_the_armature_of_the_rotors() -> None:
     assert stiff.q == pytest.approx(rigid.q, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_stops_hold(panda: tuple[pin.Model, oc.Robot], plant: MuJoCoPlant) -> None:
     robot = panda[1]
     for sign in (-1, 1):

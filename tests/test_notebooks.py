@@ -16,6 +16,7 @@ from orthocas.tools.progress import NotebookBars, Progress, TerminalLines, as_ba
 EVIL = "<img src=x>"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "build", [lambda: oc.evaluate(fitted().chart, 200), trajectory, joint_motion, comparison, lambda: fitted().chart]
 )

@@ -61,6 +61,7 @@ def differences(known: oc.Chart, q: np.ndarray, p: np.ndarray, middle: np.ndarra
     return np.concatenate([*parts, scaled[:fitted] / known.coordinates.scale])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [4, 6])
 @pytest.mark.parametrize("task", ["position", "orientation", "axis:y", "pose", "position+axis"])
 def test_finite_differences_of_phi_lie_within_their_bounds(task: str, order: int) -> None:
@@ -110,6 +111,7 @@ def polynomial(coefficients: np.ndarray, t: np.ndarray) -> np.ndarray:
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["position", "orientation", "axis", "pose:z", "position:xy", "position+axis"])
 def test_no_second_solution_is_found_in_a_proved_box_of_a_random_arm(task: str) -> None:
     held = 0
@@ -126,6 +128,7 @@ def test_no_second_solution_is_found_in_a_proved_box_of_a_random_arm(task: str) 
     assert held  # some are proved
 
 
+@pytest.mark.slow
 def test_box_of_an_arm_with_two_solutions_is_refused() -> None:
     """Method taylor-3/1 certified this box, by rows in a body's frame that are the derivative of nothing."""
     ready = oc.charts.load("ur5-position")
@@ -146,6 +149,7 @@ def test_wide_range_of_a_turning_base_is_kept_where_the_coordinates_bound_it() -
     assert not len(second_solutions(known, centre - half, centre + half, 2000, 1))
 
 
+@pytest.mark.slow
 def test_one_to_one_boxes_of_networks_and_planar_arms_are_checked() -> None:
     for known in (network(), oc.fit(planar("euclidean"), oc.Fourier(2), samples=300).chart):
         certificate = oc.certify(known)
@@ -155,6 +159,7 @@ def test_one_to_one_boxes_of_networks_and_planar_arms_are_checked() -> None:
         assert not len(pairs)
 
 
+@pytest.mark.slow
 def test_one_to_one_part_of_an_older_method_is_void() -> None:
     old = replace(certified(), method="taylor-3/1")
     assert old.injective is None
@@ -163,6 +168,7 @@ def test_one_to_one_part_of_an_older_method_is_void() -> None:
         oc.check_certificate(chart(), old)
 
 
+@pytest.mark.slow
 def test_forged_one_to_one_box_in_one_part_does_not_pass_the_check() -> None:
     regular = certified(0.4).regular
     box = Subdivision(regular.low, regular.high, np.array([PROVED], dtype=np.uint8))

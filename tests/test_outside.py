@@ -23,6 +23,7 @@ def pose_chart(iiwa: oc.Problem) -> oc.Chart:
     return oc.fit(problem, oc.Linear()).chart
 
 
+@pytest.mark.slow
 def test_boxes_that_lie_outside_for_a_pose_hold_no_position_that_is_clear_for_the_frame(pose_chart: oc.Chart) -> None:
     domain, bound, rng = pose_chart.problem.domain, BOUND / 2, np.random.default_rng(0)
     middle = domain.centre + domain.half_width * rng.uniform(-1, 1, (2000, 7))
@@ -45,6 +46,7 @@ def chart(iiwa: oc.Problem) -> oc.Chart:
     return oc.fit(problem, oc.Polynomial(3), samples=2000).chart
 
 
+@pytest.mark.slow
 def test_boxes_without_a_proof_of_their_own_hold_no_clear_position(chart: oc.Chart) -> None:
     domain, rng = chart.problem.domain, np.random.default_rng(0)
     middle = domain.centre + domain.half_width * rng.uniform(-1, 1, (3000, 7))
@@ -58,6 +60,7 @@ def test_boxes_without_a_proof_of_their_own_hold_no_clear_position(chart: oc.Cha
     assert found.proved[singular & (half[:, 0] < 0.05)].mean() > 0.9
 
 
+@pytest.mark.slow
 def test_a_chart_next_to_singular_positions_needs_few_boxes(chart: oc.Chart) -> None:
     base = certifying.whole_domain(chart.problem.domain)
     search = Search(judge_of(chart, chart_rows(chart), 0.0), base, Limits(), largest_first(base))

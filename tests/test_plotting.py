@@ -20,12 +20,14 @@ def test_quality_figure_shows_both_deviations_and_the_leak(planar_fit: Fit) -> N
     assert "[deg]" in left.get_xlabel()
 
 
+@pytest.mark.slow
 def test_quality_figure_without_mutual_angles(planar_xy: oc.Problem, tmp_path: Path) -> None:
     report = oc.evaluate(oc.fit(planar_xy, oc.Linear()).chart, 100)
     quality_figure(report).savefig(tmp_path / "q.png")
     assert (tmp_path / "q.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_self_motion_figure_has_a_panel_per_coordinate_and_a_line_per_posture(iiwa_fit: Fit) -> None:
     figure = self_motion_figure(iiwa_fit.chart, postures=3, reach=0.2)
     assert len(figure.axes) == 4

@@ -23,6 +23,7 @@ def chart_with_normals(normals: list[list[float]], metric: object = "euclidean")
     return Chart(problem, coordinates)
 
 
+@pytest.mark.slow
 def test_perfect_coordinates_have_right_angles_and_conditioning_one() -> None:
     report = oc.evaluate(chart_with_normals([[0, 1, 0], [0, 0, 2]]), 100)
     assert report.task_angle.mean == report.mutual_angle.mean == 90
@@ -77,6 +78,7 @@ def test_conditioning_matches_a_direct_computation_in_whitened_coordinates(plana
     np.testing.assert_allclose(given.worst_point, worst)
 
 
+@pytest.mark.slow
 def test_search_finds_less_than_samples_and_says_where(planar_fit: Fit) -> None:
     chart = planar_fit.chart
     report = oc.evaluate(chart, samples=200, seed=5)
@@ -109,6 +111,7 @@ def test_nothing_left_to_evaluate_is_an_error() -> None:
         oc.evaluate(flat, 10)
 
 
+@pytest.mark.slow
 def test_held_out_samples_depend_on_the_seed(planar_fit: Fit) -> None:
     first, again, other = (oc.evaluate(planar_fit.chart, 500, seed) for seed in (1, 1, 2))
     assert first.as_dict() == again.as_dict()

@@ -44,6 +44,7 @@ def test_recipes_are_those_on_the_cards_and_licences_travel(name: str) -> None:
     assert any(word in licence for word in ("Apache License", "Mozilla Public License", "Redistribution and use"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda-pose", "tiago-pro-left-position"])
 def test_figures_of_cards_are_found_at_other_samples(name: str) -> None:
     """Root mean squares of 4,000 other points differ by some percent."""
@@ -54,6 +55,7 @@ def test_figures_of_cards_are_found_at_other_samples(name: str) -> None:
     assert report.conditioning.min >= 0.95 * quality["conditioning"]["min"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_one_to_one_box_is_large_and_holds_no_two_points_with_the_same_phi(name: str) -> None:
     """100,000 pairs, half of them near the pairs that come closest: J(c)^-1 (phi(q) - phi(p)) never comes near 0."""

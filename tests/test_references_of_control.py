@@ -94,6 +94,7 @@ def test_points_of_another_size_are_refused() -> None:
         Reference.through(("x", "y"), [0.0, 1.0], np.zeros((2, 3)))
 
 
+@pytest.mark.slow
 def test_path_follows_the_reference_and_comes_back(planar_chart: oc.Chart) -> None:
     q0 = planar_chart.problem.domain.centre
     phi0 = planar_chart.phi(q0)

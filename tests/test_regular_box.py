@@ -24,6 +24,7 @@ def test_middle_of_the_limits_stays_where_the_task_is_regular(name: str, kind: s
     np.testing.assert_array_equal(box.half_width, middle.half_width)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind"),
     [

@@ -23,6 +23,7 @@ def run(law: PDPlus, natural_frequency: float = 6.0, **settings: Any) -> np.ndar
     return oc.simulate(law, reference, q, dq_start=[0.1, -0.1, 0.2], **settings).q[-1]
 
 
+@pytest.mark.slow
 def test_ends_are_those_of_a_process_that_remembers_nothing(law: PDPlus) -> None:
     robot = law.problem.robot
     variants: list[tuple[PDPlus, dict[str, Any]]] = [

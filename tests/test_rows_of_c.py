@@ -40,6 +40,7 @@ def phi_rows(generated: GeneratedC, q: Array, *flags: str) -> tuple[Array, int]:
     return phi.astype(float), int(status)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [fitted, with_idle_joint, given, cyclic, network, fourier])
 def test_rows_are_those_of_python(build: Callable[[], object], tmp_path: Path) -> None:
     made = build()
@@ -54,6 +55,7 @@ def test_rows_are_those_of_python(build: Callable[[], object], tmp_path: Path) -
     np.testing.assert_allclose(found / largest, want / largest, atol=2e-13)
 
 
+@pytest.mark.slow
 def test_rows_without_numbers_or_far_away_are_treated_as_single_ones(tmp_path: Path) -> None:
     chart = fitted().chart
     q = sample_uniform(chart.problem.domain, 20, 4)
@@ -73,6 +75,7 @@ def test_rows_in_single_precision(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, chart.phi(q), atol=3e-5)
 
 
+@pytest.mark.slow
 def test_large_networks_are_refused(tmp_path: Path) -> None:
     problem = fitted().chart.problem
     chart = oc.fit(problem, oc.MLP((96, 96)), oc.solvers.LBFGS(max_iterations=1), samples=50).chart

@@ -25,6 +25,7 @@ def arm_chart() -> oc.Chart:
     return oc.fit(oc.problems.get("iiwa"), oc.Polynomial(2)).chart
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [Impedance, PDPlus])
 def test_payload_acts_on_inertia_coriolis_forces_and_gravity(arm_chart: oc.Chart, law: Any) -> None:
     """The law with a payload equals the formulas of the paper with Pinocchio's model that carries the body."""
@@ -40,6 +41,7 @@ def test_payload_acts_on_inertia_coriolis_forces_and_gravity(arm_chart: oc.Chart
         np.testing.assert_allclose(found, want, rtol=2e-7, atol=1e-6 * np.abs(want).max())
 
 
+@pytest.mark.slow
 def test_fallback_carries_the_payload(arm_chart: oc.Chart) -> None:
     payload = random_payload(np.random.default_rng(5))
     controller = PDPlus(arm_chart, K, limit=np.inf, model=RunTimeModel(payload=payload))
@@ -122,6 +124,7 @@ def test_wrench_and_extra_torque_are_added_to_the_law_but_not_to_its_fallback(ar
     np.testing.assert_allclose(outside, arm_chart.problem.robot.gravity(s.q + 3), atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", ["square_root", "double_diagonal"])
 def test_a_coordinate_without_a_spring_is_damped(arm_chart: oc.Chart, damping: Any) -> None:
     """With K_xi = 0, D is that of the damping stiffness, and the free coordinate comes to rest without swinging."""
@@ -194,6 +197,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.slow
 @needs_c
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_generated_c_equals_python_for_every_variant(planar_chart: oc.Chart, tmp_path: Path, variant: str) -> None:

@@ -58,6 +58,7 @@ LARGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*OBJECTS, *LARGE])
 def test_objects_print_in_a_few_lines(name: str) -> None:
     text = repr((OBJECTS | LARGE)[name]())

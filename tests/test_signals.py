@@ -46,6 +46,7 @@ def test_loops_around_fit_end_with_ctrl_c(planar_x: oc.Problem) -> None:
     assert stop.value.result.chart.r == 2
 
 
+@pytest.mark.slow
 def test_what_needs_a_finished_minimisation_ends_with_ctrl_c(planar_x: oc.Problem) -> None:
     """Distilling into a network: the minimiser would return its best point."""
     grown = oc.grow(planar_x, leaf="linear")

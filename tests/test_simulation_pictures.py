@@ -65,6 +65,7 @@ def test_figure_shows_values_references_joints_commands_and_storage(planar_run: 
     assert [panel.get_xlabel() for panel in axes] == ["", "", "time [s]", "", "", "time [s]"]
 
 
+@pytest.mark.slow
 def test_velocity_controllers_have_no_storage_panel(spatial_run: Trajectory) -> None:
     axes = trajectory_figure(spatial_run).axes
     assert len(axes) == 7 + 2
@@ -94,6 +95,7 @@ def test_units_follow_task_and_joints() -> None:
     assert units_of(oc.Problem(arm, named, "euclidean", box))["sum[0]"] == "rad"
 
 
+@pytest.mark.slow
 def test_moving_picture_draws_the_arm_where_it_is(planar_run: Trajectory, planar_fit: Fit) -> None:
     """The tip's way is blue, on pixels that the tip has passed, and nowhere ahead of it."""
     problem = planar_fit.chart.problem
@@ -127,6 +129,7 @@ def test_moving_picture_moves_on_both_sides_in_the_plane_and_in_space(
         assert changed.mean() < 0.2
 
 
+@pytest.mark.slow
 def test_gif_plays_in_real_time(planar_run: Trajectory, planar_fit: Fit, tmp_path: Path) -> None:
     seen: list[Progress] = []
     save_animation(tmp_path / "a.gif", planar_run, planar_fit.chart.problem, seen.append)
@@ -142,6 +145,7 @@ def test_gif_plays_in_real_time(planar_run: Trajectory, planar_fit: Fit, tmp_pat
     assert {path.name for path in tmp_path.iterdir()} == {"a.gif", LIST}
 
 
+@pytest.mark.slow
 def test_long_runs_are_shown_faster(
     planar_run: Trajectory, planar_fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,6 +168,7 @@ def fake_ffmpeg(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> Non
 TAKE_ALL = "data = sys.stdin.buffer.read(); open(sys.argv[-1], 'w').write(json.dumps([sys.argv[1:], len(data)]))"
 
 
+@pytest.mark.slow
 def test_mp4_goes_through_ffmpeg(
     planar_run: Trajectory, planar_fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

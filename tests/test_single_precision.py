@@ -96,6 +96,7 @@ def test_every_controller_is_near_its_python(planar_chart: oc.Chart, tmp_path: P
         assert proof.differences["mass_matrix"] > 1e-9  # it is in single precision
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parametrisation", [oc.Linear(), oc.Fourier(2), oc.MLP((5, 4))], ids=lambda p: p.label)
 def test_every_family_is_near_its_python(planar_xy: oc.Problem, parametrisation: Any, tmp_path: Path) -> None:
     fitted = oc.fit(planar_xy, parametrisation, samples=300, seed=1).chart
@@ -117,6 +118,7 @@ def test_seven_joints_and_a_pose(iiwa: oc.Problem, tmp_path: Path) -> None:
         assert max(check_c(generated, chart, law, states=200).differences.values()) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_wrong_gain_is_found(law: Controller, tmp_path: Path) -> None:
     generated = oc.generate_c(law.chart, tmp_path, law, "arm", single_precision=True)
     source = tmp_path / "arm.c"
@@ -144,6 +146,7 @@ def test_near_singularities_the_law_gives_up_earlier(tmp_path: Path) -> None:
     assert found == sorted(found, reverse=True)
 
 
+@pytest.mark.slow
 def test_there_is_no_double_in_it(generated: GeneratedC, library: CompiledLibrary) -> None:
     """Neither in its text nor in what the compiler makes of it."""
     for suffix in ("c", "h"):
@@ -178,6 +181,7 @@ def test_a_processor_in_single_precision_emulates_nothing(generated: GeneratedC,
     assert b"__aeabi_dmul" in emulated[1]
 
 
+@pytest.mark.slow
 def test_bounds_belong_to_the_domain(library: CompiledLibrary, law: Controller) -> None:
     low, high = library.domain
     np.testing.assert_allclose(library.domain, bounds_of(law.problem.domain), rtol=3e-7)
@@ -244,6 +248,7 @@ def test_the_closed_loop_moves_like_the_double_one(
     assert statuses == wanted
 
 
+@pytest.mark.slow
 def test_the_low_pass_comes_to_rest_and_is_never_stale(library: CompiledLibrary, law: Controller) -> None:
     q = law.problem.domain.centre
     supervisor = Supervisor(library, law, Safety.of(law, stale_ticks=10_000))  # measurements stand still here
@@ -256,6 +261,7 @@ def test_the_low_pass_comes_to_rest_and_is_never_stale(library: CompiledLibrary,
     np.testing.assert_allclose(reference[:3], target, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_stack_and_numbers_are_smaller(generated: GeneratedC, law: Controller, tmp_path: Path) -> None:
     double = oc.generate_c(law.chart, tmp_path, law, "arm")
     assert generated.stack_bytes < 0.9 * double.stack_bytes
@@ -272,6 +278,7 @@ def test_constants_of_any_size_compile(planar_x: oc.Problem, tmp_path: Path) -> 
     assert check_c(generated, chart, states=50).differences["phi"] < 1e-5
 
 
+@pytest.mark.slow
 def test_command_writes_and_checks_it(planar_fit: Fit, run: Run) -> None:
     planar_fit.chart.save("arm.orthocas")
     words = ("--controller", "pd_plus", "--out", "c", "--name", "arm", "--float", "--check")

@@ -66,6 +66,7 @@ def test_gradient_flow_takes_the_hessian_where_there_is_one_and_keeps_it_for_som
     assert result.iterations < len(asked) < result.evaluations / 4
 
 
+@pytest.mark.slow
 def test_flow_of_a_basis_costs_a_few_times_what_lbfgs_does(planar_xy: oc.Problem) -> None:
     """In evaluations, of which the flow's come with few Hessians; processor times: benchmarks/gradient_flow.py."""
     ours, theirs = (

@@ -34,6 +34,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert not HEAVY & loaded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "module", ["orthocas.charts.chart", "orthocas.fitting.fit", "orthocas.cli.info", "orthocas.control"]
 )

@@ -126,6 +126,7 @@ def test_home_comes_from_the_files_or_is_a_bent_posture() -> None:
     np.testing.assert_array_equal(home_posture(xarm, oc.Task.position(xarm), "hold-up").q, xarm.homes["hold-up"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
 def test_trial_charts_are_as_good_as_fits_of_their_degree(metric: str) -> None:
     """With Euclidean cosines, the loss of the other metric, the trial for A = M folds and leaks 1.5 times as much."""

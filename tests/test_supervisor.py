@@ -15,6 +15,7 @@ from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PD
 pytestmark = needs_c
 
 
+@pytest.mark.slow
 def test_starts_anywhere_inside_without_a_jump(
     supervisor: Supervisor, planar_for_control: oc.Chart, supervised_law: Controller
 ) -> None:
@@ -30,6 +31,7 @@ def test_starts_anywhere_inside_without_a_jump(
     assert speeds.max() < 2.0
 
 
+@pytest.mark.slow
 def test_after_the_start_the_law_commands(
     supervisor: Supervisor, planar_for_control: oc.Chart, supervised_law: Controller
 ) -> None:
@@ -95,6 +97,7 @@ def test_the_catcher_takes_energy_and_never_adds_any(supervisor: Supervisor, pla
     assert energy[-1] < 1e-6
 
 
+@pytest.mark.slow
 def test_a_start_outside_is_caught_and_brought_back_only_when_asked(
     supervisor: Supervisor, planar_for_control: oc.Chart
 ) -> None:
@@ -113,6 +116,7 @@ def test_a_start_outside_is_caught_and_brought_back_only_when_asked(
     assert speeds.max() < 1.5
 
 
+@pytest.mark.slow
 def test_another_chart_takes_over_while_the_arm_moves(
     supervisor: Supervisor, planar_for_control: oc.Chart, supervised_law: Controller, tmp_path: Path
 ) -> None:
@@ -142,6 +146,7 @@ def test_another_chart_takes_over_while_the_arm_moves(
     np.testing.assert_allclose(arm.q, q + 400 * TICK * wanted, atol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [Impedance.on_chart, Kinematic.on_chart, Projector.on_chart])
 def test_every_law_can_be_supervised(
     planar_for_control: oc.Chart, tmp_path: Path, make: Callable[..., Controller]

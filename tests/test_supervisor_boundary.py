@@ -81,6 +81,7 @@ def from_path(q: Array) -> tuple[float, Array]:
     return float(np.linalg.norm((q - nearest)[1:])) / RADIUS, np.asarray(nearest)
 
 
+@pytest.mark.slow
 def test_the_distance_to_the_path_of_a_corridor_is_a_boundary_with_a_zone_before_it(
     in_corridor: tuple[PDPlus, CompiledLibrary],
 ) -> None:
@@ -115,6 +116,7 @@ def test_the_distance_to_the_path_of_a_corridor_is_a_boundary_with_a_zone_before
     assert supervisor.cause == ControlStatus.OUTSIDE_DOMAIN
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beyond", [[0.4, 0.9, -0.2], [2.0, -0.8, -0.3]])  # beside the path, and before its begin
 def test_from_outside_of_a_corridor_the_arm_goes_to_the_nearest_part_of_the_path(
     in_corridor: tuple[PDPlus, CompiledLibrary], beyond: list[float]

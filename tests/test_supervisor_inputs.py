@@ -61,6 +61,7 @@ def settled(supervisor: Supervisor, chart: oc.Chart, q: Array) -> Array:
     return command
 
 
+@pytest.mark.slow
 def test_the_same_measurement_of_a_moving_arm_is_missing_after_five_ticks(
     supervisor: Supervisor, planar_for_control: oc.Chart
 ) -> None:
@@ -79,6 +80,7 @@ def test_the_same_measurement_of_a_moving_arm_is_missing_after_five_ticks(
         assert supervisor.cause == ControlStatus.BAD_INPUT
 
 
+@pytest.mark.slow
 def test_a_measurement_now_and_then_is_enough(supervisor: Supervisor, planar_for_control: oc.Chart) -> None:
     """Sensors that are five times slower than the law, and equal measurements between others."""
     chart, q = planar_for_control, planar_for_control.problem.domain.centre
@@ -100,6 +102,7 @@ def test_spoiled_ticks_between_do_not_hide_that_sensors_stand_still(
     assert supervisor.mode == 1
 
 
+@pytest.mark.slow
 def test_a_simulated_arm_that_rests_starts_and_rests_again_is_not_taken_for_a_fault(
     supervisor: Supervisor, supervised_library: CompiledLibrary, planar_for_control: oc.Chart
 ) -> None:
@@ -119,6 +122,7 @@ def test_a_simulated_arm_that_rests_starts_and_rests_again_is_not_taken_for_a_fa
     assert np.abs(arm.dq).max() > 0
 
 
+@pytest.mark.slow
 def test_sensors_that_stand_still_at_rest_are_found_once_the_reference_moves(
     supervisor: Supervisor, planar_for_control: oc.Chart
 ) -> None:
@@ -174,6 +178,7 @@ def test_an_arm_in_mujoco_does_not_run_away_from_sensors_that_stand_still(name: 
 BAD = (np.nan, np.inf, -np.inf, 1e300)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", BAD)
 def test_the_low_pass_goes_on_to_its_last_good_target(supervised_library: CompiledLibrary, bad: float) -> None:
     """A bad target changes nothing: the reference is that of a low pass that never heard of it, to rounding."""
@@ -212,6 +217,7 @@ def test_the_spline_stops_at_its_last_good_value(supervised_library: CompiledLib
         np.testing.assert_array_equal(supervised_library.spline(start, target, 1.0, 0.4, held), good)
 
 
+@pytest.mark.slow
 def test_the_arm_follows_good_targets_again_after_a_bad_one(
     supervisor: Supervisor, supervised_library: CompiledLibrary, planar_for_control: oc.Chart
 ) -> None:
@@ -245,6 +251,7 @@ def test_a_bad_reference_is_held(supervisor: Supervisor, planar_for_control: oc.
     assert statuses[-1] is ControlStatus.BAD_INPUT
 
 
+@pytest.mark.slow
 def test_a_reference_that_comes_to_rest_is_never_stale(
     supervisor: Supervisor, supervised_library: CompiledLibrary, planar_for_control: oc.Chart
 ) -> None:

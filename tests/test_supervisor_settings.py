@@ -67,6 +67,7 @@ def test_margins_at_run_time_decide_where_the_law_starts(
     assert np.abs(supervisor.safe - domain.centre).max() < np.abs(q - domain.centre).max()
 
 
+@pytest.mark.slow
 def test_velocity_laws_carry_no_settings_of_torques(planar_for_control: oc.Chart, tmp_path: Path) -> None:
     law = Kinematic.on_chart(planar_for_control)
     generated = oc.generate_c(planar_for_control, tmp_path, law, "arm")

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from programs import needs_c
 from textbook_law import TextbookLaw
 
@@ -11,6 +12,7 @@ from orthocas.codegen import CompiledLibrary, compile_shared
 from orthocas.control import PDPlus
 
 
+@pytest.mark.slow
 @needs_c
 def test_textbook_law_gives_the_task_the_commanded_acceleration_whatever_the_posture(tmp_path: Path) -> None:
     problem = oc.problems.get("planar_3r_xy")

@@ -90,6 +90,7 @@ def test_normal_blocks_are_sums_of_products() -> None:
         np.testing.assert_array_equal(other, found[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
     [solvers.GaussNewton(), solvers.LBFGS(max_iterations=20), solvers.Adam(epochs=2), solvers.GradientFlow(8)],
@@ -104,6 +105,7 @@ def test_threads_do_not_change_a_fit(planar_x: oc.Problem, solver: Solver) -> No
         np.testing.assert_array_equal(other, found[0])
 
 
+@pytest.mark.slow
 def test_threads_do_not_change_a_network(planar_x: oc.Problem) -> None:
     """Pieces of samples in a fixed order, more than one, in both precisions."""
     settings = {"samples": 1000, "weights": (1000, 30)}
@@ -184,6 +186,7 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
 def test_a_forked_process_starts_threads_of_its_own() -> None:
     assert subprocess.run([sys.executable, "-c", FORKED], check=False, timeout=60).returncode == 0

@@ -159,6 +159,7 @@ def test_simulations_share_a_law() -> None:
             np.testing.assert_array_equal(found, wanted)
 
 
+@pytest.mark.slow
 @needs_c
 def test_supervised_arms_in_mujoco_share_a_library(tmp_path: Path) -> None:
     """Library, law and robot are shared; every run has its own state and plant."""

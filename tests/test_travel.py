@@ -35,12 +35,14 @@ def require_same(found: list[Array], expected: list[Array]) -> None:
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OBJECTS)
 def test_pickles_are_equal(objects: dict[str, Any], expected: dict[str, list[Array]], name: str) -> None:
     for protocol in (2, pickle.DEFAULT_PROTOCOL, pickle.HIGHEST_PROTOCOL):
         require_same(numbers(pickle.loads(pickle.dumps(objects[name], protocol))), expected[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OBJECTS)
 def test_copies_are_equal(objects: dict[str, Any], expected: dict[str, list[Array]], name: str) -> None:
     for other in (copy.deepcopy(objects[name]), copy.copy(objects[name])):
@@ -57,6 +59,7 @@ def test_another_process_computes_the_same(objects: dict[str, Any], expected: di
     require_same(numbers(back.chart), expected["linear chart"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("library", ["cloudpickle", "joblib"])
 def test_other_ways_to_travel(expected: dict[str, list[Array]], objects: dict[str, Any], library: str) -> None:
     module = pytest.importorskip(library)

@@ -106,6 +106,7 @@ def test_distance_to_a_disk_from_outside(leaf: TriangleMesh) -> None:
     assert_allclose(found.distance, over_all(disk, leaf.faces, points), rtol=1e-14, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_centre_of_a_sphere_is_equally_far_from_everything() -> None:
     ball = sphere(1.25, 20)
     found = checked(ball.vertices, ball.faces, np.zeros((3, 3)))
@@ -164,6 +165,7 @@ def length_over_height(triangles: Array) -> Array:
 coordinate = st.floats(-1.0, 1.0, width=32)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     st.integers(2, 3).flatmap(

@@ -226,5 +226,6 @@ def test_pages_of_others_in_a_real_browser_get_no_websocket(view: oc.viewer.View
         evil.shutdown()
 
 
+@pytest.mark.slow
 def test_spoiled_requests_are_refused_and_good_ones_served() -> None:
     assert views(300) == []

@@ -31,6 +31,7 @@ def test_body_poses_are_those_of_pinocchio() -> None:
     np.testing.assert_allclose(quaternions[:, 0], [[1, 0, 0, 0]] * 2)
 
 
+@pytest.mark.slow
 def test_meshes_are_where_pinocchio_places_them() -> None:
     path = robot_data("panda_description/urdf/panda.urdf")
     robot = oc.Robot.from_urdf(path, "panda_hand")

@@ -63,6 +63,7 @@ def test_panels_of_charts_without_boundaries() -> None:
     assert 'data-oc="boundary" data-value="inf"' in page
 
 
+@pytest.mark.slow
 def test_a_loop_does_the_last_of_several_wishes_and_settles_once() -> None:
     done: list[str] = []
     errors: list[Exception] = []
