@@ -8,7 +8,7 @@ from pathlib import Path
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.cli.progress import terminal_monitor
+from orthocas.cli.output import terminal_monitor
 from orthocas.plotting import quality_figure, self_motion_figure
 
 PAPER = {"task": 2.06, "mutual": 3.44, "minutes": 100.64}

@@ -29,7 +29,7 @@ from orthocas.bases.registry import register_parametrisation as register_paramet
 from orthocas.bases.sew import SEW as SEW
 from orthocas.certificates.certify import certified_box as certified_box
 from orthocas.certificates.certify import certify as certify
-from orthocas.certificates.check import check_certificate as check_certificate
+from orthocas.certificates.certify import check_certificate as check_certificate
 from orthocas.charts.certificate import Certificate as Certificate
 from orthocas.charts.chart import Chart as Chart
 from orthocas.charts.chart import GrownChart as GrownChart

@@ -16,7 +16,7 @@ from programs import Run, needs_c
 import orthocas as oc
 from orthocas import control
 from orthocas.bases.cyclic import over_cyclic_joints
-from orthocas.certificates.check import check_certificate
+from orthocas.certificates.certify import check_certificate
 from orthocas.charts.worst_points import worst_points
 from orthocas.codegen import CompiledLibrary, check_c, compile_shared
 from orthocas.control import ControlStatus

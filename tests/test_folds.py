@@ -11,8 +11,8 @@ from orthocas.charts.point_quality import Judged
 from orthocas.charts.worst_points import least_in_domain, worst_points
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import Fit
-from orthocas.fitting.fold_search import FoldSearch
 from orthocas.fitting.residuals import Loss, sample_loss
+from orthocas.fitting.stages import FoldSearch
 from orthocas.fitting.starts import Mirror, find_mirror
 from orthocas.fitting.terms import LEAST_CONDITIONING, Sizes, Weights
 from orthocas.tasks.domains import sample_heavily

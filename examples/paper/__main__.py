@@ -10,8 +10,7 @@ import typer
 from orthocas.bases import parse_parametrisation
 from orthocas.charts.chart import load
 from orthocas.cli.commands import run
-from orthocas.cli.output import AsJson, Force, print_json, print_rows, whole_number
-from orthocas.cli.progress import terminal_monitor
+from orthocas.cli.output import AsJson, Force, print_json, print_rows, terminal_monitor, whole_number
 from orthocas.errors import InvalidValueError
 from orthocas.tools.files import output_folder
 

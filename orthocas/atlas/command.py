@@ -11,9 +11,8 @@ from orthocas.atlas.atlas import Atlas
 from orthocas.atlas.building import MARGIN_DEG, RADIUS, build_atlas
 from orthocas.atlas.coverage import draw_coverage, evaluate_atlas
 from orthocas.atlas.plan import AtlasSettings
-from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
+from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, terminal_monitor, whole_number
 from orthocas.cli.problem_argument import CHAIN, ProblemName, ProblemOptions, build_problem, with_options
-from orthocas.cli.progress import terminal_monitor
 from orthocas.errors import Interrupted
 from orthocas.robots.homes import read_postures
 from orthocas.tools.checks import require_count

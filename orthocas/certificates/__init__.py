@@ -5,7 +5,6 @@
 - `taylor`, `functions` and `graph` are the arithmetic: Taylor models with remainders that cover rounding.
 """
 
-from orthocas.certificates.certify import certified_box, certify
-from orthocas.certificates.check import check_certificate
+from orthocas.certificates.certify import certified_box, certify, check_certificate
 
 __all__ = ["certified_box", "certify", "check_certificate"]

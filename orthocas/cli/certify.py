@@ -15,8 +15,7 @@ from orthocas import certificates
 from orthocas.charts.certificate import METHOD, Certificate
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import CHART
-from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
-from orthocas.cli.progress import terminal_monitor
+from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, terminal_monitor, whole_number
 from orthocas.errors import Interrupted
 from orthocas.tools.archive import require_free
 from orthocas.tools.checks import require_count

@@ -6,7 +6,7 @@ from typing import Annotated, cast
 import typer
 
 from orthocas.bases.registry import parse_parametrisation
-from orthocas.cli.output import AsJson, Force, note, print_json, print_table, whole_number
+from orthocas.cli.output import AsJson, Force, note, print_json, print_table, terminal_monitor, whole_number
 from orthocas.cli.problem_argument import (
     CHAIN,
     DOMAIN,
@@ -21,7 +21,6 @@ from orthocas.cli.problem_argument import (
     parse_weights,
     with_options,
 )
-from orthocas.cli.progress import terminal_monitor
 from orthocas.errors import Interrupted, printable
 from orthocas.fitting.compare import compare as compare_fits
 from orthocas.fitting.comparison import Comparison

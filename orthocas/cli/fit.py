@@ -10,7 +10,17 @@ from orthocas.bases.family import Parametrisation
 from orthocas.bases.registry import parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import Report, evaluate
-from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, report_rows, whole_number
+from orthocas.cli.output import (
+    AsJson,
+    Force,
+    note,
+    number,
+    print_json,
+    print_rows,
+    report_rows,
+    terminal_monitor,
+    whole_number,
+)
 from orthocas.cli.problem_argument import (
     CHAIN,
     DOMAIN,
@@ -29,7 +39,6 @@ from orthocas.cli.problem_argument import (
     suggested,
     with_options,
 )
-from orthocas.cli.progress import terminal_monitor
 from orthocas.errors import Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart

@@ -1,7 +1,9 @@
 """What commands share: how options are read, and output as aligned text for people or one JSON object."""
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,6 +11,7 @@ import typer
 
 from orthocas.errors import one_line, printable
 from orthocas.tools.json import to_json
+from orthocas.tools.progress import Monitor, Progress, silent
 
 if TYPE_CHECKING:
     from orthocas.charts.quality import Report
@@ -102,3 +105,34 @@ def report_rows(report: "Report") -> dict[str, str]:
     if report.length_ratio > _UNEVEN:
         rows["lengths"] += "; for use in controllers, fit with --weights 1000,30,150,1,1000"
     return rows
+
+
+@contextmanager
+def terminal_monitor() -> Iterator[Monitor]:
+    """A monitor that draws one bar per stage. It is silent when standard error is not a terminal."""
+    if not sys.stderr.isatty():
+        yield silent
+        return
+    with _stage_bars() as show:
+        yield show
+
+
+@contextmanager
+def _stage_bars() -> Iterator[Monitor]:
+    """A monitor that draws one bar per stage by rich."""
+    from rich.console import Console  # takes longer to import than the rest
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[detail]}"))
+    tasks: dict[str, Any] = {}
+    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+
+        def show(progress: Progress) -> None:
+            if progress.stage not in tasks:
+                for task in tasks.values():
+                    bars.update(task, completed=1.0)
+                tasks[progress.stage] = bars.add_task(progress.stage, total=1.0, detail="")
+            bars.update(tasks[progress.stage], completed=progress.fraction, detail=progress.detail)
+
+        yield show

@@ -17,9 +17,8 @@ from orthocas.cli.controller_argument import (
     require_torques,
     with_settings,
 )
-from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, whole_number
+from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, terminal_monitor, whole_number
 from orthocas.cli.problem_argument import parse_numbers
-from orthocas.cli.progress import terminal_monitor
 from orthocas.cli.run_report import fallback_text, run_report, run_rows
 from orthocas.control.controller import Controller
 from orthocas.control.posture import posture_reference

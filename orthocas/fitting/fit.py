@@ -26,9 +26,8 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.worst_points import WorstPoints
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.checkpoint import Checkpoint, Stage
-from orthocas.fitting.fold_search import FoldSearch
 from orthocas.fitting.settings import FitSettings, Precision, default_parametrisation
-from orthocas.fitting.stages import Plan, StageRunner
+from orthocas.fitting.stages import FoldSearch, Plan, StageRunner
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, LEAST_CONDITIONING, WeightNumbers, Weights
 from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.clear_box import ClearBox
