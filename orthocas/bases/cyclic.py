@@ -272,18 +272,26 @@ def parse_suffix(text: str) -> Cyclic:
 def resolved(cyclic: Cyclic, problem: "Problem") -> tuple[str, ...]:
     """The names of the cyclic joints of a problem that are meant.
 
+    A joint that is named need not keep the size of task gradients, only their span: as the first and the last joint of
+    a pose, at all of whose positions coordinates are as regular and as orthogonal as at one.
+
     Raises:
         InvalidValueError: if a named joint is not cyclic.
     """
     if not cyclic:
         return ()
-    known = cyclic_joints(problem)
+    known, names = cyclic_joints(problem), problem.robot.joint_names
     if cyclic == "auto":
         return known
-    wrong = [name for name in cyclic if name not in known]
+    wrong = [name for name in cyclic if name not in known and not _keeps_leaves(problem, name)]
     if wrong:
         raise InvalidValueError("cyclic", repr(wrong[0]), f"one of the cyclic joints: {', '.join(known) or 'none'}")
-    return tuple(name for name in known if name in cyclic)
+    return tuple(name for name in names if name in cyclic)
+
+
+def _keeps_leaves(problem: "Problem", name: str) -> bool:
+    names = problem.robot.joint_names
+    return name in names and leaves_stay(problem, names.index(name))
 
 
 def indices(cyclic: Cyclic, space: JointSpace) -> list[int]:

@@ -1,6 +1,6 @@
 """How good coordinates are at given joint positions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from orthocas.charts.angles import MOST_JOINTS, judge_by_columns, judge_by_lapack
 from orthocas.charts.coordinates import CoordinateMap
 from orthocas.tasks.domains import bounds_of, contains
-from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.problem import Problem, distance_from_half_a_turn, task_jacobians
 from orthocas.tasks.samples import Samples, samples_at
 from orthocas.tools.batch import in_threads
 from orthocas.tools.checks import Array
@@ -17,6 +17,7 @@ from orthocas.tools.columns import MANY
 from orthocas.tools.display import Shown, number_list
 
 _CHUNK = 40_000  # joint positions evaluated at once
+_NEAR_THE_END = 0.1  # cos(angle / 2) of turns beyond which rounding of J_x shows
 _LONGEST = 1e100  # squares of longer gradients overflow: they have no value
 
 
@@ -57,7 +58,20 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict
     kept[kept] = alive
     if not alive.all():
         samples, J = samples[alive], J[alive]
-    return {"kept": kept, "points": samples.points, "jacobian": J, **judge(samples, J)}
+    found = judge(samples, J)
+    ends = distance_from_half_a_turn(problem, samples.points) < _NEAR_THE_END
+    if ends.any():
+        for name, values in zip(
+            ("leak_sines", "conditioning", "signs"), _by_frame(problem, samples[ends], J[ends]), strict=True
+        ):
+            found[name][ends] = values
+    return {"kept": kept, "points": samples.points, "jacobian": J, **found}
+
+
+def _by_frame(problem: Problem, samples: Samples, J: Array) -> tuple[Array, Array, Array]:
+    """`in_the_metric` by the frame Jacobian, whose rows span the same and keep their rank where J_x loses it."""
+    rows = problem.task.batched_frame_jacobian(samples.points)[0].reshape(samples.task_jacobian.shape)
+    return in_the_metric(replace(samples, task_jacobian=rows), J)
 
 
 def judge(samples: Samples, J: Array) -> dict[str, Array]:

@@ -1,0 +1,387 @@
+"""Wide charts: coordinates that are regular on a whole branch of the joint range."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike
+
+from orthocas.bases.cyclic import leaves_stay, over_cyclic_joints
+from orthocas.bases.family import (
+    CyclicParametrisation,
+    GradedFamily,
+    GradedParametrisation,
+    JointSpace,
+    LinearFamily,
+    Parametrisation,
+)
+from orthocas.bases.products import Polynomial
+from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.point_quality import Judged
+from orthocas.charts.worst_points import worst_points
+from orthocas.errors import DomainError, Interrupted, InvalidValueError
+from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
+from orthocas.fitting.checkpoint import Stage
+from orthocas.fitting.fit import Fit, fit, in_gauge, normalised
+from orthocas.fitting.settings import require_parametrisation
+from orthocas.robots.robot import Robot
+from orthocas.solvers.protocol import SolveResult, Status
+from orthocas.tasks.branches import Branch, Branches, branches
+from orthocas.tasks.domains import Box, sample_heavily
+from orthocas.tasks.metric import Metric, MetricSpec, metric_matrices
+from orthocas.tasks.problem import Problem, check
+from orthocas.tasks.regular_box import home_posture
+from orthocas.tasks.samples import sample_problem
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array, as_number, require_count, require_kind
+from orthocas.tools.interrupts import remembered
+from orthocas.tools.progress import Monitor, Progress, silent
+
+CLEARANCE = 0.1  #: default least relative singular value
+DEGREE = 6
+_PER_TERM, _LEAST_SAMPLES, _MOST_SAMPLES = 40, 5000, 40_000
+_TAG, _JUDGED_TAG, _FIRST_TAG = 3000, 3001, 1000  # seed tags; other samples use other ones
+_FIRST = 200  # samples that scale coordinates
+_JUDGED = 20_000
+_PIECE = 1000  # samples whose gradients of all functions are in memory at once
+_SMOOTH = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)  # weights of the mean squared gradient, from nearly orthogonal to regular
+_LEAST = 0.1  # slope along self-motions, relative to the gradient, below which a position counts as bad
+_ROUNDS, _ADDED = 2, 5.0  # rounds with worst points, and the weight of each of these
+_EVERY = 4  # samples whose gradients count as long
+_TINY = 1e-12  # length of a row
+_NEWTON_STEPS, _GAIN, _RIDGE = 50, 1e-7, 1e-10
+_START = 3  # degree of the start, if there are several coordinates
+_START_WEIGHTS = (100.0, 3.0, 1000.0, 0.0, 10_000.0)
+_SHRINK, _SHRINKS = 0.96, 12  # of a branch whose centre is not clear
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class WideFit(Fit):
+    """A chart of a branch, and how it was found.
+
+    Its numbers are from 20,000 clear positions that took no part in the fit, two thirds of them near limits and cuts.
+    """
+
+    branch: Branch | None = None  #: the branch of the chart
+    regular_share: float = float("nan")  #: share of positions where no coordinate folds
+
+    def facts(self) -> dict[str, str]:
+        """The facts of a fit, with branch and regular share."""
+        known = super().facts()
+        branch = "" if self.branch is None else self.branch.name
+        own = {"branch": branch, "regular": f"{self.regular_share:.3%} of clear positions, many near limits"}
+        return {"fit": known.pop("fit"), "problem": known.pop("problem"), **own, **known}
+
+
+def fit_wide(
+    robot: Robot,
+    task: Task,
+    branch: Branch | str | None = None,
+    metric: Metric | MetricSpec = "euclidean",
+    *,
+    clearance: float = CLEARANCE,
+    parametrisation: Parametrisation | None = None,
+    home: ArrayLike | str | None = None,
+    samples: int | None = None,
+    seed: int = 0,
+    monitor: Monitor = silent,
+) -> WideFit:
+    """Find coordinates that are regular on a whole branch of the joint range, and as orthogonal as that permits.
+
+    Let z(q), with z^T A z = 1, be the direction of the self-motion; with r > 1, of the self-motion along which the
+    other coordinates stay. A coordinate is regular if and only if dxi/dq . z > 0 everywhere, which is linear in its
+    coefficients. So the fit solves a convex problem, the least
+
+        mean max(0, 1 - dxi/dq . z)^2 + s mean |dxi/dq|^2_A^-1
+
+    over boundary-heavy samples of the branch that are clear of singular positions, by Newton's method. The second mean
+    is least where gradients point along z, that is where coordinates are orthogonal to the task and to each other. Its
+    weight s is the largest of five that leaves the fewest positions bad. Worst points are searched, and join the
+    samples. With r > 1 the problem is solved for one coordinate after the other, from a fit of degree 3.
+
+    Wide charts have one solution for what users ask nearly everywhere, but leaks of 20 to 60 degrees, as geometry has
+    it. They serve inverse kinematics, closed loops and laws with the whole inertia; for decoupled control see `fit`.
+
+    Args:
+        robot: the robot.
+        task: a task of that robot. A missing reference orientation is taken at the centre of the branch.
+        branch: a branch of `orthocas.branches`, or its name. Default: that of the home; with none there, the largest.
+        metric: as in `Problem`.
+        clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
+        parametrisation: a family that is linear in its parameters. Default: Polynomial(6), with one linear
+            term for each joint on whose position self-motions do not depend, such as the first and the last one.
+        home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
+        samples: number of samples. Default: 40 for each function, 5,000 to 40,000.
+        seed: seed of the samples.
+        monitor: called with progress.
+
+    Returns:
+        The chart, the branch, and the regular share.
+
+    Raises:
+        DomainError: if there is no clear position near the middle of the branch.
+        InvalidValueError, UnknownNameError, NotRedundantError: if an argument is invalid.
+        Interrupted: after Ctrl-C, once there are coordinates; before that, KeyboardInterrupt.
+
+    Source:
+        ours, docs/wide.md.
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+        >>> found = oc.fit_wide(robot, oc.Task.position(robot, "xy"), home=[0.6, 0.8, 0.8])
+        >>> found.regular_share
+        1.0
+    """
+    start = time.perf_counter()
+    require_kind("robot", robot, Robot)
+    require_kind("task", task, Task)
+    bound = as_number("clearance", clearance)
+    require_count("seed", seed, least=0)
+    chosen = _chosen(robot, task, branch, home)
+    problem = _problem(robot, task, metric, chosen, bound)
+    wanted = Polynomial(DEGREE, _free_joints(problem)) if parametrisation is None else parametrisation
+    require_parametrisation(wanted)
+    wanted = wanted.for_problem(problem)
+    if isinstance(wanted, CyclicParametrisation):
+        problem = over_cyclic_joints(problem, tuple(wanted.cyclic))
+    if wanted.closed_form is not None or not isinstance(wanted.family(JointSpace.of(problem), problem.r), LinearFamily):
+        raise InvalidValueError("parametrisation", wanted.label, "a family to fit that is linear in its parameters")
+    count = None if samples is None else require_count("samples", samples, least=2)
+    search = _Search(problem, wanted, count, seed, monitor)
+    with remembered() as pressed:
+        try:
+            search.run()
+        except KeyboardInterrupt:
+            if search.best is None:
+                raise
+        result = _finished(search, chosen, start, interrupted=pressed())
+    if pressed():
+        raise Interrupted(result)
+    return result
+
+
+def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: bool) -> WideFit:
+    """The result of a search, normalised and judged."""
+    assert search.best is not None
+    folded, _, C = search.best
+    problem, seed = search.problem, search.seed
+    centre, status = problem.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
+    first = sample_problem(problem, _FIRST, (seed, _FIRST_TAG))
+    coordinates = in_gauge(normalised(search.coordinates(C), centre, first), centre)
+    worst = worst_points(problem, coordinates, seed, thorough=True)
+    notes: dict[str, str | float] = {
+        "solver": "convex",
+        "seed": seed,
+        "samples": search.samples,
+        "status": status.value,
+        "branch": branch.name,
+        "regular share": 1 - folded,
+        "least conditioning": worst.least,
+    }
+    return WideFit(
+        chart=Chart(problem, coordinates, notes),
+        stages=tuple(stage.interrupted() if interrupted else stage for stage in search.stages),
+        problem_check=check(problem, seed=seed),
+        idle_joints=(),
+        worst=worst,
+        seconds=time.perf_counter() - start,
+        branch=branch,
+        regular_share=1 - folded,
+    )
+
+
+def _chosen(robot: Robot, task: Task, branch: Branch | str | None, home: ArrayLike | str | None) -> Branch:
+    """The branch that is meant."""
+    if isinstance(branch, Branch):
+        return branch
+    found: Branches = branches(robot, task)
+    if branch is not None:
+        return found[branch]
+    return found.of(home_posture(robot, task, home).q) or found[0]
+
+
+def _free_joints(problem: Problem) -> tuple[str, ...]:
+    """Names of the joints on whose position the self-motions do not depend, by proof."""
+    return tuple(name for k, name in enumerate(problem.robot.joint_names) if leaves_stay(problem, k))
+
+
+def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
+    """The problem on the clear part of a branch. Its box shrinks a little around the branch's posture if it must."""
+    box = branch.box
+    low, high = box.centre - box.half_width, box.centre + box.half_width
+    for _ in range(_SHRINKS):
+        try:
+            domain = Box((low + high) / 2, (high - low) / 2, box.unbounded)
+            return Problem(robot, task, metric, domain, branch.name, clearance)
+        except DomainError:  # the centre is not clear
+            low, high = (branch.posture + _SHRINK * (end - branch.posture) for end in (low, high))
+    raise DomainError(
+        f"the middle of branch '{branch.name}' is not clear with clearance = {clearance:g}, expected less"
+    )
+
+
+class _Field:
+    """Samples with the rows and the metric that self-motions are orthogonal to."""
+
+    def __init__(self, problem: Problem, points: Array, weight: float = 1.0) -> None:
+        task = problem.task
+        J = task.batched_frame_jacobian(points)[0].reshape(len(points), task.m, problem.n)
+        self.points, self.weight = points, weight
+        self.rows = J / np.maximum(np.linalg.norm(J, axis=2, keepdims=True), _TINY)
+        self.metric = None if problem.metric.is_identity else metric_matrices(problem.metric, points)
+        self.design: Array | None = None  # of a single coordinate, which does not depend on others
+
+    def directions(self, J: Array, k: int) -> Array:
+        """z (N, n) along which the task and all rows of J (N, r, n) but row k stay, with det [J_x; J] > 0 for row z."""
+        unit = J / np.maximum(np.linalg.norm(J, axis=2, keepdims=True), _TINY)
+        others = np.concatenate([self.rows, np.delete(unit, k, axis=1)], axis=1)
+        z = np.linalg.svd(others)[2][:, -1]
+        z = z * np.sign(np.linalg.det(np.insert(others, self.rows.shape[1] + k, z, axis=1)))[:, None]
+        squares = 1.0 if self.metric is None else np.einsum("si,sij,sj->s", z, self.metric, z)[:, None]
+        return np.asarray(z / np.sqrt(squares))
+
+
+class _Search:
+    """A search for regular coordinates of a problem."""
+
+    def __init__(
+        self, problem: Problem, parametrisation: Parametrisation, samples: int | None, seed: int, monitor: Monitor
+    ) -> None:
+        self.problem, self.parametrisation, self.seed, self.monitor = problem, parametrisation, seed, monitor
+        family = parametrisation.family(JointSpace.of(problem), problem.r)
+        assert isinstance(family, LinearFamily)
+        self._family: LinearFamily = family
+        self._basis: BasisGradients = gradients_of(family, problem.n)
+        self.samples = samples or int(np.clip(_PER_TERM * family.width, _LEAST_SAMPLES, _MOST_SAMPLES))
+        self.best: tuple[float, float, Array] | None = None  #: shares of folded and of bad positions, coefficients
+        self.stages: list[Stage] = []
+
+    def run(self) -> None:
+        """Solve with less and less smoothness, then with the worst points of the best solution."""
+        self._judged = self._draw(_JUDGED, _JUDGED_TAG)
+        fields = [_Field(self.problem, self._draw(self.samples, _TAG))]
+        energy, C = self._energy(fields[0]), self._first()
+        smooth, least = _SMOOTH[0], np.inf
+        for trial in _SMOOTH:
+            C = self._swept(fields, energy, C, trial, f"smoothness {trial:g}")
+            folded = self._keep(C)
+            if folded < least:
+                smooth, least = trial, folded
+        for turn in range(1, 1 + _ROUNDS):
+            assert self.best is not None
+            bad = worst_points(self.problem, self.coordinates(self.best[2]), self.seed).below(_LEAST)
+            if not len(bad):
+                break
+            fields.append(_Field(self.problem, bad, _ADDED))
+            self._keep(self._swept(fields, energy, self.best[2], smooth, f"worst points, round {turn}"))
+
+    def coordinates(self, C: Array) -> Coordinates:
+        """Coordinates of coefficients (r, K), not normalised."""
+        r, space = self.problem.r, JointSpace.of(self.problem)
+        return Coordinates(self.parametrisation, space, (), C.ravel(), np.zeros(r), np.ones(r))
+
+    def _swept(self, fields: list[_Field], energy: Array, C: Array, smooth: float, name: str) -> Array:
+        """Coefficients (r, K) after the problem of each coordinate was solved once."""
+        started, C = time.perf_counter(), C.copy()
+        weights = np.concatenate([np.full(len(field.points), field.weight) for field in fields])
+        value = 0.0
+        for k in range(len(C)):
+            design = np.concatenate([self._design(field, C, k) for field in fields])
+            C[k], value = least_hinge(design, energy, weights, smooth)
+            self.monitor(Progress(name, (k + 1) / len(C), f"loss {value:.5g}", value))
+        result = SolveResult(C.ravel(), value, Status.CONVERGED, len(C), len(C), time.perf_counter() - started)
+        self.stages.append(Stage(name, C.size, len(weights), result))
+        return C
+
+    def _keep(self, C: Array) -> float:
+        """Keep coefficients if they are the best so far; their share of folded positions."""
+        found = Judged.at(self.problem, self.coordinates(C), self._judged)
+        signed = found.signs * found.conditioning * (1.0 if found.signs.sum() >= 0 else -1.0)
+        folded, bad = (float(1 - np.sum(signed > least) / len(self._judged)) for least in (0.0, _LEAST))
+        if self.best is None or (folded, bad) < self.best[:2]:
+            self.best = folded, bad, C
+        return folded
+
+    def _first(self) -> Array:
+        """Where the search starts, (r, K): anywhere with one coordinate, otherwise at a fit of low degree."""
+        r, wanted = self.problem.r, self.parametrisation
+        if r == 1:
+            return np.zeros((1, self._family.width))
+        low = wanted.of_degree(min(wanted.degree, _START)) if isinstance(wanted, GradedParametrisation) else wanted
+        found = fit(self.problem, low, weights=_START_WEIGHTS, seed=self.seed, split_idle=False, monitor=self.monitor)
+        coarse = found.chart.coordinates
+        assert isinstance(coarse, Coordinates)
+        theta = coarse.theta
+        if isinstance(self._family, GradedFamily):
+            theta = self._family.embed(theta, cast(Any, coarse.family))
+        return np.asarray(theta.reshape(r, -1) * coarse.scale[:, None])
+
+    def _draw(self, count: int, tag: int) -> Array:
+        return sample_heavily(self.problem.domain, count, (self.seed, tag))
+
+    def _gradients(self, points: Array) -> Iterator[tuple[slice, Array]]:
+        """Gradients of all functions (c, n, K), some points at a time."""
+        for begin in range(0, len(points), _PIECE):
+            part = slice(begin, min(begin + _PIECE, len(points)))
+            yield part, self._basis.dense(self._basis.at(points[part]), part.stop - begin)
+
+    def _design(self, field: _Field, C: Array, k: int) -> Array:
+        """dpsi/dq . z at the samples of a field, (N, K)."""
+        if field.design is not None:
+            return field.design
+        z = field.directions(self.coordinates(C).jacobian(field.points), k)
+        found = np.empty((len(field.points), self._family.width))
+        for part, G in self._gradients(field.points):
+            np.matmul(z[part, None, :], G, out=found[part, None, :])
+        if len(C) == 1:
+            field.design = found
+        return found
+
+    def _energy(self, field: _Field) -> Array:
+        """Mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K), over every fourth sample."""
+        total, metric = np.zeros((self._family.width,) * 2), field.metric
+        points = field.points[::_EVERY]
+        for part, G in self._gradients(points):
+            raised = G if metric is None else np.linalg.solve(metric[::_EVERY][part], G)
+            total += G.reshape(-1, G.shape[2]).T @ raised.reshape(-1, G.shape[2])
+        return total / len(points)
+
+
+def least_hinge(D: Array, energy: Array, weights: Array, smooth: float) -> tuple[Array, float]:
+    """The c (K,) with the least sum_s w_s max(0, 1 - D_s c)^2 / sum w + smooth c^T E c, by Newton's method; its value.
+
+    Args:
+        D: (N, K).
+        energy: E, (K, K), positive semidefinite.
+        weights: w, (N,).
+        smooth: > 0.
+    """
+    weights = weights / weights.sum()
+    E = smooth * energy
+    E[np.diag_indices(len(E))] += _RIDGE * np.trace(energy) / len(E)
+
+    def value(c: Array) -> float:
+        short = np.maximum(0.0, 1 - D @ c)
+        return float(weights @ short**2 + c @ E @ c)
+
+    c, last, now = np.zeros(len(E)), np.inf, np.inf
+    for _ in range(_NEWTON_STEPS):
+        active = D @ c < 1
+        rows = D[active]
+        weighted = rows * weights[active, None]
+        factor = scipy.linalg.cho_factor(rows.T @ weighted + E)
+        step = scipy.linalg.cho_solve(factor, weighted.sum(axis=0)) - c
+        size = 1.0
+        while not value(c + size * step) < last and size > 1e-3:
+            size /= 2
+        c = c + size * step
+        now = value(c)
+        if last - now <= _GAIN * now:
+            break
+        last = now
+    return c, now

@@ -1,0 +1,299 @@
+"""Branches of the joint range: what is left of it if it is cut where self-motions cannot pass."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike
+
+from orthocas.errors import SingularTaskError, UnknownNameError
+from orthocas.robots.robot import Robot
+from orthocas.tasks.clear_box import row_scale
+from orthocas.tasks.domains import Box, sample_evenly
+from orthocas.tasks.regular_box import joint_range
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array, as_point, require_kind
+from orthocas.tools.display import Shown, listed
+
+CLEAR = 0.1  #: relative singular value above which a position counts as clear where shares are counted
+_SLICES, _ON_SLICE, _FINER, _SEED = 61, 200, 400, 0  # slices q_k = v, and positions on each
+_NOT_SINGULAR = 0.02  # relative singular value of the positions that count for crossing
+_FEW = 8  # positions on a slice; fewer say nothing about it
+_QUANTILE = 0.9  # of the positions of a slice that must be singular, or that self-motions must not leave
+_LOW = 0.12  # of that quantile, relative to the largest one of the joint's slices
+_STILL = 0.02  # joints that self-motions move less are not cut where they move least
+_EXACT = 1e-4  # the quantile where a cut is one of geometry, not of offsets between axes
+_APART = 0.45  # [rad or m] cuts of one joint that are nearer are one
+_MOST_CUTS = 2  # of a joint
+_NEIGHBOURS, _SAME = 5, 1e-8  # of a minimum; difference of poses that are equal [m and rad]
+_SAMPLES = 20_000
+_ARM = 7  #: joints of an arm, counted from its tip, whose self-motions are looked at
+_PARTS = {6: {1: "shoulder", 2: "elbow", 4: "wrist"}, 7: {1: "shoulder", 3: "elbow", 5: "wrist"}}
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A hypersurface q_k = value that cuts the joint range."""
+
+    joint: int  #: k
+    joint_name: str
+    part: str  #: "elbow", ... or the name of the joint
+    value: float  #: [rad] or [m]
+    singular: bool  #: whether its positions are singular; otherwise self-motions cannot leave it
+    exact: bool  #: whether all of its positions are so, not only nearly
+
+    @property
+    def explained(self) -> str:
+        """The cut in words."""
+        why = "singular" if self.singular else "self-motions do not cross it"
+        return f"{self.joint_name} = {self.value:.4g}, {why}{'' if self.exact else ', nearly'}"
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """A part of the joint range between cuts."""
+
+    name: str  #: such as "shoulder+ elbow- wrist+"; "whole" without cuts
+    box: Box  #: up to the joint limits
+    posture: Array  #: its clear position farthest from limits and cuts, (n,)
+    clear_share: float  #: share of its positions with a relative singular value above 0.1
+    share: float  #: its share of all such positions of the joint range
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Branches(Shown, Sequence[Branch]):
+    """The branches of a robot, the one with most clear positions first; see `orthocas.branches`."""
+
+    robot: Robot
+    cuts: tuple[Cut, ...]
+    items: tuple[Branch, ...]
+    mirrors: tuple[int, ...]  #: cuts that a reflection of the joints crosses without moving the tip
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __iter__(self) -> Iterator[Branch]:
+        return iter(self.items)
+
+    def __getitem__(self, key: int | str) -> Branch:  # type: ignore[override]
+        """A branch by its place or its name."""
+        if isinstance(key, str):
+            names = [item.name for item in self.items]
+            if key not in names:
+                raise UnknownNameError("branch", key, names)
+            return self.items[names.index(key)]
+        return self.items[key]
+
+    def of(self, q: ArrayLike) -> Branch | None:
+        """The branch of a joint position (n,); None outside the joint range, and on parts without clear positions."""
+        point = as_point("q", q, self.robot.n)
+        return next((item for item in self.items if item.box.contains(point)), None)
+
+    def mirrored(self, q: ArrayLike, cut: int) -> Array:
+        """The joint position (n,) beyond a cut with the same pose of the tip, for cuts among `mirrors`.
+
+        q_k - value changes its sign, and its neighbours turn by half a turn, towards the middle of their range.
+        """
+        q = as_point("q", q, self.robot.n)
+        return _reflected(self.robot, self.cuts[cut], q[None])[0]
+
+    def facts(self) -> dict[str, str]:
+        """Cuts and branches."""
+        shares = [f"{item.name} ({item.share:.1%})" for item in self.items]
+        return {
+            "branches": f"{len(self)} of {self.robot.heading}",
+            "cuts": "; ".join(cut.explained for cut in self.cuts) or "none",
+            "clear positions": listed(shares),
+        }
+
+
+def branches(robot: Robot, task: Task | None = None) -> Branches:
+    """Find the parts of the joint range between which self-motions and ways around singular positions do not lead.
+
+    Cuts are hypersurfaces q_k = v of two kinds. On singular ones, no position is clear, such as those of a stretched
+    elbow. Others are not crossed by self-motions: joint k stands still on them while the arm moves without its tip,
+    as the second joint of a shoulder with three intersecting axes at q2 = 0. A coordinate keeps its sense along
+    self-motions on each side of a cut, and not across it. Each is looked for on 61 slices of every joint but the first
+    and the last of the arm, then refined; nearly so counts too, because offsets between axes move such places a little.
+    They are found from samples, not proved.
+
+    Self-motions are those of the tip's pose, by the last seven joints: charts of its position keep to the same
+    branches. With fewer than six joints they are those of the task. Joints that can turn farther than a full turn are
+    taken from -pi to pi.
+
+    Args:
+        robot: the robot.
+        task: a task of that robot, needed with fewer than six joints. Default: the pose of the tip.
+
+    Raises:
+        SingularTaskError: if no position is clear.
+
+    Source:
+        ours, docs/wide.md.
+
+    Example:
+        >>> import orthocas as oc
+        >>> found = oc.branches(oc.problems.get("iiwa").robot)
+        >>> [cut.explained for cut in found.cuts][1], len(found)
+        ('A4 = 0, singular', 8)
+        >>> found["shoulder+ elbow- wrist+"].share > 0.1
+        True
+    """
+    require_kind("robot", robot, Robot)
+    whole = joint_range(robot, 0)
+    arm = _Arm.of(robot, task, whole)
+    cuts = tuple(cut for k in arm.inner for cut in arm.cuts(k))
+    points = sample_evenly(Box(whole.centre, whole.half_width), _SAMPLES, _SEED)
+    clear = points[arm.judged(points)[0] > CLEAR]
+    if not len(clear):
+        raise SingularTaskError("no position of the joint range is clear of singular ones")
+    items = [item for sides in product(*_sides(cuts)) if (item := _branch(whole, cuts, sides, points, clear))]
+    items.sort(key=lambda item: -item.share)
+    mirrors = tuple(i for i, cut in enumerate(cuts) if _is_mirror(robot, cut, points[:50]))
+    return Branches(robot, cuts, tuple(items), mirrors)
+
+
+@dataclass(frozen=True, eq=False)
+class _Arm:
+    """The joints whose self-motions are looked at."""
+
+    robot: Robot
+    task: Task
+    whole: Box
+    joints: list[int]
+    scale: Array
+
+    @classmethod
+    def of(cls, robot: Robot, task: Task | None, whole: Box) -> "_Arm":
+        if robot.n >= 6 or task is None:
+            task = Task.pose(robot)
+        judged = task.with_reference_at(whole.centre)
+        J = _jacobians(judged, sample_evenly(Box(whole.centre, whole.half_width), 2000, _SEED))
+        joints = list(range(max(0, robot.n - _ARM), robot.n))
+        return cls(robot, judged, whole, joints, row_scale(J[:, :, joints], judged.units))
+
+    @property
+    def inner(self) -> list[int]:
+        """The joints that may be cut: turning the base or the tool changes nothing."""
+        return self.joints[1:-1]
+
+    def judged(self, points: Array) -> tuple[Array, Array]:
+        """Relative singular values (N,), and how far unit self-motions move each joint, (N, n); NaN without any."""
+        J = _jacobians(self.task, points)[:, :, self.joints] / self.scale[:, None]
+        m = J.shape[1]
+        moved = np.full(points.shape, np.nan)
+        if m >= len(self.joints):
+            return np.linalg.svd(J, compute_uv=False)[:, -1], moved
+        _, s, V = np.linalg.svd(J)
+        moved[:, self.joints] = np.sqrt((V[:, m:] ** 2).sum(axis=1))
+        return s[:, -1], moved
+
+    def cuts(self, k: int) -> list[Cut]:
+        """The cuts of joint k."""
+        low, high = (self.whole.centre[k] + side * self.whole.half_width[k] for side in (-1, 1))
+        values = np.linspace(low, high, _SLICES)
+        found: list[tuple[Cut, float]] = []
+        for singular in (True, False):
+            sizes = np.array([self._size(k, v, singular, _ON_SLICE) for v in values])
+            if not np.isfinite(sizes).any() or (not singular and np.nanmax(sizes) < _STILL):
+                continue
+            for i in _minima(sizes, _LOW * float(np.nanmax(sizes))):
+                cut, size = self._refined(k, values, i, singular)
+                if all(abs(cut.value - other.value) > _APART for other, _ in found):
+                    found.append((cut, size))
+        strongest = sorted(found, key=lambda pair: pair[1])[:_MOST_CUTS]
+        return sorted((cut for cut, _ in strongest), key=lambda cut: cut.value)
+
+    def _size(self, k: int, value: float, singular: bool, count: int) -> float:
+        """The 90 % quantile, over a slice, of the singular value, or of how far self-motions move the joint."""
+        points = sample_evenly(Box(self.whole.centre, self.whole.half_width), count, (_SEED, k))
+        points[:, k] = value
+        s, moved = self.judged(points)
+        clear = moved[s > _NOT_SINGULAR, k]
+        if singular:
+            return float(np.quantile(s, _QUANTILE))
+        return float(np.quantile(clear, _QUANTILE)) if len(clear) >= _FEW else np.nan
+
+    def _refined(self, k: int, values: Array, i: int, singular: bool) -> tuple[Cut, float]:
+        """The cut near slice i, and its quantile."""
+
+        def size(value: float) -> float:
+            found = self._size(k, value, singular, _FINER)
+            return found if np.isfinite(found) else 1.0
+
+        found = scipy.optimize.minimize_scalar(
+            size, bounds=(values[i - 1], values[i + 1]), method="bounded", options={"xatol": 1e-6}
+        )
+        value = 0.0 if size(0.0) <= found.fun + _EXACT and values[i - 1] < 0 < values[i + 1] else float(found.x)
+        name = self.robot.joint_names[k]
+        part = _PARTS.get(len(self.joints), {}).get(k - self.joints[0], name)
+        least = size(value)
+        return Cut(k, name, part, value, singular, least < _EXACT), least
+
+
+def _jacobians(task: Task, points: Array) -> Array:
+    """Frame Jacobians, zero where they are not finite, (N, m, n)."""
+    J: Array = task.batched_frame_jacobian(points)[0].reshape(len(points), task.m, points.shape[1])
+    return np.where(np.isfinite(J), J, 0.0)
+
+
+def _minima(sizes: Array, limit: float) -> list[int]:
+    """Inner slices that are the lowest of their neighbours and below a limit, the lowest first."""
+    found = []
+    for i in range(1, len(sizes) - 1):
+        near = sizes[max(0, i - _NEIGHBOURS) : i + _NEIGHBOURS + 1]
+        if sizes[i] <= limit and sizes[i] == np.nanmin(near):
+            found.append(i)
+    return sorted(found, key=lambda i: float(sizes[i]))
+
+
+def _sides(cuts: tuple[Cut, ...]) -> list[range]:
+    """For each joint that is cut, the numbers of its parts."""
+    joints = sorted({cut.joint for cut in cuts})
+    return [range(1 + sum(cut.joint == k for cut in cuts)) for k in joints]
+
+
+def _branch(whole: Box, cuts: tuple[Cut, ...], sides: tuple[int, ...], points: Array, clear: Array) -> Branch | None:
+    """The branch on some sides of the cuts; None if it has no clear sample."""
+    low, high = whole.centre - whole.half_width, whole.centre + whole.half_width
+    words = []
+    for k, side in zip(sorted({cut.joint for cut in cuts}), sides, strict=True):
+        own = [cut for cut in cuts if cut.joint == k]
+        if side:
+            low[k] = own[side - 1].value
+        if side < len(own):
+            high[k] = own[side].value
+        words.append(own[0].part + ("-", "+")[side] if len(own) == 1 else own[0].part + ("-", "0", "+")[side])
+    inside = clear[((clear > low) & (clear < high)).all(axis=1)]
+    if not len(inside):
+        return None
+    box = Box((low + high) / 2, (high - low) / 2, whole.unbounded)
+    drawn = int(((points > low) & (points < high)).all(axis=1).sum())
+    room = (1 - np.abs((inside - box.centre) / box.half_width)).min(axis=1)
+    posture = inside[np.argmax(room)]
+    return Branch(" ".join(words) or "whole", box, posture, len(inside) / drawn, len(inside) / len(clear))
+
+
+def _reflected(robot: Robot, cut: Cut, points: Array) -> Array:
+    """Points (N, n) on the other side of a cut, the neighbours of its joint turned by half a turn."""
+    k = cut.joint
+    moved = points.copy()
+    moved[:, k] = 2 * cut.value - points[:, k]
+    middle = np.where(np.isfinite(robot.tree.middle), robot.tree.middle, 0.0)
+    for j in (k - 1, k + 1):
+        if 0 <= j < robot.n:
+            moved[:, j] += np.where(points[:, j] > middle[j], -np.pi, np.pi)
+    return moved
+
+
+def _is_mirror(robot: Robot, cut: Cut, points: Array) -> bool:
+    """Whether the reflection at a cut keeps the pose of the tip."""
+    prismatic = robot.tree.prismatic
+    near = [j for j in (cut.joint - 1, cut.joint, cut.joint + 1) if 0 <= j < robot.n]
+    if not cut.exact or any(prismatic[j] for j in near):
+        return False
+    moved = _reflected(robot, cut, points)
+    same = [np.abs(of(points) - of(moved)).max() < _SAME for of in (robot.tip_position, robot.tip_rotation)]
+    return bool(all(same))
