@@ -37,6 +37,7 @@ from orthocas.charts.chart import load as load
 from orthocas.charts.grow import grow as grow
 from orthocas.charts.quality import Report as Report
 from orthocas.charts.quality import evaluate as evaluate
+from orthocas.charts.regular_part import RegularPart as RegularPart
 from orthocas.charts.singularities import jumps as jumps
 from orthocas.charts.singularities import singular_points as singular_points
 from orthocas.charts.solutions import InverseStatus as InverseStatus
@@ -59,11 +60,16 @@ from orthocas.fitting.suggest_domain import suggest_domain as suggest_domain
 from orthocas.fitting.symbolic_loss import loss as loss
 from orthocas.fitting.terms import Weights as Weights
 from orthocas.fitting.terms import register_loss_term as register_loss_term
+from orthocas.fitting.wide import WideFit as WideFit
+from orthocas.fitting.wide import fit_wide as fit_wide
 from orthocas.paths.follow import follow as follow
 from orthocas.robots import obstacles as obstacles
 from orthocas.robots.robot import Robot as Robot
 from orthocas.simulation.run import simulate as simulate
 from orthocas.simulation.run import simulate_many as simulate_many
+from orthocas.tasks.branches import Branch as Branch
+from orthocas.tasks.branches import Branches as Branches
+from orthocas.tasks.branches import branches as branches
 from orthocas.tasks.clear_box import ClearBox as ClearBox
 from orthocas.tasks.corridor import Corridor as Corridor
 from orthocas.tasks.domains import Box as Box

@@ -36,15 +36,26 @@ def whitened(gram: ca.SX, columns: ca.SX, least: float) -> ca.SX:
 
 
 def determinant_sign(matrix: ca.SX) -> ca.SX:
-    """Sign of the determinant of a square matrix, by reflections of its rows; 0 if a pivot is exactly 0."""
-    A, n = ca.SX(matrix), matrix.size1()
+    """Sign of the determinant of a square matrix; 0 if a pivot is exactly 0."""
     sign = ca.SX(1)
+    for pivot in triangle(matrix):
+        sign *= ca.sign(pivot)
+    return sign
+
+
+def triangle(matrix: ca.SX) -> list[ca.SX]:
+    """Numbers whose product is the determinant of a square matrix, by reflections of its rows.
+
+    The first k are, up to their signs, the diagonal of the Cholesky factor of the Gram matrix of the first k rows.
+    """
+    A, n = ca.SX(matrix), matrix.size1()
+    found = []
     for k in range(n - 1):
-        v, _, half = _reflection(A[k, k:].T)
-        sign *= ca.if_else(A[k, k] >= 0, 1.0, -1.0) * (half > 0)  # of the pivot, and of the reflection
+        v, norm, half = _reflection(A[k, k:].T)
+        found.append(ca.if_else(A[k, k] >= 0, norm, -norm))  # the pivot is of the other sign, and so is the reflection
         shares = A[k + 1 :, k:] @ v / _or_one(half)
         A[k + 1 :, k + 1 :] -= shares @ v[1:].T
-    return sign * ca.sign(A[n - 1, n - 1])
+    return [*found, A[n - 1, n - 1]]
 
 
 def tridiagonal(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:

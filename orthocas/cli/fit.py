@@ -22,10 +22,12 @@ from orthocas.cli.output import (
     whole_number,
 )
 from orthocas.cli.problem_argument import (
+    BRANCH,
     CHAIN,
     DOMAIN,
     WEIGHTS_TEXT,
     AnglesName,
+    BranchName,
     CorridorPath,
     CorridorRadius,
     DomainText,
@@ -37,6 +39,7 @@ from orthocas.cli.problem_argument import (
     corridor_or_box,
     parse_weights,
     suggested,
+    wide_fit,
     with_options,
 )
 from orthocas.errors import Interrupted, InvalidValueError, OptionError
@@ -46,6 +49,7 @@ from orthocas.fitting.probe import Bounds
 from orthocas.fitting.settings import PRECISIONS, Precision, default_parametrisation
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion
 from orthocas.fitting.terms import Weights
+from orthocas.fitting.wide import WideFit
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.problem import Problem
@@ -64,7 +68,8 @@ def fit(
         typer.Option(
             "--param",
             help="Parametrisation: polynomial:5, polynomial:5:cyclic, fourier:2, mlp:64x64, linear or sew; "
-            "default: polynomial:5, or polynomial:4 for more than seven joints; polynomial:3:cyclic with --corridor.",
+            "default: polynomial:5, or polynomial:4 for more than seven joints; polynomial:3:cyclic with --corridor; "
+            "polynomial:6 with --domain branch.",
         ),
     ] = None,
     solver: Annotated[
@@ -76,6 +81,7 @@ def fit(
         ),
     ] = None,
     domain: DomainText = None,
+    branch: BranchName = None,
     corridor: CorridorPath = None,
     radius: CorridorRadius = None,
     leak_deg: Annotated[
@@ -114,7 +120,14 @@ def fit(
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
     bounds = _bounds(domain, leak_deg, conditioning, corridor)
-    built = corridor_or_box(problem, words, corridor, radius) if bounds is None else None
+    wide = domain == BRANCH
+    if branch is not None and not wide:
+        raise OptionError("--branch requires --domain branch")
+    if wide:
+        usual_loss = weights == WEIGHTS_TEXT and angles is None and precision == PRECISIONS[0]
+        _require_none({"solver": solver, "max-mutual-deg": max_mutual_deg, "checkpoint": checkpoint})
+        _require_none({"weights, --angles and --precision": None if usual_loss else weights})
+    built = corridor_or_box(problem, words, corridor, radius) if bounds is None and not wide else None
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
     require_free(target, CHART, force)
     param = _IN_CORRIDOR if param is None and corridor is not None else param
@@ -126,22 +139,23 @@ def fit(
         with terminal_monitor() as monitor:
             if bounds is not None:
                 built, suggestion = suggested(problem, words, parametrisation, bounds, seed, monitor)
-            assert built is not None
-            others = (minimiser, samples, max_mutual_deg, checkpoint)
-            usual = others == (None,) * 4 and loss == Weights() and precision == PRECISIONS[0]
-            result = _confirming(suggestion, built, parametrisation) if usual else None
-            result = result or fit_chart(
-                built,
-                parametrisation,
-                minimiser,
-                weights=loss,
-                samples=samples,
-                seed=seed,
-                monitor=monitor,
-                max_mutual_deg=max_mutual_deg,
-                checkpoint=checkpoint,
-                precision=cast(Precision, precision),
-            )
+            if built is None:
+                result: Fit = wide_fit(problem, words, branch, parametrisation, samples, seed, monitor)
+            else:
+                others = (minimiser, samples, max_mutual_deg, checkpoint)
+                usual = others == (None,) * 4 and loss == Weights() and precision == PRECISIONS[0]
+                result = (_confirming(suggestion, built, parametrisation) if usual else None) or fit_chart(
+                    built,
+                    parametrisation,
+                    minimiser,
+                    weights=loss,
+                    samples=samples,
+                    seed=seed,
+                    monitor=monitor,
+                    max_mutual_deg=max_mutual_deg,
+                    checkpoint=checkpoint,
+                    precision=cast(Precision, precision),
+                )
     except Interrupted as stop:
         result = stop.result
     result.chart.save(target, force)
@@ -153,6 +167,13 @@ def fit(
     if result.status is Status.INTERRUPTED:
         note("interrupted: the chart holds the best coordinates found so far")
         raise typer.Exit(130)
+
+
+def _require_none(given: dict[str, Any]) -> None:
+    """Raise OptionError for options that wide charts do not have."""
+    for option, value in given.items():
+        if value is not None:
+            raise OptionError(f"--domain branch solves a convex problem of its own: leave out --{option}")
 
 
 def _confirming(
@@ -172,13 +193,15 @@ def _bounds(
     if domain is not None and corridor is not None:
         raise OptionError("--corridor is a domain: leave out --domain")
     given = {"--leak-deg": leak_deg, "--conditioning": conditioning}
-    if domain is None:
+    if domain in (None, BRANCH):
         for option, value in given.items():
             if value is not None:
                 raise OptionError(f"{option} requires --domain auto")
         return None
     if domain != "auto":
-        raise InvalidValueError("--domain", repr(domain), "auto, or --centre and --half-width for a box of your own")
+        raise InvalidValueError(
+            "--domain", repr(domain), "auto, branch, or --centre and --half-width for a box of your own"
+        )
     return Bounds(LEAK_DEG if leak_deg is None else leak_deg, CONDITIONING if conditioning is None else conditioning)
 
 
@@ -186,6 +209,9 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     coordinates = result.chart.coordinates
     rows = report_rows(report)
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
+    if isinstance(result, WideFit) and result.branch is not None:
+        rows["branch"] = f"{result.branch.name}, {result.branch.share:.1%} of the clear positions of the joint range"
+        rows["regular"] = f"{result.regular_share:.3%} of the clear positions of the branch, which are the domain"
     if result.idle_joints:
         rows["exact"] = f"joints that do not move the task: {', '.join(result.idle_joints)}"
     if result.cyclic_joints:
@@ -213,6 +239,12 @@ def _domain_rows(suggestion: DomainSuggestion) -> dict[str, str]:
     return rows
 
 
+def _wide(result: Fit) -> dict[str, Any]:
+    if not isinstance(result, WideFit) or result.branch is None:
+        return {}
+    return {"branch": result.branch.name, "regular_share": result.regular_share}
+
+
 def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSuggestion | None) -> dict[str, Any]:
     check = result.problem_check
     return {
@@ -222,6 +254,7 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
         "status": result.status.value,
         "seconds": result.seconds,
         "idle_joints": list(result.idle_joints),
+        **_wide(result),
         "least_conditioning": None if result.worst is None else result.worst.least,
         "cyclic_joints": list(result.cyclic_joints),
         "near_singular_share": check.singular_share,

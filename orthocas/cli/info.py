@@ -1,7 +1,9 @@
 """`orthocas info`: what a chart, a named problem or a robot file holds."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
@@ -16,10 +18,12 @@ from orthocas.cli.problem_argument import (
     is_robot_file,
     with_options,
 )
-from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.errors import InvalidValueError, OptionError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
+from orthocas.tasks.branches import branches as find_branches
 from orthocas.tasks.problem import Problem, check
+from orthocas.tasks.task import Task
 from orthocas.tools.json import plain
 
 if TYPE_CHECKING:
@@ -27,12 +31,23 @@ if TYPE_CHECKING:
 
 
 @with_options(*ROBOT)
-def info(target: ProblemName, words: ProblemOptions, json: AsJson = False) -> None:
+def info(
+    target: ProblemName,
+    words: ProblemOptions,
+    branches: Annotated[
+        bool, typer.Option("--branches", help="Of a robot: also the branches of its joint range, for wide charts.")
+    ] = False,
+    json: AsJson = False,
+) -> None:
     """Show a chart file, a named problem, or a robot file."""
     if is_robot_file(target):
-        data = _robot(build_robot(target, words))
+        robot = build_robot(target, words)
+        data = {**_robot(robot), **(_branches(robot, None) if branches else {})}
     elif target in problems.names():
-        data = _problem(build_problem(target, words))
+        problem = build_problem(target, words)
+        data = {**_problem(problem), **(_branches(problem.robot, problem.task) if branches else {})}
+    elif branches:
+        raise OptionError(f"--branches requires a robot file or a named problem, not the chart {target}")
     else:
         words.require_no_robot(f"the chart {target}")
         chart = _load(_chart_path(target))
@@ -75,6 +90,16 @@ def _robot(robot: Robot) -> dict[str, Any]:
         "homes": list(robot.homes),
         "tip": robot.tree.tip_name,
         "mass_kg": float(robot.tree.masses.sum()),
+    }
+
+
+def _branches(robot: Robot, task: Task | None) -> dict[str, Any]:
+    """The branches of the joint range: what cuts it, and for each its share of the clear positions and a posture."""
+    found = find_branches(robot, task)
+    return {
+        "cuts": [cut.explained for cut in found.cuts],
+        "branches": {item.name: item.share for item in found},
+        "postures": {item.name: plain(item.posture) for item in found},
     }
 
 

@@ -16,6 +16,7 @@ from orthocas.fitting.corridor_problem import RADIUS, corridor_problem
 from orthocas.fitting.probe import Bounds
 from orthocas.fitting.suggest_domain import DomainSuggestion, suggest_domain
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Angles, Weights
+from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide
 from orthocas.robots.homes import read_postures
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import default_box
@@ -75,9 +76,16 @@ ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A
 DomainText = Annotated[
     str | None,
     typer.Option(
-        "--domain", help="auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning."
+        "--domain",
+        help="auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning; "
+        "branch: all of a branch of the joint range (a wide chart).",
     ),
 ]
+BranchName = Annotated[
+    str | None,
+    typer.Option("--branch", help="A branch by its name, see orthocas info --branches; default: that of the home."),
+]
+BRANCH = "branch"  #: the word of --domain for wide charts
 
 
 @dataclass(frozen=True)
@@ -269,6 +277,41 @@ def suggested(
         monitor=monitor,
     )
     return Problem(robot, task, metric, found.domain, Path(name).stem if base is None else base.name), found
+
+
+def wide_fit(
+    name: str,
+    options: ProblemOptions,
+    branch: str | None,
+    parametrisation: Parametrisation | None,
+    samples: int | None,
+    seed: int,
+    monitor: Monitor,
+) -> WideFit:
+    """Fit the wide chart of `--domain branch`.
+
+    Raises:
+        UnknownNameError: if `name` is neither a named problem nor a robot file.
+        OrthocasError: if anything does not fit together.
+    """
+    for option in ("centre", "half_width"):
+        if getattr(options, option) is not None:
+            raise OptionError(f"--domain branch is a domain: leave out --{option.replace('_', '-')}")
+    base = None if is_robot_file(name) else build_problem(name, replace(options, least_singular_value=None))
+    robot = build_robot(name, options) if base is None else base.robot
+    known = options.least_singular_value
+    return fit_wide(
+        robot,
+        Task.named(robot, options.task or "position") if base is None else base.task,
+        branch,
+        (options.metric or "euclidean") if base is None else base.metric,
+        clearance=CLEARANCE if known is None else known,
+        parametrisation=parametrisation,
+        home=options.home if base is None else base.domain.centre,
+        samples=samples,
+        seed=seed,
+        monitor=monitor,
+    )
 
 
 CorridorPath = Annotated[

@@ -22,6 +22,7 @@ from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import Judged
+from orthocas.charts.regular_part import RegularPart
 from orthocas.charts.worst_points import worst_points
 from orthocas.errors import DomainError, Interrupted, InvalidValueError
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
@@ -31,7 +32,8 @@ from orthocas.fitting.settings import require_parametrisation
 from orthocas.robots.robot import Robot
 from orthocas.solvers.protocol import SolveResult, Status
 from orthocas.tasks.branches import Branch, Branches, branches
-from orthocas.tasks.domains import Box, sample_heavily
+from orthocas.tasks.clear_box import ClearBox
+from orthocas.tasks.domains import Box, sample_heavily, sample_uniform
 from orthocas.tasks.metric import Metric, MetricSpec, metric_matrices
 from orthocas.tasks.problem import Problem, check
 from orthocas.tasks.regular_box import home_posture
@@ -42,6 +44,7 @@ from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, Progress, silent
 
 CLEARANCE = 0.1  #: default least relative singular value
+LEAST_VOLUME = 0.05  #: of the coordinates, in the domains of wide charts; see `RegularPart`
 DEGREE = 6
 _PER_TERM, _LEAST_SAMPLES, _MOST_SAMPLES = 40, 5000, 40_000
 _TAG, _JUDGED_TAG, _FIRST_TAG = 3000, 3001, 1000  # seed tags; other samples use other ones
@@ -61,19 +64,21 @@ _SHRINK, _SHRINKS = 0.96, 12  # of a branch whose centre is not clear
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WideFit(Fit):
-    """A chart of a branch, and how it was found.
-
-    Its numbers are from 20,000 clear positions that took no part in the fit, two thirds of them near limits and cuts.
-    """
+    """A chart of a branch, and how it was found."""
 
     branch: Branch | None = None  #: the branch of the chart
-    regular_share: float = float("nan")  #: share of positions where no coordinate folds
+    regular_share: float = float(
+        "nan"
+    )  #: of the branch's clear positions, the share in the chart's domain, from 20,000 samples
 
     def facts(self) -> dict[str, str]:
         """The facts of a fit, with branch and regular share."""
         known = super().facts()
         branch = "" if self.branch is None else self.branch.name
-        own = {"branch": branch, "regular": f"{self.regular_share:.3%} of clear positions, many near limits"}
+        own = {
+            "branch": branch,
+            "regular": f"{self.regular_share:.3%} of the branch's clear positions; the domain is this part",
+        }
         return {"fit": known.pop("fit"), "problem": known.pop("problem"), **own, **known}
 
 
@@ -101,7 +106,8 @@ def fit_wide(
     over boundary-heavy samples of the branch that are clear of singular positions, by Newton's method. The second mean
     is least where gradients point along z, that is where coordinates are orthogonal to the task and to each other. Its
     weight s is the largest of five that leaves the fewest positions bad. Worst points are searched, and join the
-    samples. With r > 1 the problem is solved for one coordinate after the other, from a fit of degree 3.
+    samples. With r > 1 the problem is solved for one coordinate after the other, from a fit of degree 3. The domain of
+    the chart is the part of the branch where coordinates are regular with a margin, see `RegularPart`.
 
     Wide charts have one solution for what users ask nearly everywhere, but leaks of 20 to 60 degrees, as geometry has
     it. They serve inverse kinematics, closed loops and laws with the whole inertia; for decoupled control see `fit`.
@@ -168,11 +174,13 @@ def fit_wide(
 def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: bool) -> WideFit:
     """The result of a search, normalised and judged."""
     assert search.best is not None
-    folded, _, C = search.best
-    problem, seed = search.problem, search.seed
-    centre, status = problem.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
-    first = sample_problem(problem, _FIRST, (seed, _FIRST_TAG))
-    coordinates = in_gauge(normalised(search.coordinates(C), centre, first), centre)
+    clear, seed = search.problem, search.seed
+    centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
+    first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
+    coordinates = in_gauge(normalised(search.coordinates(search.best[2]), centre, first), centre)
+    domain = RegularPart(cast(ClearBox, clear.domain), coordinates, LEAST_VOLUME)
+    share = float(domain.is_clear(sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))).mean())
+    problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     worst = worst_points(problem, coordinates, seed, thorough=True)
     notes: dict[str, str | float] = {
         "solver": "convex",
@@ -180,7 +188,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         "samples": search.samples,
         "status": status.value,
         "branch": branch.name,
-        "regular share": 1 - folded,
+        "regular share": share,
         "least conditioning": worst.least,
     }
     return WideFit(
@@ -191,7 +199,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         worst=worst,
         seconds=time.perf_counter() - start,
         branch=branch,
-        regular_share=1 - folded,
+        regular_share=share,
     )
 
 

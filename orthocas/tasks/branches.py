@@ -97,7 +97,8 @@ class Branches(Shown, Sequence[Branch]):
         q_k - value changes its sign, and its neighbours turn by half a turn, towards the middle of their range.
         """
         q = as_point("q", q, self.robot.n)
-        return _reflected(self.robot, self.cuts[cut], q[None])[0]
+        found: Array = _reflected(self.robot, self.cuts[cut], q[None])[0]
+        return found
 
     def facts(self) -> dict[str, str]:
         """Cuts and branches."""
@@ -185,10 +186,10 @@ class _Arm:
         m = J.shape[1]
         moved = np.full(points.shape, np.nan)
         if m >= len(self.joints):
-            return np.linalg.svd(J, compute_uv=False)[:, -1], moved
+            return np.asarray(np.linalg.svd(J, compute_uv=False)[:, -1]), moved
         _, s, V = np.linalg.svd(J)
         moved[:, self.joints] = np.sqrt((V[:, m:] ** 2).sum(axis=1))
-        return s[:, -1], moved
+        return np.asarray(s[:, -1]), moved
 
     def cuts(self, k: int) -> list[Cut]:
         """The cuts of joint k."""

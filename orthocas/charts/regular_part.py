@@ -1,0 +1,159 @@
+"""The part of a clear box where coordinates do not fold: the domain of wide charts."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocas.bases.family import JointSpace
+from orthocas.bases.registry import parametrisation_from_data, parametrisation_to_data
+from orthocas.charts.angles import triangle
+from orthocas.charts.coordinates import Coordinates
+from orthocas.errors import DomainError, InvalidValueError
+from orthocas.tasks.clear_box import ClearBox
+from orthocas.tasks.domains import Box, Domain, register_domain
+from orthocas.tasks.task import Task
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, as_number, as_point_set, frozen_array, require_kind
+from orthocas.tools.json import part
+
+REGULAR_PART = "regular part"  #: name of the kind
+_ARRAYS = ("theta", "space_centre", "space_half_width")
+
+
+@register_domain
+@dataclass(frozen=True, eq=False, init=False, kw_only=True)
+class RegularPart(ClearBox):
+    """All q of a clear box at which coordinates are regular, with a margin.
+
+    The volume v(q) of coordinates is det [N; G] with an orthonormal basis N of the span of the frame Jacobian's rows
+    and unit gradients G, rows of coordinates after those of the task. For r = 1, it is the cosine of the angle between
+    gradient and self-motion. It has the sign of det J, so a chart whose domain keeps |v| > bound and the sign of the
+    centre has no fold. `fit_wide` builds it.
+
+    Args:
+        box: the clear box.
+        coordinates: the coordinates; offset and scale do not matter.
+        least_volume: the bound, > 0 and < 1.
+
+    Raises:
+        DomainError: if coordinates are not regular at the centre.
+    """
+
+    name: str = REGULAR_PART
+    coordinates: Coordinates
+    least_volume: float
+    orientation: float
+
+    def __init__(self, box: ClearBox, coordinates: Coordinates, least_volume: float) -> None:
+        require_kind("box", box, ClearBox)
+        require_kind("coordinates", coordinates, Coordinates)
+        bound = as_number("least_volume", least_volume)
+        if not 0 < bound < 1:
+            raise InvalidValueError("least_volume", least_volume, "a number between 0 and 1")
+        if coordinates.space.n != len(box.centre) or coordinates.r + box.task.m != len(box.centre):
+            raise InvalidValueError("coordinates", f"r = {coordinates.r}", f"n - m = {len(box.centre) - box.task.m}")
+        object.__setattr__(self, "coordinates", coordinates)
+        object.__setattr__(self, "least_volume", bound)
+        object.__setattr__(self, "orientation", 1.0)
+        whole = Box(box.centre, box.half_width, box.unbounded)
+        at_centre = float(_volume(box.task, coordinates)(box.centre))
+        object.__setattr__(self, "orientation", -1.0 if at_centre < 0 else 1.0)
+        if not abs(at_centre) > bound:
+            raise DomainError(
+                f"coordinates have the volume {at_centre:.3g} at the centre, expected one above {bound:g}"
+            )
+        super().__init__(whole, box.task, box.least_singular_value, box.scale, box.rows)
+
+    @property
+    def heading(self) -> str:
+        """Both conditions in one line."""
+        return f"{super().heading}, and volume of the coordinates above {self.least_volume:g}"
+
+    def numbers_of_condition(self) -> dict[str, Any]:
+        """Those of the clear box, and the bound."""
+        return {**super().numbers_of_condition(), "least_volume": self.least_volume}
+
+    def identity(self) -> list[Array]:
+        """Those of the clear box, bound and coordinates."""
+        return [*super().identity(), np.array([self.least_volume]), self.coordinates.theta]
+
+    def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Those of the clear box, bound and coordinates."""
+        data, arrays = super().to_data()
+        own, space = self.coordinates, self.coordinates.space
+        numbers = dict(zip(_ARRAYS, (own.theta, space.centre, space.half_width), strict=True))
+        kind = {**parametrisation_to_data(own.parametrisation), "idle": list(own.idle)}
+        return {**data, "least_volume": self.least_volume, "regular": kind}, {**arrays, **numbers}
+
+    @classmethod
+    def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
+        """The domain of a file."""
+        box = ClearBox.from_data(task, data, arrays)
+        require_kind("box", box, ClearBox)
+        clear, kind, robot = cast("ClearBox", box), part(data, "regular", dict), task.robot
+        theta, centre, half_width = (part(arrays, name, np.ndarray) for name in _ARRAYS)
+        n = robot.n
+        centre, half_width = (
+            frozen_array("space_centre", centre, (n,)),
+            frozen_array("space_half_width", half_width, (n,)),
+        )
+        space = JointSpace(centre, half_width, robot.tree.prismatic, robot.joint_names)
+        if not space.half_width.min() > 0:
+            raise InvalidValueError("space_half_width", space.half_width.min(), "positive numbers")
+        idle = tuple(part(kind, "idle", list))
+        fitted = n - clear.task.m - len(idle)
+        own = Coordinates(parametrisation_from_data(kind), space, idle, theta, np.zeros(fitted), np.ones(fitted))
+        return cls(clear, own, part(data, "least_volume", float))
+
+    def explained(self, q: Array) -> str:
+        """What is wrong with a position (n,) of the box."""
+        if self.singular_values(q) <= self.least_singular_value:
+            return super().explained(q)
+        bound = f"expected one above least_volume = {self.least_volume:g}"
+        return f"the coordinates have a volume of {self.volumes(q):.3g}, {bound}"
+
+    def within(self, box: Box) -> "RegularPart":
+        """The same conditions on another box."""
+        return RegularPart(super().within(box), self.coordinates, self.least_volume)
+
+    def volumes(self, q: ArrayLike) -> Any:
+        """v(q), positive as at the centre, at points (n,) or (N, n): a number, or (N,)."""
+        points, single = as_point_set("q", q, len(self.centre))
+        values: NDArray[np.float64] = self.orientation * self._batched_volume(points)[0][:, 0]
+        return values[0] if single else values
+
+    @property
+    def pivots(self) -> ca.Function:
+        """q (n, 1) -> those of the clear box, then v(q) - bound, (m + 1, 1)."""
+        return self._all_pivots
+
+    @cached_property
+    def _all_pivots(self) -> ca.Function:
+        q = ca.MX.sym("q", len(self.centre))
+        volume = _volume(self.task, self.coordinates)(q)
+        return dense_function(
+            "pivots", [q], [ca.vertcat(super().pivots(q), self.orientation * volume - self.least_volume)]
+        )
+
+    @cached_property
+    def _batched_volume(self) -> Batched:
+        return Batched(_volume(self.task, self.coordinates))
+
+
+def _volume(task: Task, coordinates: Coordinates) -> ca.Function:
+    """q (n, 1) -> v (1, 1)."""
+    n, m, r = task.robot.n, task.m, coordinates.r
+    rows, gradients = ca.SX.sym("rows", m, n), ca.SX.sym("gradients", r, n)
+    diagonal = triangle(ca.vertcat(rows, gradients))
+    value = ca.SX(1)
+    for k in range(n):
+        value *= ca.sign(diagonal[k]) if k < m else diagonal[k] / ca.norm_2(gradients[k - m, :])
+    volume = ca.Function("volume", [rows, gradients], [value])
+    q = ca.MX.sym("q", n)
+    found = volume(task.frame_jacobian_function(q), coordinates.functions["jacobian"](q))
+    return dense_function("volume", [q], [found])
