@@ -86,6 +86,15 @@ def clear() -> oc.Chart:
     return oc.fit(problem, oc.Polynomial(2), samples=300).chart
 
 
+BENT = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])
+
+
+@cache
+def wide() -> oc.WideFit:
+    known = problems.get("planar_3r_xy")
+    return oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Polynomial(3, ["q1"]))
+
+
 @cache
 def suggestion() -> Any:
     known = problems.get("planar_3r_xy")
@@ -223,6 +232,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "chart with an idle joint": with_idle_joint,
     "cyclic chart": cyclic,
     "chart of a clear box": clear,
+    "wide chart": lambda: wide().chart,
     "circle chart": circle,
     "disk chart": disk,
     "linear leaf chart": on_planes,
@@ -268,6 +278,10 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "box": lambda: planar().domain,
     "unbounded box": lambda: cyclic().problem.domain,
     "clear box": lambda: clear().problem.domain,
+    "regular part": lambda: wide().chart.problem.domain,
+    "wide fit": wide,
+    "branches": lambda: oc.branches(problems.get("iiwa").robot),
+    "branch": lambda: oc.branches(problems.get("iiwa").robot)[0],
     "corridor": lambda: oc.Corridor(oc.Box([0.0, 0.9], 0.8), [[0.0, 0.5], [0.3, 1.2]], [np.inf, 0.2]),
     "clear part of a domain": lambda: ClearPart(0.1, 0.95),
     "torus": lambda: oc.Torus(3),

@@ -15,6 +15,7 @@ from orthocas.bases.products import Fourier, Linear, Polynomial
 from orthocas.bases.registry import parametrisation_from_data, parametrisation_to_data
 from orthocas.charts.certificate import Certificate, Subdivision
 from orthocas.charts.coordinates import CoordinateMap, Coordinates
+from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
 from orthocas.exact.grown import GrownCoordinates
 from orthocas.exact.leaves import leaf_from_arrays
@@ -28,6 +29,7 @@ from orthocas.tools.json import part
 _TREES = ("regular", "injective")
 _CORNERS = ("low", "high", "codes")
 CHART = Kind("chart", 1, ChartFileError)
+KINDS = (RegularPart,)  #: of domains that files may have beside those of `orthocas.tasks`; the import registers them
 _PROBES = 8  # points of the domain where a chart that is read is evaluated
 _MODERATE = 1e50  # products of a few such numbers do not overflow
 _BOUNDED = (Polynomial, Fourier, Linear, MLP)  # finite wherever their parameters are

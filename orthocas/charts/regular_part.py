@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -36,7 +36,7 @@ class RegularPart(ClearBox):
     centre has no fold. `fit_wide` builds it.
 
     Args:
-        box: the clear box.
+        box: a clear box.
         coordinates: the coordinates; offset and scale do not matter.
         least_volume: the bound, > 0 and < 1.
 
@@ -49,8 +49,9 @@ class RegularPart(ClearBox):
     least_volume: float
     orientation: float
 
-    def __init__(self, box: ClearBox, coordinates: Coordinates, least_volume: float) -> None:
+    def __init__(self, box: Domain, coordinates: Coordinates, least_volume: float) -> None:
         require_kind("box", box, ClearBox)
+        assert isinstance(box, ClearBox)
         require_kind("coordinates", coordinates, Coordinates)
         bound = as_number("least_volume", least_volume)
         if not 0 < bound < 1:
@@ -94,8 +95,7 @@ class RegularPart(ClearBox):
     def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
         """The domain of a file."""
         box = ClearBox.from_data(task, data, arrays)
-        require_kind("box", box, ClearBox)
-        clear, kind, robot = cast("ClearBox", box), part(data, "regular", dict), task.robot
+        kind, robot = part(data, "regular", dict), task.robot
         theta, centre, half_width = (part(arrays, name, np.ndarray) for name in _ARRAYS)
         n = robot.n
         centre, half_width = (
@@ -106,9 +106,9 @@ class RegularPart(ClearBox):
         if not space.half_width.min() > 0:
             raise InvalidValueError("space_half_width", space.half_width.min(), "positive numbers")
         idle = tuple(part(kind, "idle", list))
-        fitted = n - clear.task.m - len(idle)
+        fitted = n - task.m - len(idle)
         own = Coordinates(parametrisation_from_data(kind), space, idle, theta, np.zeros(fitted), np.ones(fitted))
-        return cls(clear, own, part(data, "least_volume", float))
+        return cls(box, own, part(data, "least_volume", float))
 
     def explained(self, q: Array) -> str:
         """What is wrong with a position (n,) of the box."""

@@ -83,7 +83,8 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
     ]
     condition = None if source.condition is None else source.condition.condition
     if condition is not None:
-        found.append(scalar_code(ca.Function("pivots", [q], [condition.pivots(q)])))
+        pivots = ca.Function("pivots", [q], [condition.pivots(q)])  # as a graph where tables of coordinates are in it
+        found.append(pivots if condition.pivots.is_a("MXFunction") else scalar_code(pivots))
     if controller is not None:
         graph = source.graph(precision.graph(controller))
         inputs = graph.mx_in()

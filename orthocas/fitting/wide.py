@@ -32,10 +32,9 @@ from orthocas.fitting.settings import require_parametrisation
 from orthocas.robots.robot import Robot
 from orthocas.solvers.protocol import SolveResult, Status
 from orthocas.tasks.branches import Branch, Branches, branches
-from orthocas.tasks.clear_box import ClearBox
-from orthocas.tasks.domains import Box, sample_heavily, sample_uniform
+from orthocas.tasks.domains import Box, sample_evenly, sample_heavily, sample_uniform
 from orthocas.tasks.metric import Metric, MetricSpec, metric_matrices
-from orthocas.tasks.problem import Problem, check
+from orthocas.tasks.problem import Problem, check, relative_singular_values
 from orthocas.tasks.regular_box import home_posture
 from orthocas.tasks.samples import sample_problem
 from orthocas.tasks.task import Task
@@ -59,7 +58,7 @@ _TINY = 1e-12  # length of a row
 _NEWTON_STEPS, _GAIN, _RIDGE = 50, 1e-7, 1e-10
 _START = 3  # degree of the start, if there are several coordinates
 _START_WEIGHTS = (100.0, 3.0, 1000.0, 0.0, 10_000.0)
-_SHRINK, _SHRINKS = 0.96, 12  # of a branch whose centre is not clear
+_MIDDLES, _CLEARER = 20_000, 1.5  # positions that may be the middle of a domain, and their clearance over the bound
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -85,7 +84,7 @@ class WideFit(Fit):
 def fit_wide(
     robot: Robot,
     task: Task,
-    branch: Branch | str | None = None,
+    branch: Branch | Box | str | None = None,
     metric: Metric | MetricSpec = "euclidean",
     *,
     clearance: float = CLEARANCE,
@@ -115,7 +114,8 @@ def fit_wide(
     Args:
         robot: the robot.
         task: a task of that robot. A missing reference orientation is taken at the centre of the branch.
-        branch: a branch of `orthocas.branches`, or its name. Default: that of the home; with none there, the largest.
+        branch: a branch of `orthocas.branches`, its name, or a box of your own. Default: the branch of the home; with
+            none there, the largest.
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
         parametrisation: a family that is linear in its parameters. Default: Polynomial(6), with one linear
@@ -139,14 +139,17 @@ def fit_wide(
     Example:
         >>> import orthocas as oc
         >>> robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
-        >>> found = oc.fit_wide(robot, oc.Task.position(robot, "xy"), home=[0.6, 0.8, 0.8])
-        >>> found.regular_share
-        1.0
+        >>> bent = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])
+        >>> found = oc.fit_wide(robot, oc.Task.position(robot, "xy"), bent)
+        >>> found.regular_share > 0.99
+        True
     """
     start = time.perf_counter()
     require_kind("robot", robot, Robot)
     require_kind("task", task, Task)
     bound = as_number("clearance", clearance)
+    if not 0 < bound < np.inf:
+        raise InvalidValueError("clearance", clearance, "positive and finite")
     require_count("seed", seed, least=0)
     chosen = _chosen(robot, task, branch, home)
     problem = _problem(robot, task, metric, chosen, bound)
@@ -178,7 +181,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
     coordinates = in_gauge(normalised(search.coordinates(search.best[2]), centre, first), centre)
-    domain = RegularPart(cast(ClearBox, clear.domain), coordinates, LEAST_VOLUME)
+    domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME)
     share = float(domain.is_clear(sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))).mean())
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     worst = worst_points(problem, coordinates, seed, thorough=True)
@@ -203,10 +206,12 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     )
 
 
-def _chosen(robot: Robot, task: Task, branch: Branch | str | None, home: ArrayLike | str | None) -> Branch:
+def _chosen(robot: Robot, task: Task, branch: Branch | Box | str | None, home: ArrayLike | str | None) -> Branch:
     """The branch that is meant."""
     if isinstance(branch, Branch):
         return branch
+    if isinstance(branch, Box):
+        return Branch("box", branch, branch.centre, float("nan"), float("nan"))
     found: Branches = branches(robot, task)
     if branch is not None:
         return found[branch]
@@ -219,18 +224,20 @@ def _free_joints(problem: Problem) -> tuple[str, ...]:
 
 
 def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
-    """The problem on the clear part of a branch. Its box shrinks a little around the branch's posture if it must."""
+    """The problem on the clear part of a branch; if its middle is not clear, of the largest box whose middle is."""
     box = branch.box
-    low, high = box.centre - box.half_width, box.centre + box.half_width
-    for _ in range(_SHRINKS):
-        try:
-            domain = Box((low + high) / 2, (high - low) / 2, box.unbounded)
-            return Problem(robot, task, metric, domain, branch.name, clearance)
-        except DomainError:  # the centre is not clear
-            low, high = (branch.posture + _SHRINK * (end - branch.posture) for end in (low, high))
-    raise DomainError(
-        f"the middle of branch '{branch.name}' is not clear with clearance = {clearance:g}, expected less"
-    )
+    try:
+        return Problem(robot, task, metric, box, branch.name, clearance)
+    except DomainError:
+        points = sample_evenly(Box(box.centre, box.half_width), _MIDDLES, 0)
+    values = relative_singular_values(Problem(robot, task, metric, box), points)
+    middles = points[values > _CLEARER * clearance]
+    room = box.half_width - np.abs(middles - box.centre)
+    if not len(middles):
+        raise DomainError(f"branch '{branch.name}' has no position clear by clearance = {clearance:g}, expected less")
+    best = int(np.argmax(np.log(room).sum(axis=1)))
+    domain = Box(middles[best], room[best], box.unbounded)
+    return Problem(robot, task, metric, domain, branch.name, clearance)
 
 
 class _Field:

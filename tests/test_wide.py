@@ -1,0 +1,268 @@
+"""Branches of the joint range, and charts that are regular on a whole one."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chart_files import header_of, resealed
+from conftest import robot_data
+from numpy.typing import NDArray
+from programs import Run, needs_c
+from scipy.optimize import minimize
+
+import orthocas as oc
+from orthocas import control
+from orthocas.codegen import check_c
+from orthocas.errors import ChartFileError, DomainError, InvalidValueError, UnknownNameError
+from orthocas.fitting.wide import least_hinge
+from orthocas.tasks.domains import sample_heavily, sample_uniform
+
+Numbers = NDArray[np.float64]
+BENT = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])  # of the planar arm, which has no branches
+
+
+@cache
+def iiwa() -> oc.Robot:
+    return oc.problems.get("iiwa").robot
+
+
+@cache
+def panda() -> oc.Robot:
+    return oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+
+
+@cache
+def wide_pose() -> oc.WideFit:
+    return oc.fit_wide(
+        iiwa(), oc.Task.pose(iiwa()), "shoulder+ elbow- wrist+", parametrisation=oc.Polynomial(4, ["A1", "A7"])
+    )
+
+
+@cache
+def narrower() -> oc.Chart:
+    """The same coordinates where their volume is above 0.4, which is not everywhere."""
+    chart = wide_pose().chart
+    domain = oc.RegularPart(chart.problem.domain, wide_pose().chart.coordinates, 0.4)  # type: ignore[arg-type]
+    return oc.Chart(oc.Problem(iiwa(), chart.problem.task, domain=domain), chart.coordinates)
+
+
+@cache
+def wide_plane() -> oc.WideFit:
+    known = oc.problems.get("planar_3r_xy")
+    return oc.fit_wide(known.robot, known.task, BENT)
+
+
+def geometric_jacobians(robot: oc.Robot, q: Numbers) -> Numbers:
+    """Velocity and angular velocity of the tip per joint velocity, (N, 6, n), by differences of its pose."""
+    columns = []
+    for e in 1e-6 * np.eye(robot.n):
+        moved = (robot.tip_position(q + e) - robot.tip_position(q - e)) / 2e-6
+        turned = (
+            (robot.tip_rotation(q + e) - robot.tip_rotation(q - e)) / 2e-6 @ robot.tip_rotation(q).transpose(0, 2, 1)
+        )
+        columns.append(np.hstack([moved, turned[:, [2, 0, 1], [1, 2, 0]]]))
+    return np.stack(columns, axis=2)
+
+
+def self_motions(robot: oc.Robot, q: Numbers) -> Numbers:
+    """Generalised cross products of the rows, (N, n): a smooth field, by cofactors of NumPy's determinants."""
+    J = geometric_jacobians(robot, q)
+    signs = (-1.0) ** np.arange(robot.n)
+    return np.stack([signs[k] * np.linalg.det(np.delete(J, k, axis=2)) for k in range(robot.n)], axis=1)
+
+
+@pytest.mark.slow
+def test_branches_of_arms_are_cut_where_geometry_says() -> None:
+    found = oc.branches(iiwa())
+    assert [(cut.joint_name, cut.value, cut.singular, cut.exact) for cut in found.cuts] == [
+        ("A2", 0.0, False, True),
+        ("A4", 0.0, True, True),
+        ("A6", 0.0, False, True),
+    ]
+    assert len(found) == 8
+    np.testing.assert_allclose([item.share for item in found], 1 / 8, atol=5e-3)
+    offset = oc.branches(panda())  # axes of its elbow do not meet
+    assert [(cut.joint_name, cut.singular) for cut in offset.cuts] == [("panda_joint2", False), ("panda_joint4", True)]
+    stretched = -2 * np.arctan2(0.0825, 0.384) + 0.0  # both links, seen from the offset elbow
+    assert abs(offset.cuts[1].value - stretched) < 0.05
+
+
+@pytest.mark.slow
+def test_self_motions_do_not_cross_cuts() -> None:
+    q = sample_uniform(oc.Box(np.zeros(7), 2.0), 200, 3)
+    for cut in oc.branches(iiwa()).cuts:
+        on = q.copy()
+        on[:, cut.joint] = cut.value
+        z = self_motions(iiwa(), on)
+        clear = np.linalg.norm(self_motions(iiwa(), q), axis=1).mean()
+        moved = np.abs(z[:, cut.joint]) if not cut.singular else np.linalg.norm(z, axis=1)
+        assert moved.max() < 1e-8 * clear
+
+
+@pytest.mark.slow
+def test_mirrored_positions_have_the_same_pose() -> None:
+    found = oc.branches(iiwa())
+    assert found.mirrors == (0, 1, 2)
+    q = found["shoulder+ elbow- wrist+"].posture
+    for k, word in enumerate(("shoulder-", "elbow+", "wrist-")):
+        other = found.mirrored(q, k)
+        np.testing.assert_allclose(iiwa().tip_position(other), iiwa().tip_position(q), atol=1e-12)
+        np.testing.assert_allclose(iiwa().tip_rotation(other), iiwa().tip_rotation(q), atol=1e-12)
+        assert np.sign(other[2 * k + 1]) == -np.sign(q[2 * k + 1])
+        branch = found.of(other)
+        assert branch is None or word in branch.name  # a neighbour may lie beyond its limits
+
+
+@pytest.mark.slow
+def test_branches_are_found_by_name_and_position() -> None:
+    found = oc.branches(iiwa())
+    assert found.of(found[3].posture) is found[3]
+    assert found.of(np.full(7, 3.0)) is None
+    with pytest.raises(UnknownNameError, match="unknown branch 'up'"):
+        found["up"]
+
+
+@pytest.mark.slow
+def test_one_polynomial_is_regular_on_a_whole_branch() -> None:
+    fit = wide_pose()
+    assert fit.regular_share > 0.995
+    chart, domain = fit.chart, fit.chart.problem.domain
+    assert isinstance(domain, oc.RegularPart)
+    assert domain.half_width[1] > 0.99 * iiwa().upper[1] / 2  # from the cut to the limit
+    q = sample_heavily(domain, 3000, 8)
+    slopes = np.einsum("sn,sn->s", chart.coordinates.jacobian(q)[:, 0], self_motions(iiwa(), q))
+    assert np.sign(slopes).min() == np.sign(slopes).max()
+    assert fit.worst is not None
+    assert fit.worst.least > 0  # by descents, too
+
+
+@pytest.mark.slow
+def test_volumes_are_those_of_orthonormal_rows() -> None:
+    domain = narrower().problem.domain
+    assert isinstance(domain, oc.RegularPart)
+    q = sample_uniform(oc.Box(domain.centre, domain.half_width), 500, 4)
+    z = self_motions(iiwa(), q)
+    gradients = wide_pose().chart.coordinates.jacobian(q)[:, 0]
+    cosines = np.einsum("sn,sn->s", gradients, z) / np.linalg.norm(gradients, axis=1) / np.linalg.norm(z, axis=1)
+    found = domain.volumes(q)
+    np.testing.assert_allclose(found, np.sign(cosines @ found) * cosines, atol=1e-6)
+    inside = domain.is_clear(q)
+    clear = domain.singular_values(q) > domain.least_singular_value
+    np.testing.assert_array_equal(inside, clear & (found > domain.least_volume))
+    assert 0 < inside.sum() < clear.sum() < 500
+
+
+@pytest.mark.slow
+def test_charts_of_a_branch_are_saved_and_found_again(tmp_path: Path) -> None:
+    chart = wide_pose().chart
+    chart.save(tmp_path / "wide.orthocas")
+    loaded = oc.load(tmp_path / "wide.orthocas")
+    q = sample_uniform(chart.problem.domain, 300, 5)
+    np.testing.assert_array_equal(loaded.phi(q), chart.phi(q))
+    np.testing.assert_array_equal(loaded.problem.domain.contains(q * 1.2), chart.problem.domain.contains(q * 1.2))
+    found = chart.solve(chart.phi(q))
+    assert found.found.mean() > 0.99
+    back = chart.phi(found.q[found.found])
+    np.testing.assert_allclose(back[:, :3], chart.phi(q)[found.found][:, :3], atol=1e-8)
+
+
+@pytest.mark.slow
+def test_several_coordinates_are_regular_together() -> None:
+    fit = oc.fit_wide(iiwa(), oc.Task.position(iiwa()), parametrisation=oc.Polynomial(3, ["A1", "A7"]), samples=5000)
+    assert fit.chart.r == 4
+    assert fit.regular_share > 0.97
+    q = sample_uniform(fit.chart.problem.domain, 2000, 6)
+    J = np.concatenate([geometric_jacobians(iiwa(), q)[:, :3], fit.chart.coordinates.jacobian(q)], axis=1)
+    signs = np.sign(np.linalg.det(J))
+    assert signs.min() == signs.max()
+
+
+def test_the_hinge_has_the_least_value() -> None:
+    rng = np.random.default_rng(0)
+    D, weights = rng.normal(size=(60, 5)) + 0.4, rng.uniform(0.5, 2.0, 60)
+    energy = np.diag([1.0, 2.0, 3.0, 4.0, 5.0])
+
+    def value(c: Numbers) -> float:
+        return float(weights @ np.maximum(0, 1 - D @ c) ** 2 / weights.sum() + 0.1 * c @ energy @ c)
+
+    c, least = least_hinge(D, energy, weights, 0.1)
+    peer = minimize(value, np.zeros(5), method="BFGS", options={"gtol": 1e-10})
+    assert abs(least - peer.fun) < 1e-8
+    np.testing.assert_allclose(c, peer.x, atol=1e-5)
+
+
+@needs_c
+@pytest.mark.slow
+def test_c_knows_where_coordinates_are_regular(tmp_path: Path) -> None:
+    chart = wide_plane().chart
+    law = control.PDPlus(chart, 50.0)
+    check_c(oc.generate_c(chart, tmp_path, name="arm", controller=law), chart, law, states=400)
+
+
+@pytest.mark.slow
+def test_laws_stop_where_coordinates_end() -> None:
+    chart = narrower()
+    domain = chart.problem.domain
+    assert isinstance(domain, oc.RegularPart)
+    q = sample_heavily(oc.Box(domain.centre, domain.half_width), 20_000, 3)
+    clear = domain.singular_values(q) > 1.05 * domain.least_singular_value
+    bad = q[clear & (domain.volumes(q) < domain.least_volume)][0]
+    law, zero = control.PDPlus(chart, 50.0), np.zeros(7)
+    _, status = law.function(bad, zero, chart.phi(bad), zero, zero, *law.gains.values())
+    assert int(status) == control.ControlStatus.OUTSIDE_DOMAIN
+    assert "volume" in domain.explained(bad)
+
+
+@pytest.mark.slow
+def test_command_fits_a_branch(run: Run) -> None:
+    code, out, err = run("info", "iiwa", "--branches", "--json")
+    assert (code, err) == (0, "")
+    assert len(json.loads(out)["branches"]) == 8
+    words = (
+        "fit",
+        "iiwa",
+        "--task",
+        "pose",
+        "--domain",
+        "branch",
+        "--param",
+        "polynomial:3:cyclic=A1,A7",
+        "--out",
+        "a",
+    )
+    code, out, err = run(*words, "--branch", "shoulder+ elbow- wrist+", "--samples", "3000", "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["branch"] == "shoulder+ elbow- wrist+"
+    assert run(*words, "--solver", "lbfgs")[::2] == (
+        2,
+        "orthocas: --domain branch solves a convex problem of its own: leave out --solver\n",
+    )
+    assert run("fit", "iiwa", "--branch", "up")[::2] == (2, "orthocas: --branch requires --domain branch\n")
+
+
+def test_bad_settings_are_named() -> None:
+    known = oc.problems.get("planar_3r_xy")
+    with pytest.raises(InvalidValueError, match="clearance"):
+        oc.fit_wide(known.robot, known.task, clearance=float("nan"))
+    with pytest.raises(InvalidValueError, match=r"parametrisation is mlp:4x4, expected a family to fit that is linear"):
+        oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.MLP((4, 4)))
+    with pytest.raises(UnknownNameError, match="unknown branch 'up'"):
+        oc.fit_wide(known.robot, known.task, "up")
+
+
+def test_damaged_files_are_refused(tmp_path: Path) -> None:
+    wide_plane().chart.save(tmp_path / "a.orthocas")
+    header = header_of(tmp_path / "a.orthocas")
+    for value in (0.0, 1.0, -3.0):
+        header["problem"]["least_volume"] = value
+        with pytest.raises(ChartFileError, match="least_volume"):
+            oc.load(resealed(tmp_path / "a.orthocas", header))
+
+
+def test_regular_part_refuses_coordinates_that_fold_at_its_centre() -> None:
+    domain = wide_plane().chart.problem.domain
+    assert isinstance(domain, oc.RegularPart)
+    with pytest.raises(DomainError, match="coordinates have the volume .* at the centre"):
+        oc.RegularPart(domain, domain.coordinates, 0.999999)
