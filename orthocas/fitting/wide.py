@@ -21,7 +21,6 @@ from orthocas.bases.family import (
 from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.point_quality import Judged
 from orthocas.charts.regular_part import RegularPart
 from orthocas.charts.worst_points import worst_points
 from orthocas.errors import DomainError, Interrupted, InvalidValueError
@@ -43,15 +42,23 @@ from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, Progress, silent
 
 CLEARANCE = 0.1  #: default least relative singular value
-LEAST_VOLUME = 0.05  #: of the coordinates, in the domains of wide charts; see `RegularPart`
+LEAST_VOLUME = 0.05  #: over r, of the coordinates in domains of wide charts; see `RegularPart`
 DEGREE = 6
 _PER_TERM, _LEAST_SAMPLES, _MOST_SAMPLES = 40, 5000, 40_000
 _TAG, _JUDGED_TAG, _FIRST_TAG = 3000, 3001, 1000  # seed tags; other samples use other ones
 _FIRST = 200  # samples that scale coordinates
 _JUDGED = 20_000
 _PIECE = 1000  # samples whose gradients of all functions are in memory at once
-_SMOOTH = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4)  # weights of the mean squared gradient, from nearly orthogonal to regular
-_LEAST = 0.1  # slope along self-motions, relative to the gradient, below which a position counts as bad
+_SMOOTH = (
+    0.3,
+    0.1,
+    3e-2,
+    1e-2,
+    3e-3,
+    1e-3,
+    3e-4,
+)  # weights of the mean squared gradient
+_ENOUGH = 5e-4  # share of bad positions, many near limits, at which more smoothness is worth more
 _ROUNDS, _ADDED = 2, 5.0  # rounds with worst points, and the weight of each of these
 _EVERY = 4  # samples whose gradients count as long
 _TINY = 1e-12  # length of a row
@@ -104,12 +111,14 @@ def fit_wide(
 
     over boundary-heavy samples of the branch that are clear of singular positions, by Newton's method. The second mean
     is least where gradients point along z, that is where coordinates are orthogonal to the task and to each other. Its
-    weight s is the largest of five that leaves the fewest positions bad. Worst points are searched, and join the
-    samples. With r > 1 the problem is solved for one coordinate after the other, from a fit of degree 3. The domain of
-    the chart is the part of the branch where coordinates are regular with a margin, see `RegularPart`.
+    weight s is the largest of seven with which all but 0.05 % of other samples are regular; if there is none, worst
+    points are searched and join the samples. With r > 1 the problem is solved for one coordinate after the other, from
+    a fit of degree 3. The domain of the chart is the part of the branch where coordinates are regular with a margin,
+    see `RegularPart`.
 
-    Wide charts have one solution for what users ask nearly everywhere, but leaks of 20 to 60 degrees, as geometry has
-    it. They serve inverse kinematics, closed loops and laws with the whole inertia; for decoupled control see `fit`.
+    Wide charts hold wherever the arm gets without passing a singular position, but leaks are 20 to 60 degrees, as
+    geometry has it. They serve inverse kinematics, closed loops, trackers and laws with the whole inertia; see `fit`
+    for decoupled control. That det J keeps its sign does not mean that phi is one-to-one.
 
     Args:
         robot: the robot.
@@ -181,7 +190,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
     coordinates = in_gauge(normalised(search.coordinates(search.best[2]), centre, first), centre)
-    domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME)
+    domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     share = float(domain.is_clear(sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))).mean())
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     worst = worst_points(problem, coordinates, seed, thorough=True)
@@ -260,6 +269,13 @@ class _Field:
         squares = 1.0 if self.metric is None else np.einsum("si,sij,sj->s", z, self.metric, z)[:, None]
         return np.asarray(z / np.sqrt(squares))
 
+    def volumes(self, J: Array) -> Array:
+        """The volumes of `RegularPart` for gradients J (N, r, n), (N,)."""
+        N = np.linalg.qr(self.rows.transpose(0, 2, 1))[0].transpose(0, 2, 1)
+        N[:, 0] *= np.sign(np.linalg.det(N @ self.rows.transpose(0, 2, 1)))[:, None]
+        unit = J / np.maximum(np.linalg.norm(J, axis=2, keepdims=True), _TINY)
+        return np.asarray(np.linalg.det(np.concatenate([N, unit], axis=1)))
+
 
 class _Search:
     """A search for regular coordinates of a problem."""
@@ -273,27 +289,26 @@ class _Search:
         self._family: LinearFamily = family
         self._basis: BasisGradients = gradients_of(family, problem.n)
         self.samples = samples or int(np.clip(_PER_TERM * family.width, _LEAST_SAMPLES, _MOST_SAMPLES))
-        self.best: tuple[float, float, Array] | None = None  #: shares of folded and of bad positions, coefficients
+        self.best: tuple[float, float, Array] | None = None  #: share of bad positions, smoothness, coefficients
         self.stages: list[Stage] = []
 
     def run(self) -> None:
-        """Solve with less and less smoothness, then with the worst points of the best solution."""
-        self._judged = self._draw(_JUDGED, _JUDGED_TAG)
+        """Solve with less and less smoothness until coordinates are regular enough, then with worst points too."""
+        self._judged = _Field(self.problem, self._draw(_JUDGED, _JUDGED_TAG))
         fields = [_Field(self.problem, self._draw(self.samples, _TAG))]
         energy, C = self._energy(fields[0]), self._first()
-        smooth, least = _SMOOTH[0], np.inf
-        for trial in _SMOOTH:
-            C = self._swept(fields, energy, C, trial, f"smoothness {trial:g}")
-            folded = self._keep(C)
-            if folded < least:
-                smooth, least = trial, folded
+        for smooth in _SMOOTH:
+            C = self._swept(fields, energy, C, smooth, f"smoothness {smooth:g}")
+            if self._keep(C, smooth):
+                return
         for turn in range(1, 1 + _ROUNDS):
             assert self.best is not None
-            bad = worst_points(self.problem, self.coordinates(self.best[2]), self.seed).below(_LEAST)
-            if not len(bad):
-                break
-            fields.append(_Field(self.problem, bad, _ADDED))
-            self._keep(self._swept(fields, energy, self.best[2], smooth, f"worst points, round {turn}"))
+            _, smooth, C = self.best
+            fields.append(
+                _Field(self.problem, worst_points(self.problem, self.coordinates(C), self.seed).points, _ADDED)
+            )
+            if self._keep(self._swept(fields, energy, C, smooth, f"worst points, round {turn}"), smooth):
+                return
 
     def coordinates(self, C: Array) -> Coordinates:
         """Coordinates of coefficients (r, K), not normalised."""
@@ -313,14 +328,14 @@ class _Search:
         self.stages.append(Stage(name, C.size, len(weights), result))
         return C
 
-    def _keep(self, C: Array) -> float:
-        """Keep coefficients if they are the best so far; their share of folded positions."""
-        found = Judged.at(self.problem, self.coordinates(C), self._judged)
-        signed = found.signs * found.conditioning * (1.0 if found.signs.sum() >= 0 else -1.0)
-        folded, bad = (float(1 - np.sum(signed > least) / len(self._judged)) for least in (0.0, _LEAST))
-        if self.best is None or (folded, bad) < self.best[:2]:
-            self.best = folded, bad, C
-        return folded
+    def _keep(self, C: Array, smooth: float) -> bool:
+        """Keep coefficients if they are the best so far; whether they are regular enough."""
+        volumes = self._judged.volumes(self.coordinates(C).jacobian(self._judged.points))
+        orientation = 1.0 if np.median(volumes) >= 0 else -1.0
+        bad = float(np.mean(orientation * volumes <= LEAST_VOLUME / self.problem.r))
+        if self.best is None or bad < self.best[0]:
+            self.best = bad, smooth, C
+        return bad <= _ENOUGH
 
     def _first(self) -> Array:
         """Where the search starts, (r, K): anywhere with one coordinate, otherwise at a fit of low degree."""

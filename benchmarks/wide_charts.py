@@ -1,0 +1,118 @@
+"""Wide charts of arms that nobody tuned: time, regular share, quality, targets found, loops closed (12 min)."""
+
+import time
+from importlib.metadata import files
+from pathlib import Path
+
+import numpy as np
+from benchmark import run, table
+from numpy.typing import NDArray
+
+import orthocas as oc
+from orthocas.tasks.domains import sample_uniform
+
+Numbers = NDArray[np.float64]
+ROBOTS = {  # of the package example-robot-data: file and tip
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef"),
+    "baxter, left": ("baxter_description/urdf/baxter.urdf", "left_gripper_base_link"),
+    "pr2, lift and left": ("pr2_description/urdf/pr2.urdf", "l_gripper_tool_frame"),
+    "tiago, with its lift": ("tiago_description/robots/tiago.urdf", "arm_7_link"),
+    "tiago pro, lift and left": ("tiago_pro_description/robots/tiago_pro.urdf", "arm_left_tool_link"),
+    "centauro, torso and arm": ("centauro_description/urdf/centauro.urdf", "arm1_8"),
+}
+POSITIONS = ("iiwa", "panda", "xarm7", "baxter, left")
+HEADER = (
+    "| arm, task | branch, its share | fit [s CPU] | regular share | leak rms [deg] | conditioning mean, 1 % "
+    "| targets found |\n|" + " --- |" * 7
+)
+LOOPS = (
+    "| arm | radius [m] | closed, xi held | left over [rad] | closed, pseudo-inverse | left over [rad] |\n|"
+    + " --- |" * 6
+)
+STEPS = 300  #: of a circle
+
+
+def robot_of(name: str) -> oc.Robot:
+    """The 7-DoF arm, or a robot of example-robot-data."""
+    if name not in ROBOTS:
+        return oc.problems.get(name).robot
+    file, tip = ROBOTS[name]
+    path = next(Path(str(f.locate())).resolve() for f in files("example-robot-data") or [] if str(f).endswith(file))
+    return oc.Robot.from_urdf(path, tip)
+
+
+def row(name: str, task: str, quick: bool, charts: dict[str, oc.Chart]) -> str:
+    """One row of the table: the chart of the home's branch, with default settings. Charts of poses are kept."""
+    robot, start = robot_of(name), time.process_time()
+    polynomial = oc.Polynomial(3, ["A1", "A7"]) if quick else None
+    fit = oc.fit_wide(robot, oc.Task.named(robot, task), parametrisation=polynomial, samples=3000 if quick else None)
+    seconds, chart, branch = time.process_time() - start, fit.chart, fit.branch
+    assert branch is not None
+    if task == "pose":
+        charts[name] = chart
+    report = oc.evaluate(chart, 2000 if quick else 100_000, seed=1)
+    targets = chart.phi(sample_uniform(chart.problem.domain, 50 if quick else 2000, 2))
+    return (
+        f"| {name}, {task} | {branch.name}, {branch.share:.0%} | {seconds:.1f} | {fit.regular_share:.3%} "
+        f"| {report.leak.rms:.1f} | {report.conditioning.mean:.2f}, {report.conditioning.p01:.2f} "
+        f"| {chart.solve(targets).found.mean():.2%} |"
+    )
+
+
+def circle(robot: oc.Robot, q: Numbers, radius: float) -> Numbers:
+    """Positions of a circle in the y-z plane that begins and ends at the tip, (STEPS, 3)."""
+    angles = np.linspace(0, 2 * np.pi, STEPS + 1)[1:]
+    around = np.stack([0 * angles, 1 - np.cos(angles), np.sin(angles)], axis=1)
+    return np.asarray(robot.tip_position(q) + radius * around)
+
+
+def with_chart(chart: oc.Chart, q: Numbers, path: Numbers) -> float:
+    """What a circle with xi held leaves over in the joints; NaN if it cannot be followed inside the domain."""
+    tracker, phi = chart.tracker(q), chart.phi(q)
+    for position in path:
+        now = tracker.step(np.concatenate([position, phi[3:]]))
+        if tracker.status != oc.TrackerStatus.OK:
+            return float("nan")
+    return float(np.abs(now - q).max())
+
+
+def with_pseudo_inverse(chart: oc.Chart, q: Numbers, path: Numbers) -> float:
+    """The same with steps of least norm."""
+    task, domain, x = chart.problem.task, chart.problem.domain, chart.phi(q)[:6]
+    clear = oc.ClearBox(oc.Box(domain.centre, domain.half_width), task, 0.1, domain.scale)  # type: ignore[attr-defined]
+    now = q.copy()
+    for position in path:
+        for _ in range(4):
+            error = np.concatenate([position, x[3:]]) - task.batched(now[None])[0].ravel()
+            now = now + np.linalg.pinv(task.batched_jacobian(now[None])[0].reshape(6, -1)) @ error
+        if not clear.contains(now):
+            return float("nan")
+    return float(np.abs(now - q).max())
+
+
+def loops(name: str, chart: oc.Chart, radius: float, starts: int) -> str:
+    """One row: circles of one radius at constant orientation, from starts in the inner three quarters."""
+    domain = chart.problem.domain
+    drawn = sample_uniform(domain, 40 * starts, 5)
+    inner = drawn[(np.abs(drawn - domain.centre) < 0.75 * domain.half_width).all(axis=1)][:starts]
+    words = []
+    for follow in (with_chart, with_pseudo_inverse):
+        left = np.array([follow(chart, q, circle(chart.problem.robot, q, radius)) for q in inner])
+        known = left[np.isfinite(left)]
+        words.append(f"{len(known)} of {len(inner)} | {np.median(known) if len(known) else np.nan:.1e}")
+    return f"| {name} | {radius:g} | {' | '.join(words)} |"
+
+
+def main(quick: bool = False) -> list[str]:
+    """All rows; `quick` takes one arm, cubic coordinates and few samples."""
+    cases = [("iiwa", "pose"), *((name, "pose") for name in ROBOTS), *((name, "position") for name in POSITIONS)]
+    charts: dict[str, oc.Chart] = {}
+    rows = table(HEADER, (row(*case, quick, charts) for case in (cases[:1] if quick else cases)))
+    arms = [(name, radius) for name in ("iiwa", "panda") for radius in (0.05, 0.1, 0.2, 0.3)]
+    count = 3 if quick else 60
+    return rows + table(LOOPS, (loops(name, charts[name], radius, count) for name, radius in arms[: 1 if quick else 8]))
+
+
+if __name__ == "__main__":
+    run(main, __doc__)
