@@ -29,6 +29,7 @@ SCRIPTS = (
     "atlas",
     "atlas_c",
     "suggested_domains",
+    "wide_charts",
     "choices",
     "elbow_angle",
     "scaling",

@@ -31,6 +31,7 @@ import quality_and_time
 import scaling
 import starts
 import suggested_domains
+import wide_charts
 import supervised_tick
 from paper.registry import FIGURES
 from PIL import Image
@@ -286,3 +287,12 @@ def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -
     assert oc.evaluate(chart, points=points).leak.rms == pytest.approx(
         np.sqrt((elbow_angle.leaks(chart, points) ** 2).mean()), rel=1e-6
     )
+
+
+@pytest.mark.slow
+def test_benchmark_of_wide_charts_closes_loops() -> None:
+    row, loops = wide_charts.main(quick=True)
+    assert float(row.split("|")[4].strip("% ")) > 99
+    words = [word.strip() for word in loops.split("|")]
+    assert words[3] == "3 of 3"
+    assert float(words[4]) < 1e-9

@@ -127,11 +127,11 @@ def _step(value: Value, u: Array, found: Array, step: Array, rng: np.random.Gene
 
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:
     """Conditioning times the sign of det J at points of the cube, (N,); NaN outside the domain."""
-    points = _joint_positions(problem, u)
-    judged = Judged.at(problem, coordinates, points)
-    values = np.full(len(u), np.nan)
-    values[judged.kept] = judged.signs * judged.conditioning
-    return np.where(contains(problem.domain, points), values, np.nan)
+    points, values = _joint_positions(problem, u), np.full(len(u), np.nan)
+    inside = np.flatnonzero(contains(problem.domain, points))  # outside, the task may have no finite Jacobian
+    judged = Judged.at(problem, coordinates, points[inside])
+    values[inside[judged.kept]] = judged.signs * judged.conditioning
+    return values
 
 
 def _joint_positions(problem: Problem, u: Array) -> Array:
