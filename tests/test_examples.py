@@ -31,8 +31,8 @@ import quality_and_time
 import scaling
 import starts
 import suggested_domains
-import wide_charts
 import supervised_tick
+import wide_charts
 from paper.registry import FIGURES
 from PIL import Image
 from programs import needs_c

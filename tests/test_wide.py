@@ -215,6 +215,31 @@ def test_laws_stop_where_coordinates_end() -> None:
     assert "volume" in domain.explained(bad)
 
 
+@needs_c
+@pytest.mark.slow
+def test_the_whole_inertia_follows_in_mujoco(run: Run, tmp_path: Path) -> None:
+    wide_pose().chart.save(tmp_path / "wide.orthocas")
+    branch = wide_pose().branch
+    assert branch is not None
+    points = [{"time": 1.0, "move": {"y": -0.2}}, {"time": 2.0, "move": {"z": 0.1, "xi1": 0.3}}]
+    (tmp_path / "points.json").write_text(json.dumps({"start": branch.posture.tolist(), "points": points}))
+    words = (
+        "simulate",
+        str(tmp_path / "wide.orthocas"),
+        "--controller",
+        "pd_plus",
+        "--steps",
+        str(tmp_path / "points.json"),
+    )
+    simulator = ("--rate", "1000", "--plant", "mujoco", "--supervised", "--animation", "none")
+    code, out, _ = run(*words, *simulator, "--out", str(tmp_path / "run"), "--json")
+    assert code == 0
+    report = json.loads(out)
+    assert report["outcome"] == "complete"
+    largest = report["tracking_error"]
+    assert max(largest[name] for name in "xyz") < 1e-4  # m, though gradients lean into the task by 40 degrees
+
+
 @pytest.mark.slow
 def test_command_fits_a_branch(run: Run) -> None:
     code, out, err = run("info", "iiwa", "--branches", "--json")
