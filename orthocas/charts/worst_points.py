@@ -128,7 +128,9 @@ def _step(value: Value, u: Array, found: Array, step: Array, rng: np.random.Gene
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:
     """Conditioning times the sign of det J at points of the cube, (N,); NaN outside the domain."""
     points, values = _joint_positions(problem, u), np.full(len(u), np.nan)
-    inside = np.flatnonzero(contains(problem.domain, points))  # outside, the task may have no finite Jacobian
+    inside = np.flatnonzero(contains(problem.domain, points))
+    J = problem.task.batched_jacobian(points[inside])[0]
+    inside = inside[np.isfinite(J.reshape(len(inside), -1)).all(axis=1)]  # not half a turn from the reference
     judged = Judged.at(problem, coordinates, points[inside])
     values[inside[judged.kept]] = judged.signs * judged.conditioning
     return values
