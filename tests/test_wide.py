@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 
 import orthocas as oc
 from orthocas import control
+from orthocas.bases.sew import sew_angle
 from orthocas.codegen import check_c
 from orthocas.errors import ChartFileError, DomainError, InvalidValueError, UnknownNameError
 from orthocas.fitting.wide import least_hinge
@@ -179,15 +180,44 @@ def test_several_coordinates_are_regular_together() -> None:
     assert signs.min() == signs.max()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("like", ["swivel", "A3"])
+def test_coordinates_mean_what_is_asked(like: str) -> None:
+    task, polynomial = oc.Task.pose(iiwa()), oc.Polynomial(4, ["A1", "A7"])
+    fit = oc.fit_wide(iiwa(), task, "shoulder+ elbow- wrist+", like=like, parametrisation=polynomial)
+    assert fit.regular_share > 0.995
+    assert fit.branch is not None
+    q, chart = fit.branch.posture, fit.chart
+    value = sew_angle(iiwa(), "conventional") if like == "swivel" else lambda q: q[2]
+    assert abs(float(chart.xi(q)[0]) - float(value(q))) < 1e-9
+    tracker, phi = chart.tracker(q), chart.phi(q)
+    for moved in (0.1, 0.2, 0.3):
+        there = tracker.step(phi + np.append(np.zeros(6), moved))
+        assert tracker.status is oc.TrackerStatus.OK
+        assert abs(float(value(there)) - float(value(q)) - moved) < 0.01
+        np.testing.assert_allclose(iiwa().tip_position(there), iiwa().tip_position(q), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_meanings_that_cannot_be_are_refused() -> None:
+    task = oc.Task.pose(iiwa())
+    with pytest.raises(InvalidValueError, match="like is a quantity that stands still at the home"):
+        oc.fit_wide(iiwa(), task, "shoulder+ elbow- wrist+", like="A4")  # the elbow bends as the hand is far
+    with pytest.raises(UnknownNameError, match="unknown like 'elbow'"):
+        oc.fit_wide(iiwa(), task, "shoulder+ elbow- wrist+", like="elbow")
+    with pytest.raises(InvalidValueError, match="r = 4"):
+        oc.fit_wide(iiwa(), oc.Task.position(iiwa()), "shoulder+ elbow- wrist+", like="A3")
+
+
 def test_the_hinge_has_the_least_value() -> None:
     rng = np.random.default_rng(0)
     D, weights = rng.normal(size=(60, 5)) + 0.4, rng.uniform(0.5, 2.0, 60)
-    energy = np.diag([1.0, 2.0, 3.0, 4.0, 5.0])
+    energy, pull = np.diag([1.0, 2.0, 3.0, 4.0, 5.0]), rng.normal(size=5) * 0.1
 
     def value(c: Numbers) -> float:
-        return float(weights @ np.maximum(0, 1 - D @ c) ** 2 / weights.sum() + 0.1 * c @ energy @ c)
+        return float(weights @ np.maximum(0, 1 - D @ c) ** 2 / weights.sum() + 0.1 * c @ energy @ c - 2 * pull @ c)
 
-    c, least = least_hinge(D, energy, weights, 0.1)
+    c, least = least_hinge(D, 0.1 * energy, weights, pull)
     peer = minimize(value, np.zeros(5), method="BFGS", options={"gtol": 1e-10})
     assert abs(least - peer.fun) < 1e-8
     np.testing.assert_allclose(c, peer.x, atol=1e-5)

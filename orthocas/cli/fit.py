@@ -31,6 +31,7 @@ from orthocas.cli.problem_argument import (
     CorridorPath,
     CorridorRadius,
     DomainText,
+    LikeName,
     PrecisionName,
     ProblemName,
     ProblemOptions,
@@ -82,6 +83,7 @@ def fit(
     ] = None,
     domain: DomainText = None,
     branch: BranchName = None,
+    like: LikeName = None,
     corridor: CorridorPath = None,
     radius: CorridorRadius = None,
     leak_deg: Annotated[
@@ -121,8 +123,9 @@ def fit(
     """Fit extra coordinates to a problem and save the chart."""
     bounds = _bounds(domain, leak_deg, conditioning, corridor)
     wide = domain == BRANCH
-    if branch is not None and not wide:
-        raise OptionError("--branch requires --domain branch")
+    for option, value in {"--branch": branch, "--like": like}.items():
+        if value is not None and not wide:
+            raise OptionError(f"{option} requires --domain branch")
     if wide:
         usual_loss = weights == WEIGHTS_TEXT and angles is None and precision == PRECISIONS[0]
         _require_none({"solver": solver, "max-mutual-deg": max_mutual_deg, "checkpoint": checkpoint})
@@ -140,7 +143,7 @@ def fit(
             if bounds is not None:
                 built, suggestion = suggested(problem, words, parametrisation, bounds, seed, monitor)
             if built is None:
-                result: Fit = wide_fit(problem, words, branch, parametrisation, samples, seed, monitor)
+                result: Fit = wide_fit(problem, words, branch, like, parametrisation, samples, seed, monitor)
             else:
                 others = (minimiser, samples, max_mutual_deg, checkpoint)
                 usual = others == (None,) * 4 and loss == Weights() and precision == PRECISIONS[0]
@@ -212,6 +215,8 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     if isinstance(result, WideFit) and result.branch is not None:
         rows["branch"] = f"{result.branch.name}, {result.branch.share:.1%} of the clear positions of the joint range"
         rows["regular"] = f"{result.regular_share:.3%} of the clear positions of the branch, which are the domain"
+        if (error := result.chart.notes.get("error of its meaning")) is not None:
+            rows["meaning"] = f"xi1 is what was asked, but for {float(error):.2g} rms along the home's self-motion"
     if result.idle_joints:
         rows["exact"] = f"joints that do not move the task: {', '.join(result.idle_joints)}"
     if result.cyclic_joints:

@@ -85,6 +85,12 @@ BranchName = Annotated[
     str | None,
     typer.Option("--branch", help="A branch by its name, see orthocas info --branches; default: that of the home."),
 ]
+LikeName = Annotated[
+    str | None,
+    typer.Option(
+        "--like", help="What xi of a wide chart means along the self-motion of the home: a joint, or swivel (r = 1)."
+    ),
+]
 BRANCH = "branch"  #: the word of --domain for wide charts
 
 
@@ -283,6 +289,7 @@ def wide_fit(
     name: str,
     options: ProblemOptions,
     branch: str | None,
+    like: str | None,
     parametrisation: Parametrisation | None,
     samples: int | None,
     seed: int,
@@ -307,7 +314,8 @@ def wide_fit(
         (options.metric or "euclidean") if base is None else base.metric,
         clearance=CLEARANCE if known is None else known,
         parametrisation=parametrisation,
-        home=options.home if base is None else base.domain.centre,
+        home=options.home if base is None else base.domain.centre if branch is None else None,
+        like=like,
         samples=samples,
         seed=seed,
         monitor=monitor,

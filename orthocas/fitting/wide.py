@@ -1,10 +1,11 @@
 """Wide charts: coordinates that are regular on a whole branch of the joint range."""
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
+import casadi as ca
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
@@ -19,6 +20,7 @@ from orthocas.bases.family import (
     Parametrisation,
 )
 from orthocas.bases.products import Polynomial
+from orthocas.bases.sew import sew_angle
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.regular_part import RegularPart
@@ -37,9 +39,13 @@ from orthocas.tasks.problem import Problem, check, relative_singular_values
 from orthocas.tasks.regular_box import home_posture
 from orthocas.tasks.samples import sample_problem
 from orthocas.tasks.task import Task
-from orthocas.tools.checks import Array, as_number, require_count, require_kind
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.checks import Array, as_number, require_count, require_kind, require_known, require_shape
+from orthocas.tools.expressions import expression_of
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, Progress, silent
+
+Quantity = Callable[[ca.SX], ca.SX]  #: a function of an SX column q
 
 CLEARANCE = 0.1  #: default least relative singular value
 LEAST_VOLUME = 0.05  #: over r, of the coordinates in domains of wide charts; see `RegularPart`
@@ -63,6 +69,9 @@ _ROUNDS, _ADDED = 2, 5.0  # rounds with worst points, and the weight of each of 
 _EVERY = 4  # samples whose gradients count as long
 _TINY = 1e-12  # length of a row
 _NEWTON_STEPS, _GAIN, _RIDGE = 50, 1e-7, 1e-10
+_MEANT = 100.0  # weight of the mean squared error of a meaning, relative to the slope
+_STEP, _MOST_STEPS, _FEWEST = 0.02, 400, 5  # of unit self-motions, along which a meaning is taken
+_STILL = 1e-3  # change of a quantity for a unit self-motion
 _START = 3  # degree of the start, if there are several coordinates
 _START_WEIGHTS = (100.0, 3.0, 1000.0, 0.0, 10_000.0)
 _MIDDLES, _CLEARER = 20_000, 1.5  # positions that may be the middle of a domain, and their clearance over the bound
@@ -97,6 +106,7 @@ def fit_wide(
     clearance: float = CLEARANCE,
     parametrisation: Parametrisation | None = None,
     home: ArrayLike | str | None = None,
+    like: Quantity | str | None = None,
     samples: int | None = None,
     seed: int = 0,
     monitor: Monitor = silent,
@@ -130,6 +140,9 @@ def fit_wide(
         parametrisation: a family that is linear in its parameters. Default: Polynomial(6), with one linear
             term for each joint on whose position self-motions do not depend, such as the first and the last one.
         home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
+        like: with r = 1, what xi is to mean: a function of an SX column q, the name of a joint, or "swivel", the angle
+            of the elbow about the line from shoulder to wrist [rad]. Along the self-motion of the home, or else of the
+            branch's posture, xi then has nearly the values of that quantity, as far as these are monotone there.
         samples: number of samples. Default: 40 for each function, 5,000 to 40,000.
         seed: seed of the samples.
         monitor: called with progress.
@@ -170,7 +183,11 @@ def fit_wide(
     if wanted.closed_form is not None or not isinstance(wanted.family(JointSpace.of(problem), problem.r), LinearFamily):
         raise InvalidValueError("parametrisation", wanted.label, "a family to fit that is linear in its parameters")
     count = None if samples is None else require_count("samples", samples, least=2)
-    search = _Search(problem, wanted, count, seed, monitor)
+    meaning = None
+    if like is not None:
+        posture = chosen.posture if home is None else home_posture(robot, task, home).q
+        meaning = Meaning.of(problem, _quantity(robot, like), posture)
+    search = _Search(problem, wanted, count, seed, monitor, meaning)
     with remembered() as pressed:
         try:
             search.run()
@@ -189,7 +206,11 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     clear, seed = search.problem, search.seed
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
-    coordinates = in_gauge(normalised(search.coordinates(search.best[2]), centre, first), centre)
+    raw = search.coordinates(search.best[2])
+    if search.meaning is None:
+        coordinates = in_gauge(normalised(raw, centre, first), centre)
+    else:
+        coordinates = search.meaning.named(raw)
     domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     share = float(domain.is_clear(sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))).mean())
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
@@ -202,6 +223,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         "branch": branch.name,
         "regular share": share,
         "least conditioning": worst.least,
+        **({} if search.meaning is None else {"error of its meaning": search.meaning.error(coordinates)}),
     }
     return WideFit(
         chart=Chart(problem, coordinates, notes),
@@ -213,6 +235,90 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         branch=branch,
         regular_share=share,
     )
+
+
+def _quantity(robot: Robot, like: Quantity | str) -> ca.Function:
+    """q (n, 1) -> the quantity (1, 1)."""
+    q = ca.SX.sym("q", robot.n)
+    if isinstance(like, str):
+        require_known("like", like, ("swivel", *robot.joint_names))
+        return sew_angle(robot, "conventional") if like == "swivel" else _of(q, q[robot.joint_names.index(like)])
+    found = expression_of("like", like, q)
+    require_shape("like", found.shape, (1, 1))
+    return _of(q, found)
+
+
+def _of(q: ca.SX, value: ca.SX) -> ca.Function:
+    return dense_function("like", [q], [value])
+
+
+@dataclass(frozen=True, eq=False)
+class Meaning:
+    """Values that a coordinate is to have along the self-motion of a posture."""
+
+    points: Array  #: (k, n), the posture in the middle
+    values: Array  #: (k,), monotone
+    middle: int  #: place of the posture
+    slope: float  #: mean change of the value for a unit self-motion, in the sense of `_Field.directions`
+
+    @classmethod
+    def of(cls, problem: Problem, quantity: ca.Function, posture: Array) -> "Meaning":
+        """Follow the self-motion of a posture both ways, as long as it is in the domain and the quantity is monotone.
+
+        Raises:
+            InvalidValueError: if r > 1, or the quantity stands still there.
+        """
+        if problem.r != 1:
+            raise InvalidValueError(
+                "like", f"given with r = {problem.r}", "none: a meaning for all coordinates but one"
+            )
+        sides = [_followed(problem, posture, sign * _STEP) for sign in (-1.0, 1.0)]
+        points = np.concatenate([sides[0][:0:-1], sides[1]])
+        middle = len(sides[0]) - 1
+        values = np.unwrap(Batched(quantity)(points)[0][:, 0])  # angles do not jump
+        steps = np.diff(values)
+        if len(points) < _FEWEST or not np.isfinite(steps).all():
+            raise InvalidValueError(
+                "like", "of too short a self-motion at the home", "another home, farther from limits"
+            )
+        k = min(middle, len(steps) - 1)
+        same = np.sign(steps) == np.sign(steps[k])
+        low = k - int(np.argmin(same[k::-1])) + 1 if not same[: k + 1].all() else 0
+        high = k + int(np.argmin(same[k:])) if not same[k:].all() else len(steps)
+        slope = (values[high] - values[low]) / (_STEP * max(1, high - low))
+        if high - low < _FEWEST or abs(slope) < _STILL:
+            raise InvalidValueError("like", "a quantity that stands still at the home", "one that self-motions change")
+        return cls(points[low : high + 1], values[low : high + 1], middle - low, float(slope))
+
+    def equations(self, family: LinearFamily) -> tuple[Array, Array]:
+        """Rows (k, K) and right sides (k,) of the coefficients, over the slope."""
+        q = ca.SX.sym("q", self.points.shape[1])
+        psi = Batched(dense_function("psi", [q], [family.basis(q)]))(self.points)[0].reshape(len(self.points), -1)
+        return psi - psi[self.middle], (self.values - self.values[self.middle]) / self.slope
+
+    def named(self, raw: Coordinates) -> Coordinates:
+        """Coordinates in units of the quantity, with its value at the posture."""
+        xi = raw.once("xi", self.points[self.middle][None])[0, 0]
+        return replace(raw, offset=np.array([xi - self.values[self.middle] / self.slope]), scale=np.array([self.slope]))
+
+    def error(self, coordinates: Coordinates) -> float:
+        """Root mean square of what coordinates miss along the self-motion."""
+        return float(np.sqrt(np.mean((coordinates.once("xi", self.points)[:, 0] - self.values) ** 2)))
+
+
+def _followed(problem: Problem, posture: Array, step: float) -> Array:
+    """The self-motion from a posture in steps of unit self-motions, up to the boundary of the domain, (k, n)."""
+    found = [posture]
+
+    def slope(q: Array) -> Array:
+        return _Field(problem, q[None]).directions(np.zeros((1, 1, problem.n)), 0)[0]
+
+    while len(found) < _MOST_STEPS and problem.domain.contains(found[-1]):
+        q = found[-1]
+        middle = q + step / 2 * slope(q)
+        again = q + step / 2 * slope(middle)
+        found.append(q + step / 6 * (slope(q) + 2 * slope(middle) + 2 * slope(again) + slope(q + step * slope(again))))
+    return np.array(found[:-1] if len(found) > 1 else found)
 
 
 def _chosen(robot: Robot, task: Task, branch: Branch | Box | str | None, home: ArrayLike | str | None) -> Branch:
@@ -281,9 +387,16 @@ class _Search:
     """A search for regular coordinates of a problem."""
 
     def __init__(
-        self, problem: Problem, parametrisation: Parametrisation, samples: int | None, seed: int, monitor: Monitor
+        self,
+        problem: Problem,
+        parametrisation: Parametrisation,
+        samples: int | None,
+        seed: int,
+        monitor: Monitor,
+        meaning: Meaning | None,
     ) -> None:
         self.problem, self.parametrisation, self.seed, self.monitor = problem, parametrisation, seed, monitor
+        self.meaning = meaning
         family = parametrisation.family(JointSpace.of(problem), problem.r)
         assert isinstance(family, LinearFamily)
         self._family: LinearFamily = family
@@ -319,10 +432,13 @@ class _Search:
         """Coefficients (r, K) after the problem of each coordinate was solved once."""
         started, C = time.perf_counter(), C.copy()
         weights = np.concatenate([np.full(len(field.points), field.weight) for field in fields])
-        value = 0.0
+        value, E, pull = 0.0, smooth * energy + _RIDGE * np.trace(energy) / len(energy) * np.eye(len(energy)), None
+        if self.meaning is not None:
+            rows, sides = self.meaning.equations(self._family)
+            E, pull = E + _MEANT / len(rows) * rows.T @ rows, _MEANT / len(rows) * rows.T @ sides
         for k in range(len(C)):
             design = np.concatenate([self._design(field, C, k) for field in fields])
-            C[k], value = least_hinge(design, energy, weights, smooth)
+            C[k], value = least_hinge(design, E, weights, pull)
             self.monitor(Progress(name, (k + 1) / len(C), f"loss {value:.5g}", value))
         result = SolveResult(C.ravel(), value, Status.CONVERGED, len(C), len(C), time.perf_counter() - started)
         self.stages.append(Stage(name, C.size, len(weights), result))
@@ -382,22 +498,20 @@ class _Search:
         return total / len(points)
 
 
-def least_hinge(D: Array, energy: Array, weights: Array, smooth: float) -> tuple[Array, float]:
-    """The c (K,) with the least sum_s w_s max(0, 1 - D_s c)^2 / sum w + smooth c^T E c, by Newton's method; its value.
+def least_hinge(D: Array, E: Array, weights: Array, pull: Array | None = None) -> tuple[Array, float]:
+    """The c (K,) with the least sum_s w_s max(0, 1 - D_s c)^2 / sum w + c^T E c - 2 g^T c, and that value.
 
     Args:
         D: (N, K).
-        energy: E, (K, K), positive semidefinite.
+        E: (K, K), positive definite.
         weights: w, (N,).
-        smooth: > 0.
+        pull: g, (K,). Default: 0.
     """
-    weights = weights / weights.sum()
-    E = smooth * energy
-    E[np.diag_indices(len(E))] += _RIDGE * np.trace(energy) / len(E)
+    weights, g = weights / weights.sum(), np.zeros(len(E)) if pull is None else pull
 
     def value(c: Array) -> float:
         short = np.maximum(0.0, 1 - D @ c)
-        return float(weights @ short**2 + c @ E @ c)
+        return float(weights @ short**2 + c @ E @ c - 2 * g @ c)
 
     c, last, now = np.zeros(len(E)), np.inf, np.inf
     for _ in range(_NEWTON_STEPS):
@@ -405,13 +519,13 @@ def least_hinge(D: Array, energy: Array, weights: Array, smooth: float) -> tuple
         rows = D[active]
         weighted = rows * weights[active, None]
         factor = scipy.linalg.cho_factor(rows.T @ weighted + E)
-        step = scipy.linalg.cho_solve(factor, weighted.sum(axis=0)) - c
+        step = scipy.linalg.cho_solve(factor, weighted.sum(axis=0) + g) - c
         size = 1.0
         while not value(c + size * step) < last and size > 1e-3:
             size /= 2
         c = c + size * step
         now = value(c)
-        if last - now <= _GAIN * now:
+        if last - now <= _GAIN * abs(now):
             break
         last = now
     return c, now
