@@ -311,7 +311,8 @@ def _followed(problem: Problem, posture: Array, step: float) -> Array:
     found = [posture]
 
     def slope(q: Array) -> Array:
-        return _Field(problem, q[None]).directions(np.zeros((1, 1, problem.n)), 0)[0]
+        found: Array = _Field(problem, q[None]).directions(np.zeros((1, 1, problem.n)), 0)[0]
+        return found
 
     while len(found) < _MOST_STEPS and problem.domain.contains(found[-1]):
         q = found[-1]
