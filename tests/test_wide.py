@@ -297,6 +297,14 @@ def test_command_fits_a_branch(run: Run) -> None:
     assert run("fit", "iiwa", "--branch", "up")[::2] == (2, "orthocas: --branch requires --domain branch\n")
 
 
+@pytest.mark.slow
+def test_decoupled_laws_are_warned_of_the_leak() -> None:
+    chart = wide_pose().chart
+    decoupled, coupled = control.PDPlus(chart, 50.0, coupling="decoupled"), control.PDPlus(chart, 50.0)
+    assert any("lean into the task by 4" in remark for remark in decoupled.remarks())
+    assert not any("lean into" in remark for remark in coupled.remarks())
+
+
 def test_bad_settings_are_named() -> None:
     known = oc.problems.get("planar_3r_xy")
     with pytest.raises(InvalidValueError, match="clearance"):

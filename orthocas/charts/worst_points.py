@@ -130,7 +130,9 @@ def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array)
     points, values = _joint_positions(problem, u), np.full(len(u), np.nan)
     inside = np.flatnonzero(contains(problem.domain, points))
     J = problem.task.batched_jacobian(points[inside])[0]
-    inside = inside[np.isfinite(J.reshape(len(inside), problem.m * problem.n)).all(axis=1)]  # not half a turn from the reference
+    inside = inside[
+        np.isfinite(J.reshape(len(inside), problem.m * problem.n)).all(axis=1)
+    ]  # not half a turn from the reference
     judged = Judged.at(problem, coordinates, points[inside])
     values[inside[judged.kept]] = judged.signs * judged.conditioning
     return values

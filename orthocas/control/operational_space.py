@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
+from orthocas.charts.point_quality import Judged
 from orthocas.charts.worst_points import least_in_domain
 from orthocas.control.controller import (
     Command,
@@ -45,6 +46,7 @@ from orthocas.tools.checks import Array, as_point_set, require_kind, require_kno
 from orthocas.tools.display import Shown, number_list
 
 _MODE_SAMPLES = 256
+_MUCH_DEG = 15.0  # leak from which on decoupled laws are warned of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -247,14 +249,19 @@ class _OperationalSpace(Shown):
     def remarks(self) -> list[str]:
         """Warnings.
 
-        The metric does not decouple task and extra coordinates, D is not positive semi-definite, or the task describes
-        an orientation by a rotation vector.
+        The metric does not decouple task and extra coordinates, a decoupled law has a chart that leaks much, D is not
+        positive semi-definite, or the task describes an orientation by a rotation vector.
         """
         found, metric = [], self.problem.metric.name
         if metric != "inertia":
             found.append(
                 f"the metric of this chart is {metric}, but task and extra coordinates are decoupled only for A = M "
                 "(inertia)"
+            )
+        if self.coupling == "decoupled" and (leak := self._leak_deg()) > _MUCH_DEG:
+            found.append(
+                f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull at "
+                "both, which coupled ones do not; see docs/wide.md"
             )
         if share := self.check_damping().indefinite_share:
             found.append(
@@ -268,6 +275,12 @@ class _OperationalSpace(Shown):
                 "last joint, keeps that turn apart, and such arms then hold more unknown mass"
             )
         return found + self.model.remarks()
+
+    def _leak_deg(self) -> float:
+        """Root mean square of the chart's leaks at samples [deg]."""
+        points = sample_uniform(self.problem.domain, _MODE_SAMPLES, 0)
+        sines = Judged.at(self.problem, self.chart.coordinates, points).leak_sines
+        return float(np.degrees(np.sqrt(np.mean(np.arcsin(np.clip(sines, 0.0, 1.0)) ** 2))))
 
     @property
     def problem(self) -> Problem:

@@ -211,7 +211,13 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         coordinates = in_gauge(normalised(raw, centre, first), centre)
     else:
         coordinates = search.meaning.named(raw)
-    domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
+    try:
+        domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
+    except DomainError as error:
+        advice = (
+            f"in the middle of branch '{branch.name}', {error}: give a smaller box as branch, or a home in another one"
+        )
+        raise DomainError(advice) from None
     share = float(domain.is_clear(sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))).mean())
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     worst = worst_points(problem, coordinates, seed, thorough=True)
