@@ -15,8 +15,9 @@ from scipy.optimize import minimize
 import orthocas as oc
 from orthocas import control
 from orthocas.bases.sew import sew_angle
+from orthocas.charts.self_motion import StopKind
 from orthocas.codegen import check_c
-from orthocas.errors import ChartFileError, DomainError, InvalidValueError, UnknownNameError
+from orthocas.errors import ChartFileError, DomainError, InvalidValueError, ShapeError, UnknownNameError
 from orthocas.fitting.wide import least_hinge
 from orthocas.tasks.domains import sample_heavily, sample_uniform
 
@@ -167,6 +168,43 @@ def test_charts_of_a_branch_are_saved_and_found_again(tmp_path: Path) -> None:
     assert found.found.mean() > 0.99
     back = chart.phi(found.q[found.found])
     np.testing.assert_allclose(back[:, :3], chart.phi(q)[found.found][:, :3], atol=1e-8)
+
+
+@pytest.mark.slow
+def test_the_nearest_xi_is_the_end_of_its_range() -> None:
+    chart = wide_pose().chart
+    domain = chart.problem.domain
+    there, wishes = sample_uniform(domain, 40, 7), sample_uniform(domain, 40, 8)
+    x = chart.phi(there)[:, :6]
+    found = chart.nearest_xi(wishes, x)
+    wanted, got = chart.xi(wishes)[:, 0], chart.xi(found.q)[:, 0]
+    assert found.found.sum() > 20  # some are possible as they are
+    np.testing.assert_allclose(got[found.found], wanted[found.found], atol=1e-7)
+    compared = 0
+    for k, status in enumerate(found.statuses):
+        if status is not oc.InverseStatus.NEAREST:
+            continue
+        assert domain.contains(found.q[k])
+        np.testing.assert_allclose(iiwa().tip_position(found.q[k]), iiwa().tip_position(there[k]), atol=1e-8)
+        (reach,) = chart.xi_range(found.q[k])
+        end = np.clip(wanted[k], reach.low, reach.high)
+        assert abs(got[k] - end) < 1e-4
+        compared += 1
+    assert compared > 3
+    assert abs(chart.nearest_xi(there[0]).q[0] - there[0]).max() < 1e-9  # its own x and xi
+    with pytest.raises(ShapeError, match="x"):
+        chart.nearest_xi(there, x[:, :5])
+
+
+@pytest.mark.slow
+def test_self_motions_end_where_coordinates_do() -> None:
+    chart = narrower()
+    stops = set()
+    for q in sample_uniform(chart.problem.domain, 40, 2):
+        (reach,) = chart.xi_range(q)
+        stops |= {reach.low_stop.kind, reach.high_stop.kind}
+        assert chart.problem.domain.contains(q)
+    assert StopKind.FOLD in stops  # v(q) is at its bound of 0.4
 
 
 @pytest.mark.slow

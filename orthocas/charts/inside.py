@@ -235,9 +235,12 @@ class Nearest:
         upper = np.zeros(m)
         clear = domain.singular_bound
         if clear is not None:
-            pivots = clear.pivots(q) / clear.least_singular_value**2
+            pivots = clear.pivots(q)[: clear.gram.size1_out(0)] / clear.least_singular_value**2
             constraints += [_CLEAR - _products(pivots)]  # the pivots themselves have poles
             upper = np.zeros(m + m)
+            if domain.room_to_fold is not None:
+                constraints += [_CLEAR - domain.room_to_fold(q)]
+                upper = np.zeros(m + m + 1)
         elif domain.condition is not None:
             constraints += [-domain.condition.pivots(q)]
             upper = np.zeros(m + domain.condition.pivots.size1_out(0))

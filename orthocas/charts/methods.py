@@ -133,6 +133,34 @@ class InverseMethods(PhiFunctions):
         inverse = self._inverse if local is None else replace(self._inverse, local=local)
         return inverse.solve(targets, starts, float(tolerance), inside)
 
+    def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
+        """Joint positions in the domain with task values x, and of these the xi nearest to that of a wished posture.
+
+        For postures of a person or a demonstration, which the arm is to resemble while its hand is elsewhere. It is
+        `solve` for phi = [x; xi(q_wish)] with `inside=True`, from q_wish.
+
+        Args:
+            q_wish: wished joint positions, (n,) or (N, n). What lies beyond the box of the domain is moved to its face.
+            x: task values, (m,) or (N, m). Default: those of q_wish.
+            tolerance: as in `solve`.
+
+        Returns:
+            As `solve`: FOUND where that xi is possible, NEAREST where another one had to be taken, NOT_FOUND where no
+            position with that x was found.
+
+        Raises:
+            ShapeError: if a row has another number of entries, or x another number of rows.
+            NoExpressionError: for grown coordinates.
+        """
+        wishes = np.clip(self._rows("q_wish", q_wish), *bounds_of(self.problem.domain))
+        phi = np.array(self.phi(wishes))
+        if x is not None:
+            values = as_float_array("x", x)
+            if values.shape not in ((self.m,), (len(phi), self.m)):
+                raise ShapeError("x", values.shape, (len(phi), self.m))
+            phi[:, : self.m] = values
+        return self.solve(phi, wishes, tolerance=tolerance, inside=True)
+
     def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
         """All q inside the domain with phi(q) = phi that a search of the whole domain finds.
 

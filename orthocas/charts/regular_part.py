@@ -135,10 +135,14 @@ class RegularPart(ClearBox):
     @cached_property
     def _all_pivots(self) -> ca.Function:
         q = ca.MX.sym("q", len(self.centre))
+        return dense_function("pivots", [q], [ca.vertcat(super().pivots(q), self.room_to_fold(q))])
+
+    @cached_property
+    def room_to_fold(self) -> ca.Function:
+        """q (n, 1) -> v(q) - bound, (1, 1)."""
+        q = ca.MX.sym("q", len(self.centre))
         volume = _volume(self.task, self.coordinates)(q)
-        return dense_function(
-            "pivots", [q], [ca.vertcat(super().pivots(q), self.orientation * volume - self.least_volume)]
-        )
+        return dense_function("room_to_fold", [q], [self.orientation * volume - self.least_volume])
 
     @cached_property
     def _batched_volume(self) -> Batched:

@@ -39,7 +39,7 @@ class StopKind(Enum):
 
     JOINT = "joint"  #: a joint is at the boundary of the domain, or at its limit
     NEAR_SINGULAR = "near singular"  #: the relative singular value of the task is at the bound of a `ClearBox`
-    FOLD = "fold"  #: the coordinate turns back: J = dphi/dq is singular
+    FOLD = "fold"  #: the coordinate turns back, or would: J = dphi/dq is singular, or at the bound of a `RegularPart`
     SINGULAR = "singular"  #: no way on: the task is singular there, or grown coordinates end
     ENDLESS = "endless"  #: nothing: the motion returns to its start up to full turns of unbounded joints
 
@@ -69,14 +69,14 @@ class Walls:
     """The boundaries of a problem's domain as functions that are positive inside.
 
     They are (q_i - low_i) and (high_i - q_i), divided by the half-width of the domain, for every bounded joint; and for
-    a `ClearBox` also s(q) - bound.
+    a `ClearBox` also s(q) - bound, for a `RegularPart` v(q) - bound.
     """
 
     def __init__(self, problem: Problem) -> None:
         domain = problem.domain
         self._domain, self._robot = domain, problem.robot
         self._low, self._high = bounds_of(domain)
-        self._clear = domain.singular_bound
+        self._clear, self._room = domain.singular_bound, domain.room_to_fold
         endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
         self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
 
@@ -87,12 +87,17 @@ class Walls:
         if self._clear is not None:
             value = self._clear.singular_values(q) - self._clear.least_singular_value
             parts.append(np.array([value if np.isfinite(value) else -1.0]))
+        if self._room is not None:
+            room = float(self._room(q))
+            parts.append(np.array([room if np.isfinite(room) else -1.0]))
         return np.concatenate(parts)
 
     def stop(self, k: int, q: Array) -> Stop:
         """What the k-th function stands for, at q (n,)."""
         n = len(q)
-        if k >= 2 * n:
+        if k > 2 * n:
+            return Stop(StopKind.FOLD)
+        if k == 2 * n:
             assert self._clear is not None
             return Stop(StopKind.NEAR_SINGULAR, value=float(self._clear.singular_values(q)))
         i = k % n

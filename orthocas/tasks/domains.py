@@ -77,6 +77,14 @@ class Domain(ABC):
         """The condition, if it is a bound on the distance to a path."""
         return None
 
+    @property
+    def room_to_fold(self) -> ca.Function | None:
+        """q (n, 1) -> a number (1, 1) that is positive inside, if a chart's coordinates end where it is 0.
+
+        For domains that have this beside a bound on singular values; it is the last one of the pivots of `condition`.
+        """
+        return None
+
     def require_bounds(self, what: str) -> None:
         """Raise DomainError unless proofs and C know the form of the condition."""
         if not (self.is_box or self.singular_bound or self.path_bound):
