@@ -17,9 +17,11 @@ from orthocas import control
 from orthocas.bases.sew import sew_angle
 from orthocas.charts.self_motion import StopKind
 from orthocas.codegen import check_c
-from orthocas.errors import ChartFileError, DomainError, InvalidValueError, ShapeError, UnknownNameError
+from orthocas.errors import ChartFileError, DomainError, Interrupted, InvalidValueError, ShapeError, UnknownNameError
 from orthocas.fitting.wide import least_hinge
+from orthocas.solvers.protocol import Status
 from orthocas.tasks.domains import sample_heavily, sample_uniform
+from orthocas.tools.progress import Progress
 
 Numbers = NDArray[np.float64]
 BENT = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])  # of the planar arm, which has no branches
@@ -341,6 +343,25 @@ def test_decoupled_laws_are_warned_of_the_leak() -> None:
     decoupled, coupled = control.PDPlus(chart, 50.0, coupling="decoupled"), control.PDPlus(chart, 50.0)
     assert any("lean into the task by 4" in remark for remark in decoupled.remarks())
     assert not any("lean into" in remark for remark in coupled.remarks())
+
+
+def test_interrupted_fits_keep_the_best_so_far() -> None:
+    known = oc.problems.get("planar_3r_xy")
+    reports = []
+
+    def stop(progress: Progress) -> None:
+        reports.append(progress.stage)
+        if len(reports) == 2:
+            raise KeyboardInterrupt
+
+    whole = oc.Box([0.0, 1.0, 1.0], [3.0, 1.8, 1.8])  # nothing is regular enough there, so all steps are taken
+    with pytest.raises(Interrupted) as stopped:
+        oc.fit_wide(known.robot, known.task, whole, monitor=stop)
+    fit = stopped.value.result
+    assert fit.status is Status.INTERRUPTED
+    assert len(fit.stages) == 1  # the second was not finished
+    with pytest.raises(KeyboardInterrupt):
+        oc.fit_wide(known.robot, known.task, BENT, monitor=lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
 
 
 def test_bad_settings_are_named() -> None:

@@ -55,15 +55,7 @@ _TAG, _JUDGED_TAG, _FIRST_TAG = 3000, 3001, 1000  # seed tags; other samples use
 _FIRST = 200  # samples that scale coordinates
 _JUDGED = 20_000
 _PIECE = 1000  # samples whose gradients of all functions are in memory at once
-_SMOOTH = (
-    0.3,
-    0.1,
-    3e-2,
-    1e-2,
-    3e-3,
-    1e-3,
-    3e-4,
-)  # weights of the mean squared gradient
+_SMOOTH = (0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4)  # weights of the mean squared gradient
 _ENOUGH = 5e-4  # share of bad positions, many near limits, at which more smoothness is worth more
 _ROUNDS, _ADDED = 2, 5.0  # rounds with worst points, and the weight of each of these
 _EVERY = 4  # samples whose gradients count as long
@@ -189,14 +181,16 @@ def fit_wide(
         meaning = Meaning.of(problem, _quantity(robot, like), posture)
     search = _Search(problem, wanted, count, seed, monitor, meaning)
     with remembered() as pressed:
+        stopped = False
         try:
             search.run()
         except KeyboardInterrupt:
             if search.best is None:
                 raise
-        result = _finished(search, chosen, start, interrupted=pressed())
-    if pressed():
-        raise Interrupted(result)
+            stopped = True
+        result = _finished(search, chosen, start, interrupted=stopped or pressed())
+        if result.status is Status.INTERRUPTED or pressed():
+            raise Interrupted(result)
     return result
 
 
@@ -214,10 +208,8 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     try:
         domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     except DomainError as error:
-        advice = (
-            f"in the middle of branch '{branch.name}', {error}: give a smaller box as branch, or a home in another one"
-        )
-        raise DomainError(advice) from None
+        advice = "give a smaller box as branch, or another branch"
+        raise DomainError(f"in the middle of branch '{branch.name}', {error}: {advice}") from None
     share = float(domain.is_clear(sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))).mean())
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     worst = worst_points(problem, coordinates, seed, thorough=True)
