@@ -119,8 +119,9 @@ def fit_wide(
     see `RegularPart`.
 
     Wide charts hold on most of what the arm reaches without passing a singular position (`regular_share`), but their
-    leaks are large, 20 to 70 degrees on the arms that were measured. They serve inverse kinematics, closed loops, trackers and laws with the whole inertia; see `fit`
-    for decoupled control. That det J keeps its sign does not mean that phi is one-to-one.
+    leaks are large, 20 to 70 degrees on the arms that were measured. They serve inverse kinematics, closed loops,
+    trackers and laws with the whole inertia; see `fit` for decoupled control. That det J keeps its sign does not mean
+    that phi is one-to-one.
 
     Args:
         robot: the robot.
