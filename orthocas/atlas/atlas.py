@@ -18,13 +18,14 @@ from orthocas.atlas.plan import AtlasSettings, Plan, is_turning
 from orthocas.atlas.view_session import AtlasSession
 from orthocas.charts.chart import Chart
 from orthocas.charts.newton import Newton
-from orthocas.charts.phi import PhiMap, largest
+from orthocas.charts.phi import Differences, PhiMap, largest
 from orthocas.codegen.library import GeneratedC
 from orthocas.codegen.proof import Proof
 from orthocas.control.controller import Controller
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.relative import Relative
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
@@ -122,7 +123,7 @@ def inverse_in_charts(evaluation: Evaluation, phi: Array, charts: Indices, start
 
 def _phi_map(evaluation: Evaluation, chart: int) -> PhiMap:
     """(h, xi) in one chart."""
-    task = evaluation.index.plan.problem.task
+    relative = Relative(task := evaluation.index.plan.problem.task)
 
     def charts(q: Array) -> Indices:
         return np.full(len(q), chart)
@@ -131,11 +132,11 @@ def _phi_map(evaluation: Evaluation, chart: int) -> PhiMap:
         return np.hstack([task.batched(q)[0], evaluation.xi(q, charts(q))])
 
     def jacobian(q: Array) -> Array:
-        J_x = task.batched_jacobian(q)[0].reshape(len(q), task.m, -1)
+        J_x = relative.batched_rates(q)[0].reshape(len(q), task.m, -1)
         return np.concatenate([J_x, evaluation.jacobian(q, charts(q))], axis=1)
 
     n = evaluation.index.plan.problem.n
-    return PhiMap(phi, jacobian, np.ones(n), np.zeros(n))
+    return PhiMap(phi, jacobian, np.ones(n), Differences(np.zeros(n), relative))
 
 
 Turns = tuple[int, ...]  #: full turns of each joint that boxes divide; then steps of cyclic ones, for orientations

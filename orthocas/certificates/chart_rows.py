@@ -179,7 +179,7 @@ def closed_form_rows(rows: ca.Function, joints: Sequence[int], allowance: float 
 
 def true_gradients(task: Task, joints: Sequence[int]) -> tuple[GraphRows, set[int]]:
     """Columns of J_x itself, the derivative of h, and the joints that they depend on."""
-    return _derivatives(task.function, joints, "the task")
+    return _derivatives(task.smooth_function, joints, "the task")
 
 
 def _derivatives(function: ca.Function, joints: Sequence[int], what: str) -> tuple[GraphRows, set[int]]:

@@ -68,7 +68,7 @@ def _same_after_turns(chart: Chart) -> set[int]:
     """The joints whose full turns change neither J_x nor J_xi."""
     coordinates = chart.coordinates
     assert isinstance(coordinates, Coordinates)  # `chart_rows` has refused others
-    task = _alike(to_tape(chart.problem.task.function), chart.n)
+    task = _alike(to_tape(chart.problem.task.smooth_function), chart.n)
     if not len(coordinates.offset):
         return task
     own = _family_alike(coordinates.family, len(coordinates.active), coordinates)

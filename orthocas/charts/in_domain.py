@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from orthocas.charts.newton import inverses
 from orthocas.charts.phi import ROUNDING, PhiMap, largest
 from orthocas.tasks.domains import Domain, bounds_of
+from orthocas.tasks.relative import Relative
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
@@ -99,11 +100,11 @@ class BoxedPhi:
         return J[:, : self.m] / self._scale(targets[:, : self.m])[:, :, None], J[:, self.m :]
 
     def _task_errors(self, x: Array, u: Array) -> Array:
-        errors = (x - self.task.batched(self.points(u))[0]) / self._scale(x)
+        errors = self._relative.difference(x, self.task.batched(self.points(u))[0]) / self._scale(x)
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def _task_jacobians(self, x: Array, u: Array) -> Array:
-        J = self.task.batched_jacobian(self.points(u))[0].reshape(len(u), self.m, -1)
+        J = self._relative.batched_rates(self.points(u))[0].reshape(len(u), self.m, -1)
         J = J * self.domain.half_width / self._scale(x)[:, :, None]
         return np.where(np.isfinite(J), J, 0.0)
 
@@ -114,6 +115,10 @@ class BoxedPhi:
     def _phi_jacobians(self, targets: Array, u: Array) -> Array:
         J = self.phi_map.jacobian(self.points(u)) * self.domain.half_width / self.phi_map.scale(targets)[:, :, None]
         return np.where(np.isfinite(J), J, 0.0)
+
+    @cached_property
+    def _relative(self) -> Relative:
+        return Relative(self.task)
 
     def _scale(self, x: Array) -> Array:
         scale: Array = self.phi_map.sizes[: self.m] + ROUNDING * np.abs(x)

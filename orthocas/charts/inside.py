@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.in_domain import KEPT, BoxedPhi, solve_in_box
 from orthocas.charts.newton import Starts
-from orthocas.charts.phi import PhiMap, largest, shortest
+from orthocas.charts.phi import PhiMap, largest
 from orthocas.tasks.domains import Domain, bounds_of
 from orthocas.tools.batch import evaluate_columns
 from orthocas.tools.cached import cached_property
@@ -230,7 +230,7 @@ class Nearest:
         """start (n, 1), target (n, 1) -> q (n, 1)."""
         m, domain, n = self.m, self.domain, len(self.domain.centre)
         q, target = ca.MX.sym("q", n), ca.MX.sym("phi", n)
-        difference = shortest(self.phi(q) - target, self.phi_map.turns)
+        difference = -self.phi_map.difference(target, self.phi(q))
         constraints = [difference[:m] / ca.DM(self.phi_map.sizes[:m])]
         upper = np.zeros(m)
         clear = domain.singular_bound

@@ -11,9 +11,9 @@ from orthocas.charts.in_domain import BoxedPhi, Cells, InDomain
 from orthocas.charts.inside import Inside, Nearest
 from orthocas.charts.inverse import Inverse
 from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, PointFunctions, Starts, inverse_function
-from orthocas.charts.phi import PhiFunctions, PhiMap
+from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
 from orthocas.charts.solutions import Solutions, Tracker
-from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, SingularTaskError
+from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.problem import task_sizes
 from orthocas.tools.cached import cached_property
@@ -238,7 +238,7 @@ class InverseMethods(PhiFunctions):
     @cached_property
     def phi_map(self) -> PhiMap:
         """phi and J for solvers of phi(q) = phi."""
-        return PhiMap(self.phi, self._jacobian_or_nan, self.phi_sizes, self.turns)
+        return PhiMap(self.phi, self.batched_rates, self.phi_sizes, Differences(self.turns, self.relative))
 
     @cached_property
     def _inverse(self) -> Inverse:
@@ -254,11 +254,11 @@ class InverseMethods(PhiFunctions):
 
     @cached_property
     def _inverse_function(self) -> ca.Function:
-        return inverse_function(self.function("phi"), self.phi_sizes, self.turns)
+        return inverse_function(self.function("phi"), self.phi_sizes, self.phi_map.difference)
 
     @cached_property
     def _point_functions(self) -> PointFunctions:
-        return PointFunctions.of(self.function("phi"), self.function("jacobian"), self.phi_sizes, self.turns)
+        return PointFunctions.of(self.function("phi"), self.rates, self.phi_sizes, self.phi_map.difference)
 
     def _outside_error(
         self, targets: Array, q_start: ArrayLike | None, found: Solutions, beyond: Indices, single: bool
@@ -283,14 +283,6 @@ class InverseMethods(PhiFunctions):
             "`error.nearest` has joint positions inside; outside=True accepts those outside",
             None if nearest is None else nearest[0] if single else nearest,
         )
-
-    def _jacobian_or_nan(self, points: Array) -> Array:
-        """J at points (N, n), with NaN where the task has no finite Jacobian."""
-        try:
-            return self.jacobian(points)
-        except SingularTaskError:
-            J_x = self.problem.task.batched_jacobian(points)[0].reshape(-1, self.m, self.n)
-            return np.concatenate([J_x, self.coordinates.jacobian(points)], axis=1)
 
     def _require_expression(self, what: str) -> None:
         """Raise NoExpressionError if the coordinates are grown."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.coordinates import InvertibleMap
-from orthocas.charts.phi import ROUNDING, PhiMap, largest, shortest
+from orthocas.charts.phi import ROUNDING, Differences, PhiMap, largest
 from orthocas.errors import SingularTaskError
 from orthocas.tasks.domains import Domain, sample_uniform
 from orthocas.tools.batch import dense_function, in_threads
@@ -214,19 +214,19 @@ class PointFunctions:
     chord: ca.Function  #: q, phi, H, target -> q and phi after 3 steps, and |residual| at each of the 4 points
 
     @classmethod
-    def of(cls, phi: ca.Function, jacobian: ca.Function, sizes: Array, turns: Array) -> "PointFunctions":
-        """For phi and J of a column q (n, 1), and the sizes and periods of the components of phi."""
+    def of(cls, phi: ca.Function, jacobian: ca.Function, sizes: Array, difference: Differences) -> "PointFunctions":
+        """For phi and J of a column q (n, 1), and the sizes and differences of phi, as in `PhiMap`."""
         n = len(sizes)
         q, known, target = (ca.MX.sym(name, n) for name in ("q", "phi", "target"))
         H = ca.MX.sym("H", n, n)
         inverted = dense_function("inverted", [q], [phi(q), *_inversion(sizes).call([jacobian(q)])])
         scale = ca.DM(sizes) + ROUNDING * ca.fabs(target)
-        now, value, left = q, known, shortest(target - known, turns)
+        now, value, left = q, known, difference(target, known)
         errors = [ca.norm_2(left / scale)]  # norm_inf drops NaN
         for _ in range(STEPS):
             now = now + H @ left
             value = phi(now)
-            left = shortest(target - value, turns)
+            left = difference(target, value)
             errors.append(ca.norm_2(left / scale))
         chord = dense_function("chord", [q, known, H, target], [now, value, ca.vertcat(*errors)])
         return cls(inverted, chord)
@@ -332,13 +332,13 @@ def _inversion(sizes: Array) -> ca.Function:
     return ca.Function("inversion", [J], [inverse, ca.norm_fro(J / D) * ca.norm_fro(inverse * D.T)])
 
 
-def inverse_function(phi: ca.Function, sizes: Array, turns: Array) -> ca.Function:
+def inverse_function(phi: ca.Function, sizes: Array, difference: Differences) -> ca.Function:
     """phi (n, 1), q_start (n, 1) -> q (n, 1) with phi(q) = phi, NaN where Newton's method finds none from q_start."""
     n = len(sizes)
     q, target, start = (ca.MX.sym(name, n) for name in ("q", "phi", "q_start"))
 
     def residual(at: ca.MX) -> Any:
-        return shortest(phi(at) - target, turns) / (ca.DM(sizes) + ROUNDING * ca.fabs(target))
+        return -difference(target, phi(at)) / (ca.DM(sizes) + ROUNDING * ca.fabs(target))
 
     solve = ca.rootfinder("solve", "newton", {"x": q, "p": target, "g": residual(q)}, _OPTIONS)
     found = solve(start, target)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.charts.coordinates import CoordinateMap, Coordinates
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.relative import Relative
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_shape
 from orthocas.tools.expressions import fast_form
@@ -53,13 +54,33 @@ def require_no_turns(labels: tuple[str, ...], turns: Array, purpose: str) -> Non
 
 
 @dataclass(frozen=True)
+class Differences:
+    """Differences of two phi: the shorter way around for periodic components and for orientations."""
+
+    turns: Array  #: periods of the components, (n,); 0 for those that have none
+    task: Relative | None = None  #: of the first components; None for plain differences
+
+    def __call__(self, targets: Any, values: Any) -> Any:
+        """Targets - values, as NumPy rows (..., n) or CasADi columns (n, 1)."""
+        if self.task is None or not self.task.turned:
+            return shortest(targets - values, self.turns)
+        m, symbolic = self.task.task.m, isinstance(values, ca.SX | ca.MX)
+        pair = (targets[:m], values[:m]) if symbolic else (targets[..., :m], values[..., :m])
+        first = self.task.difference(*pair)
+        if symbolic:
+            return ca.vertcat(first, shortest(targets[m:] - values[m:], self.turns[m:]))
+        rest = shortest(targets[..., m:] - values[..., m:], self.turns[m:])
+        return np.concatenate([first, rest], axis=-1)
+
+
+@dataclass(frozen=True)
 class PhiMap:
     """phi at many points. Points are finite, values need not be."""
 
     phi: Callable[[Array], Array]  #: (N, n) -> (N, n)
-    jacobian: Callable[[Array], Array]  #: (N, n) -> (N, n, n)
+    jacobian: Callable[[Array], Array]  #: (N, n) -> (N, n, n): how fast phi moves, d(difference) = -J dq where it is 0
     sizes: Array  #: sizes of the components, (n,)
-    turns: Array  #: periods of the components, (n,); 0 for those that have none
+    difference: Differences  #: of targets (..., n) and values (..., n)
 
     def scale(self, targets: Array) -> Array:
         """Scale of errors (N, n): the sizes of the components, and more where rounding of phi exceeds them."""
@@ -67,14 +88,9 @@ class PhiMap:
         return scale
 
     def residual(self, targets: Array, q: Array) -> Array:
-        """(phi - phi(q)) / scale, (N, n), by the shorter way around for periodic components."""
+        """(phi - phi(q)) / scale, (N, n), by the shorter way around."""
         residual: Array = self.difference(targets, self.phi(q)) / self.scale(targets)
         return residual
-
-    def difference(self, targets: Array, values: Array) -> Array:
-        """Targets - values, (N, n), without whole turns of periodic components."""
-        difference: Array = shortest(targets - values, self.turns)
-        return difference
 
     def is_singular(self, q: Array) -> NDArray[np.bool_]:
         """Whether J is singular or undefined at points (N, n), (N,)."""
@@ -179,6 +195,27 @@ class PhiFunctions:
         task_jacobians(self.problem, points, J[:, : self.m])
         self._coordinates_into("jacobian", J[:, self.m :], points)
         return J[0] if single else J
+
+    @cached_property
+    def relative(self) -> Relative:
+        """Task values relative to wanted ones."""
+        return Relative(self.problem.task)
+
+    @cached_property
+    def rates(self) -> ca.Function:
+        """q (n, 1) -> J (n, n) with the rows of `Relative.rates` for the task: for solvers and laws."""
+        if not self.relative.turned:
+            return self._graph("jacobian")
+        q = ca.MX.sym("q", self.n)
+        rows = ca.vertcat(self.relative.rates(q), self.coordinates.functions["jacobian"](q))
+        return ca.Function("rates", [q], [ca.densify(rows)], ["q"], ["rates"])
+
+    def batched_rates(self, points: Array) -> Array:
+        """Those rows at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
+        J = np.empty((len(points), self.n, self.n))
+        J[:, : self.m] = self.relative.batched_rates(points)[0].reshape(-1, self.m, self.n)
+        self._coordinates_into("jacobian", J[:, self.m :], points)
+        return J
 
     def _graph(self, name: str) -> ca.Function:
         """The CasADi function of that name, but the inverse."""

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
-from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import bounds_of, contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, Indices, as_number, as_point, frozen_array, require_count
@@ -147,8 +147,8 @@ class LevelCurve:
 
     def __init__(self, chart: "Chart", held: Indices, step: float) -> None:
         self.walls, self._step = Walls(chart.problem), step
-        functions: tuple[Callable[[Array], Array], ...] = (chart.phi, chart.jacobian)
-        self._value, self._jacobian = functions if (held >= chart.m).any() else _of_task(chart)
+        whole = bool((held >= chart.m).any())
+        self._value, self._jacobian, self._difference = _of_phi(chart) if whole else _of_task(chart)
         self._held, self._sizes = held, chart.phi_sizes[held]
 
     def follow(self, q: Array, direction: Array, signs: Signs | None = None) -> Branch:
@@ -163,7 +163,7 @@ class LevelCurve:
         if t is None:
             return Branch(q[None], np.zeros(1), Stop(StopKind.SINGULAR))
         points, tangents, lengths, h = [q], [t], [0.0], self._step
-        target, stop = self._levels(q), None
+        target, stop = self._value(q), None
         while stop is None:
             found = self._stepped(points[-1], tangents[-1], h, target)
             if found is None:
@@ -190,22 +190,16 @@ class LevelCurve:
         t: Array = np.linalg.qr(J.T, mode="complete")[0][:, -1]
         return t if t @ along >= 0 else -t
 
-    def _levels(self, q: Array) -> Array:
-        return np.asarray(self._value(q)[self._held])
-
     def _rows(self, q: Array) -> Array | None:
         """The held rows of J, relative to the sizes of the components; None where they are not finite."""
-        try:
-            J = self._jacobian(q)[self._held] / self._sizes[:, None]
-        except SingularTaskError:
-            return None
+        J = self._jacobian(q)[self._held] / self._sizes[:, None]
         return J if np.isfinite(J).all() else None
 
     def _stepped(self, q: Array, t: Array, h: float, target: Array) -> tuple[Array, Array] | None:
         """The point a step ahead and the tangent there; None if the corrector fails or the curve turns too far."""
         new = q + h * t
         for _ in range(_CORRECTIONS):
-            error = (self._levels(new) - target) / self._sizes
+            error = -self._difference(target, self._value(new))[self._held] / self._sizes
             J = self._rows(new)
             if J is None or not np.abs(error).max() < np.inf:
                 return None
@@ -258,10 +252,18 @@ class LevelCurve:
         return self._stepped(q, t, scipy.optimize.brentq(ahead, 0.0, h, xtol=_ROUNDING), target) or (q, t)
 
 
-def _of_task(chart: "Chart") -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Task values and J_x at one joint position."""
-    task = chart.problem.task
-    return chart.task, lambda q: task.batched_jacobian(q[None])[0].reshape(chart.m, chart.n)
+Functions = tuple[Callable[[Array], Array], Callable[[Array], Array], Callable[[Array, Array], Array]]
+
+
+def _of_phi(chart: "Chart") -> Functions:
+    """phi and its rates at one joint position, and differences of two values."""
+    return chart.phi, lambda q: chart.batched_rates(q[None])[0], chart.phi_map.difference
+
+
+def _of_task(chart: "Chart") -> Functions:
+    """The same of the task alone."""
+    relative = chart.relative
+    return chart.task, lambda q: relative.batched_rates(q[None])[0].reshape(chart.m, chart.n), relative.difference
 
 
 def _arc(q: Array, t: Array, new: Array, onward: Array) -> float:
@@ -370,7 +372,7 @@ def start_inside(chart: "Chart", q: ArrayLike) -> Array:
     if not contains(chart.problem.domain, point):
         stop = Walls(chart.problem).worst(point)
         raise InvalidValueError("q", given, f"a point of the domain, which ends at {stop}")
-    if not (np.isfinite(chart.phi(point)).all() and np.isfinite(chart.jacobian(point)).all()):
+    if not (np.isfinite(chart.phi(point)).all() and np.isfinite(chart.batched_rates(point[None])).all()):
         raise InvalidValueError("q", given, "a point at which the chart is finite")
     return point
 
@@ -384,7 +386,7 @@ def branch_along(chart: "Chart", q: Array, k: int, sign: float) -> Branch:
         gradient = chart.coordinates.jacobian(point[None])[0, k]
         return float(sign * gradient @ t / (np.linalg.norm(gradient) or 1.0))
 
-    return curve.follow(q, sign * chart.jacobian(q)[row], rising)
+    return curve.follow(q, sign * chart.batched_rates(q[None])[0, row], rising)
 
 
 def xi_along(chart: "Chart", points: Array) -> Array:
@@ -448,7 +450,7 @@ def filled(chart: "Chart", q: Array, alone: XiRange, samples: int) -> Array:
     spacing = _spans(alone) / cells
     known: dict[tuple[int, ...], Array] = {(0,) * chart.r: q}
     front, tried = list(known), set(known)
-    start, sign = chart.phi(q), np.sign(np.linalg.det(chart.jacobian(q)))
+    start, sign = chart.phi(q), np.sign(np.linalg.det(chart.batched_rates(q[None])[0]))
     while front and len(known) < _MOST * samples:
         pairs = _neighbours(front, tried, cells)
         if not pairs:
@@ -485,7 +487,7 @@ def _solved(chart: "Chart", starts: Array, targets: Array, sign: float) -> tuple
     """Newton's method from all starts (N, n), and the rows where it found a point of the domain on the same sheet."""
     phi_map = chart.phi_map
     found = Newton(phi_map)(targets, starts)
-    step = np.linalg.solve(phi_map.jacobian(starts), (targets - phi_map.phi(starts))[..., None])[..., 0]
+    step = np.linalg.solve(phi_map.jacobian(starts), phi_map.difference(targets, phi_map.phi(starts))[..., None])[..., 0]
     near = np.linalg.norm(found.q - starts, axis=1) <= _FARTHEST * np.linalg.norm(step, axis=1) + 1e-9
     rows = np.flatnonzero((largest(found.residual) < _PHI_TOLERANCE) & near & chart.problem.domain.contains(found.q))
     same = np.sign(np.linalg.det(phi_map.jacobian(found.q[rows]))) == sign
@@ -547,7 +549,7 @@ def self_motion(chart: "Chart", q: ArrayLike, step: float = 0.05, samples: int =
 def _curve(chart: "Chart", q: Array, step: float) -> SelfMotionCurve:
     """Both directions of the curve; the coordinate rises at q."""
     curve = LevelCurve(chart, np.arange(chart.m), step)
-    gradient = chart.jacobian(q)[chart.m]
+    gradient = chart.batched_rates(q[None])[0, chart.m]
     up = curve.follow(q, gradient)
     down = Branch(q[None], np.zeros(1), up.stop) if up.endless else curve.follow(q, -gradient)
     points = np.concatenate([down.q[:0:-1], up.q])

@@ -11,6 +11,8 @@ from orthocas.errors import InvalidValueError
 from orthocas.robots.spatial import (
     constant,
     half_angle_vector,
+    half_angle_vector_anywhere,
+    quaternion_product,
     rotation_matrix,
     rotation_z_to,
     skew,
@@ -23,6 +25,7 @@ from orthocas.robots.tree import KinematicTree
 from orthocas.tools.checks import Array, as_float_array, frozen_array, require_finite, require_known
 
 _AXES = ("x", "y", "z")
+_LEAST_SQUARE = 1e-24  # of a cosine
 _KINDS = {  # whether the position comes first, and whether the whole orientation counts
     "orientation": (False, True),
     "pose": (True, True),
@@ -134,10 +137,41 @@ class TipTurn:
         """Units of the components."""
         return tuple("m" if label in _AXES else "rad" for label in self.labels)
 
-    def components(self, turned: ca.SX, position: ca.SX) -> ca.SX:
-        """The task value x, from the tip's rotation in the reference frame (3, 3) and its position (3, 1)."""
-        turns = half_angle_vector(turned) if self.axis is None else self._about_axis(turned, _AXES.index(self.axis))
+    def components(self, turned: ca.SX, position: ca.SX, to_differentiate: bool = False) -> ca.SX:
+        """The task value x, from the tip's rotation in the reference frame (3, 3) and its position (3, 1).
+
+        Args:
+            turned: the rotation.
+            position: the position.
+            to_differentiate: use the shorter formula, which loses digits next to half a turn.
+        """
+        if self.axis is None:
+            turns = half_angle_vector(turned) if to_differentiate else half_angle_vector_anywhere(turned)
+        else:
+            turns = self._about_axis(turned, _AXES.index(self.axis))
         return ca.vertcat(position, turns) if self.with_position else turns
+
+    def quaternion(self, turns: ca.SX) -> ca.SX:
+        """The rotation (w, x, y, z) that the components of a whole orientation (3, 1) describe, w >= 0 without axis."""
+        half = turns / 2
+        if self.axis is None:
+            return ca.vertcat(_cosine(half), half)
+        axis = _AXES.index(self.axis)
+        i, j = _others(axis)
+        tilted, along, spun = ca.SX(3, 1), ca.SX(3, 1), ca.SX(3, 1)
+        tilted[i], tilted[j], along[axis], spun[axis] = half[0], half[1], 1, ca.sin(half[2])
+        tilting = ca.cross(along, tilted)
+        return quaternion_product(ca.vertcat(_cosine(tilting), tilting), ca.vertcat(ca.cos(half[2]), spun))
+
+    @property
+    def order(self) -> Array:
+        """S (3, 3): S omega is how fast the components of a whole orientation change, as the rows of `rates`."""
+        if self.axis is None:
+            return np.eye(3)
+        axis = _AXES.index(self.axis)
+        along = np.eye(3)[axis]
+        tilting = -np.array(ca.DM(skew(ca.SX(along))))
+        return np.vstack([tilting[_others(axis)], along])
 
     def _about_axis(self, turned: ca.SX, axis: int) -> ca.SX:
         return ca.vertcat(tilt(turned, axis), *([turn_about(turned, axis)] if self.whole else []))
@@ -164,6 +198,11 @@ class TipTurn:
             angles = np.maximum(angles, np.abs(turns[:, 2]))
         margin: Array = np.cos(angles / 2)
         return margin
+
+
+def _cosine(sines: ca.SX) -> ca.SX:
+    """The positive cosine of half an angle, from sines (3, 1) times an axis; its derivative is finite."""
+    return ca.sqrt(ca.fmax(1 - ca.sumsqr(sines), _LEAST_SQUARE))
 
 
 def _others(axis: int) -> list[int]:

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array, frozen_array
 
+_TINY = 1e-24  # under square roots, so that their derivatives are finite
 _ROUNDING = 1e-14  # entries of rotations this close to 0 or +-1 are rounding of rpy -> matrix
 
 
@@ -26,6 +27,45 @@ def half_angle_vector(R: ca.SX) -> ca.SX:
     """2 sin(angle / 2) axis of a rotation matrix, (3, 1): vee(R - R^T) / sqrt(1 + trace R)."""
     vee = ca.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
     return vee / ca.sqrt(1 + ca.trace(R))
+
+
+def half_angle_vector_anywhere(R: ca.SX) -> ca.SX:
+    """The same without loss of digits up to half a turn, where the vector and its opposite mean one rotation.
+
+    Beyond 120 degrees it is taken from the column of v v^T with the largest diagonal entry, v = sin(angle / 2) axis.
+    """
+    trace, far = ca.trace(R), ca.SX(3, 1)
+    squares = [ca.fmax(1 + 2 * R[k, k] - trace, _TINY) for k in range(3)]  # 4 v_k^2
+    for k in (2, 1, 0):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        size = ca.sqrt(squares[k])
+        column = ca.SX(3, 1)
+        column[k], column[i], column[j] = size, (R[k, i] + R[i, k]) / size, (R[k, j] + R[j, k]) / size
+        column = column * ca.if_else(R[j, i] - R[i, j] < 0, -1, 1)
+        largest = 1.0 if k == 2 else ca.if_else(squares[k] >= ca.fmax(squares[i], squares[j]), 1, 0)
+        far = ca.if_else(largest, column, far)
+    near = ca.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]) / ca.sqrt(ca.fmax(1 + trace, _TINY))
+    return ca.if_else(trace > 0, near, far)
+
+
+def quaternion_product(a: ca.SX, b: ca.SX) -> ca.SX:
+    """a b of quaternions (w, x, y, z), (4, 1)."""
+    v, u = a[1:], b[1:]
+    return ca.vertcat(a[0] * b[0] - ca.dot(v, u), a[0] * u + b[0] * v + ca.cross(v, u))
+
+
+def conjugate(a: ca.SX) -> ca.SX:
+    """The conjugate of a quaternion (w, x, y, z), the inverse of a unit one."""
+    return ca.vertcat(a[0], -a[1:])
+
+
+def rotations_of(quaternions: Array) -> Array:
+    """Rotation matrices (N, 3, 3) of unit quaternions (w, x, y, z), (N, 4)."""
+    w, x, y, z = quaternions.T
+    o = np.zeros_like(w)
+    cross = np.array([[o, -z, y], [z, o, -x], [-y, x, o]]).transpose(2, 0, 1)
+    R: Array = np.eye(3) + 2 * (w[:, None, None] * cross + cross @ cross)
+    return R
 
 
 def tilt(R: ca.SX, axis: int) -> ca.SX:

@@ -5,15 +5,24 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import casadi as ca
+import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots.kinematics import TipTurn, frame_along
 from orthocas.robots.robot import Robot
-from orthocas.robots.spatial import rotation_matrix
-from orthocas.tools.batch import dense_function
+from orthocas.robots.spatial import rotation_matrix, rotations_of
+from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import require_kind, require_text
+from orthocas.tools.checks import (
+    Array,
+    as_float_array,
+    as_point_set,
+    require_finite,
+    require_kind,
+    require_shape,
+    require_text,
+)
 from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.display import Shown, listed
 from orthocas.tools.expressions import expression_of
@@ -234,7 +243,7 @@ class Task(Shown):
     def jacobian_function(self) -> ca.Function:
         """q (n, 1) -> J_x = dh/dq (m, n), by automatic differentiation."""
         q = ca.SX.sym("q", self.robot.n)
-        return dense_function("task_jacobian", [q], [ca.jacobian(self.function(q), q)])
+        return dense_function("task_jacobian", [q], [ca.jacobian(self.smooth_function(q), q)])
 
     @cached_property
     def frame_jacobian_function(self) -> ca.Function:
@@ -256,17 +265,17 @@ class Task(Shown):
     def second_derivative_function(self) -> ca.Function:
         """q, v, w (n, 1) -> d^2 h(q)[v, w] = (d/ds) J_x(q + s v) w, (m, 1)."""
         q, v, w = (ca.SX.sym(name, self.robot.n) for name in ("q", "v", "w"))
-        second = ca.jtimes(ca.jtimes(self.function(q), q, w), q, v)
+        second = ca.jtimes(ca.jtimes(self.smooth_function(q), q, w), q, v)
         return dense_function("task_second_derivative", [q, v, w], [second], ["q", "v", "w"])
 
     @cached_property
     def centred_jacobian_function(self) -> ca.Function:
         """q, centre (n, 1) -> J_x at q (m, n). A missing reference is taken at the centre."""
         q, centre = (ca.SX.sym(name, self.robot.n) for name in ("q", "centre"))
-        x, turn = self.function(q), self.turn
+        x, turn = self.smooth_function(q), self.turn
         if turn is not None and self.lacks_reference:
             rotation, position = self.robot.function("tip_rotation"), self.robot.function("tip_position")
-            x = turn.components(rotation(centre).T @ rotation(q), position(q))
+            x = turn.components(rotation(centre).T @ rotation(q), position(q), True)
         return dense_function("centred_jacobian", [q, centre], [ca.jacobian(x, q)], ["q", "centre"])
 
     @cached_property
@@ -283,6 +292,83 @@ class Task(Shown):
     def batched_frame_jacobian(self) -> BlockedFunction:
         """Evaluates the rows of `frame_jacobian_function` at many points."""
         return self.batched_jacobian if self.turn is None else BlockedFunction(self.frame_jacobian_function)
+
+    def value(self, position: ArrayLike | None, orientation: ArrayLike) -> Array:
+        """The task value x, (m,) or (N, m), of a pose of the tip, for tasks of a whole orientation.
+
+        Args:
+            position: of the tip [m], (3,) or (N, 3); None for tasks without one.
+            orientation: of the tip in the world: rotation matrices (3, 3) or (N, 3, 3), or unit quaternions
+                (w, x, y, z), (4,) or (N, 4).
+
+        Raises:
+            InvalidValueError, ShapeError: if the task has no whole orientation, or for arguments that do not fit.
+
+        Example:
+            >>> import orthocas as oc
+            >>> robot = oc.problems.get("iiwa").robot
+            >>> task = oc.Task.pose(robot, reference=[[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+            >>> task.value([0.5, 0.0, 0.4], [0.0, 1.0, 0.0, 0.0]).round(3).tolist()  # half a turn about x
+            [0.5, 0.0, 0.4, 2.0, 0.0, 0.0]
+        """
+        turn = self._whole_turn()
+        R, single = _rotations("orientation", orientation)
+        turned = Batched(self._components_function)(self.reference.T @ R)[0]
+        if turn.with_position:
+            p = as_float_array("position", np.nan if position is None else position)
+            require_shape("position", p.shape, (3,) if single else (len(R), 3))
+            require_finite("position", p)
+            turned = np.hstack([p.reshape(-1, 3), turned])
+        elif position is not None:
+            raise InvalidValueError("position", repr(position)[:80], f"None for the task {self.name}")
+        return np.asarray(turned[0] if single else turned)
+
+    def orientation_of(self, x: ArrayLike) -> Array:
+        """The tip's orientation in the world, (3, 3) or (N, 3, 3), at task values x (m,) or (N, m); see `value`."""
+        self._whole_turn()
+        values, single = as_point_set("x", x, self.m)
+        found = self.reference @ rotations_of(Batched(self.quaternion_function)(values)[0])
+        return np.asarray(found[0] if single else found)
+
+    @cached_property
+    def quaternion_function(self) -> ca.Function:
+        """x (m, 1) -> the rotation (w, x, y, z) from the reference to the tip, for tasks of a whole orientation."""
+        x = ca.SX.sym("x", self.m)
+        return dense_function("quaternion", [x], [self._whole_turn().quaternion(x[self.m - 3 :])], ["x"])
+
+    @cached_property
+    def _components_function(self) -> ca.Function:
+        """The rotation from the reference to the tip (3, 3) -> the components of the orientation (3, 1)."""
+        R = ca.SX.sym("R", 3, 3)
+        return dense_function("components", [R], [self._whole_turn().components(R, ca.SX.zeros(3))[-3:]], ["R"])
+
+    def _whole_turn(self) -> TipTurn:
+        if self.turn is None or not self.turn.whole:
+            raise InvalidValueError("task", self.name, "one with a whole orientation, such as pose")
+        return self.turn
+
+    @property
+    def reference(self) -> Array:
+        """The reference orientation (3, 3) of a task that has one: as given, or the tip's in mid-range.
+
+        Raises:
+            InvalidValueError: if the task has no orientation.
+        """
+        if self.turn is None:
+            raise InvalidValueError("task", self.name, "one with an orientation")
+        given = self.recipe.get("reference")
+        return self.robot.tip_rotation(self.robot.tree.middle) if given is None else np.array(given)
+
+    @cached_property
+    def smooth_function(self) -> ca.Function:
+        """q (n, 1) -> x (m, 1) in the form to differentiate: without cases, but with few digits next to half a turn."""
+        turn = self.turn
+        if turn is None or turn.axis is not None:
+            return self.function
+        q = ca.SX.sym("q", self.robot.n)
+        rotation, position = self.robot.function("tip_rotation")(q), self.robot.function("tip_position")(q)
+        x = turn.components(ca.SX(ca.DM(self.reference.T)) @ rotation, position, True)
+        return dense_function("h", [q], [x])
 
     @classmethod
     def _turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None) -> Self:
@@ -312,6 +398,22 @@ class Task(Shown):
         q = ca.SX.sym("q", robot.n)
         x = components(robot.function("tip_rotation")(q), robot.function("tip_position")(q))
         return cls(robot, name, labels, units, dense_function("h", [q], [x]), {"kind": name, **(extra or {})})
+
+
+def _rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
+    """Rotation matrices (N, 3, 3) from such, or from unit quaternions, and whether it was one."""
+    given = as_float_array(name, value)
+    require_finite(name, given)
+    single = given.shape in ((4,), (3, 3))
+    if not single and given.shape[1:] not in ((4,), (3, 3)):
+        raise InvalidValueError(f"shape of {name}", given.shape, "(3, 3), (N, 3, 3), (4,) or (N, 4)")
+    rows = given[None] if single else given
+    if rows.ndim == 2:
+        off = np.abs(np.linalg.norm(rows, axis=1) - 1)
+        if len(rows) and off.max() > 1e-6:
+            raise InvalidValueError(name, rows[off.argmax()].tolist(), "a quaternion (w, x, y, z) of length 1")
+        return rotations_of(rows / np.linalg.norm(rows, axis=1, keepdims=True)), single
+    return np.array([rotation_matrix(name, R) for R in rows]).reshape(-1, 3, 3), single
 
 
 _REGISTERED: dict[str, Callable[[Robot, str], Task]] = {

@@ -1,0 +1,152 @@
+"""Task values relative to wanted ones: where x holds a whole orientation, nothing happens half a turn from anywhere."""
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.robots.spatial import conjugate, quaternion_product, skew
+from orthocas.tasks.task import Task
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
+from orthocas.tools.columns import BlockedFunction
+
+
+class Relative:
+    """A task value x relative to a wanted one x_d.
+
+    For most tasks that is e = x - x_d. For orientation and pose tasks, with the tip's orientation R and the wanted one
+    R_d, the rows of the orientation are 2 sin(angle / 2) axis of R_d^T R, so they do not depend on the reference of the
+    task; with an AXIS they are put into its order: tilt, tilt, turn. The error is continuous but where R is half a turn
+    from R_d. The rates are J(q) dq with d(e)/dt = J dq at e = 0: those rows are the angular velocity in the tip's axes.
+
+    Args:
+        task: the task.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        turn = task.turn
+        self.turned = turn is not None and turn.whole  #: whether x holds a whole orientation
+        self._first = task.m - 3 if self.turned else task.m  # rows before those of the orientation
+
+    def difference(self, x_d: Any, x: Any) -> Any:
+        """-e: how far x_d is from x, as NumPy rows (..., m) or CasADi columns (m, 1)."""
+        if not self.turned:
+            return x_d - x
+        if isinstance(x, ca.SX | ca.MX | ca.DM) or isinstance(x_d, ca.SX | ca.MX | ca.DM):
+            return -self._error(x, x_d)[0]
+        wanted, here = np.broadcast_arrays(x_d, x)
+        rows = self._batched_error(here.reshape(-1, self.task.m), wanted.reshape(-1, self.task.m))[0]
+        return -rows.reshape(wanted.shape)
+
+    @cached_property
+    def rates(self) -> ca.Function:
+        """q (n, 1) -> J (m, n)."""
+        turn, robot = self.task.turn, self.task.robot
+        if turn is None or not self.turned:
+            return self.task.jacobian_function
+        q = ca.SX.sym("q", robot.n)
+        J, R = robot.function("tip_jacobian")(q), robot.function("tip_rotation")(q)
+        return dense_function("task_rates", [q], [ca.cse(turn.rates(R.T @ J[3:, :], J[:3, :]))])
+
+    @cached_property
+    def batched_rates(self) -> BlockedFunction:
+        """Evaluates J at many points."""
+        return BlockedFunction(self.rates) if self.turned else self.task.batched_jacobian
+
+    @cached_property
+    def rates_derivative(self) -> ca.Function:
+        """q, v, w (n, 1) -> (d/ds) J(q + s v) w, (m, 1)."""
+        if not self.turned:
+            return self.task.second_derivative_function
+        q, v, w = (ca.SX.sym(name, self.task.robot.n) for name in ("q", "v", "w"))
+        return dense_function("task_rates_derivative", [q, v, w], [ca.jtimes(self.rates(q) @ w, q, v)])
+
+    def error(self, q: ca.MX, x_d: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """E (m, 1), and de/dq (m, n) for x_d at rest."""
+        J = self.rates(q)
+        if not self.turned:
+            return self.task.function(q) - x_d, J
+        e, slope = self._error(self.task.function(q), x_d)
+        return e, slope @ J
+
+    def drift(self, q: ca.MX, x_d: ca.MX, dx_d: ca.MX) -> ca.MX:
+        """-de/dt of an arm at rest, (m, 1): the rate that de/dq dq must have to stay at the wanted value."""
+        return -self._drift(self.task.function(q), x_d, dx_d) if self.turned else dx_d
+
+    def bend(self, q: ca.MX, dq: ca.MX, w: ca.MX, wanted: tuple[ca.MX, ca.MX, ca.MX]) -> ca.MX:
+        """(d/dt) (de/dq w - drift) for a constant w (n, 1), (m, 1), with x_d and its two derivatives."""
+        bend = self.rates_derivative(q, dq, w)
+        if not self.turned:
+            return bend - wanted[2]
+        J = self.rates(q)
+        return self._bend(self.task.function(q), *wanted, J @ dq, J @ w, bend)
+
+    @cached_property
+    def _batched_error(self) -> Batched:
+        return Batched(self._error)
+
+    @cached_property
+    def _error(self) -> ca.Function:
+        """x, x_d -> e, and the slope E with de/dq = E J."""
+        x, x_d = self._symbols("x", "x_d")
+        w, v = self._relative(x, self._quaternion(x_d))
+        slope = ca.SX.eye(self.task.m)
+        slope[self._first :, self._first :] = self._ordered(w * ca.SX.eye(3) + skew(v))
+        e = ca.vertcat(x[: self._first] - x_d[: self._first], self._order @ (2 * v))
+        return dense_function("relative", [x, x_d], [e, slope], ["x", "x_d"])
+
+    @cached_property
+    def _drift(self) -> ca.Function:
+        """x, x_d, dx_d -> de/dt of an arm at rest."""
+        x, x_d, dx_d = self._symbols("x", "x_d", "dx_d")
+        p, omega = self._wanted(x_d, dx_d, ca.SX.zeros(self.task.m))[:2]
+        w, v = self._relative(x, p)
+        turning = self._order @ (w * omega - ca.cross(v, omega))
+        return dense_function("drift", [x, x_d, dx_d], [-ca.vertcat(dx_d[: self._first], turning)], ["x", "x_d", "v"])
+
+    @cached_property
+    def _bend(self) -> ca.Function:
+        """x, x_d, dx_d, ddx_d, rates of dq, rates of w, dJ/dt w -> d/dt (E J w + de/dt of an arm at rest)."""
+        names = ("x", "x_d", "dx_d", "ddx_d", "here", "there", "change")
+        x, x_d, dx_d, ddx_d, here, there, change = symbols = self._symbols(*names)
+        p, omega, alpha = self._wanted(x_d, dx_d, ddx_d)
+        w, v = self._relative(x, p)
+        turning, along, changing = (self._order.T @ rate[self._first :] for rate in (here, there, change))
+        dv = (w * (turning - omega) + ca.cross(v, turning + omega)) / 2
+        dw = -ca.dot(v, turning - omega) / 2
+        moved = dw * along + ca.cross(dv, along) + w * changing + ca.cross(v, changing)
+        left = dw * omega + w * alpha - ca.cross(dv, omega) - ca.cross(v, alpha)
+        straight = change[: self._first] - ddx_d[: self._first]
+        return dense_function("bend", symbols, [ca.cse(ca.vertcat(straight, self._order @ (moved - left)))], names)
+
+    def _symbols(self, *names: str) -> list[ca.SX]:
+        return [ca.SX.sym(name, self.task.m) for name in names]
+
+    @property
+    def _order(self) -> ca.SX:
+        assert self.task.turn is not None
+        return ca.SX(ca.sparsify(ca.DM(self.task.turn.order)))
+
+    def _ordered(self, matrix: ca.SX) -> ca.SX:
+        return self._order @ matrix @ self._order.T
+
+    def _quaternion(self, x: ca.SX) -> ca.SX:
+        quaternion: ca.SX = self.task.quaternion_function(x)
+        return quaternion
+
+    def _relative(self, x: ca.SX, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """w >= 0 and v of the rotation from the wanted orientation to that of x."""
+        found = quaternion_product(conjugate(wanted), self._quaternion(x))
+        found = found * ca.if_else(found[0] < 0, -1, 1)
+        return found[0], found[1:]
+
+    def _wanted(self, x_d: ca.SX, dx_d: ca.SX, ddx_d: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """The wanted orientation, and its angular velocity and acceleration in its own axes."""
+        p = self._quaternion(x_d)
+        dp = ca.jtimes(p, x_d, dx_d)
+        ddp = ca.jtimes(dp, x_d, dx_d) + ca.jtimes(p, x_d, ddx_d)
+        back = conjugate(p)
+        return p, 2 * quaternion_product(back, dp)[1:], 2 * quaternion_product(back, ddp)[1:]
