@@ -15,7 +15,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.phi import shortest
 from orthocas.codegen import check_c
 from orthocas.control import Kinematic, Reference
-from orthocas.control.turns import without_turns
+from orthocas.control.errors import without_turns
 from orthocas.errors import InvalidValueError
 
 RING = oc.Box([0.0, 1.2], [np.pi, 0.4], unbounded=[0])  # joint 1 turns without end

@@ -181,7 +181,9 @@ def _moves_the_task(task: Task, joint: int) -> bool:
 
 def _is_no_part_of_gradients(task: Task, joint: int) -> bool:
     """Whether the steps of h show that J_x does not depend on a joint."""
-    return all(joint not in joints for row in gradient_dependences(to_tape(task.smooth_function)) for joints in row.values())
+    return all(
+        joint not in joints for row in gradient_dependences(to_tape(task.smooth_function)) for joints in row.values()
+    )
 
 
 def _metric_stays(metric: Metric, tree: KinematicTree, joint: int) -> bool:

@@ -92,7 +92,8 @@ class BoxedPhi:
 
     def xi_errors(self, targets: Array, u: Array) -> Array:
         """xi - xi(q), (N, r), for targets (N, n) of phi."""
-        return self.phi_map.difference(targets, self.phi_map.phi(self.points(u)))[:, self.m :]
+        errors: Array = self.phi_map.difference(targets, self.phi_map.phi(self.points(u)))[:, self.m :]
+        return errors
 
     def jacobians(self, targets: Array, u: Array) -> tuple[Array, Array]:
         """d(h / scale)/du (N, m, n) and dxi/du (N, r, n)."""
@@ -170,7 +171,8 @@ class Cells:
         return points
 
     def _difference(self, targets: Array, phi: Array) -> Array:
-        return self._boxed.phi_map.difference(targets, phi)
+        difference: Array = self._boxed.phi_map.difference(targets, phi)
+        return difference
 
     @cached_property
     def _halved(self) -> tuple[int, ...]:

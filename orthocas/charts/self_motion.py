@@ -487,7 +487,9 @@ def _solved(chart: "Chart", starts: Array, targets: Array, sign: float) -> tuple
     """Newton's method from all starts (N, n), and the rows where it found a point of the domain on the same sheet."""
     phi_map = chart.phi_map
     found = Newton(phi_map)(targets, starts)
-    step = np.linalg.solve(phi_map.jacobian(starts), phi_map.difference(targets, phi_map.phi(starts))[..., None])[..., 0]
+    step = np.linalg.solve(phi_map.jacobian(starts), phi_map.difference(targets, phi_map.phi(starts))[..., None])[
+        ..., 0
+    ]
     near = np.linalg.norm(found.q - starts, axis=1) <= _FARTHEST * np.linalg.norm(step, axis=1) + 1e-9
     rows = np.flatnonzero((largest(found.residual) < _PHI_TOLERANCE) & near & chart.problem.domain.contains(found.q))
     same = np.sign(np.linalg.det(phi_map.jacobian(found.q[rows]))) == sign

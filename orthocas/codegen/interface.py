@@ -1,5 +1,7 @@
 """The interface of generated C: functions, supervised laws, and the text of the header."""
 
+from collections.abc import Mapping
+
 import casadi as ca
 import numpy as np
 
@@ -9,8 +11,9 @@ from orthocas.codegen.description import control_values, description_values, fil
 from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.precision import Precision, check_values
 from orthocas.control.controller import Controller
+from orthocas.control.errors import without_turns
 from orthocas.control.safety import Safety
-from orthocas.control.turns import without_turns
+from orthocas.tasks.relative import Relative
 from orthocas.version import VERSION
 
 _TORQUE = """It compensates gravity, damps with the mass matrix,
@@ -25,23 +28,29 @@ def supervision_kernels(controller: Controller, condition: BoundaryCondition | N
     fallback, q, reference = controller.fallback, ca.MX.sym("q", n), ca.MX.sym("reference", k)
     inputs = fallback.mx_in()
     measured = controller.measured(q)
-    error = reference - measured
+    m, relative = controller.problem.m, Relative(controller.problem.task)
+    error = ca.vertcat(relative.difference(reference[:m], measured[:m]), reference[m:] - measured[m:])
     if controller.chart is not None and controller.labels == controller.chart.labels:
         error = without_turns(controller.chart, error)
     found = [
         ca.Function("fallback", inputs, fallback.call(inputs)),
         ca.Function("deviation", [q, reference], [ca.densify(measured), ca.densify(error)]),
     ]
+    if relative.turned:
+        found.append(relative.moved)
     return found if condition is None else [*found, *condition.kernels]
 
 
-def supervision_values(controller: Controller, safety: Safety, condition: BoundaryCondition | None) -> dict[str, str]:
+def supervision_values(
+    controller: Controller, safety: Safety, condition: BoundaryCondition | None, known: Mapping[str, str]
+) -> dict[str, str]:
     """Values of the placeholders in the templates of the supervised law.
 
     Args:
         controller: the law.
         safety: its settings.
         condition: the condition of the law's domain, if it has one.
+        known: values of other placeholders.
     """
     robot = controller.problem.robot
     endless = np.isinf(robot.lower) & np.isinf(robot.upper) & ~np.array(robot.tree.prismatic)
@@ -52,6 +61,7 @@ def supervision_values(controller: Controller, safety: Safety, condition: Bounda
         "safety_fields": "\n".join(_field(name, value) for name, value in settings.items()),
         "safety_values": ",\n".join(f"  {_literal(value)}" for value in settings.values()),
         **_clearance_values(condition),
+        "turn_reference": filled("turn_reference.c", known) if Relative(controller.problem.task).turned else "",
         "fallback_arguments": "\n".join(f"  arg[{1 + i}] = gains->{gain};" for i, gain in enumerate(controller.gains)),
     }
 
@@ -114,9 +124,10 @@ def template_values(
         **kernels.sizes(),
     }
     values |= source.values(values, precision)
+    values["difference"] = filled("turned.c", values) if chart.relative.turned else ""
     if controller is not None and safety is not None:
         condition = boundary_condition(source, controller)
-        values |= control_values(controller) | supervision_values(controller, safety, condition)
+        values |= control_values(controller) | supervision_values(controller, safety, condition, values)
         values["clearance_c"] = "" if condition is None else _clearance(condition, values)
         values |= source.law_values(controller, values)
         values["compose"] = filled(f"compose_{controller.command}.c", values)
@@ -136,13 +147,19 @@ def _sizes(chart: Chart) -> dict[str, str]:
 
 
 def _shortest_way(chart: Chart) -> dict[str, str]:
-    """The difference of two phi in C; angles of circle-valued coordinates take the shorter way around."""
-    if not chart.turns.any():
-        return {"turn_table": "", "shortest": "(wanted[i] - phi[i])"}
-    rounds = np.where(chart.turns > 0, 1 / np.where(chart.turns > 0, chart.turns, 1.0), 0.0)
-    table = f"\n  static const double turn[N] = {{{numbers(chart.turns)}}}, rounds[N] = {{{numbers(rounds)}}};"
-    whole = "turn[i] * floor((wanted[i] - phi[i]) * rounds[i] + 0.5)"
-    return {"turn_table": table, "shortest": f"(wanted[i] - phi[i] - {whole})"}
+    """The difference of two phi in C; angles and orientations take the shorter way around."""
+    plain = "(wanted[i] - phi[i])"
+    table = ""
+    if chart.turns.any():
+        rounds = np.where(chart.turns > 0, 1 / np.where(chart.turns > 0, chart.turns, 1.0), 0.0)
+        table = f"\n  static const double turn[N] = {{{numbers(chart.turns)}}}, rounds[N] = {{{numbers(rounds)}}};"
+        plain = "(wanted[i] - phi[i] - turn[i] * floor((wanted[i] - phi[i]) * rounds[i] + 0.5))"
+    if chart.relative.turned:
+        return {
+            "turn_table": f"{table}\n  double turn_left[{chart.m}];",
+            "shortest": f"(i < {chart.m} ? turn_left[i] : {plain})",
+        }
+    return {"turn_table": table, "shortest": plain}
 
 
 def _title(source: Source, controller: Controller | None) -> str:

@@ -81,6 +81,10 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
         ca.Function("curvature", [q, dq, v], [chart.function("second_derivative")(q, dq, v)]),
         fast_form(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)]), n),
     ]
+    if chart.relative.turned:
+        x, wanted = ca.MX.sym("x", chart.m), ca.MX.sym("wanted", chart.m)
+        difference = ca.densify(chart.relative.difference(wanted, x))
+        found.append(ca.Function("turned", [q, x, wanted], [difference, chart.relative.rates(q).T]))
     condition = None if source.condition is None else source.condition.condition
     if condition is not None:
         pivots = ca.Function("pivots", [q], [condition.pivots(q)])  # as a graph where tables of coordinates are in it

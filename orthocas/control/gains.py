@@ -11,7 +11,15 @@ from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import Array, as_float_array, as_number, frozen_array, require_kind, require_shape
+from orthocas.tools.checks import (
+    Array,
+    as_float_array,
+    as_number,
+    as_point_set,
+    frozen_array,
+    require_kind,
+    require_shape,
+)
 
 STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT, SECOND_FORCE = (  #: units of gains, in words
     "J per squared unit of the quantity, > 0",
@@ -124,7 +132,7 @@ def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUE
 
 def mobility(chart: Chart, points: ArrayLike, robot: Robot) -> Array:
     """M_phi^-1 = J M^-1 J^T of a robot at points (N, n), (N, n, n)."""
-    J, M = chart.jacobian(points), robot.mass_matrix(points)
+    J, M = chart.batched_rates(as_point_set("points", points, chart.n)[0]), robot.mass_matrix(points)
     return np.asarray(J @ np.linalg.solve(M, J.transpose(0, 2, 1)))
 
 

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
 from orthocas.control.controller import Command, fallback_function, guarded_graph, law_facts, named_inputs
+from orthocas.control.errors import drift, errors
 from orthocas.control.gains import FEEDBACK, FEEDBACK_SETTING, LIMIT, Setting, command_limit, non_negative_gains
 from orthocas.control.linear_algebra import block_inertia, median_volume
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
-from orthocas.control.turns import without_turns
 from orthocas.tasks.problem import Problem
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_kind
@@ -102,10 +102,10 @@ class Kinematic(Shown):
         n, problem = self.chart.n, self.problem
         inputs = named_inputs(n, self.gains, n)
         q = inputs["q"]
-        B, Lambda, volume = block_inertia(n, (n,))(self.chart.function("jacobian")(q), problem.metric.function(q))
-        error = without_turns(self.chart, inputs["reference"] - self.measured(q))
-        rate = inputs["reference_velocity"] + inputs["feedback"] * error
-        scale = median_volume(problem, self.chart.function("jacobian"), problem.metric, (n,))
+        e, J = errors(self.chart, q, inputs["reference"])
+        B, Lambda, volume = block_inertia(n, (n,))(J, problem.metric.function(q))
+        rate = drift(self.chart, q, inputs["reference"], inputs["reference_velocity"]) - inputs["feedback"] * e
+        scale = median_volume(problem, self.chart.rates, problem.metric, (n,))
         velocity = B @ (Lambda @ rate)  # J^-1 = A^-1 J^T (J A^-1 J^T)^-1
         return guarded_graph(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain, True)
 

@@ -19,6 +19,7 @@ from orthocas.control.controller import (
     named_function,
     named_inputs,
 )
+from orthocas.control.errors import bend, drift, errors
 from orthocas.control.gains import (
     DAMPING_RATIO,
     DAMPING_RATIO_SETTING,
@@ -36,7 +37,6 @@ from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, bloc
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
-from orthocas.control.turns import without_turns
 from orthocas.robots.kinematics import TipTurn
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem
@@ -323,10 +323,9 @@ class _OperationalSpace(Shown):
     def graph(self) -> ca.Function:
         """The same function as a graph with shared subexpressions; C is generated from it."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
-        q = inputs["q"]
-        J, robot = self.chart.function("jacobian")(q), self.problem.robot
+        robot = self.problem.robot
         gravity = self.model.gravity_torque(robot, inputs)
-        force, volume = self._force(inputs, J)
+        force, volume, J = self._force(inputs)
         torque = J.T @ force + gravity + self.model.feed_forward(robot, inputs)
         relative = volume / self._median_volume
         return guarded_graph(self.name, inputs, torque, gravity, relative, self.problem.domain)
@@ -351,11 +350,10 @@ class _OperationalSpace(Shown):
         that of the problem's robot with the payload, also if the law is given another one.
         """
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
-        q, K = inputs["q"], ca.diag(inputs["stiffness"])
-        J = self.chart.function("jacobian")(q)
+        K = ca.diag(inputs["stiffness"])
         M = self.model.own_mass_matrix(self.problem.robot, inputs)
+        e, de, J = self._errors(inputs)
         D = self._inertia(J, M, inputs)[-1]
-        e, de = self._errors(inputs, J)
         M_phi = block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
         kinetic = ca.bilin(M_phi, de, de) if self.feed_forward else ca.bilin(M, inputs["dq"], inputs["dq"])
         storage = (kinetic + ca.bilin(K, e, e)) / 2
@@ -367,7 +365,7 @@ class _OperationalSpace(Shown):
         """q, stiffness, damping_ratio, then damping_stiffness and payload if they are inputs -> D(q), (n, n)."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         chosen = {name: inputs[name] for name in ("q", *self._of_the_damping)}
-        J, M = self.chart.function("jacobian")(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
+        J, M = self.chart.rates(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
         D = self._inertia(J, M, inputs)[-1]
         return self.chart.runnable(named_function("damping_matrix", chosen, {"D": D}))
 
@@ -430,27 +428,31 @@ class _OperationalSpace(Shown):
         D = _block_damping(self.damping, self._blocks)(Lambda, designed_for, inputs["damping_ratio"])
         return B, Lambda, volume, D
 
-    def _errors(self, inputs: dict[str, ca.MX], J: ca.MX) -> tuple[ca.MX, ca.MX]:
-        e = without_turns(self.chart, self.measured(inputs["q"]) - inputs["reference"])
+    def _errors(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
+        """E, how fast it changes, and J = de/dq."""
+        e, J = errors(self.chart, inputs["q"], inputs["reference"])
         velocity = J @ inputs["dq"]
-        return e, velocity - inputs["reference_velocity"] if self.feed_forward else velocity
+        return e, velocity - self._drift(inputs) if self.feed_forward else velocity, J
 
-    def _force(self, inputs: dict[str, ca.MX], J: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """Force in the coordinates, (n, 1), and the volume of the gradients."""
+    def _drift(self, inputs: dict[str, ca.MX]) -> ca.MX:
+        return drift(self.chart, inputs["q"], inputs["reference"], inputs["reference_velocity"])
+
+    def _force(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
+        """Force in the coordinates, (n, 1), the volume of the gradients, and J."""
         q, dq, robot, model = inputs["q"], inputs["dq"], self.problem.robot, self.model
+        e, de, J = self._errors(inputs)
         B, Lambda, volume, D = self._inertia(J, model.mass_matrix(robot, inputs), inputs)
-        e, de = self._errors(inputs, J)
         force = -inputs["stiffness"] * e - D @ de
         if self.feed_forward:
-            w = B @ (Lambda @ inputs["reference_velocity"])  # J^-1 d_phi_d; if (5) holds, by (8) also when decoupled
-            curvature = self.chart.function("second_derivative")(q, dq, dq if model.source == "given" else w)
-            acceleration = inputs["reference_acceleration"] + B.T @ model.coriolis_torque(robot, inputs, w) - curvature
-            force += Lambda @ acceleration
-        return force, volume
+            w = B @ (Lambda @ self._drift(inputs))  # J^-1 d_phi_d; if (5) holds, by (8) also when decoupled
+            wanted = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
+            bent = bend(self.chart, q, dq, dq if model.source == "given" else w, wanted)
+            force += Lambda @ (B.T @ model.coriolis_torque(robot, inputs, w) - bent)
+        return force, volume, J
 
     @cached_property
     def _median_volume(self) -> float:
-        return median_volume(self.problem, self.chart.function("jacobian"), "inertia", self._blocks)
+        return median_volume(self.problem, self.chart.rates, "inertia", self._blocks)
 
 
 class Impedance(_OperationalSpace):

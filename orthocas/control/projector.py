@@ -45,6 +45,7 @@ from orthocas.control.two_tasks import (
     two_task_forces,
 )
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.relative import Relative
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, frozen_array, require_kind
@@ -146,14 +147,16 @@ class KinematicProjector(TwoTaskLaw):
         problem, m = self.problem, self.problem.m
         inputs = named_inputs(problem.n, self.gains, len(self.labels))
         q = inputs["q"]
-        J, A = problem.task.jacobian_function(q), problem.metric.function(q)
+        x_d, dx_d, gain = (inputs[name] for name in ("reference", "reference_velocity", "feedback"))
+        known = Relative(problem.task)
+        e, J = known.error(q, x_d[:m])
+        A = problem.metric.function(q)
         B, Lambda, volume = block_inertia(problem.n, (m,))(J, A)
         J_2_inverse, _, relative = self._second.weighted(q, A)
-        error = self._second.shortest(inputs["reference"] - self.measured(q))
-        rate = inputs["reference_velocity"] + inputs["feedback"] * error
-        second = J_2_inverse @ rate[m:]
-        velocity = second + B @ (Lambda @ (rate[:m] - J @ second))
-        scale = median_volume(problem, problem.task.jacobian_function, problem.metric, (m,))
+        rest = self._second.shortest(x_d - self.measured(q))[m:]
+        second = J_2_inverse @ (dx_d[m:] + gain[m:] * rest)
+        velocity = second + B @ (Lambda @ (known.drift(q, x_d[:m], dx_d[:m]) - gain[:m] * e - J @ second))
+        scale = median_volume(problem, known.rates, problem.metric, (m,))
         domain = None if self.chart is None else self.chart.problem.domain
         return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale * relative, domain, True)
 
@@ -314,12 +317,13 @@ class Projector(TwoTaskLaw):
         problem, m = self.problem, self.problem.m
         inputs = self._inputs()
         q = inputs["q"]
-        J, A, gravity = problem.task.jacobian_function(q), problem.metric.function(q), problem.robot.gravity(q)
+        known = Relative(problem.task)
+        J, A, gravity = known.error(q, inputs["reference"][:m])[1], problem.metric.function(q), problem.robot.gravity(q)
         f_x, f_2 = two_task_forces(problem, self._second, inputs, self.feed_forward)
         B, Lambda, volume = block_inertia(problem.n, (m,))(J, A)
         second = self._second.jacobian(q).T @ f_2
         torque = J.T @ f_x + second - J.T @ (Lambda @ (B.T @ second)) + gravity
-        scale = median_volume(problem, problem.task.jacobian_function, problem.metric, (m,))
+        scale = median_volume(problem, known.rates, problem.metric, (m,))
         relative = volume / scale * self._second.weighted(q, A)[2]
         domain = None if self.chart is None else self.chart.problem.domain
         return guarded_graph(self.name, inputs, torque, gravity, relative, domain)
@@ -344,8 +348,8 @@ class Projector(TwoTaskLaw):
         problem, m = self.problem, self.problem.m
         inputs = self._inputs()
         q, dq = inputs["q"], inputs["dq"]
-        e, D_x, D_2 = errors_and_damping(problem, self._second, inputs)
-        J, J_2 = problem.task.jacobian_function(q), self._second.jacobian(q)
+        e, J, D_x, D_2 = errors_and_damping(problem, self._second, inputs)
+        J_2 = self._second.jacobian(q)
         B, Lambda, _ = block_inertia(problem.n, (m,))(J, problem.metric.function(q))
         through = dq - B @ (Lambda @ (J @ dq))  # P dq
         storage = (ca.bilin(problem.robot.mass_matrix(q), dq, dq) + ca.dot(e, inputs["stiffness"] * e)) / 2

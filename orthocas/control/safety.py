@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from orthocas.control.controller import Command, Controller, require_controller
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, as_float_array, as_number, require_count, require_shape
 
@@ -138,8 +139,10 @@ class Safety:
 def _joint_motion(controller: Controller, points: Array) -> Array:
     """How far the fastest joint moves per unit of each controlled quantity, at 90 % of the points (k,)."""
     q = ca.MX.sym("q", controller.problem.n)
-    rows = Batched(dense_function("J", [q], [ca.jacobian(controller.measured(q), q)]))(points)[0]
-    J = rows.reshape(len(points), q.shape[0], -1).transpose(0, 2, 1)
+    m, relative = controller.problem.m, Relative(controller.problem.task)
+    moving = ca.vertcat(relative.rates(q), ca.jacobian(controller.measured(q)[m:], q))
+    rows = Batched(dense_function("J", [q], [moving]))(points)[0]
+    J = rows.reshape(len(points), -1, q.shape[0])
     largest = np.abs(np.linalg.pinv(J[np.isfinite(J).all(axis=(1, 2))])).max(axis=1)
     return np.asarray(np.quantile(largest, 0.9, axis=0))
 

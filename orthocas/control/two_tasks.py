@@ -8,14 +8,15 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
+from orthocas.control.errors import without_turns
 from orthocas.control.linear_algebra import block_inertia, damping_matrix, median_volume
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
-from orthocas.control.turns import without_turns
 from orthocas.errors import InvalidValueError, SingularTaskError, UnreachableReferenceError
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.relative import Relative
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_known
@@ -268,8 +269,8 @@ def two_task_forces(problem: Problem, second: SecondTask, inputs: Inputs, feed_f
     """
     m, K = problem.m, inputs["stiffness"]
     q, dq = inputs["q"], inputs["dq"]
-    J, J_2 = problem.task.jacobian_function(q), second.jacobian(q)
-    e, D_x, D_2 = errors_and_damping(problem, second, inputs)
+    J_2 = second.jacobian(q)
+    e, J, D_x, D_2 = errors_and_damping(problem, second, inputs)
     f_x = -K[:m] * e[:m] - D_x @ (J @ dq)
     f_2 = -K[m:] * e[m:] - D_2 @ (J_2 @ dq) + inputs.get("second_force", 0)
     if not feed_forward:
@@ -277,21 +278,24 @@ def two_task_forces(problem: Problem, second: SecondTask, inputs: Inputs, feed_f
     M, C_dq = problem.robot.mass_matrix(q), problem.robot.coriolis_product(q, dq, dq)
     B, M_x, _ = block_inertia(problem.n, (m,))(J, M)
     sharp, M_2, _ = second.weighted(q, M)
-    rate, acceleration = inputs["reference_velocity"], inputs["reference_acceleration"]
-    bend = problem.task.second_derivative_function(q, dq, dq)
-    f_x += M_x @ (acceleration[:m] - bend + B.T @ C_dq) + D_x @ rate[:m]
+    x_d, rate, acceleration = (inputs[name] for name in ("reference", "reference_velocity", "reference_acceleration"))
+    relative = Relative(problem.task)
+    bend = relative.bend(q, dq, dq, (x_d[:m], rate[:m], acceleration[:m]))
+    f_x += M_x @ (B.T @ C_dq - bend) + D_x @ relative.drift(q, x_d[:m], rate[:m])
     f_2 += M_2 @ (acceleration[m:] - second.curvature(q, dq)) + sharp.T @ C_dq + D_2 @ rate[m:]
     return f_x, f_2
 
 
-def errors_and_damping(problem: Problem, second: SecondTask, inputs: Inputs) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """e = [x - x_d; x_2 - x_2d], and D_x with the inertia M_x and D_2 with M_2 by [AS2023] eq. (29)."""
+def errors_and_damping(problem: Problem, second: SecondTask, inputs: Inputs) -> tuple[ca.MX, ca.MX, ca.MX, ca.MX]:
+    """e = [x - x_d; x_2 - x_2d], de_x/dq, D_x with the inertia M_x, and D_2 with M_2 by [AS2023] eq. (29)."""
     q, K, Z, m = inputs["q"], inputs["stiffness"], inputs["damping_ratio"], problem.m
     M = problem.robot.mass_matrix(q)
-    M_x = block_inertia(problem.n, (m,))(problem.task.jacobian_function(q), M)[1]
+    e_x, J = Relative(problem.task).error(q, inputs["reference"][:m])
+    M_x = block_inertia(problem.n, (m,))(J, M)[1]
     M_2 = second.weighted(q, M)[1]
     D_x, D_2 = _damping(m)(M_x, K[:m], Z[:m]), _damping(M_2.shape[0])(M_2, K[m:], Z[m:])
-    return second.shortest(second.measured(q) - inputs["reference"]), D_x, D_2
+    rest = second.shortest(second.measured(q) - inputs["reference"])[m:]
+    return ca.vertcat(e_x, rest), J, D_x, D_2
 
 
 def _damping(size: int) -> ca.Function:

@@ -103,12 +103,12 @@ def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
 
 
 def _step(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
-    J = chart.problem.task.batched_jacobian(q[None])[0].reshape(chart.m, chart.n)
+    J = chart.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
     inner = np.linalg.svd(J)[2][chart.m :].T  # (n, r)
     residuals, gradients = (part[0] for part in costs(q[None]))
     G = gradients @ inner
     along = -inner @ np.linalg.solve(G.T @ G + _WALK_DAMPING * np.eye(chart.r), G.T @ residuals)
-    task = np.linalg.pinv(J, rcond=1e-3) @ (x - chart.task(q))
+    task = np.linalg.pinv(J, rcond=1e-3) @ chart.relative.difference(x, chart.task(q))
     return _cut(task) + _cut(along)
 
 
@@ -138,7 +138,7 @@ class XiChoice:
 
     def __init__(self, plan: Plan, costs: Costs, solver: Solver) -> None:
         self.plan, self.costs, self.solver, self.chart = plan, costs, solver, solver.chart
-        pieces = _pieces(plan, self.chart.phi_sizes[: self.chart.m])
+        pieces = _pieces(plan)
         self.s = np.linspace(0.0, 1.0, _PLACES * pieces + 1)
         self.nodes = np.linspace(0.0, 1.0, pieces + 1)
         unit = np.eye(pieces + 1)
@@ -208,7 +208,7 @@ class XiChoice:
         return new if new is not None and new.cost < state.cost else None
 
 
-def _pieces(plan: Plan, sizes: Array) -> int:
+def _pieces(plan: Plan) -> int:
     """Pieces of the spline: more on longer paths."""
-    length = np.linalg.norm(np.diff(plan.waypoints / sizes, axis=0), axis=1).sum()
+    length = np.linalg.norm(plan.steps, axis=1).sum()
     return int(np.clip(np.ceil(_DENSITY * length), _LEAST, _MOST))

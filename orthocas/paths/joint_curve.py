@@ -38,15 +38,19 @@ class Solver:
         self.chart = chart
         self._newton = Newton(chart.phi_map)
         q, v, w = (ca.MX.sym(name, chart.n) for name in ("q", "v", "w"))
-        turning = ca.Function("turning", [q, v, w], [chart.function("second_derivative")(q, v, w)])
+        bends = (
+            chart.problem.task.rates_derivative_function(q, v, w),
+            chart.coordinates.functions["second_derivative"](q, v, w),
+        )
+        turning = ca.Function("turning", [q, v, w], [ca.densify(ca.vertcat(*bends))])
         self._turning = Batched(chart.runnable(turning))
 
     def jacobian(self, q: Array) -> Array:
-        """J (N, n, n) at joint positions (N, n)."""
+        """J (N, n, n) at joint positions (N, n), with the rates of orientations."""
         return self.chart.phi_map.jacobian(q)
 
     def turning(self, q: Array, v: Array, w: Array) -> Array:
-        """Second derivatives d2phi(q)[v, w], (N, n)."""
+        """The derivative of J w along v, (N, n)."""
         return self._turning(q, v, w)[0]
 
     def solve(self, starts: Array, goals: Array) -> Array:
@@ -66,7 +70,7 @@ def solved(J: Array, right: Array) -> Array:
         return found
 
 
-Goal = Callable[..., Array]  #: s, order of the derivative -> phi (n,), or (N, n)
+Goal = Callable[..., Array]  #: s, order of the derivative -> phi or its rates, (n,) or (N, n)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.phi import counted_on
 from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.robots.spatial import rotations_of
+from orthocas.tasks.relative import Relative
+from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array, as_float_array, frozen_array
 from orthocas.tools.csv_table import LONGEST, column_places, read_table
 
@@ -39,18 +43,81 @@ def sampled(name: str, given: Any, size: int, labels: tuple[str, ...]) -> Array:
     return points
 
 
-def same_ends(points: Array, sizes: Array) -> bool:
-    """Whether a path returns to its first point."""
-    return bool((np.abs(points[-1] - points[0]) <= _SAME * sizes).all()) and len(points) > 2
+class TaskSpline:
+    """A spline x(s) through task values: cubic, in quaternions of length 1 for a whole orientation.
+
+    Orientations go from each to the next by the shorter turn, half a turn from the reference of the task too.
+
+    Args:
+        relative: the task.
+        s: parameters (N,).
+        points: task values (N, m).
+        sizes: of the components, (m,).
+    """
+
+    def __init__(self, relative: Relative, s: Array, points: Array, sizes: Array) -> None:
+        self._relative, self._s = relative, s
+        rows = points
+        if relative.turned:
+            p = continued(Batched(relative.task.quaternion_function)(points)[0])
+            rows = np.hstack([points[:, : relative.first], p])
+            sizes = np.concatenate([sizes[: relative.first], np.ones(4)])
+        away = np.abs(rows[-1] - rows[0])
+        self.returns = bool((away <= _SAME * sizes).all()) and len(rows) > 2  #: to its first point, without a full turn
+        self._rows = rows
+        self._curve = spline(s, rows, False)
+
+    def closed(self) -> "TaskSpline":
+        """The same, periodic."""
+        self._curve = spline(self._s, self._rows, True)
+        return self
+
+    def __call__(self, s: ArrayLike) -> Array:
+        """x at parameters (N,), (N, m), or at one number, (m,)."""
+        rows = np.asarray(self._curve(s))
+        if not self._relative.turned:
+            return rows
+        first, p = np.split(rows.reshape(-1, rows.shape[-1]), [self._relative.first], axis=1)
+        R = rotations_of(p / np.linalg.norm(p, axis=1, keepdims=True))
+        x = np.hstack([first, Batched(self._relative.task.components_function)(R)[0]])
+        return np.asarray(x.reshape(*rows.shape[:-1], -1))
+
+    def rates(self, s: ArrayLike, order: int) -> Array:
+        """The first or second derivative: with `Relative.rates` J, J q' and J q'' + dJ/ds q' of joints that follow."""
+        rows = [np.asarray(self._curve(s, k)) for k in range(order + 1)]
+        if not self._relative.turned:
+            return rows[order]
+        first = self._relative.first
+        p, *slopes = (row[..., first:] for row in rows)
+        square = (p**2).sum(axis=-1, keepdims=True)
+        omega = 2 * _across(p, slopes[0]) / square
+        if order == 2:
+            growth = 2 * (p * slopes[0]).sum(axis=-1, keepdims=True) / square
+            omega = 2 * _across(p, slopes[1]) / square - growth * omega
+        assert self._relative.task.turn is not None
+        return np.concatenate([rows[order][..., :first], omega @ self._relative.task.turn.order.T], axis=-1)
 
 
-def places(points: Array, sizes: Array) -> Array:
-    """Parameters s (N,) of points (N, k) from 0 to 1, in proportion to the lengths of the chords.
+def continued(quaternions: Array) -> Array:
+    """Quaternions (N, 4) with signs such that each is nearer to the one before than its opposite is."""
+    turns = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    signed: Array = quaternions * np.concatenate([[1.0], np.cumprod(turns)])[:, None]
+    return signed
+
+
+def _across(a: Array, b: Array) -> Array:
+    """The vector part of conj(a) b, (..., 3)."""
+    found: Array = a[..., :1] * b[..., 1:] - b[..., :1] * a[..., 1:] - np.cross(a[..., 1:], b[..., 1:])
+    return found
+
+
+def places(steps: Array) -> Array:
+    """Parameters s (N,) of points from 0 to 1, in proportion to the lengths of the chords (N - 1, k) between them.
 
     Raises:
         InvalidValueError: if a point repeats the one before it.
     """
-    chords = np.linalg.norm(np.diff(points / sizes, axis=0), axis=1)
+    chords = np.linalg.norm(steps, axis=1)
     repeated = np.flatnonzero(chords <= 1e-12)
     if repeated.size:
         k = int(repeated[0]) + 1
@@ -78,10 +145,11 @@ def _value(name: str, function: Callable[[float], Any], s: float, size: int) -> 
 class Plan:
     """A path of the tool, and one of the extra coordinates."""
 
-    x: CubicSpline  #: s -> (m,)
+    x: TaskSpline  #: s -> (m,)
     xi: CubicSpline  #: s -> (r,)
     s: Array  #: (N,) parameters of the waypoints
     waypoints: Array  #: (N, m)
+    steps: Array  #: from each to the next, relative to the sizes of the task components, (N - 1, m)
     is_function: bool  #: whether the path was given as a function, so that waypoints are samples of it
     closed: bool
 
@@ -104,25 +172,23 @@ class Plan:
         x = sampled("tool_path", tool_path, chart.m, chart.labels[: chart.m])
         if s_xi is None and len(xi) != len(x):
             raise InvalidValueError("number of rows of xi", len(xi), f"{len(x)}, as of tool_path")
-        sizes = chart.phi_sizes[: chart.m]
-        closed = same_ends(x, sizes) and bool(np.abs(xi[-1] - xi[0]).max() < 1e-9)
+        steps = chart.relative.difference(x[1:], x[:-1]) / chart.phi_sizes[: chart.m]
         if callable(tool_path):
             s = np.linspace(0.0, 1.0, len(x))
-        elif s_xi is None:
-            s = places(np.hstack([x, xi]), chart.phi_sizes)
         else:
-            s = places(x, sizes)
-        places_of_xi = s if s_xi is None else s_xi
-        curve = spline(places_of_xi, xi, closed and len(xi) > 2)
-        return cls(spline(s, x, closed), curve, s, x, callable(tool_path), closed)
+            s = places(np.hstack([steps, np.diff(xi, axis=0)]) if s_xi is None else steps)
+        path = TaskSpline(chart.relative, s, x, chart.phi_sizes[: chart.m])
+        closed = path.returns and bool(np.abs(xi[-1] - xi[0]).max() < 1e-9)
+        curve = spline(s if s_xi is None else s_xi, xi, closed and len(xi) > 2)
+        return cls(path.closed() if closed else path, curve, s, x, steps, callable(tool_path), closed)
 
     def with_xi(self, xi: CubicSpline) -> "Plan":
         """The same tool path with other coordinates."""
         return replace(self, xi=xi)
 
     def phi(self, s: Array, order: int = 0) -> Array:
-        """phi or a derivative of it at parameters (N,), (N, n); at one number (n,)."""
-        return np.concatenate([self.x(s, order), self.xi(s, order)], axis=-1)
+        """phi, or derivatives as rates, at parameters (N,), (N, n); at one number (n,). See `TaskSpline.rates`."""
+        return np.concatenate([self.x.rates(s, order) if order else self.x(s), self.xi(s, order)], axis=-1)
 
     def checked(self) -> Array:
         """Parameters (P,) at which the path is checked: the waypoints, and between them."""

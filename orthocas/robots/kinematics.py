@@ -11,7 +11,7 @@ from orthocas.errors import InvalidValueError
 from orthocas.robots.spatial import (
     constant,
     half_angle_vector,
-    half_angle_vector_anywhere,
+    quaternion_of,
     quaternion_product,
     rotation_matrix,
     rotation_z_to,
@@ -146,7 +146,7 @@ class TipTurn:
             to_differentiate: use the shorter formula, which loses digits next to half a turn.
         """
         if self.axis is None:
-            turns = half_angle_vector(turned) if to_differentiate else half_angle_vector_anywhere(turned)
+            turns = half_angle_vector(turned) if to_differentiate else 2 * quaternion_of(turned)[1:]
         else:
             turns = self._about_axis(turned, _AXES.index(self.axis))
         return ca.vertcat(position, turns) if self.with_position else turns
@@ -162,6 +162,13 @@ class TipTurn:
         tilted[i], tilted[j], along[axis], spun[axis] = half[0], half[1], 1, ca.sin(half[2])
         tilting = ca.cross(along, tilted)
         return quaternion_product(ca.vertcat(_cosine(tilting), tilting), ca.vertcat(ca.cos(half[2]), spun))
+
+    def of_quaternion(self, p: ca.SX) -> ca.SX:
+        """The components of a whole orientation (3, 1) that a unit quaternion (w, x, y, z) describes."""
+        if self.axis is None:
+            return 2 * p[1:] * ca.if_else(p[0] < 0, -1, 1)
+        cross = skew(p[1:])
+        return self._about_axis(ca.SX.eye(3) + 2 * (p[0] * cross + cross @ cross), _AXES.index(self.axis))
 
     @property
     def order(self) -> Array:

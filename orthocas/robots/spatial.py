@@ -29,23 +29,25 @@ def half_angle_vector(R: ca.SX) -> ca.SX:
     return vee / ca.sqrt(1 + ca.trace(R))
 
 
-def half_angle_vector_anywhere(R: ca.SX) -> ca.SX:
-    """The same without loss of digits up to half a turn, where the vector and its opposite mean one rotation.
+def quaternion_of(R: ca.SX) -> ca.SX:
+    """The unit quaternion (w, x, y, z) of a rotation matrix with w >= 0, without loss of digits, (4, 1).
 
-    Beyond 120 degrees it is taken from the column of v v^T with the largest diagonal entry, v = sin(angle / 2) axis.
+    Beyond 120 degrees it is taken from the column of v v^T with the largest diagonal entry, v = (x, y, z).
     """
-    trace, far = ca.trace(R), ca.SX(3, 1)
+    trace, far = ca.trace(R), ca.SX(4, 1)
     squares = [ca.fmax(1 + 2 * R[k, k] - trace, _TINY) for k in range(3)]  # 4 v_k^2
     for k in (2, 1, 0):
         i, j = (k + 1) % 3, (k + 2) % 3
-        size = ca.sqrt(squares[k])
-        column = ca.SX(3, 1)
-        column[k], column[i], column[j] = size, (R[k, i] + R[i, k]) / size, (R[k, j] + R[j, k]) / size
-        column = column * ca.if_else(R[j, i] - R[i, j] < 0, -1, 1)
+        size, turned = ca.sqrt(squares[k]), R[j, i] - R[i, j]
+        column = ca.SX(4, 1)
+        column[0], column[1 + k] = turned / size, size
+        column[1 + i], column[1 + j] = (R[k, i] + R[i, k]) / size, (R[k, j] + R[j, k]) / size
+        column = column * ca.if_else(turned < 0, -0.5, 0.5)
         largest = 1.0 if k == 2 else ca.if_else(squares[k] >= ca.fmax(squares[i], squares[j]), 1, 0)
         far = ca.if_else(largest, column, far)
-    near = ca.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]) / ca.sqrt(ca.fmax(1 + trace, _TINY))
-    return ca.if_else(trace > 0, near, far)
+    cosine = ca.sqrt(ca.fmax(1 + trace, _TINY))
+    vee = ca.vertcat(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
+    return ca.if_else(trace > 0, ca.vertcat(cosine, vee / cosine) / 2, far)
 
 
 def quaternion_product(a: ca.SX, b: ca.SX) -> ca.SX:

@@ -9,7 +9,6 @@ from orthocas.robots.spatial import conjugate, quaternion_product, skew
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array
 from orthocas.tools.columns import BlockedFunction
 
 
@@ -29,7 +28,7 @@ class Relative:
         self.task = task
         turn = task.turn
         self.turned = turn is not None and turn.whole  #: whether x holds a whole orientation
-        self._first = task.m - 3 if self.turned else task.m  # rows before those of the orientation
+        self.first = task.m - 3 if self.turned else task.m  #: rows before those of the orientation
 
     def difference(self, x_d: Any, x: Any) -> Any:
         """-e: how far x_d is from x, as NumPy rows (..., m) or CasADi columns (m, 1)."""
@@ -41,28 +40,15 @@ class Relative:
         rows = self._batched_error(here.reshape(-1, self.task.m), wanted.reshape(-1, self.task.m))[0]
         return -rows.reshape(wanted.shape)
 
-    @cached_property
+    @property
     def rates(self) -> ca.Function:
         """q (n, 1) -> J (m, n)."""
-        turn, robot = self.task.turn, self.task.robot
-        if turn is None or not self.turned:
-            return self.task.jacobian_function
-        q = ca.SX.sym("q", robot.n)
-        J, R = robot.function("tip_jacobian")(q), robot.function("tip_rotation")(q)
-        return dense_function("task_rates", [q], [ca.cse(turn.rates(R.T @ J[3:, :], J[:3, :]))])
+        return self.task.rates_function
 
     @cached_property
     def batched_rates(self) -> BlockedFunction:
         """Evaluates J at many points."""
         return BlockedFunction(self.rates) if self.turned else self.task.batched_jacobian
-
-    @cached_property
-    def rates_derivative(self) -> ca.Function:
-        """q, v, w (n, 1) -> (d/ds) J(q + s v) w, (m, 1)."""
-        if not self.turned:
-            return self.task.second_derivative_function
-        q, v, w = (ca.SX.sym(name, self.task.robot.n) for name in ("q", "v", "w"))
-        return dense_function("task_rates_derivative", [q, v, w], [ca.jtimes(self.rates(q) @ w, q, v)])
 
     def error(self, q: ca.MX, x_d: ca.MX) -> tuple[ca.MX, ca.MX]:
         """E (m, 1), and de/dq (m, n) for x_d at rest."""
@@ -78,11 +64,38 @@ class Relative:
 
     def bend(self, q: ca.MX, dq: ca.MX, w: ca.MX, wanted: tuple[ca.MX, ca.MX, ca.MX]) -> ca.MX:
         """(d/dt) (de/dq w - drift) for a constant w (n, 1), (m, 1), with x_d and its two derivatives."""
-        bend = self.rates_derivative(q, dq, w)
+        bend = self.task.rates_derivative_function(q, dq, w)
         if not self.turned:
             return bend - wanted[2]
         J = self.rates(q)
         return self._bend(self.task.function(q), *wanted, J @ dq, J @ w, bend)
+
+    @cached_property
+    def moved(self) -> ca.Function:
+        """x, e, x_d, dx_d, ddx_d -> the value at e from x, in the sense of the error, and the derivatives it has there.
+
+        They are those of an orientation with the angular velocity and acceleration of x_d in its own axes.
+        """
+        x, e, x_d, dx_d, ddx_d = symbols = self._symbols("x", "e", "x_d", "dx_d", "ddx_d")
+        if not self.turned:
+            return dense_function("moved", symbols, [x + e, dx_d, ddx_d])
+        turn, first = self.task.turn, self.first
+        assert turn is not None
+        _, omega, alpha = self._wanted(x_d, dx_d, ddx_d)
+        half = self._order.T @ e[first:] / 2
+        step = ca.vertcat(ca.sqrt(ca.fmax(1 - ca.sumsqr(half), 0)), half)
+        p = quaternion_product(self._quaternion(x), step)
+        dp = quaternion_product(p, ca.vertcat(0, omega)) / 2
+        ddp = (quaternion_product(dp, ca.vertcat(0, omega)) + quaternion_product(p, ca.vertcat(0, alpha))) / 2
+        at = ca.SX.sym("p", 4)
+        value = turn.of_quaternion(at)
+        rate = ca.jtimes(value, at, dp)
+        found = [value, rate, ca.jtimes(rate, at, dp) + ca.jtimes(value, at, ddp)]
+        found = ca.substitute(found, [at], [p])
+        whole = [
+            ca.vertcat(a, b) for a, b in zip((x[:first] + e[:first], dx_d[:first], ddx_d[:first]), found, strict=True)
+        ]
+        return dense_function("moved", symbols, [ca.cse(part) for part in whole])
 
     @cached_property
     def _batched_error(self) -> Batched:
@@ -94,8 +107,8 @@ class Relative:
         x, x_d = self._symbols("x", "x_d")
         w, v = self._relative(x, self._quaternion(x_d))
         slope = ca.SX.eye(self.task.m)
-        slope[self._first :, self._first :] = self._ordered(w * ca.SX.eye(3) + skew(v))
-        e = ca.vertcat(x[: self._first] - x_d[: self._first], self._order @ (2 * v))
+        slope[self.first :, self.first :] = self._ordered(w * ca.SX.eye(3) + skew(v))
+        e = ca.vertcat(x[: self.first] - x_d[: self.first], self._order @ (2 * v))
         return dense_function("relative", [x, x_d], [e, slope], ["x", "x_d"])
 
     @cached_property
@@ -105,7 +118,7 @@ class Relative:
         p, omega = self._wanted(x_d, dx_d, ca.SX.zeros(self.task.m))[:2]
         w, v = self._relative(x, p)
         turning = self._order @ (w * omega - ca.cross(v, omega))
-        return dense_function("drift", [x, x_d, dx_d], [-ca.vertcat(dx_d[: self._first], turning)], ["x", "x_d", "v"])
+        return dense_function("drift", [x, x_d, dx_d], [-ca.vertcat(dx_d[: self.first], turning)], ["x", "x_d", "v"])
 
     @cached_property
     def _bend(self) -> ca.Function:
@@ -114,12 +127,12 @@ class Relative:
         x, x_d, dx_d, ddx_d, here, there, change = symbols = self._symbols(*names)
         p, omega, alpha = self._wanted(x_d, dx_d, ddx_d)
         w, v = self._relative(x, p)
-        turning, along, changing = (self._order.T @ rate[self._first :] for rate in (here, there, change))
+        turning, along, changing = (self._order.T @ rate[self.first :] for rate in (here, there, change))
         dv = (w * (turning - omega) + ca.cross(v, turning + omega)) / 2
         dw = -ca.dot(v, turning - omega) / 2
         moved = dw * along + ca.cross(dv, along) + w * changing + ca.cross(v, changing)
         left = dw * omega + w * alpha - ca.cross(dv, omega) - ca.cross(v, alpha)
-        straight = change[: self._first] - ddx_d[: self._first]
+        straight = change[: self.first] - ddx_d[: self.first]
         return dense_function("bend", symbols, [ca.cse(ca.vertcat(straight, self._order @ (moved - left)))], names)
 
     def _symbols(self, *names: str) -> list[ca.SX]:

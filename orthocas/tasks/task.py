@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots.kinematics import TipTurn, frame_along
 from orthocas.robots.robot import Robot
-from orthocas.robots.spatial import rotation_matrix, rotations_of
+from orthocas.robots.spatial import quaternion_of, quaternion_product, rotation_matrix, rotations_of, skew
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
@@ -241,9 +241,40 @@ class Task(Shown):
 
     @cached_property
     def jacobian_function(self) -> ca.Function:
-        """q (n, 1) -> J_x = dh/dq (m, n), by automatic differentiation."""
+        """q (n, 1) -> J_x = dh/dq (m, n), by automatic differentiation.
+
+        For a rotation vector x = 2 v of the unit quaternion (w, v), dx/dt = w omega + v x omega with the angular
+        velocity omega in the tip's axes, which also holds next to half a turn.
+        """
         q = ca.SX.sym("q", self.robot.n)
-        return dense_function("task_jacobian", [q], [ca.jacobian(self.smooth_function(q), q)])
+        if not self._has_rotation_vector:
+            return dense_function("task_jacobian", [q], [ca.jacobian(self.smooth_function(q), q)])
+        J, p = self.rates_function(q), self._quaternion(q)
+        turns = (p[0] * ca.SX.eye(3) + skew(p[1:])) @ J[self.m - 3 :, :]
+        return dense_function("task_jacobian", [q], [ca.cse(ca.vertcat(J[: self.m - 3, :], turns))])
+
+    @cached_property
+    def rates_function(self) -> ca.Function:
+        """q (n, 1) -> rows (m, n): dq gives how fast x moves, as seen from where it is; J_x for most tasks.
+
+        For orientation and pose tasks, the rows of the orientation are the angular velocity in the tip's axes; with an
+        AXIS in the order tilt, tilt, turn. They are those of J_x where the tip has the reference orientation.
+        """
+        turn = self.turn
+        if turn is None or not turn.whole:
+            return self.jacobian_function
+        q = ca.SX.sym("q", self.robot.n)
+        J, R = self.robot.function("tip_jacobian")(q), self.robot.function("tip_rotation")(q)
+        return dense_function("task_rates", [q], [ca.cse(turn.rates(R.T @ J[3:, :], J[:3, :]))])
+
+    @cached_property
+    def rates_derivative_function(self) -> ca.Function:
+        """q, v, w (n, 1) -> (d/ds) J(q + s v) w with the rows J of `rates_function`, (m, 1)."""
+        if self.rates_function is self.jacobian_function:
+            return self.second_derivative_function
+        q, v, w = (ca.SX.sym(name, self.robot.n) for name in ("q", "v", "w"))
+        change = ca.jtimes(self.rates_function(q) @ w, q, v)
+        return dense_function("task_rates_derivative", [q, v, w], [ca.cse(change)], ["q", "v", "w"])
 
     @cached_property
     def frame_jacobian_function(self) -> ca.Function:
@@ -265,7 +296,15 @@ class Task(Shown):
     def second_derivative_function(self) -> ca.Function:
         """q, v, w (n, 1) -> d^2 h(q)[v, w] = (d/ds) J_x(q + s v) w, (m, 1)."""
         q, v, w = (ca.SX.sym(name, self.robot.n) for name in ("q", "v", "w"))
-        second = ca.jtimes(ca.jtimes(self.smooth_function(q), q, w), q, v)
+        if self._has_rotation_vector:
+            J, p, change = self.rates_function(q), self._quaternion(q), self.rates_derivative_function(q, v, w)
+            along, there = (J[self.m - 3 :, :] @ rate for rate in (v, w))
+            dp = quaternion_product(p, ca.vertcat(0, along)) / 2
+            bend = dp[0] * there + ca.cross(dp[1:], there)
+            bend += p[0] * change[self.m - 3 :] + ca.cross(p[1:], change[self.m - 3 :])
+            second = ca.cse(ca.vertcat(change[: self.m - 3], bend))
+        else:
+            second = ca.jtimes(ca.jtimes(self.smooth_function(q), q, w), q, v)
         return dense_function("task_second_derivative", [q, v, w], [second], ["q", "v", "w"])
 
     @cached_property
@@ -313,7 +352,7 @@ class Task(Shown):
         """
         turn = self._whole_turn()
         R, single = _rotations("orientation", orientation)
-        turned = Batched(self._components_function)(self.reference.T @ R)[0]
+        turned = Batched(self.components_function)(self.reference.T @ R)[0]
         if turn.with_position:
             p = as_float_array("position", np.nan if position is None else position)
             require_shape("position", p.shape, (3,) if single else (len(R), 3))
@@ -337,10 +376,18 @@ class Task(Shown):
         return dense_function("quaternion", [x], [self._whole_turn().quaternion(x[self.m - 3 :])], ["x"])
 
     @cached_property
-    def _components_function(self) -> ca.Function:
+    def components_function(self) -> ca.Function:
         """The rotation from the reference to the tip (3, 3) -> the components of the orientation (3, 1)."""
         R = ca.SX.sym("R", 3, 3)
         return dense_function("components", [R], [self._whole_turn().components(R, ca.SX.zeros(3))[-3:]], ["R"])
+
+    @property
+    def _has_rotation_vector(self) -> bool:
+        return self.turn is not None and self.turn.whole and self.turn.axis is None
+
+    def _quaternion(self, q: ca.SX) -> ca.SX:
+        """The rotation from the reference to the tip, (4, 1)."""
+        return quaternion_of(ca.SX(ca.DM(self.reference.T)) @ self.robot.function("tip_rotation")(q))
 
     def _whole_turn(self) -> TipTurn:
         if self.turn is None or not self.turn.whole:

@@ -1,4 +1,4 @@
-"""Whole turns of joints that turn without end: they change the coordinates, but not the posture."""
+"""Errors of phi for laws: orientations relative to the wanted ones, and no whole turns."""
 
 from typing import Any
 
@@ -29,6 +29,31 @@ def without_turns(chart: Chart, difference: Any) -> Any:
         return difference
     whole = ca.floor(ca.DM(np.linalg.pinv(T)) @ difference + 0.5)
     return difference - ca.DM(T) @ whole
+
+
+def errors(chart: Chart, q: ca.MX, reference: ca.MX) -> tuple[ca.MX, ca.MX]:
+    """phi relative to phi_d, e (n, 1), and de/dq (n, n) for a reference at rest.
+
+    For most tasks e = phi - phi_d and de/dq = J. A whole orientation counts from the wanted one, see `Relative`.
+    """
+    m, own = chart.m, chart.coordinates.functions
+    e, slope = chart.relative.error(q, reference[:m])
+    e = without_turns(chart, ca.vertcat(e, own["xi"](q) - reference[m:]))
+    return e, ca.vertcat(slope, own["jacobian"](q))
+
+
+def drift(chart: Chart, q: ca.MX, reference: ca.MX, velocity: ca.MX) -> ca.MX:
+    """The rate de/dq dq at which q stays with a reference that moves, (n, 1): d_phi_d for most tasks."""
+    m = chart.m
+    return ca.vertcat(chart.relative.drift(q, reference[:m], velocity[:m]), velocity[m:])
+
+
+def bend(chart: Chart, q: ca.MX, dq: ca.MX, w: ca.MX, wanted: tuple[ca.MX, ca.MX, ca.MX]) -> ca.MX:
+    """(d/dt) (de/dq w - drift), (n, 1), with phi_d and its two derivatives: dJ/dt w - dd_phi_d for most tasks."""
+    m = chart.m
+    x, dx, ddx = (part[:m] for part in wanted)
+    rest = chart.coordinates.functions["second_derivative"](q, dq, w) - wanted[2][m:]
+    return ca.vertcat(chart.relative.bend(q, dq, w, (x, dx, ddx)), rest)
 
 
 def _turns(chart: Chart) -> Array:
