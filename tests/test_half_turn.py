@@ -17,7 +17,6 @@ from orthocas.codegen.library import CompiledLibrary, compile_shared
 from orthocas.codegen.supervisor import Supervisor
 from orthocas.control.controller import ControlStatus
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.relative import Relative
 
 Numbers = NDArray[np.float64]
@@ -172,9 +171,8 @@ def test_self_motions_do_not_depend_on_the_reference() -> None:
 
 def test_wishes_are_met_half_a_turn_away() -> None:
     q = oc.problems.get("iiwa").domain.centre + np.pi * np.eye(7)[6]
-    wish = q + [0.05, -0.1, 0.1, 0.05, 0, 0, 0]
+    wish = q + np.array([0.05, -0.1, 0.1, 0.05, 0, 0, 0])
     found = [known.nearest_xi(wish, known.task(q)).q for known in (chart(), chart(turned_deg=100.0))]
-    assert [known.shape for known in found] == [(1, 7), (1, 7)] or found[0].shape == (7,)
     R = [arm().tip_rotation(np.atleast_2d(each)[0]) for each in found]
     np.testing.assert_allclose(R[0], arm().tip_rotation(q), atol=1e-7)
     np.testing.assert_allclose(R[1], R[0], atol=1e-7)

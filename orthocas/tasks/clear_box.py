@@ -58,7 +58,7 @@ class ClearBox(Box):
     D^-1 J J^T D^-1 - bound^2 I is positive definite, so guards test the m pivots of its elimination.
 
     Half a turn of the tool from the reference, x itself ends although the robot may be clear, and J_x loses rank. Laws
-    report SINGULAR close to it; rows="x" keeps a domain away from it.
+    for tasks of one axis report SINGULAR close to it; rows="x" keeps a domain away from it.
 
     `Problem(..., least_singular_value=bound)` builds it.
 

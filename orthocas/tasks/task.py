@@ -90,7 +90,8 @@ class Task(Shown):
         """Orientation of the tip relative to a reference, (3,): a rotation vector, or tilt and turn of an axis.
 
         By default x = 2 sin(angle / 2) axis of the rotation from the reference to the tip. Near the reference, it is
-        the rotation vector [rad]. It is smooth except half a turn away from the reference.
+        the rotation vector [rad]. Half a turn away from the reference it jumps to its opposite; solvers, laws and C
+        compare orientations by the turn between them, so they pass there (`orthocas.tasks.relative`).
 
         With `axis`, the first two components are those of the task `axis`, and the third is the tip's turn about that
         axis in (-pi, pi] [rad], after the shortest rotation that tilts the axis. A last joint along the axis then moves
