@@ -74,12 +74,18 @@ class Chart(InverseMethods, Shown):
         )
         return {
             "chart": f"{self.coordinates.label} coordinates of {self.problem.heading}",
-            "phi": listed(self.labels),
+            "phi": listed([*self.labels[: self.m], *self.named_coordinates]),
             "parameters": str(self.coordinates.size),
             **{name: problem[name] for name in ("task", "metric", "domain")},
             **({"made by": made} if made else {}),
             **({"certificate": self.certificate.heading} if self.certificate else {}),
         }
+
+    @property
+    def named_coordinates(self) -> tuple[str, ...]:
+        """Labels of the coordinates, with what they mean where `fit_wide` gave them a meaning: 'xi1: swivel [rad]'."""
+        labels, meaning = self.labels[self.m :], self.notes.get("meaning")
+        return (f"{labels[0]}: {meaning}",) if isinstance(meaning, str) and self.r == 1 else labels
 
     def quality(self, q: ArrayLike) -> PointQuality:
         """How good the chart is at one joint position (n,), or at each of a set or a path (N, n).

@@ -75,7 +75,7 @@ def description_values(chart: Chart) -> dict[str, str]:
         ),
         "task_labels": ", ".join(_with_units(chart.problem.task)),
         "orientation": _orientation(chart.problem.task),
-        "extra_labels": ", ".join(words(chart.labels[chart.m :])),
+        "extra_labels": ", ".join(words(chart.named_coordinates)),
         "angles": _angles(chart),
         "tip": words([tree.tip_name])[0],
         "gravity": _row(tree.gravity),

@@ -25,7 +25,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.regular_part import RegularPart
 from orthocas.charts.worst_points import worst_points
-from orthocas.errors import DomainError, Interrupted, InvalidValueError
+from orthocas.errors import DomainError, Interrupted, InvalidValueError, RobotError
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.checkpoint import Stage
 from orthocas.fitting.fit import Fit, fit, in_gauge, normalised
@@ -47,6 +47,7 @@ from orthocas.tools.progress import Monitor, Progress, silent
 
 Quantity = Callable[[ca.SX], ca.SX]  #: a function of an SX column q
 
+SWIVEL = "swivel"  #: the name of the angle of the elbow
 CLEARANCE = 0.1  #: default least relative singular value
 LEAST_VOLUME = 0.05  #: over r, of the coordinates in domains of wide charts; see `RegularPart`
 DEGREE = 6
@@ -136,6 +137,7 @@ def fit_wide(
         like: with r = 1, what xi is to mean: a function of an SX column q, the name of a joint, or "swivel", the angle
             of the elbow about the line from shoulder to wrist [rad]. Along the self-motion of the home, or else of the
             branch's posture, xi then has nearly the values of that quantity, as far as these are monotone there.
+            Default: with shoulder, elbow and wrist, the scale and the sense of the swivel there.
         samples: number of samples. Default: 40 for each function, 5,000 to 40,000.
         seed: seed of the samples.
         monitor: called with progress.
@@ -176,10 +178,8 @@ def fit_wide(
     if wanted.closed_form is not None or not isinstance(wanted.family(JointSpace.of(problem), problem.r), LinearFamily):
         raise InvalidValueError("parametrisation", wanted.label, "a family to fit that is linear in its parameters")
     count = None if samples is None else require_count("samples", samples, least=2)
-    meaning = None
-    if like is not None:
-        posture = chosen.posture if home is None else home_posture(robot, task, home).q
-        meaning = Meaning.of(problem, _quantity(robot, like), posture)
+    posture = chosen.posture if home is None else home_posture(robot, task, home).q
+    meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
     search = _Search(problem, wanted, count, seed, monitor, meaning)
     with remembered() as pressed:
         stopped = False
@@ -202,10 +202,8 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
     raw = search.coordinates(search.best[2])
-    if search.meaning is None:
-        coordinates = in_gauge(normalised(raw, centre, first), centre)
-    else:
-        coordinates = search.meaning.named(raw)
+    meaning = search.meaning
+    coordinates = in_gauge(normalised(raw, centre, first), centre) if meaning is None else meaning.named(raw)
     try:
         domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     except DomainError as error:
@@ -222,7 +220,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         "branch": branch.name,
         "regular share": share,
         "least conditioning": worst.least,
-        **({} if search.meaning is None else {"error of its meaning": search.meaning.error(coordinates)}),
+        **({} if meaning is None else {"meaning": meaning.name, "error of its meaning": meaning.error(coordinates)}),
     }
     return WideFit(
         chart=Chart(problem, coordinates, notes),
@@ -236,15 +234,19 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     )
 
 
-def _quantity(robot: Robot, like: Quantity | str) -> ca.Function:
-    """q (n, 1) -> the quantity (1, 1)."""
+def _quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
+    """Its name with a unit, and q (n, 1) -> the quantity (1, 1)."""
     q = ca.SX.sym("q", robot.n)
     if isinstance(like, str):
-        require_known("like", like, ("swivel", *robot.joint_names))
-        return sew_angle(robot, "conventional") if like == "swivel" else _of(q, q[robot.joint_names.index(like)])
+        require_known("like", like, (SWIVEL, *robot.joint_names))
+        if like == SWIVEL:
+            return f"{SWIVEL} [rad]", sew_angle(robot, "conventional")
+        k = robot.joint_names.index(like)
+        return f"{like} [{'m' if robot.tree.prismatic[k] else 'rad'}]", _of(q, q[k])
     found = expression_of("like", like, q)
     require_shape("like", found.shape, (1, 1))
-    return _of(q, found)
+    name = str(getattr(like, "__name__", ""))
+    return name if name.isidentifier() else "a function of q", _of(q, found)
 
 
 def _of(q: ca.SX, value: ca.SX) -> ca.Function:
@@ -259,14 +261,25 @@ class Meaning:
     values: Array  #: (k,), monotone
     middle: int  #: place of the posture
     slope: float  #: mean change of the value for a unit self-motion, in the sense of `_Field.directions`
+    name: str  #: with its unit
+    wanted: bool  #: whether coordinates are fitted to the values; otherwise they only get their scale and offset
 
     @classmethod
-    def of(cls, problem: Problem, quantity: ca.Function, posture: Array) -> "Meaning":
+    def by_default(cls, problem: Problem, posture: Array) -> "Meaning | None":
+        """The scale of the angle of the elbow, if the arm has shoulder, elbow and wrist and r = 1."""
+        try:
+            return replace(cls.of(problem, SWIVEL, posture), wanted=False)
+        except (InvalidValueError, RobotError):
+            return None
+
+    @classmethod
+    def of(cls, problem: Problem, like: Quantity | str, posture: Array) -> "Meaning":
         """Follow the self-motion of a posture both ways, as long as it is in the domain and the quantity is monotone.
 
         Raises:
             InvalidValueError: if r > 1, or the quantity stands still there.
         """
+        name, quantity = _quantity(problem.robot, like)
         if problem.r != 1:
             raise InvalidValueError(
                 "like", f"given with r = {problem.r}", "none: a meaning for all coordinates but one"
@@ -275,6 +288,8 @@ class Meaning:
         points = np.concatenate([sides[0][:0:-1], sides[1]])
         middle = len(sides[0]) - 1
         values = np.unwrap(Batched(quantity)(points)[0][:, 0])  # angles do not jump
+        if like == SWIVEL:
+            values -= 2 * np.pi * np.round(values[middle] / (2 * np.pi))
         steps = np.diff(values)
         if len(points) < _FEWEST or not np.isfinite(steps).all():
             raise InvalidValueError(
@@ -287,7 +302,7 @@ class Meaning:
         slope = (values[high] - values[low]) / (_STEP * max(1, high - low))
         if high - low < _FEWEST or abs(slope) < _STILL:
             raise InvalidValueError("like", "a quantity that stands still at the home", "one that self-motions change")
-        return cls(points[low : high + 1], values[low : high + 1], middle - low, float(slope))
+        return cls(points[low : high + 1], values[low : high + 1], middle - low, float(slope), name, True)
 
     def equations(self, family: LinearFamily) -> tuple[Array, Array]:
         """Rows (k, K) and right sides (k,) of the coefficients, over the slope."""
@@ -296,9 +311,17 @@ class Meaning:
         return psi - psi[self.middle], (self.values - self.values[self.middle]) / self.slope
 
     def named(self, raw: Coordinates) -> Coordinates:
-        """Coordinates in units of the quantity, with its value at the posture."""
-        xi = raw.once("xi", self.points[self.middle][None])[0, 0]
-        return replace(raw, offset=np.array([xi - self.values[self.middle] / self.slope]), scale=np.array([self.slope]))
+        """Coordinates in units of the quantity, with its value at the posture.
+
+        The scale is that for which they were fitted, or the best one.
+        """
+        xi, scale = raw.once("xi", self.points)[:, 0], self.slope
+        away, values = xi - xi[self.middle], self.values - self.values[self.middle]
+        if not self.wanted:
+            scale = float(away @ values / max(away @ away, _TINY))
+        return replace(
+            raw, offset=np.array([xi[self.middle] - self.values[self.middle] / scale]), scale=np.array([scale])
+        )
 
     def error(self, coordinates: Coordinates) -> float:
         """Root mean square of what coordinates miss along the self-motion."""
@@ -433,7 +456,7 @@ class _Search:
         started, C = time.perf_counter(), C.copy()
         weights = np.concatenate([np.full(len(field.points), field.weight) for field in fields])
         value, E, pull = 0.0, smooth * energy + _RIDGE * np.trace(energy) / len(energy) * np.eye(len(energy)), None
-        if self.meaning is not None:
+        if self.meaning is not None and self.meaning.wanted:
             rows, sides = self.meaning.equations(self._family)
             E, pull = E + _MEANT / len(rows) * rows.T @ rows, _MEANT / len(rows) * rows.T @ sides
         for k in range(len(C)):

@@ -66,9 +66,9 @@ class ChartPage:
         phi, sizes = chart.phi(self.session.home), chart.phi_sizes
         sliders = {}
         with gui.add_folder("Coordinates: the task stays"):
-            for label, value in zip(chart.labels[m:], phi[m:].tolist(), strict=True):
+            for label, name, value in zip(chart.labels[m:], chart.named_coordinates, phi[m:].tolist(), strict=True):
                 hint = f"Moves the joints along {label}, and keeps the task and the other coordinates."
-                sliders[label] = self._slider(label, value, 0.5, hint)
+                sliders[label] = self._slider(name, value, 0.5, hint, label)
         with gui.add_folder("Task: the coordinates stay"):
             units = chart.problem.task.units
             for label, unit, value, size in zip(chart.labels[:m], units, phi[:m].tolist(), sizes[:m], strict=True):

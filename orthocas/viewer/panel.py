@@ -86,7 +86,9 @@ class ChartPanel:
         self._labels, self._units = chart.labels, problem.task.units
         self._half_width = float(domain.half_width.min())
         task = ", ".join(map(escape, chart.labels[: chart.m]))
+        branch = chart.notes.get("branch")
         lines = [place] if place else []
+        lines += [f"branch {escape(branch)}"] if isinstance(branch, str) else []
         lines += [f"{escape(chart.coordinates.label)}, {chart.n} joints"]
         lines += [f"task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}"]
         self._head = f'<div class="name">{escape(problem.name)}</div><div class="about">{"<br>".join(lines)}</div>'
