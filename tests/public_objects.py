@@ -313,6 +313,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "self-motion curve": lambda: cyclic().self_motion(cyclic().problem.domain.centre),
     "solutions": lambda: fitted().chart.solve([[1.6, 0.1, 0.1], [9.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]),
     "tracker": lambda: fitted().chart.tracker(planar().domain.centre),
+    "nearest tracker": lambda: fitted().chart.tracker(planar().domain.centre, nearest=True),
     "involutivity": lambda: oc.involutivity(planar(), 100),
     "singular point": lambda: oc.singular_points(problems.get("planar_2r"))[0],
     "jump": lambda: oc.jumps(circle())[0],

@@ -1,12 +1,17 @@
 """Trackers: streams of phi, and where they stop."""
 
+import pickle
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from public_objects import circle, clear
+from scipy.optimize import minimize
 
 import orthocas as oc
-from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError
+from orthocas.errors import DomainError, InvalidValueError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
+from orthocas.tasks.domains import bounds_of
 
 
 def circle_of_the_tool(chart: oc.Chart, count: int = 500) -> np.ndarray:
@@ -89,3 +94,63 @@ def test_trackers_are_made_for_fitted_charts_and_points_inside(planar_arm: oc.Ch
     for wrong in (np.zeros(2), 0.5, [[0.0, 0.0, 0.0]]):
         with pytest.raises(ShapeError, match="phi has shape"):
             tracker.step(wrong)
+
+
+def cost(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
+    """What a tracker of the nearest x makes small, without the zones at the boundary."""
+    e = (phi - chart.phi(q)) / chart.phi_sizes
+    return float((e[: chart.m] ** 2).sum() + 1e-6 * (e[chart.m :] ** 2).sum())
+
+
+@pytest.mark.parametrize("make", [clear, lambda: oc.fit(oc.problems.get("planar_3r_xy"), oc.Polynomial(2)).chart])
+def test_trackers_go_to_the_nearest_x_and_come_back(make: Callable[[], oc.Chart]) -> None:
+    """Far out of reach, the end is as near as what another method finds, inside; on the way nothing jumps."""
+    chart = make()
+    domain = chart.problem.domain
+    start, home = domain.centre, chart.phi(domain.centre)
+    tracker, q, statuses = chart.tracker(start, nearest=True), start, []
+    direction = np.zeros(chart.n)
+    direction[: chart.m] = home[: chart.m] / np.linalg.norm(home[: chart.m])
+    out = np.linspace(0.0, 3.0, 600)
+    for away in np.concatenate([out, out[::-1]]):
+        new = tracker.step(home + away * direction)
+        assert domain.contains(new)
+        assert np.abs(new - q).max() < 0.05
+        q = new
+        statuses.append(tracker.status)
+        if away == out[-1]:
+            farthest = q
+    assert statuses[0] == statuses[-1] == oc.TrackerStatus.OK
+    assert set(statuses) == {oc.TrackerStatus.OK, oc.TrackerStatus.NEAREST}
+    np.testing.assert_allclose(q, start, atol=1e-9)
+    wanted = home + out[-1] * direction
+    low, high = bounds_of(domain)
+    rooms = [{"type": "ineq", "fun": lambda q: -np.abs(q - start) + (high - low) / 2}]
+    if domain.condition is not None:
+        pivots = domain.condition.pivots
+        rooms.append({"type": "ineq", "fun": lambda q: np.array(pivots(q))[:, 0]})
+    other = minimize(lambda q: cost(chart, wanted, q), farthest, method="SLSQP", constraints=rooms, tol=1e-12)
+    sizes = np.linalg.norm(chart.phi_sizes[: chart.m])
+    assert np.sqrt(cost(chart, wanted, farthest)) < np.sqrt(other.fun) + 0.03 * sizes  # the zones
+
+
+def test_xi_gives_way_to_x(planar_arm: oc.Chart) -> None:
+    home = planar_arm.problem.domain.centre
+    tracker, phi = planar_arm.tracker(home, nearest=True), planar_arm.phi(home)
+    reach = planar_arm.xi_range(home)[0]
+    for xi in np.linspace(phi[2], reach.high + 1.0, 100):
+        q = tracker.step([phi[0], phi[1], xi])
+    assert tracker.status == oc.TrackerStatus.NEAREST
+    np.testing.assert_allclose(planar_arm.phi(q)[:2], phi[:2], atol=2e-3)
+    assert planar_arm.xi(q)[0] == pytest.approx(reach.high, abs=0.05 * (reach.high - reach.low))
+    again = pickle.loads(pickle.dumps(tracker))
+    np.testing.assert_array_equal(again.step([phi[0], phi[1], 9.0]), tracker.step([phi[0], phi[1], 9.0]))
+
+
+def test_domains_without_a_nearest_x_are_named() -> None:
+    known = oc.problems.get("planar_3r_xy")
+    path = known.domain.centre + np.linspace(-0.2, 0.2, 5)[:, None] * np.ones(3)
+    problem = oc.Problem(known.robot, known.task, domain=oc.Corridor(known.domain, path, 0.2))
+    chart = oc.fit(problem, oc.Polynomial(2), samples=300).chart
+    with pytest.raises(DomainError, match="expected a box or a clear box"):
+        chart.tracker(chart.problem.domain.centre, nearest=True)

@@ -12,6 +12,7 @@ from orthocas.charts.inside import Inside, Nearest
 from orthocas.charts.inverse import Inverse
 from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, PointFunctions, Starts, inverse_function
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
+from orthocas.charts.reaching import ReachingTracker, residuals_of
 from orthocas.charts.solutions import Solutions, Tracker
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.tasks.domains import bounds_of
@@ -193,20 +194,25 @@ class InverseMethods(PhiFunctions):
         assert in_domain is not None
         return in_domain.all_solutions(as_point("phi", phi, self.n), float(tolerance))
 
-    def tracker(self, q0: ArrayLike, largest_step: ArrayLike | None = None) -> Tracker:
+    def tracker(self, q0: ArrayLike, largest_step: ArrayLike | None = None, *, nearest: bool = False) -> Tracker:
         """A tracker that follows a stream of phi from q0; see `Tracker`.
 
         Args:
             q0: a joint position inside the domain, (n,).
             largest_step: largest change of each joint in a call, (n,) or one number [rad] or [m]; default: a tenth of
                 the half-widths of the domain.
+            nearest: where phi is out of reach, go to the nearest x, and with that to the nearest xi, instead of staying
+                where it was; see `ReachingTracker`. For domains that are boxes, clear or not, and wide charts.
 
         Raises:
             NoExpressionError: if the coordinates are grown.
             InvalidValueError: if q0 lies outside the domain, or J is singular there.
+            DomainError: for `nearest=True` on other domains.
         """
         self._require_expression("a tracker")
-        return Tracker(self._point_functions, self.problem.domain, q0, largest_step)
+        require_kind("nearest", nearest, bool)
+        parts = self._point_functions, self.problem.domain, q0, largest_step
+        return ReachingTracker(*parts, self._residuals) if nearest else Tracker(*parts)
 
     def function(self, name: str) -> ca.Function:
         """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.
@@ -259,6 +265,13 @@ class InverseMethods(PhiFunctions):
     @cached_property
     def _point_functions(self) -> PointFunctions:
         return PointFunctions.of(self.function("phi"), self.rates, self.phi_sizes, self.phi_map.difference)
+
+    @cached_property
+    def _residuals(self) -> ca.Function:
+        known = self.phi_map
+        return residuals_of(
+            self.function("phi"), self.rates, self.m, known.sizes, known.difference, self.problem.domain
+        )
 
     def _outside_error(
         self, targets: Array, q_start: ArrayLike | None, found: Solutions, beyond: Indices, single: bool

@@ -118,7 +118,7 @@ class Solutions(Shown):
 
 
 class TrackerStatus(IntEnum):
-    """How the last call of a tracker ended. With all but OK, q stays where it was."""
+    """How the last call of a tracker ended. With all but OK and NEAREST, q stays where it was."""
 
     OK = 0  #: phi(q) = phi, inside the domain
     JUMP = 1  #: q would have moved by more than `largest_step`
@@ -126,6 +126,7 @@ class TrackerStatus(IntEnum):
     SINGULAR = 3  #: J is singular, or nearly so
     LOST = 4  #: no solution near the last q
     BAD_INPUT = 5  #: a number of phi is not finite
+    NEAREST = 6  #: q moved, as near to phi as it could; of trackers with `nearest=True`
 
 
 class Tracker(Shown):

@@ -1,0 +1,159 @@
+"""Trackers that go as near as they can: to the nearest x in reach, and with that to the nearest xi."""
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.charts.newton import Bound, PointFunctions
+from orthocas.charts.phi import Differences
+from orthocas.charts.solutions import Tracker, TrackerStatus
+from orthocas.errors import DomainError
+from orthocas.tasks.domains import Domain, reach
+from orthocas.tools.batch import dense_function
+from orthocas.tools.checks import Array
+
+_WEIGHT = 1e-3  # of errors of xi, relative to those of x
+_ZONE = 0.02  # next to the boundary, in half-widths of joints and in relative room of conditions
+_STEPS, _HALVINGS = 12, 12  # of Gauss and Newton in a call, and of a step
+_INERTIA = 1e-3  # weight of the way from the last q, in half-widths
+_CONVERGED = 1e-10  # relative decrease of the cost at which a call ends
+_DECREASE = 1e-4  # of the cost, relative to what the model promises
+
+
+class ReachingTracker(Tracker):
+    """A `Tracker` that goes as near as it can where phi is out of reach.
+
+    It minimises, from where it is,
+
+        |D^-1 e_x|^2 + w^2 |e_xi|^2 + sum over boundaries of max(0, 1 - room / zone)^2
+
+    by damped Gauss-Newton steps, with the sizes D of x, w = 0.001 and a zone of 2 % next to the boundaries. The cost is
+    smooth, so q is smooth in phi where the minimum is. A phi that is reached outside the zones is met to rounding, as
+    by `Tracker`; otherwise `status` is NEAREST: x has priority, xi gives way. q never leaves the domain, and no joint
+    moves more than `largest_step` in a call.
+    """
+
+    def __init__(
+        self,
+        functions: PointFunctions,
+        domain: Domain,
+        q0: ArrayLike,
+        largest_step: ArrayLike | None,
+        residuals: ca.Function,
+    ) -> None:
+        self._residuals = residuals
+        super().__init__(functions, domain, q0, largest_step)
+        n, rows = len(domain.centre), residuals.size1_out(0)
+        self._at, self._to, self._rows, self._slopes = np.empty(n), np.empty(n), np.empty(rows), np.empty((n, rows))
+        self._bound = Bound(residuals, [self._at, self._to], [self._rows, self._slopes])
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without scratch memory."""
+        return {**super().__getstate__(), "residuals": self._residuals}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        names = ("functions", "domain", "q", "limit", "residuals")
+        self.__init__(*(state[name] for name in names))  # type: ignore[misc]
+
+    def step(self, phi: ArrayLike) -> Array:
+        """The q with phi(q) = phi, or the nearest that a search from the last q finds; see `status`.
+
+        Args:
+            phi: target values, (n,).
+
+        Returns:
+            q, (n,) [rad] or [m].
+
+        Raises:
+            ShapeError: if phi has another number of entries.
+        """
+        q = super().step(phi)
+        if self.status in (TrackerStatus.OK, TrackerStatus.BAD_INPUT):
+            return q
+        found = self._descended(q)
+        self._solver.q[:] = found
+        if not self._solver.refresh():
+            self._solver.q[:] = q
+            self._solver.refresh()
+            return q
+        self.status = TrackerStatus.NEAREST
+        return found
+
+    def _descended(self, q: Array) -> Array:
+        """Where Gauss-Newton steps lead from q (n,), within the domain and the largest step."""
+        start, now = q, q
+        self._to[:] = self._solver.target
+        pull = (_INERTIA / self._domain.half_width) ** 2
+        cost, r, J = self._cost(now)
+        for _ in range(_STEPS):
+            gradient, H = J.T @ r + pull * (now - start), J.T @ J + np.diag(pull)
+            move = -np.linalg.solve(H, gradient)
+            promised = float(-gradient @ move)
+            if promised <= _CONVERGED * cost:
+                break
+            for halvings in range(_HALVINGS + 1):
+                change = np.clip(now + move * 0.5**halvings - start, -self._limit, self._limit)
+                new = start + change
+                after, r_new, J_new = self._cost(new)
+                after += float(pull @ change**2) / 2
+                if after < cost - _DECREASE * 0.5**halvings * promised and self._domain.contains(new[None])[0]:
+                    break
+            else:
+                break
+            now, cost, r, J = new, after, r_new, J_new
+        return np.asarray(now)
+
+    def _cost(self, q: Array) -> tuple[float, Array, Array]:
+        """Half the sum of squares, the residuals (k,), and their Jacobian (k, n)."""
+        self._at[:] = q
+        self._bound.run()
+        r = self._rows.copy()
+        return (float(r @ r) / 2 if np.isfinite(r).all() else np.inf), r, self._slopes.T.copy()
+
+
+def residuals_of(
+    phi: ca.Function, rates: ca.Function, m: int, sizes: Array, difference: Differences, domain: Domain
+) -> ca.Function:
+    """Q, phi_d (n, 1) -> the residuals of `ReachingTracker`, and their Jacobian.
+
+    Raises:
+        DomainError: if the domain is neither a box nor clear of singular positions.
+    """
+    n = len(sizes)
+    q, target = ca.MX.sym("q", n), ca.MX.sym("target", n)
+    weights = ca.DM(np.where(np.arange(n) < m, 1 / sizes, _WEIGHT))
+    e = -difference(target, phi(q)) * weights
+    J = rates(q) * ca.repmat(weights, 1, n)
+    widths = reach(domain)
+    bounded = np.flatnonzero(np.isfinite(widths)).tolist()
+    away = (q - ca.DM(domain.centre))[bounded] / ca.DM(widths[bounded])
+    rooms = [1 - away, 1 + away]
+    clear = domain.singular_bound
+    if clear is not None:
+        rooms.append(_clearance(clear.gram(q), clear.least_singular_value))
+        if domain.room_to_fold is not None:
+            rooms.append(domain.room_to_fold(q))
+    elif not domain.is_box:
+        raise DomainError(f"a domain of kind '{domain.name}' has no nearest x, expected a box or a clear box")
+    short = ca.fmax(0, 1 - ca.vertcat(*rooms) / _ZONE)
+    slopes = ca.vertcat(J, ca.jacobian(short, q))
+    return dense_function("residuals", [q, target], [ca.vertcat(e, short), slopes], ["q", "phi"])
+
+
+def _clearance(gram: ca.MX, bound: float) -> ca.MX:
+    """The product of 1 - bound^2 / sigma_i^2 over the singular values, which is 0 where the least one is the bound."""
+    m = gram.shape[0]
+    symbol = ca.SX.sym("G", m, m)
+    share = ca.SX(1)
+    for pivot, whole in zip(_pivots(symbol - bound**2 * ca.SX.eye(m)), _pivots(symbol), strict=True):
+        share *= pivot / whole
+    return ca.Function("clearance", [symbol], [ca.cse(share)])(gram)
+
+
+def _pivots(A: ca.SX) -> list[ca.SX]:
+    found = []
+    while True:
+        found.append(A[0, 0])
+        if A.shape[0] == 1:
+            return found
+        A = A[1:, 1:] - A[1:, 0] @ A[0, 1:] / A[0, 0]
