@@ -12,7 +12,7 @@ from orthocas.charts.inside import Inside, Nearest
 from orthocas.charts.inverse import Inverse
 from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, PointFunctions, Starts, inverse_function
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
-from orthocas.charts.reaching import ReachingTracker, residuals_of
+from orthocas.charts.reaching import ReachingTracker, parts_of
 from orthocas.charts.solutions import Solutions, Tracker
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.tasks.domains import bounds_of
@@ -212,7 +212,7 @@ class InverseMethods(PhiFunctions):
         self._require_expression("a tracker")
         require_kind("nearest", nearest, bool)
         parts = self._point_functions, self.problem.domain, q0, largest_step
-        return ReachingTracker(*parts, self._residuals) if nearest else Tracker(*parts)
+        return ReachingTracker(*parts, self._reaching) if nearest else Tracker(*parts)
 
     def function(self, name: str) -> ca.Function:
         """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.
@@ -267,11 +267,8 @@ class InverseMethods(PhiFunctions):
         return PointFunctions.of(self.function("phi"), self.rates, self.phi_sizes, self.phi_map.difference)
 
     @cached_property
-    def _residuals(self) -> ca.Function:
-        known = self.phi_map
-        return residuals_of(
-            self.function("phi"), self.rates, self.m, known.sizes, known.difference, self.problem.domain
-        )
+    def _reaching(self) -> tuple[ca.Function, ca.Function]:
+        return parts_of(self.function("phi"), self.rates, self.m, self.phi_map, self.problem.domain)
 
     def _outside_error(
         self, targets: Array, q_start: ArrayLike | None, found: Solutions, beyond: Indices, single: bool

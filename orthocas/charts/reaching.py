@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.newton import Bound, PointFunctions
-from orthocas.charts.phi import Differences
+from orthocas.charts.phi import PhiMap
 from orthocas.charts.solutions import Tracker, TrackerStatus
 from orthocas.errors import DomainError
 from orthocas.tasks.domains import Domain, reach
@@ -39,20 +39,25 @@ class ReachingTracker(Tracker):
         domain: Domain,
         q0: ArrayLike,
         largest_step: ArrayLike | None,
-        residuals: ca.Function,
+        parts: tuple[ca.Function, ca.Function],
     ) -> None:
-        self._residuals = residuals
+        self._parts = parts
         super().__init__(functions, domain, q0, largest_step)
-        n, rows = len(domain.centre), residuals.size1_out(0)
-        self._at, self._to, self._rows, self._slopes = np.empty(n), np.empty(n), np.empty(rows), np.empty((n, rows))
-        self._bound = Bound(residuals, [self._at, self._to], [self._rows, self._slopes])
+        n, rooms = len(domain.centre), parts[1].size1_out(0)
+        self._at, self._to, self._e, self._rooms = np.empty(n), np.empty(n), np.empty(n), np.empty(rooms)
+        self._J, self._slopes = np.empty((n, n)), np.empty((n, rooms))
+        self._near = Bound(parts[0], [self._at, self._to], [self._e, self._J, self._rooms])
+        self._inwards = Bound(parts[1], [self._at], [self._slopes])
+        widths = reach(domain)
+        self._bounded = np.flatnonzero(np.isfinite(widths))
+        self._widths = widths[self._bounded]
 
     def __getstate__(self) -> dict[str, object]:
         """Without scratch memory."""
-        return {**super().__getstate__(), "residuals": self._residuals}
+        return {**super().__getstate__(), "parts": self._parts}
 
     def __setstate__(self, state: dict[str, object]) -> None:
-        names = ("functions", "domain", "q", "limit", "residuals")
+        names = ("functions", "domain", "q", "limit", "parts")
         self.__init__(*(state[name] for name in names))  # type: ignore[misc]
 
     def step(self, phi: ArrayLike) -> Array:
@@ -84,8 +89,9 @@ class ReachingTracker(Tracker):
         start, now = q, q
         self._to[:] = self._solver.target
         pull = (_INERTIA / self._domain.half_width) ** 2
-        cost, r, J = self._cost(now)
+        cost = self._cost(now)
         for _ in range(_STEPS):
+            r, J = self._model()
             gradient, H = J.T @ r + pull * (now - start), J.T @ J + np.diag(pull)
             move = -np.linalg.solve(H, gradient)
             promised = float(-gradient @ move)
@@ -93,51 +99,63 @@ class ReachingTracker(Tracker):
                 break
             for halvings in range(_HALVINGS + 1):
                 change = np.clip(now + move * 0.5**halvings - start, -self._limit, self._limit)
-                new = start + change
-                after, r_new, J_new = self._cost(new)
-                after += float(pull @ change**2) / 2
-                if after < cost - _DECREASE * 0.5**halvings * promised and self._domain.contains(new[None])[0]:
+                after = self._cost(start + change) + float(pull @ change**2) / 2
+                if after < cost - _DECREASE * 0.5**halvings * promised and self._domain.contains(self._at[None])[0]:
                     break
             else:
                 break
-            now, cost, r, J = new, after, r_new, J_new
+            now, cost = start + change, after
         return np.asarray(now)
 
-    def _cost(self, q: Array) -> tuple[float, Array, Array]:
-        """Half the sum of squares, the residuals (k,), and their Jacobian (k, n)."""
+    def _cost(self, q: Array) -> float:
+        """Half the sum of squares at q (n,), without the way from the last q."""
         self._at[:] = q
-        self._bound.run()
-        r = self._rows.copy()
-        return (float(r @ r) / 2 if np.isfinite(r).all() else np.inf), r, self._slopes.T.copy()
+        self._near.run()
+        squares = float(self._e @ self._e + (self._short() ** 2).sum())
+        return squares / 2 if np.isfinite(squares) else np.inf
+
+    def _short(self) -> Array:
+        """How deep the last q lies in the zones of joints, below and above, and of conditions, (k,); 0 outside them."""
+        away = (self._at - self._domain.centre)[self._bounded] / self._widths
+        rooms = np.concatenate([1 - away, 1 + away, self._rooms])
+        return np.maximum(0.0, 1 - rooms / _ZONE)
+
+    def _model(self) -> tuple[Array, Array]:
+        """The residuals other than 0 at the last q, and their Jacobian."""
+        short = self._short()
+        active, k = short > 0, len(self._bounded)
+        rows = np.zeros((len(short), len(self._at)))
+        joints = np.arange(k)
+        rows[joints, self._bounded], rows[k + joints, self._bounded] = 1 / self._widths, -1 / self._widths
+        if active[2 * k :].any():
+            self._inwards.run()
+            rows[2 * k :] = -self._slopes.T
+        r = np.concatenate([self._e, short[active]])
+        return r, np.vstack([self._J.T, rows[active] / _ZONE])
 
 
-def residuals_of(
-    phi: ca.Function, rates: ca.Function, m: int, sizes: Array, difference: Differences, domain: Domain
-) -> ca.Function:
-    """Q, phi_d (n, 1) -> the residuals of `ReachingTracker`, and their Jacobian.
+def parts_of(
+    phi: ca.Function, rates: ca.Function, m: int, known: PhiMap, domain: Domain
+) -> tuple[ca.Function, ca.Function]:
+    """Q, phi_d (n, 1) -> weighted errors (n, 1), their Jacobian (n, n) and the rooms of conditions; their slopes at q.
 
     Raises:
         DomainError: if the domain is neither a box nor clear of singular positions.
     """
-    n = len(sizes)
+    n = len(known.sizes)
     q, target = ca.MX.sym("q", n), ca.MX.sym("target", n)
-    weights = ca.DM(np.where(np.arange(n) < m, 1 / sizes, _WEIGHT))
-    e = -difference(target, phi(q)) * weights
-    J = rates(q) * ca.repmat(weights, 1, n)
-    widths = reach(domain)
-    bounded = np.flatnonzero(np.isfinite(widths)).tolist()
-    away = (q - ca.DM(domain.centre))[bounded] / ca.DM(widths[bounded])
-    rooms = [1 - away, 1 + away]
+    weights = ca.DM(np.where(np.arange(n) < m, 1 / known.sizes, _WEIGHT))
+    e = -known.difference(target, phi(q)) * weights
+    rooms = ca.MX(0, 1)
     clear = domain.singular_bound
     if clear is not None:
-        rooms.append(_clearance(clear.gram(q), clear.least_singular_value))
+        rooms = _clearance(clear.gram(q), clear.least_singular_value)
         if domain.room_to_fold is not None:
-            rooms.append(domain.room_to_fold(q))
+            rooms = ca.vertcat(rooms, domain.room_to_fold(q))
     elif not domain.is_box:
         raise DomainError(f"a domain of kind '{domain.name}' has no nearest x, expected a box or a clear box")
-    short = ca.fmax(0, 1 - ca.vertcat(*rooms) / _ZONE)
-    slopes = ca.vertcat(J, ca.jacobian(short, q))
-    return dense_function("residuals", [q, target], [ca.vertcat(e, short), slopes], ["q", "phi"])
+    near = dense_function("near", [q, target], [e, rates(q) * ca.repmat(weights, 1, n), rooms], ["q", "phi"])
+    return near, dense_function("inwards", [q], [ca.jacobian(rooms, q)])
 
 
 def _clearance(gram: ca.MX, bound: float) -> ca.MX:
