@@ -138,7 +138,7 @@ def test_object_holds_no_state_and_calls_only_mathematics(pd_plus: Generated, tm
     assert {kind for kind, _ in rows} <= {"T", "t", "R", "r", "U"}
     public = {name for kind, name in rows if kind in "TR"}
     functions, tables = (
-        ["chart", "chart_curvature", "check", "inverse", "dynamics", "control"],
+        ["chart", "chart_curvature", "check", "inverse", "nearest", "dynamics", "control"],
         ["default_gains", "domain_lower", "domain_upper"],
     )
     functions += ["start", "take_over", "resume", "step", "reference_at", "reference_low_pass", "reference_spline"]

@@ -2,13 +2,16 @@
 
 import pickle
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
-from public_objects import circle, clear
+from programs import needs_c
+from public_objects import circle, clear, wide
 from scipy.optimize import minimize
 
 import orthocas as oc
+from orthocas.codegen.library import CompiledLibrary, compile_shared
 from orthocas.errors import DomainError, InvalidValueError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
 from orthocas.tasks.domains import bounds_of
@@ -96,6 +99,10 @@ def test_trackers_are_made_for_fitted_charts_and_points_inside(planar_arm: oc.Ch
             tracker.step(wrong)
 
 
+def wide_chart() -> oc.Chart:
+    return wide().chart
+
+
 def cost(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
     """What a tracker of the nearest x makes small, without the zones at the boundary."""
     e = (phi - chart.phi(q)) / chart.phi_sizes
@@ -154,3 +161,35 @@ def test_domains_without_a_nearest_x_are_named() -> None:
     chart = oc.fit(problem, oc.Polynomial(2), samples=300).chart
     with pytest.raises(DomainError, match="expected a box or a clear box"):
         chart.tracker(chart.problem.domain.centre, nearest=True)
+
+
+@needs_c
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [clear, wide_chart])
+def test_c_goes_to_the_same_nearest_x(make: Callable[[], oc.Chart], tmp_path: Path) -> None:
+    chart = make()
+    generated = oc.generate_c(chart, tmp_path, name="arm")
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", chart.n)
+    domain = chart.problem.domain
+    q = domain.centre
+    home, tracker = chart.phi(q), chart.tracker(q, largest_step=0.1, nearest=True)
+    known = {0: oc.TrackerStatus.OK, 1: oc.TrackerStatus.NEAREST}
+    found, alike = set(), []
+    for s in np.linspace(0.0, 1.0, 800):
+        phi = home + np.sin(np.pi * s) * np.array([4.0, 0.5 * np.sin(6 * s), 0.3])
+        tracker.reset(q)
+        q, status = library.nearest(phi, q, 0.1)
+        other = tracker.step(phi)
+        alike.append(np.abs(q - other).max() < 1e-3)
+        assert known[status] == tracker.status or not alike[-1]
+        assert domain.contains(q)
+        found.add(status)
+    assert found == {0, 1}
+    assert np.mean(alike) > 0.97  # descents of 12 steps end where they are
+    for bad in (np.nan, np.inf, 1e200):
+        assert library.nearest(np.full_like(home, bad), q, 0.1)[1] == 3
+        assert library.nearest(home, q, bad if bad != np.inf else -1.0)[1] in (0, 3)
+    outside = domain.centre + 3 * domain.half_width
+    same, status = library.nearest(home, outside, 0.1)
+    assert status == 2
+    np.testing.assert_array_equal(same, outside)

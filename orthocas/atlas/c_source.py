@@ -238,6 +238,11 @@ class AtlasTables:
         return cells or [(0.0, 0, _NO_CELL, _NO_CELL)], roots
 
     @property
+    def has_nearest(self) -> bool:
+        """Not in an atlas."""
+        return False
+
+    @property
     def _ranks(self) -> list[int]:
         """Number of each fitted chart in its tile."""
         firsts = np.searchsorted(self._orbit_of_fits, self._orbit_of_fits)
@@ -365,6 +370,8 @@ class AtlasSource:
             "that": "chart, ",
             "check_that": "0, ",
             "of_chart": " for chart 0",
+            "nearest_h": "",
+            "nearest_c": "",
             "require_chart": "  if (!known(chart)) return {NAME}_OUTSIDE_DOMAIN;\n".format(**known),
             "dynamics_status": "{NAME}_OK".format(**known),
             "basis": self._basis.code,

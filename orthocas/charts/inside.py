@@ -35,7 +35,7 @@ _OPTIONS: dict[str, Any] = {
     "ipopt.max_iter": 200,
 }
 _CLEAR = 1e-6  # least pivot over its bound: the domain is open there
-_STARTS = 3  # of the table, after a given one
+_STARTS = 8  # of the table, after a given one
 
 
 @dataclass(frozen=True)

@@ -212,7 +212,7 @@ class InverseMethods(PhiFunctions):
         self._require_expression("a tracker")
         require_kind("nearest", nearest, bool)
         parts = self._point_functions, self.problem.domain, q0, largest_step
-        return ReachingTracker(*parts, self._reaching) if nearest else Tracker(*parts)
+        return ReachingTracker(*parts, self.reaching) if nearest else Tracker(*parts)
 
     def function(self, name: str) -> ca.Function:
         """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.
@@ -267,7 +267,8 @@ class InverseMethods(PhiFunctions):
         return PointFunctions.of(self.function("phi"), self.rates, self.phi_sizes, self.phi_map.difference)
 
     @cached_property
-    def _reaching(self) -> tuple[ca.Function, ca.Function]:
+    def reaching(self) -> tuple[ca.Function, ca.Function]:
+        """The functions of `ReachingTracker`."""
         return parts_of(self.function("phi"), self.rates, self.m, self.phi_map, self.problem.domain)
 
     def _outside_error(

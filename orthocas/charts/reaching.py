@@ -13,9 +13,9 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 
 _WEIGHT = 1e-3  # of errors of xi, relative to those of x
-_ZONE = 0.02  # next to the boundary, in half-widths of joints and in relative room of conditions
-_STEPS, _HALVINGS = 12, 12  # of Gauss and Newton in a call, and of a step
-_INERTIA = 1e-3  # weight of the way from the last q, in half-widths
+ZONE = 0.02  # next to the boundary, in half-widths of joints and in relative room of conditions
+DESCENTS, _HALVINGS = 12, 20  # steps of Gauss and Newton in a call, and halvings of one
+INERTIA = 1e-3  # weight of the way from the last q, in half-widths
 _CONVERGED = 1e-10  # relative decrease of the cost at which a call ends
 _DECREASE = 1e-4  # of the cost, relative to what the model promises
 
@@ -88,9 +88,9 @@ class ReachingTracker(Tracker):
         """Where Gauss-Newton steps lead from q (n,), within the domain and the largest step."""
         start, now = q, q
         self._to[:] = self._solver.target
-        pull = (_INERTIA / self._domain.half_width) ** 2
+        pull = (INERTIA / self._domain.half_width) ** 2
         cost = self._cost(now)
-        for _ in range(_STEPS):
+        for _ in range(DESCENTS):
             r, J = self._model()
             gradient, H = J.T @ r + pull * (now - start), J.T @ J + np.diag(pull)
             move = -np.linalg.solve(H, gradient)
@@ -118,7 +118,7 @@ class ReachingTracker(Tracker):
         """How deep the last q lies in the zones of joints, below and above, and of conditions, (k,); 0 outside them."""
         away = (self._at - self._domain.centre)[self._bounded] / self._widths
         rooms = np.concatenate([1 - away, 1 + away, self._rooms])
-        return np.maximum(0.0, 1 - rooms / _ZONE)
+        return np.maximum(0.0, 1 - rooms / ZONE)
 
     def _model(self) -> tuple[Array, Array]:
         """The residuals other than 0 at the last q, and their Jacobian."""
@@ -131,7 +131,7 @@ class ReachingTracker(Tracker):
             self._inwards.run()
             rows[2 * k :] = -self._slopes.T
         r = np.concatenate([self._e, short[active]])
-        return r, np.vstack([self._J.T, rows[active] / _ZONE])
+        return r, np.vstack([self._J.T, rows[active] / ZONE])
 
 
 def parts_of(

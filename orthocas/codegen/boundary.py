@@ -36,6 +36,11 @@ class Source(Protocol):
         ...
 
     @property
+    def has_nearest(self) -> bool:
+        """Whether the library has the function that goes to the nearest x."""
+        ...
+
+    @property
     def somewhere(self) -> Array:
         """A position of the domain at which the library checks itself, (n,)."""
         ...

@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
+from orthocas.charts.reaching import DESCENTS, INERTIA, ZONE
 from orthocas.codegen.boundary import boundary_units
 from orthocas.codegen.description import chart_values, filled, flags, numbers, words
 from orthocas.codegen.precision import Precision, bounds_inside
@@ -42,6 +43,12 @@ class ChartSource:
     def somewhere(self) -> Array:
         """A joint position of the domain between its centre and a corner, (n,)."""
         return position_within(self.chart.problem.domain)
+
+    @property
+    def has_nearest(self) -> bool:
+        """Whether the library has the function that goes to the nearest x."""
+        domain = self.chart.problem.domain
+        return domain.is_box or domain.singular_bound is not None
 
     def law(self, controller: Controller) -> Controller:
         """The law as it is."""
@@ -96,6 +103,8 @@ class ChartSource:
             "is_clear": "1" if self.condition is None else "is_clear(q)",
             "mem": "0",
             "dynamics_status": "inside(q) ? {NAME}_OK : {NAME}_OUTSIDE_DOMAIN".format(**known),
+            "nearest_h": "",
+            "nearest_c": "",
             **dict.fromkeys(
                 ("which", "that", "check_that", "require_chart", "tables_c", "atlas_functions_h", "of_chart"), ""
             ),
@@ -103,6 +112,11 @@ class ChartSource:
         everything = {**known, **values}
         values["clear_c"] = "" if self.condition is None else condition_code(self.condition, everything)
         everything["clear_c"] = values["clear_c"]
+        if self.has_nearest:
+            _, inwards = self.chart.reaching
+            size = {"rooms": str(max(1, inwards.size1_out(0))), "zone": repr(ZONE), "inertia": repr(INERTIA)}
+            numbers_ = {**everything, **size, "descents": str(DESCENTS), "difference_step": precision.difference}
+            values |= {f"nearest_{kind}": filled(f"nearest.{kind}", numbers_) for kind in ("h", "c")}
         for place, template in _PARTS.items():
             values[place] = filled(template, everything)
         return values

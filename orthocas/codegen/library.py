@@ -116,6 +116,15 @@ class CompiledLibrary:
         q = self._zeros(self.n)
         return q, self._call("inverse", [phi, q_start], [q], which)
 
+    def nearest(self, phi: Array, q_start: Array, largest_step: float) -> tuple[Array, int]:
+        """q (n,), status; for boxes, clear or not."""
+        run, q = self.function("nearest"), self._zeros(self.n)
+        run.argtypes, run.restype = [_POINTER, _POINTER, self.precision.c_type, _POINTER], ctypes.c_int
+        arrays = [self.numbers(array) for array in (phi, q_start)]
+        for name, array in zip(("phi", "q_start"), arrays, strict=True):
+            require_shape(name, array.shape, (self.n,))
+        return q, int(run(*(array.ctypes.data for array in arrays), largest_step, q.ctypes.data))
+
     def dynamics(self, q: Array, dq: Array) -> tuple[Array, Array, Array, int]:
         """M (n, n), bias (n,), gravity (n,), status."""
         M, bias, gravity = self._zeros(self.n, self.n), self._zeros(self.n), self._zeros(self.n)

@@ -85,6 +85,9 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
         x, wanted = ca.MX.sym("x", chart.m), ca.MX.sym("wanted", chart.m)
         difference = ca.densify(chart.relative.difference(wanted, x))
         found.append(ca.Function("turned", [q, x, wanted], [difference, chart.relative.rates(q).T]))
+    if source.has_nearest:
+        near = chart.reaching[0]
+        found.append(ca.Function("near", near.mx_in(), near.call(near.mx_in())))
     condition = None if source.condition is None else source.condition.condition
     if condition is not None:
         pivots = ca.Function("pivots", [q], [condition.pivots(q)])  # as a graph where tables of coordinates are in it
@@ -117,7 +120,9 @@ def _stack_bytes(kernels: Kernels, source: Source, k: int, size: int) -> int:
     locals_ = round(_LOCALS * max(1.0, n / 7) ** 2)  # compilers keep matrices in local variables
     clear = sum(kernels.array_bytes(name, size) for name in ("pivots", "gram") if name in kernels.work)  # inside others
     work = max(kernels.array_bytes(name, size) for name in kernels.work)
-    return max(inverse, compose, work) + supervised + clear + locals_ + source.stack_bytes(size)
+    rooms = 2  # at most
+    nearest = kernels.array_bytes("near", size) + size * n * (3 * n + 16 + rooms) if source.has_nearest else 0
+    return max(inverse, nearest, compose, work) + supervised + clear + locals_ + source.stack_bytes(size)
 
 
 def _require_identifier(name: str) -> None:

@@ -51,6 +51,7 @@ class Precision:
     checked: float  #: largest difference that `NAME_check` returns
     tolerance: float  #: of the proof, relative to the largest entry of a result
     sensitive: float  #: relative change of a command by one rounding of q, from which the proof accepts more
+    difference: str  #: of joints, for slopes by differences
 
     @property
     def size(self) -> int:
@@ -98,6 +99,7 @@ DOUBLE = Precision(
     checked=1e-9,
     tolerance=1e-10,
     sensitive=1e-12,
+    difference="1e-6",
 )
 SINGLE = Precision(
     c_name="float",
@@ -115,6 +117,7 @@ SINGLE = Precision(
     checked=1e-4,
     tolerance=1e-3,
     sensitive=1e-5,
+    difference="1e-2",
 )
 
 
