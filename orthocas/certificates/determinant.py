@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from orthocas.bases.products import ProductFamily
 from orthocas.certificates.functions import sine_and_cosine
-from orthocas.certificates.jets import Around, multi_indices, powers
+from orthocas.certificates.jets import Around, powers
 from orthocas.certificates.product_rows import ProductRows
 from orthocas.certificates.task_rows import task_rows
 from orthocas.certificates.taylor import TINY, UNIT, UP, Monomial, Variables, above, monomials, sum_error
@@ -57,13 +57,13 @@ class WaveSeries:
                     own[place[k]] += value
                 else:  # the real part of c exp(-i k q) is that of its conjugate
                     own[place[tuple(-i for i in k)]] += np.conj(value)
-        k = np.array(kept, dtype=float).reshape(len(kept), len(joints))
-        slopes = np.array([np.prod(1j * k[:, m], axis=1) for m in multi_indices_up_to(len(joints), DEGREE)])
-        products = c[:, None] * slopes
+        waves: Array = np.array(kept, dtype=float).reshape(len(kept), len(joints))
+        slopes = [np.prod(1j * waves[:, list(m)], axis=1) for m in multi_indices_up_to(len(joints), DEGREE)]
+        products = c[:, None] * np.array(slopes)
         table = np.concatenate([products.real, -products.imag], axis=2).reshape(-1, 2 * len(kept))
         sizes = np.abs(c) * UP
         rounding = _ROUNDINGS * UNIT * sizes.sum(axis=1)
-        return cls(k, sizes, table, (np.array([each.error for each in sums]) + rounding) * UP)
+        return cls(waves, sizes, table, (np.array([each.error for each in sums]) + rounding) * UP)
 
     def __call__(self, centre: Array, half: Array) -> Expansion:
         """Expansions of all sums, (sums, monomials, boxes), for boxes of given middles and half-widths (n, boxes)."""
@@ -106,12 +106,13 @@ class PolynomialSeries:
         weights = power_table(np.ones((len(variables), 1)), degree)[:, 0]  # 1 / a!
         sizes, errors = (np.asarray(each @ weights * above(len(kept))) for each in (np.abs(values) + doubts, doubts))
         centre, scale = family.space.centre[variables], family.space.half_width[variables]
-        return cls(centre, scale, degree, table.reshape(-1, len(kept)), sizes, errors)
+        return cls(centre, scale, degree, table.reshape(len(values) * len(kept), len(kept)), sizes, errors)
 
     def __call__(self, centre: Array, half: Array) -> Expansion:
         """Expansions of all polynomials, (polynomials, monomials, boxes)."""
         u, h = ((centre.T - self.centre) / self.scale).T, (half.T / self.scale).T
-        found = (self.table @ power_table(u, self.degree)).reshape(len(self.sizes), -1, u.shape[1])
+        terms = power_table(u, self.degree)
+        found = (self.table @ terms).reshape(len(self.sizes), *terms.shape)
         reach = np.maximum(1.0, (np.abs(u) + h).max(axis=0, initial=0)) ** self.degree * UP
         rounding = sum_error(self.table.shape[1] + _ROUNDINGS) * self.sizes
         return found * power_table(h, self.degree), (self.errors + rounding)[:, None] * reach * UP + TINY
@@ -164,8 +165,8 @@ class Determinant:
         carried = rest_a * (total_b + rest_b[:-1]) + total_a * rest_b[:-1] + rest
         carried += sum_error(_SPLITS * len(A)) * total_a * total_b
         coefficients = found + B[-1]
-        rounding = UNIT * np.abs(coefficients).sum(axis=0)
-        return coefficients, (carried.sum(axis=0) + rest_b[-1] + rounding) * above(A.shape[1] + len(coefficients)) + TINY
+        unknown = carried.sum(axis=0) + rest_b[-1] + UNIT * np.abs(coefficients).sum(axis=0)
+        return coefficients, unknown * above(A.shape[1] + len(coefficients)) + TINY
 
 
 def multi_indices_up_to(n: int, degree: int) -> tuple[Monomial, ...]:

@@ -5,7 +5,7 @@ c_k exp(i k . q) with whole k, and so are its derivatives and the minors of a ma
 known up to rounding only, and each sum carries a bound of it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import combinations
@@ -132,7 +132,9 @@ def waves_of(tape: Tape, n: int) -> list[Waves]:
                 raise CertifyError("the task uses a sine of more than the position of a joint")
             work[into] = Waves.sine(joint, n) if name == "sin" else Waves.cosine(joint, n)
         else:
-            work[into] = _step(name, [_known(work[place]) for place in of])
+            if name not in _STEPS:
+                raise CertifyError(f"the task uses the operation {name}, which makes no waves")
+            work[into] = _STEPS[name](*(_known(work[place]) for place in of))
     return [results[k] for k in range(tape["rows"] * tape["columns"])]
 
 
@@ -142,22 +144,15 @@ def _known(value: Waves | int) -> Waves:
     raise CertifyError("the task uses the position of a joint other than by sine and cosine")
 
 
-def _step(name: str, of: list[Waves]) -> Waves:
-    if name == "assign":
-        return of[0]
-    if name == "neg":
-        return -of[0]
-    if name == "twice":
-        return of[0] + of[0]
-    if name == "sq":
-        return of[0] * of[0]
-    if name == "add":
-        return of[0] + of[1]
-    if name == "sub":
-        return of[0] - of[1]
-    if name == "mul":
-        return of[0] * of[1]
-    raise CertifyError(f"the task uses the operation {name}, which makes no waves")
+_STEPS: dict[str, Callable[..., Waves]] = {
+    "assign": lambda a: a,
+    "neg": lambda a: -a,
+    "twice": lambda a: a + a,
+    "sq": lambda a: a * a,
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+}
 
 
 def cofactors(rows: Sequence[Sequence[Waves]]) -> list[Waves]:
