@@ -141,7 +141,7 @@ class OutsideJudge:
         outside = np.zeros(len(low), dtype=bool)
         if near.any():
             with one_blas_thread():
-                outside[near], widest[near] = self._lie_outside(low[near], high[near])
+                outside[near], widest[near] = self.lie_outside(low[near], high[near])
         regular, sign = found.regular & ~outside, np.where(outside, 0, found.sign)
         if self.guarded:
             widest[regular & ~own & (values > self.domain.least_singular_value)] = NEVER
@@ -171,7 +171,7 @@ class OutsideJudge:
         thin &= (values < self.domain.least_singular_value) & (widest >= 0)
         return np.where(thin, joints[half.argmax(axis=1)], widest)
 
-    def _lie_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
+    def lie_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Whether boxes lie outside, and the joint to halve to find out."""
         J = self.rows(joint_models(low, high, self.variables)[0]).times(1 / self.domain.scale[:, None, None])
         left, right = singular_vectors(J)
