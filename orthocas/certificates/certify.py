@@ -12,7 +12,7 @@ from orthocas.certificates.judges import Judge, Verdicts
 from orthocas.certificates.one_to_one import one_to_one_judge
 from orthocas.certificates.outside import inside_judge, judge_of
 from orthocas.certificates.search import Limits, Look, Search, distances, largest_first, nearest_first
-from orthocas.charts.certificate import METHODS, OPEN, PROVED, Certificate, Subdivision
+from orthocas.charts.certificate import COFACTORS, ELIMINATION, METHODS, OPEN, PROVED, Certificate, Subdivision
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
@@ -23,7 +23,8 @@ from orthocas.tools.progress import Monitor, Progress, silent
 _SAMPLES = 20_000  # points where folds are looked for before the proof
 _SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
 _FEW_BOXES = 300  # for one scale
-_MANY_BOXES = (500, 45_000)  # the least and the most; between them, three times what the proof without folds took
+_MANY_BOXES = (500, 45_000)  # the least and the most
+_MORE_BOXES = {ELIMINATION: 3, COFACTORS: 30}  # between them, so many times what the proof without folds took
 _HELD_RANGE = 1.0  # half-width of a leading joint on which J does not depend, if its whole range is too wide
 _GUARDED_BOXES = 1_000_000  # for charts whose domain keeps folds out
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
@@ -95,7 +96,7 @@ def certify(
         search.run(_shown(monitor, "regular"))
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
-            most = int(np.clip(3 * search.judged, *_MANY_BOXES))
+            most = int(np.clip(_MORE_BOXES[judge.method] * search.judged, *_MANY_BOXES))
             injective = _one_to_one(chart, rows, base, Limits(left, boxes=most), executor, monitor)
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
