@@ -68,4 +68,4 @@ def test_a_chart_next_to_singular_positions_needs_few_boxes(chart: oc.Chart) -> 
     search = Search(judge_of(chart, chart_rows(chart), 0.0), base, Limits(), largest_first(base))
     search.run(lambda _: None)
     assert search.finished
-    assert search.judged < 400  # 177; with singular vectors that stay and boxes halved by linear terms alone 2,421
+    assert search.judged < 400  # 165; with singular vectors that stay and boxes halved by linear terms alone 2,421
