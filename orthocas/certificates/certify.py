@@ -42,7 +42,8 @@ def certify(
     """Prove that a chart does not fold: det J has one sign on its domain, and the conditioning is above a bound.
 
     The domain is halved again and again, until J is proved nonsingular on each part: by Taylor models of degree 3 with
-    remainders that include all rounding, taken to the singular vectors of their centre, and elimination. The robot's
+    remainders that include all rounding, taken to the singular vectors of their centre, and elimination. With one
+    polynomial coordinate and no bound, det J itself is bounded, as one polynomial of degree 5 on each part. The robot's
     numbers and those of the chart are taken as they are in the file. Samples are no part of the proof; they only find
     folds early. Also proved is a large box around the centre on which phi is one-to-one: the average of J between any
     two of its points is nonsingular, see `orthocas.certificates.one_to_one`. It has the domain's proportions, but a
@@ -51,6 +52,9 @@ def certify(
     In a `ClearBox`, parts need no proof that are proved, by the same arithmetic, to lie outside: the relative singular
     value of the task is at most the bound there. They count as proved in the share of the box. So do parts of the box
     of a `Corridor` that are farther from its path than the radius.
+
+    The domain of a wide chart, a `RegularPart`, leaves out folds itself. There, proved is that its clear box needs no
+    such test: what is not proved is left to the domain, and the search ends after a million boxes.
 
     Args:
         chart: a fitted chart.

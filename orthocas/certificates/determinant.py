@@ -47,8 +47,8 @@ class WaveSeries:
     @classmethod
     def of(cls, sums: Sequence[Waves], joints: Variables) -> "WaveSeries":
         """Of sums that depend on these joints only."""
-        every = np.unique(np.concatenate([each.frequencies[:, joints] for each in sums]), axis=0)
-        kept = [k for k in map(tuple, every.tolist()) if k >= tuple(-i for i in k)]
+        every = np.concatenate([each.frequencies[:, joints] for each in sums])
+        kept = sorted({max(k, tuple(-i for i in k)) for k in map(tuple, every.tolist())})
         place = {k: i for i, k in enumerate(kept)}
         c = np.zeros((len(sums), len(kept)), dtype=complex)
         for own, each in zip(c, sums, strict=True):
