@@ -25,6 +25,7 @@ SCRIPTS = (
     "clear_boxes",
     "clear_positions",
     "certificates",
+    "wide_certificates",
     "one_to_one",
     "atlas",
     "atlas_c",

@@ -164,7 +164,7 @@ def test_one_to_one_part_of_an_older_method_is_void() -> None:
     old = replace(certified(), method="taylor-3/1")
     assert old.injective is None
     assert "certify the chart again" in old.facts()["one-to-one"]
-    with pytest.raises(oc.errors.CertifyError, match="taylor-3/1, expected taylor-3/2: certify it again"):
+    with pytest.raises(oc.errors.CertifyError, match="taylor-3/1, expected taylor-3/2 or .*: certify it again"):
         oc.check_certificate(chart(), old)
 
 

@@ -14,7 +14,7 @@ from orthocas import problems
 from orthocas.bases import JointSpace, Parametrisation
 from orthocas.bases.cyclic import leaves_stay
 from orthocas.certificates.certify import whole_domain
-from orthocas.charts.certificate import METHOD, PROVED, Certificate, Subdivision
+from orthocas.charts.certificate import ELIMINATION, PROVED, Certificate, Subdivision
 from orthocas.charts.chart_file import fingerprint
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError, ChartFileError
@@ -35,7 +35,7 @@ def forged(chart: oc.Chart, **changes: object) -> Certificate:
     """A proof in one part, as if all were proved."""
     base = whole_domain(chart.problem.domain)
     whole = Subdivision(base.low, base.high, np.array([PROVED], dtype=np.uint8))
-    made = Certificate(fingerprint(chart.problem, chart.coordinates), METHOD, 0.0, whole, 0.0)
+    made = Certificate(fingerprint(chart.problem, chart.coordinates), ELIMINATION, 0.0, whole, 0.0)
     return replace(made, **changes).sealed()  # type: ignore[arg-type]
 
 

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from orthocas.certificates.chart_rows import ChartRows, chart_rows
-from orthocas.certificates.judges import Judge, RegularityJudge, Verdicts
+from orthocas.certificates.judges import Judge, Verdicts
 from orthocas.certificates.one_to_one import one_to_one_judge
-from orthocas.certificates.outside import judge_of
+from orthocas.certificates.outside import inside_judge, judge_of
 from orthocas.certificates.search import Limits, Look, Search, distances, largest_first, nearest_first
-from orthocas.charts.certificate import METHOD, OPEN, PROVED, Certificate, Subdivision
+from orthocas.charts.certificate import COFACTORS, ELIMINATION, METHODS, OPEN, PROVED, Certificate, Subdivision
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
@@ -23,8 +23,10 @@ from orthocas.tools.progress import Monitor, Progress, silent
 _SAMPLES = 20_000  # points where folds are looked for before the proof
 _SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
 _FEW_BOXES = 300  # for one scale
-_MANY_BOXES = (500, 45_000)  # the least and the most; between them, three times what the proof without folds took
+_MANY_BOXES = (500, 45_000)  # the least and the most
+_MORE_BOXES = {ELIMINATION: 3, COFACTORS: 30}  # between them, so many times what the proof without folds took
 _HELD_RANGE = 1.0  # half-width of a leading joint on which J does not depend, if its whole range is too wide
+_GUARDED_BOXES = 1_000_000  # for charts whose domain keeps folds out
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
 
@@ -40,7 +42,8 @@ def certify(
     """Prove that a chart does not fold: det J has one sign on its domain, and the conditioning is above a bound.
 
     The domain is halved again and again, until J is proved nonsingular on each part: by Taylor models of degree 3 with
-    remainders that include all rounding, taken to the singular vectors of their centre, and elimination. The robot's
+    remainders that include all rounding, taken to the singular vectors of their centre, and elimination. With one
+    polynomial coordinate and no bound, det J itself is bounded, as one polynomial of degree 5 on each part. The robot's
     numbers and those of the chart are taken as they are in the file. Samples are no part of the proof; they only find
     folds early. Also proved is a large box around the centre on which phi is one-to-one: the average of J between any
     two of its points is nonsingular, see `orthocas.certificates.one_to_one`. It has the domain's proportions, but a
@@ -49,6 +52,9 @@ def certify(
     In a `ClearBox`, parts need no proof that are proved, by the same arithmetic, to lie outside: the relative singular
     value of the task is at most the bound there. They count as proved in the share of the box. So do parts of the box
     of a `Corridor` that are farther from its path than the radius.
+
+    The domain of a wide chart, a `RegularPart`, leaves out folds itself. There, proved is that its clear box needs no
+    such test: what is not proved is left to the domain, and the search ends after a million boxes.
 
     Args:
         chart: a fitted chart.
@@ -80,18 +86,21 @@ def certify(
     bound = checked_bound(chart, bound)
     rows = chart_rows(chart)
     base = whole_domain(chart.problem.domain) if resume is None else _resumed(chart, bound, resume)
-    search = _regularity_search(chart, rows, bound, base, limits, executor)
+    judge = judge_of(chart, rows, bound, None if resume is None else resume.method)
+    if chart.problem.domain.room_to_fold is not None:  # near its boundary, there is always something left to prove
+        limits = replace(limits, boxes=_GUARDED_BOXES)
+    search = Search(judge, base, limits, largest_first(base), executor)
     injective: Subdivision | None = None
 
     def so_far() -> Certificate:
-        return _certificate(chart, bound, search, injective, time.monotonic() - start, resume)
+        return _certificate(chart, judge.method, bound, search, injective, time.monotonic() - start, resume)
 
     try:
         search.visit(_suspects(chart))
         search.run(_shown(monitor, "regular"))
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
-            most = int(np.clip(3 * search.judged, *_MANY_BOXES))
+            most = int(np.clip(_MORE_BOXES[judge.method] * search.judged, *_MANY_BOXES))
             injective = _one_to_one(chart, rows, base, Limits(left, boxes=most), executor, monitor)
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
@@ -101,16 +110,10 @@ def certify(
 def folds_nowhere(chart: Chart, time_limit: float) -> bool:
     """Whether a processor time [s] is enough to prove that a chart does not fold. No one-to-one box is looked for."""
     base, limits = whole_domain(chart.problem.domain), Limits(time_limit, time.thread_time)
-    search = _regularity_search(chart, chart_rows(chart), 0.0, base, limits, None)
+    search = Search(judge_of(chart, chart_rows(chart), 0.0), base, limits, largest_first(base))
     search.visit(_suspects(chart))
     search.run(lambda _: None)
     return search.finished
-
-
-def _regularity_search(
-    chart: Chart, rows: ChartRows, bound: float, base: Subdivision, limits: Limits, executor: Executor | None
-) -> Search:
-    return Search(judge_of(chart, rows, bound), base, limits, largest_first(base), executor)
 
 
 def certified_box(
@@ -143,7 +146,7 @@ def certified_box(
         True
     """
     limits = replace(_LARGEST_BOX, seconds=checked_options(chart, time_limit, executor))
-    judge = RegularityJudge(chart_rows(chart), checked_bound(chart, bound))
+    judge = inside_judge(chart, chart_rows(chart), checked_bound(chart, bound))
     base = whole_domain(chart.problem.domain)
     search = Search(judge, base, limits, nearest_first(base), executor)
     search.run(_shown(monitor, "largest box"))
@@ -191,8 +194,9 @@ def whole_domain(domain: Domain) -> Subdivision:
 def require_same(chart: Chart, certificate: Certificate) -> None:
     """Raise CertifyError unless a certificate is one of this chart and of this version's method."""
     require_kind("certificate", certificate, Certificate)
-    if certificate.method != METHOD:
-        raise CertifyError(f"the certificate is of method {certificate.method}, expected {METHOD}: certify it again")
+    if certificate.method not in METHODS:
+        expected = " or ".join(METHODS)
+        raise CertifyError(f"the certificate is of method {certificate.method}, expected {expected}: certify it again")
     certificate.require_for(fingerprint(chart.problem, chart.coordinates))
     if not certificate.digest:
         raise CertifyError("the certificate has no digest, expected one made by `certify`")
@@ -202,6 +206,8 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
             f"the certificate is void: it leaves out singular values up to {certificate.least_singular_value:g}, "
             f"the domain {left_out:g}"
         )
+    if certificate.least_volume != getattr(chart.problem.domain, "least_volume", 0.0):
+        raise CertifyError("the certificate is void: the domain keeps out folds by another volume")
     domain = whole_domain(chart.problem.domain)
     if not (
         np.array_equal(domain.low, certificate.regular.low) and np.array_equal(domain.high, certificate.regular.high)
@@ -305,6 +311,7 @@ def proved_scale(parts: Subdivision) -> float:
 
 def _certificate(
     chart: Chart,
+    method: str,
     bound: float,
     search: Search,
     injective: Subdivision | None,
@@ -318,19 +325,44 @@ def _certificate(
         if resume is None or not resume.conditioning
         else min(search.conditioning, resume.conditioning)
     )
+    domain, parts = chart.problem.domain, search.subdivision()
     return Certificate(
         fingerprint(chart.problem, chart.coordinates),
-        METHOD,
+        method,
         bound,
-        search.subdivision(),
+        parts,
         known * (1 - 1e-9) if bound > 0 and np.isfinite(known) else 0.0,
         injective,
         fold,
         before[0] + search.judged,
         before[1] + seconds,
-        getattr(chart.problem.domain, "least_singular_value", 0.0),
+        getattr(domain, "least_singular_value", 0.0),
         search.dead,
+        getattr(domain, "least_volume", 0.0),
+        _clear_share(domain, parts),
     ).sealed()
+
+
+def _clear_share(domain: Domain, parts: Subdivision) -> float:
+    """Of the clear positions of the box of a domain that keeps folds out, the share in proved parts; 0 for others.
+
+    From samples of the box, and of the parts that are not proved.
+    """
+    bound = domain.singular_bound
+    if bound is None or domain.room_to_fold is None:
+        return 0.0
+    low, high = parts.leaves(OPEN)
+    if not len(low):
+        return 1.0
+    rng, volumes = np.random.default_rng(0), (high - low).prod(axis=1)
+
+    def clear(low: Array, high: Array) -> float:
+        values = bound.singular_values(rng.uniform(low, high, (_SAMPLES, parts.n)))
+        return float(np.mean(values > bound.least_singular_value))
+
+    chosen = rng.choice(len(low), _SAMPLES, p=volumes / volumes.sum())
+    left = float(volumes.sum() / (parts.high - parts.low).prod()) * clear(low[chosen], high[chosen])
+    return max(0.0, 1 - left / clear(parts.low, parts.high))
 
 
 def _shown(monitor: Monitor, stage: str) -> Look:
@@ -342,6 +374,7 @@ def _shown(monitor: Monitor, stage: str) -> Look:
 
 
 _AT_ONCE = 512
+_SAME_SHARE = 1e-4  # of the same samples, on machines that round otherwise
 _OFF_CENTRE = 1e-6  # of the width of a box
 Mapped = Callable[..., Iterable[Verdicts]]
 
@@ -381,11 +414,13 @@ def check_certificate(
         raise CertifyError("the chart has no certificate, expected one made by `certify`")
     require_same(chart, certificate)
     bound, rows = checked_bound(chart, certificate.bound), chart_rows(chart)
-    judge = judge_of(chart, rows, bound)
+    judge = judge_of(chart, rows, bound, certificate.method)
     mapped: Mapped = map if executor is None else executor.map
     if certificate.fold and not _folds(chart, judge, np.array(certificate.fold)):
         return False
     if not _regular(certificate, _judged(judge, certificate.regular, mapped, monitor)):
+        return False
+    if abs(_clear_share(chart.problem.domain, certificate.regular) - certificate.clear_share) > _SAME_SHARE:
         return False
     box = certificate.injective
     if box is None:

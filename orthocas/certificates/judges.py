@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from orthocas.certificates.chart_rows import ChartRows
 from orthocas.certificates.functions import reciprocal, reciprocal_square_root
 from orthocas.certificates.taylor import TINY, UP, TaylorModel, Variables, monomials, stacked, sum_error
+from orthocas.charts.certificate import ELIMINATION
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
 
 _ORTHOGONAL = 1 - 1e-6  # what singular vectors that are orthogonal up to 1e-9 change at most, for up to 20 rows
-UNKNOWN = -1
+UNKNOWN, NEVER = -1, -2
 _AT_ONCE = 64  # boxes whose models fit into the cache of a processor
 
 
@@ -160,7 +161,9 @@ class Verdicts:
     regular: Array  #: (boxes,) bool: det J has the sign below on the whole box
     sign: Array  #: (boxes,) of det J at the middle of the box: +1, -1, or 0 where it is unclear
     conditioning: Array  #: (boxes,) lower bounds; 0 where none is known
-    widest: Array  #: (boxes,) the joint to halve; `UNKNOWN` where bounds are infinite, so none is known to help most
+    #: (boxes,) the joint to halve; `UNKNOWN` where bounds are infinite, so none is known to help most; `NEVER` where
+    #: halves will not be proved
+    widest: Array
 
 
 class Judge(Protocol):
@@ -176,12 +179,22 @@ class Judge(Protocol):
         ...
 
 
+class RegularJudge(Judge, Protocol):
+    """A judge whose proof of boxes is that det J has one sign there."""
+
+    @property
+    def method(self) -> str:
+        """Name of the method in certificates."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class RegularityJudge:
     """Proves det J != 0, and, for a bound above 0, conditioning >= bound."""
 
     rows: ChartRows
     bound: float
+    method = ELIMINATION
 
     @property
     def joints(self) -> Variables:

@@ -6,6 +6,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.bases.family import Family, LinearFamily
 from orthocas.bases.mlp import MLPFamily
@@ -17,26 +18,34 @@ from orthocas.certificates.chart_rows import (
     task_gradients,
     true_gradients,
 )
+from orthocas.certificates.cofactor_judge import CofactorJudge
+from orthocas.certificates.determinant import Determinant
 from orthocas.certificates.judges import (
-    Judge,
+    NEVER,
     RegularityJudge,
+    RegularJudge,
     Verdicts,
     between,
     is_orthogonal,
     most_influential,
     singular_vectors,
 )
+from orthocas.certificates.task_rows import TipRows
 from orthocas.certificates.taylor import UP, TaylorModel, Variables
+from orthocas.charts.certificate import COFACTORS, ELIMINATION
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
 from orthocas.tasks.domains import PathBound, SingularBound, bounds_of
+from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function, one_blas_thread
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import Tape, gradient_dependences, periodic_joints, to_tape
 
 _ROUNDING = 1e-6  # of distances, far above that of floating-point numbers
 _LENGTHS = 1e-7  # of squares: far above what singular vectors miss that are orthogonal up to 1e-9, and roundings of D
+_STEEP = 0.08  # how much a singular value changes over a box, at least in most cases: by so much of its half-widths
+_THIN = 0.25  # narrower than so much of the widest joint
 _GUARDS = 1e-12  # of |J|^2: elimination in floating-point numbers is exact to less, so guards agree
 
 
@@ -101,14 +110,21 @@ class OutsideJudge:
     vector of the smallest singular value at the middle of the box, plus as much of the others, linear in q, as cancels
     the change of v^T D^-1 J along them to first order. Another judge judges the other boxes, and their det J must have
     the sign of the middle of the domain: a box with the other sign is halved until its parts lie outside, or a fold
-    shows.
+    shows. Where the domain itself keeps folds out, a box with the other sign is left to it: it is not proved, halving
+    it is of no use, and its sign is no fold of the chart.
     """
 
-    inside: RegularityJudge
+    inside: RegularJudge
     rows: GraphRows  #: J, the rows that judge, or C(q) J with orthogonal C if all entries of D are the same
     domain: SingularBound
     sign: float  #: of det J at the centre of the domain
     variables: Variables
+    guarded: bool = False  #: whether the domain itself keeps folds out
+
+    @property
+    def method(self) -> str:
+        """That of the proofs inside."""
+        return self.inside.method
 
     @property
     def joints(self) -> Variables:
@@ -118,20 +134,44 @@ class OutsideJudge:
     def __call__(self, low: Array, high: Array) -> Verdicts:
         """Judge boxes between corners (boxes, n)."""
         found = self.inside(low, high)
-        near = np.flatnonzero(~self.domain.is_clear((low + high) / 2))  # others do not lie outside
-        outside, widest = np.zeros(len(low), dtype=bool), found.widest.copy()
-        if near.size:
+        own = found.proved & (found.sign == self.sign)
+        values = np.full(len(low), np.inf)  # at the middles of boxes that are not proved
+        values[~own] = self._singular_values((low + high)[~own] / 2)
+        near, widest = self._worth_a_try(values, low, high), self._no_slivers(values, low, high, found.widest)
+        outside = np.zeros(len(low), dtype=bool)
+        if near.any():
             with one_blas_thread():
-                outside[near], widest[near] = self._lie_outside(low[near], high[near])
+                outside[near], widest[near] = self.lie_outside(low[near], high[near])
+        regular, sign = found.regular & ~outside, np.where(outside, 0, found.sign)
+        if self.guarded:
+            widest[regular & ~own & (values > self.domain.least_singular_value)] = NEVER
+            regular, sign = regular & (sign == self.sign), np.where(sign == self.sign, sign, 0)
         return Verdicts(
-            proved=(found.proved & (found.sign == self.sign)) | outside,
-            regular=found.regular & ~outside,
-            sign=np.where(outside, 0, found.sign),
+            proved=own | outside,
+            regular=regular,
+            sign=sign,
             conditioning=np.where(outside, np.inf, found.conditioning),
             widest=widest,
         )
 
-    def _lie_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
+    def _singular_values(self, points: Array) -> Array:
+        return np.asarray(self.domain.singular_values(points)) if len(points) else np.zeros(0)
+
+    def _worth_a_try(self, values: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+        """Boxes that may lie outside: others, too large for the value at their middle, are rarely proved to."""
+        half = (high - low)[:, list(self.variables)] / 2
+        return np.asarray(self.domain.least_singular_value - values > _STEEP * half.sum(axis=1))
+
+    def _no_slivers(self, values: Array, low: Array, high: Array, widest: Array) -> Array:
+        """The joint to halve: of thin boxes with a middle outside the widest one, so that they become worth a try."""
+        joints = np.array(self.joints)
+        half = (high - low)[:, joints] / 2
+        known = np.maximum(widest, 0)
+        thin = (high - low)[np.arange(len(low)), known] / 2 < _THIN * half.max(axis=1)
+        thin &= (values < self.domain.least_singular_value) & (widest >= 0)
+        return np.where(thin, joints[half.argmax(axis=1)], widest)
+
+    def lie_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Whether boxes lie outside, and the joint to halve to find out."""
         J = self.rows(joint_models(low, high, self.variables)[0]).times(1 / self.domain.scale[:, None, None])
         left, right = singular_vectors(J)
@@ -166,9 +206,14 @@ class CorridorJudge:
     Another judge judges the other boxes, and their det J must have the sign of the first posture of the path.
     """
 
-    inside: RegularityJudge
+    inside: RegularJudge
     domain: PathBound
     sign: float
+
+    @property
+    def method(self) -> str:
+        """That of the proofs inside."""
+        return self.inside.method
 
     @property
     def joints(self) -> Variables:
@@ -190,17 +235,24 @@ class CorridorJudge:
         )
 
 
-def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
+def judge_of(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularJudge:
     """The judge of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
 
+    Args:
+        chart: the chart.
+        rows: its rows.
+        bound: of the conditioning.
+        method: of the proofs inside. Default: the fastest.
+
     Raises:
-        CertifyError: if a joint is unbounded, and a proof for its half-width is none for all its positions. In a
-            corridor, an unbounded joint whose distance to the path counts is one of these.
+        CertifyError: if there is no such method for the chart; if a joint is unbounded, and a proof for its half-width
+            is none for all its positions. In a corridor, an unbounded joint whose distance to the path counts is one of
+            these.
     """
     domain = chart.problem.domain
     domain.require_bounds("proof")
     require_all_positions(chart, rows.variables)
-    judge, near, clear = RegularityJudge(rows, bound), domain.path_bound, domain.singular_bound
+    judge, near, clear = inside_judge(chart, rows, bound, method), domain.path_bound, domain.singular_bound
     if near is not None:
         _require_uncounted(near, chart.problem.robot.joint_names)
         start = near.postures[near.contains(near.postures)][:1]
@@ -210,16 +262,40 @@ def judge_of(chart: Chart, rows: ChartRows, bound: float) -> Judge:
     own, variables = _judging_rows(chart, clear)
     require_all_positions(chart, variables)
     sign = float(judge(domain.centre[None], domain.centre[None]).sign[0])  # rows have other scales than the chart's
-    return OutsideJudge(judge, own, clear, sign, tuple(sorted(variables)))
+    return OutsideJudge(judge, own, clear, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
+
+
+def inside_judge(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularJudge:
+    """The judge of boxes that lie in the domain; see `judge_of`."""
+    determinant = Determinant.of(chart) if bound == 0 and method != ELIMINATION else None
+    if determinant is not None:
+        return CofactorJudge(determinant)
+    if method == COFACTORS:
+        raise CertifyError("the chart's determinant has no expansion, so it has no certificate of this method")
+    return RegularityJudge(rows, bound)
 
 
 def _judging_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[int]]:
-    """The rows that judge positions, just as `domain.is_clear` takes them, and the joints that they depend on."""
+    """The rows that judge positions, as `domain.is_clear` takes them, and the joints that they depend on.
+
+    Rows of a whole position or a whole orientation may be rotated if they have the same scale: then the rotation
+    changes no singular value, and rows in the axes of a body of the arm depend on fewer joints.
+    """
     task, joints = chart.problem.task, range(chart.n)
+    if _turns_freely(chart.problem.task, domain):
+        return task_gradients(task, chart.problem.domain, joints)
     if domain.jacobian_function is not task.jacobian_function:
         return closed_form_rows(domain.jacobian_function, joints)
-    rotated = task.recipe["kind"] == "position:xyz" and bool((domain.scale == domain.scale[0]).all())
-    return task_gradients(task, chart.problem.domain, joints) if rotated else true_gradients(task, joints)
+    return true_gradients(task, joints)
+
+
+def _turns_freely(task: Task, domain: SingularBound) -> bool:
+    """Whether no singular value depends on the axes in which position and orientation are taken."""
+    tip = TipRows.of(task)
+    if tip is None or tip.axis is not None or len(domain.scale) % 3:
+        return False
+    own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
+    return own_axes and bool((domain.scale[::3] == domain.scale.reshape(-1, 3).T).all())
 
 
 def _require_uncounted(domain: PathBound, joint_names: Sequence[str]) -> None:

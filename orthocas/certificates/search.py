@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from orthocas.certificates.judges import UNKNOWN, Judge, Verdicts
+from orthocas.certificates.judges import NEVER, UNKNOWN, Judge, Verdicts
 from orthocas.charts.certificate import MOST_BOXES, OPEN, PROVED, Subdivision, halfway
 from orthocas.tools.checks import Array
 
@@ -44,8 +44,8 @@ class Search:
     executor: Executor | None = None
     judged: int = 0
     proved_volume: float = 0.0  #: share of the whole
-    failed: float = np.inf  #: least rank of the boxes too small to halve
-    dead: int = 0  #: number of boxes too small to halve
+    dead: int = 0  #: number of boxes too small to halve, or of no use to halve
+    failed: float = np.inf  #: least rank of these boxes
     conditioning: float = np.inf  #: least of the lower bounds on proved boxes
     signs: dict[int, Array] = field(default_factory=dict)  #: sign of det J -> a point with that sign
     _codes: list[int] = field(default_factory=list)
@@ -162,7 +162,7 @@ class Search:
             joint = int(verdicts.widest[k])
             if joint == UNKNOWN:  # the relatively widest one: any choice that stays the same may never help
                 joint = max(self.judge.joints, key=lambda i: float(shares[i]))
-            if shares[joint] > self.limits.smallest:
+            if joint != NEVER and shares[joint] > self.limits.smallest:
                 self._halve(place, a, b, joint)
             else:
                 self.dead += 1

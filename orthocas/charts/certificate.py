@@ -2,11 +2,11 @@
 
 import hashlib
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.errors import CertifyError, InvalidValueError
 from orthocas.tools.checks import Array, frozen_array, require_kind, require_shape, require_text
@@ -15,8 +15,9 @@ from orthocas.tools.display import Shown, number_list
 OPEN, PROVED = 255, 254  #: codes of boxes that are not halved; others are the joint that is
 MOST_BOXES = 20_000_000
 _DEEPEST = 1000
-#: Of this version; certificates of other methods cannot be checked. The one-to-one part of taylor-3/1 was unsound.
-METHOD = "taylor-3/2"
+ELIMINATION = "taylor-3/2"  #: J by Taylor models and elimination. The one-to-one part of taylor-3/1 was unsound.
+COFACTORS = "cofactors-5/1"  #: det J of charts with one coordinate, by its expansion along the row of that coordinate
+METHODS = (ELIMINATION, COFACTORS)  #: of this version; certificates of other methods cannot be checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +79,33 @@ class Subdivision:
         return min(float((0.5**depths).sum()), 1 - 2**-53)
 
     def leaves(self, code: int) -> tuple[Array, Array]:
-        """Corners (boxes, n) of the parts with a code."""
-        low, high = [], []
-        for found, a, b in self._walk():
-            if found == code:
-                low.append(a)
-                high.append(b)
-        return np.array(low).reshape(-1, self.n), np.array(high).reshape(-1, self.n)
+        """Corners (boxes, n) of the parts with a code, in preorder."""
+        upper, found = self._upper_halves(), []
+        place, low, high = np.zeros(1, dtype=int), self.low[None], self.high[None]
+        while place.size:  # one level of the tree at a time
+            codes = self.codes[place]
+            found.append((place[codes == code], low[codes == code], high[codes == code]))
+            inner = codes < PROVED
+            place, joint, low, high = place[inner], codes[inner], low[inner], high[inner]
+            row = np.arange(len(place))
+            top, bottom = high.copy(), low.copy()
+            top[row, joint] = bottom[row, joint] = halfway(low[row, joint], high[row, joint])
+            place = np.concatenate([place + 1, upper[place]])
+            low, high = np.concatenate([low, bottom]), np.concatenate([top, high])
+        places, lows, highs = (np.concatenate(each) for each in zip(*found, strict=True))
+        order = np.argsort(places)
+        return lows[order], highs[order]
+
+    def _upper_halves(self) -> NDArray[np.intp]:
+        """Where the upper half of each part that is halved stands; the lower half follows it."""
+        found = np.zeros(self.codes.size, dtype=np.intp)
+        waiting: list[int] = []
+        for k, code in enumerate(self.codes.tolist()):
+            if code < PROVED:
+                waiting.append(k)
+            elif waiting:
+                found[waiting.pop()] = k + 1
+        return found
 
     def _depths(self) -> Array:
         depths = np.zeros(self.codes.size)
@@ -95,21 +116,9 @@ class Subdivision:
                 waiting += [depths[k] + 1] * 2
         return depths
 
-    def _walk(self) -> Iterator[tuple[int, Array, Array]]:
-        """Codes and corners of all parts, in preorder."""
-        waiting = [(np.array(self.low), np.array(self.high))]
-        for code in self.codes.tolist():
-            low, high = waiting.pop()
-            yield code, low, high
-            if code < PROVED:
-                middle = halfway(low[code], high[code])
-                top, bottom = low.copy(), high.copy()
-                top[code] = bottom[code] = middle
-                waiting += [(top, high), (low, bottom)]
 
-
-def halfway(low: float, high: float) -> float:
-    """The number between two corners where a box is halved."""
+def halfway(low: Any, high: Any) -> Any:
+    """The numbers between two corners where boxes are halved."""
     return (low + high) / 2
 
 
@@ -145,6 +154,8 @@ class Certificate(Shown):
     seconds: float = field(default=0.0)
     least_singular_value: float = 0.0  #: of a ClearBox; parts proved to lie outside it count as proved. 0: no ClearBox
     dead: int = 0  #: number of unproved parts that are too small to halve: a longer search does not help there
+    least_volume: float = 0.0  #: of a RegularPart, which keeps folds out of what is not proved. 0: another domain
+    clear_share: float = 0.0  #: of the clear positions of a RegularPart's box, the share in proved parts, from samples
     digest: str = ""  #: of all of the above, see `sealed`
 
     def __post_init__(self) -> None:
@@ -153,7 +164,7 @@ class Certificate(Shown):
         require_kind("regular", self.regular, Subdivision)
         if not 0 <= self.bound < 1 or not 0 <= self.conditioning <= 1:
             raise InvalidValueError("bound and conditioning", (self.bound, self.conditioning), "numbers from 0 to 1")
-        if self.method != METHOD:
+        if self.method not in METHODS:
             object.__setattr__(self, "injective", None)
 
     def sealed(self) -> Self:
@@ -162,7 +173,8 @@ class Certificate(Shown):
 
     def _content_digest(self) -> str:
         """SHA-256 of all numbers and texts but the digest."""
-        numbers = (self.bound, self.conditioning, self.boxes, self.seconds, self.least_singular_value, self.dead)
+        numbers = [self.bound, self.conditioning, self.boxes, self.seconds, self.least_singular_value, self.dead]
+        numbers += [self.least_volume, self.clear_share] if self.least_volume else []  # older ones have no such numbers
         points = [[float(value) for value in point] for point in self.fold]
         content = [self.fingerprint, self.method, [float(number) for number in numbers], points]
         digest = hashlib.sha256(json.dumps(content).encode())
@@ -201,10 +213,12 @@ class Certificate(Shown):
         if self.injective is not None:
             half = (self.injective.high - self.injective.low) / 2
             facts["one-to-one"] = f"on the box of half-width {number_list(half)} around the centre"
-        elif self.method != METHOD:
+        elif self.method not in METHODS:
             facts["one-to-one"] = f"void, of an older method ({self.method}): certify the chart again"
         if self.least_singular_value > 0:
             facts["left out"] = f"where the task's relative singular value is at most {self.least_singular_value:g}"
+        if self.least_volume > 0 and not self.proved:
+            facts["the rest"] = f"guarded at run time: the domain leaves out volumes up to {self.least_volume:g}"
         low, high = self.unproved
         if len(low) and not self.fold:
             largest = int(np.argmax((high - low).prod(axis=1)))
@@ -233,6 +247,7 @@ class Certificate(Shown):
             "seconds": self.seconds,
             "one_to_one_half_width": None if one is None else ((one.high - one.low) / 2).tolist(),
             "fold": [list(point) for point in self.fold],
+            **({"least_volume": self.least_volume, "clear_share": self.clear_share} if self.least_volume else {}),
             "method": self.method,
             "fingerprint": self.fingerprint,
         }
@@ -242,4 +257,6 @@ class Certificate(Shown):
             at = ", ".join(f"{value:.3f}" for value in self.fold[-1])
             return f"refuted, the chart folds at q = ({at})"
         where = "everywhere on the domain" if self.proved else f"on {100 * self.share:.4f} % of the domain"
+        if self.least_volume > 0 and not self.proved:
+            where = f"on {100 * self.share:.3f} % of the box, {100 * self.clear_share:.3f} % of what is clear (samples)"
         return f"no fold {where}, conditioning >= {self.bound:g}" if self.bound else f"no fold {where}"

@@ -28,6 +28,7 @@ from orthocas.tools.json import part
 
 _TREES = ("regular", "injective")
 _CORNERS = ("low", "high", "codes")
+_GUARDED = ("least_volume", "clear_share")  # in certificates of domains that keep folds out
 CHART = Kind("chart", 1, ChartFileError)
 KINDS = (RegularPart,)  #: of domains that files may have beside those of `orthocas.tasks`; the import registers them
 _PROBES = 8  # points of the domain where a chart that is read is evaluated
@@ -53,6 +54,7 @@ def certificate_to_data(certificate: Certificate) -> tuple[dict[str, Any], dict[
         "seconds": certificate.seconds,
         **({"least_singular_value": certificate.least_singular_value} if certificate.least_singular_value else {}),
         **({"dead": certificate.dead} if certificate.dead else {}),
+        **({name: getattr(certificate, name) for name in _GUARDED} if certificate.least_volume else {}),
         **({"digest": certificate.digest} if certificate.digest else {}),
     }
     return header, arrays
@@ -81,6 +83,8 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         _number(data, "seconds"),
         _number(data, "least_singular_value") if "least_singular_value" in data else 0.0,
         require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0) if "dead" in data else 0,
+        _number(data, "least_volume") if "least_volume" in data else 0.0,
+        _number(data, "clear_share") if "clear_share" in data else 0.0,
         part(data, "digest", str) if "digest" in data else "",  # missing in older files
     )
 

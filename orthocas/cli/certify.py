@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from orthocas import certificates
-from orthocas.charts.certificate import METHOD, Certificate
+from orthocas.charts.certificate import METHODS, Certificate
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import CHART
 from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, terminal_monitor, whole_number
@@ -106,7 +106,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor | None]:
 def _unfinished(chart: Chart, bound: float | None) -> Certificate | None:
     """The certificate in the file if there is more to prove, it is about the same bound, and it can be resumed."""
     known = chart.certificate
-    if known is None or known.method != METHOD or not known.digest:
+    if known is None or known.method not in METHODS or not known.digest:
         return None
     if known.proved or known.fold or (bound is not None and bound != known.bound):
         return None
