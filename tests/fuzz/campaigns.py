@@ -10,6 +10,7 @@ from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
 from fuzz.commands import commands
+from fuzz.messages import messages
 from fuzz.motions import motions
 from fuzz.paths import logs, paths
 from fuzz.robots import robots
@@ -25,6 +26,7 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "checkpoints": checkpoints,
     "commands": commands,
     "logs": logs,
+    "messages": messages,
     "motions": motions,
     "paths": paths,
     "robots": robots,
