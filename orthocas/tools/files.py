@@ -228,15 +228,15 @@ def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) 
         raise error_type(f"cannot write {str(path)[:200]}: {error.strerror}") from None
 
 
-def made_folder(name: str, out: str | Path) -> Path:
-    """Create the output folder if needed, and check that files can be written there.
+def made_folder(name: str, out: str | Path, mode: int = 0o777) -> Path:
+    """Create the output folder if needed, with these rights less the umask; check that files can be written there.
 
     Raises:
         InvalidValueError: if they cannot. The message names the argument `name`.
     """
     folder = Path(out)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode, parents=True, exist_ok=True)
         sweep(folder)
         with tempfile.TemporaryFile(dir=folder):
             pass

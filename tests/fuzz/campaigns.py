@@ -10,6 +10,7 @@ from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
 from fuzz.commands import commands
+from fuzz.libraries import libraries
 from fuzz.messages import messages
 from fuzz.motions import motions
 from fuzz.paths import logs, paths
@@ -25,6 +26,7 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "charts": charts,
     "checkpoints": checkpoints,
     "commands": commands,
+    "libraries": libraries,
     "logs": logs,
     "messages": messages,
     "motions": motions,
