@@ -88,6 +88,18 @@ def list_text(folder: Path, drafts: Iterable[Path]) -> str:
     return json.dumps({"format": "orthocas-list", "files": known}, indent=1) + "\n"
 
 
+def refuse_xml(path: Path, what: str, error: type[ArchiveError]) -> None:
+    """Say that a file of another kind than expected is XML, if it is: robot files are mistaken for charts.
+
+    Raises:
+        ArchiveError: the one given, if the file begins as XML does.
+    """
+    with path.open("rb") as stream:
+        begin = stream.read(200).removeprefix(b"\xef\xbb\xbf").lstrip()
+    if begin.startswith((b"<?xml", b"<robot", b"<mujoco", b"<!--")):
+        raise error(f"{path} is an XML file, such as of a robot (Robot.from_file), not {what}")
+
+
 def digest(path: Path) -> str:
     """SHA-256 of a file."""
     with path.open("rb") as stream:

@@ -235,7 +235,12 @@ def _verdict(words: list[str]) -> str | None:
     out, err, argv = io.StringIO(), io.StringIO(), sys.argv
     sys.argv = ["orthocas", *words]
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
+        closed = len(" ".join(words)) % 8 == 0  # standard output, as after >&-
+        with (
+            contextlib.redirect_stdout(None if closed else out),
+            contextlib.redirect_stderr(err),
+            warnings.catch_warnings(),
+        ):
             warnings.simplefilter("ignore")
             main()
     except SystemExit as stop:
