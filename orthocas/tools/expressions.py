@@ -1,6 +1,7 @@
 """SX expressions as data: tapes for files, their structure, scalar code, and users' functions of q."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
 from math import inf
 from typing import Any, TypeVar
 
@@ -31,6 +32,8 @@ BINARY = (  #: on two
     *("add", "sub", "mul", "div", "pow", "constpow", "atan2", "hypot", "fmod", "copysign", "fmin", "fmax"),
     *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
 )
+MOST_ROWS = 12  #: of a determinant
+_BY_CASADI = 5  # rows of determinants that CasADi writes out well
 _LINEAR = ("assign", "neg", "twice", "add", "sub")
 WRITTEN_OUT = 10  #: rows of the largest matrices whose products and inverses are written out
 Tape = dict[str, Any]
@@ -261,3 +264,27 @@ def expression_of(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function, q
     if free:
         raise InvalidValueError(what, f"using the free symbols {', '.join(free[:5])}", "an expression in q alone")
     return value
+
+
+def determinant(matrix: ca.SX) -> ca.SX:
+    """det A of a symbolic matrix (r, r), by cofactors, with r 2^(r-1) products.
+
+    Minors of the first k rows are made once for each choice of k columns. CasADi's own determinant makes them anew
+    everywhere, with r! products: a minute at r = 10, and nothing can interrupt it.
+
+    Args:
+        matrix: with at most `MOST_ROWS` rows.
+    """
+    rows = require_count("rows of a determinant", matrix.shape[0], least=1, most=MOST_ROWS)
+    if rows <= _BY_CASADI:
+        return ca.det(matrix)
+    minors: dict[tuple[int, ...], ca.SX] = {(): ca.SX(1)}
+    for k in range(rows):
+        minors = {
+            columns: sum(
+                (-1) ** (k + i) * matrix[k, column] * minors[columns[:i] + columns[i + 1 :]]
+                for i, column in enumerate(columns)
+            )
+            for columns in combinations(range(rows), k + 1)
+        }
+    return minors[tuple(range(rows))]
