@@ -194,7 +194,10 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["fit", PANDA, "--tip", "panda_hand", "--task", "grasp"], "unknown task 'grasp', known: position"),
         (["fit", PANDA, "--tip", "panda_hand", "--metric", "mass"], "unknown metric 'mass', known: euclidean, inertia"),
         (["fit", PANDA, "--tip", "panda_hand", "--half-width", "9"], "inside its limits"),
-        (["fit", PANDA, "--tip", "panda_hand", "--half-width", "-1"], "half_width is -1.0, expected positive numbers"),
+        (
+            ["fit", PANDA, "--tip", "panda_hand", "--half-width", "-1"],
+            "half_width is -1, expected numbers above 1e-09, up to 1e+06",
+        ),
         (["fit", PANDA, "--tip", "panda_hand", "--centre", "0,a"], "--centre is"),
         (["fit", PANDA, "--tip", "panda_hand", "--centre", "0,1"], "centre has shape (2,), expected (7,)"),
         (["fit", "iiwa", "--tip", "link_3"], "has its own robot: leave out --tip"),
