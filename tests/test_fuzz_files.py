@@ -7,7 +7,7 @@ from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.libraries import libraries
 from fuzz.motions import motions
-from fuzz.paths import logs, paths
+from fuzz.paths import logs, paths, postures
 from fuzz.runs import runs
 from fuzz.steps import steps
 from programs import needs_c
@@ -47,6 +47,11 @@ def test_mutated_motions_are_usable_or_refused_in_one_line() -> None:
 @pytest.mark.slow
 def test_mutated_paths_are_usable_or_refused_in_one_line() -> None:
     assert paths(60) == []
+
+
+@pytest.mark.slow
+def test_mutated_postures_are_usable_or_refused_in_one_line() -> None:
+    assert postures(100) == []
 
 
 @pytest.mark.slow
