@@ -1,6 +1,7 @@
 """SX expressions as data: tapes for files, their structure, scalar code, and users' functions of q."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from math import inf
 from typing import Any, TypeVar
@@ -38,6 +39,42 @@ _LINEAR = ("assign", "neg", "twice", "add", "sub")
 WRITTEN_OUT = 10  #: rows of the largest matrices whose products and inverses are written out
 Tape = dict[str, Any]
 Entry = TypeVar("Entry", ca.SX, ca.MX)
+
+
+class HoldsFunctions:
+    """Base of objects with CasADi functions among their fields: pickles say which CasADi wrote them."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields, with functions as text."""
+        version = ca.CasadiMeta.version()
+        return {
+            name: _Written(value.serialize(), version) if isinstance(value, ca.Function) else value
+            for name, value in vars(self).items()
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The object again.
+
+        Raises:
+            InvalidValueError: if this CasADi cannot read what another one wrote.
+        """
+        for name, value in state.items():
+            object.__setattr__(self, name, value.read() if isinstance(value, _Written) else value)
+
+
+@dataclass(frozen=True)
+class _Written:
+    """A function in a pickle."""
+
+    text: str
+    version: str  #: of CasADi
+
+    def read(self) -> ca.Function:
+        try:
+            return ca.Function.deserialize(self.text)
+        except RuntimeError:
+            wanted = f"one of CasADi {ca.CasadiMeta.version()}; files of charts outlive versions"
+            raise InvalidValueError("pickle", f"of CasADi {self.version}", wanted) from None
 
 
 #: CasADi's numbers of the operations
