@@ -7,9 +7,11 @@ from pathlib import Path as _Path
 
 from orthocas.cli.entry import is_command_line as _is_command_line
 from orthocas.cli.entry import leave_on_ctrl_c as _leave_on_ctrl_c
+from orthocas.cli.entry import open_closed_streams as _open_closed_streams
 from orthocas.version import VERSION as _VERSION
 
 if _is_command_line():
+    _open_closed_streams()
     _leave_on_ctrl_c()  # what a command imports takes half a second
 
 if "ORTHOCAS_PARENT" in _os.environ:  # a process that shares work of another one

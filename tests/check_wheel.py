@@ -50,6 +50,7 @@ def main() -> None:
             "orthocas/py.typed",
             "solvers/lbfgs.py",
             "charts/licences/MPL-2.0.txt",
+            "charts/licences/NOTICE.txt",
         ):
             assert wanted in names, wanted
     sys.stdout.write("wheel check passed\n")

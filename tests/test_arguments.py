@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+from fuzz.good_calls import good_calls
 from public_objects import CHARTS, circle, fitted, impedance, planar, points_of, steps, trajectory
 
 import orthocas as oc
@@ -15,6 +17,9 @@ from orthocas.codegen import check_c
 from orthocas.errors import InvalidValueError, NoExpressionError, OrthocasError, ShapeError, UnknownNameError
 from orthocas.tools.checks import as_float_array, as_point, as_point_set
 
+ELSEWHERE = (  # arguments that are checked later, refused for another reason first, or not used by this task
+    *("Friction.viscous", "MLP.hidden", "Robot.from_mjcf.tool", "Robot.from_urdf.tool", "Task.named.q_reference"),
+)
 EVALUATIONS = ("xi", "task", "phi", "jacobian")
 
 
@@ -193,3 +198,34 @@ def test_numbers_too_large_to_work_with_are_refused_at_once() -> None:
     for call in calls:
         with pytest.raises(OrthocasError):
             call()
+
+
+@pytest.mark.slow
+def test_masked_entries_are_refused_in_every_argument(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NumPy would hand over whatever lies below the mask. Whole masked arrays are arrays."""
+    monkeypatch.chdir(tmp_path)
+    slots, taken = 0, []
+    for name, (function, arguments) in good_calls().items():
+        for argument, good in arguments.items():
+            try:
+                array = np.array(good, dtype=float)
+            except (TypeError, ValueError, RuntimeError):
+                continue
+            if array.ndim and array.size and f"{name}.{argument}" not in ELSEWHERE:
+                slots += 1
+                masked = np.ma.array(array, mask=np.arange(array.size).reshape(array.shape) == 0)
+                try:
+                    function(**{**arguments, argument: masked})
+                except OrthocasError as error:
+                    if "masked" in str(error):
+                        continue
+                taken.append(f"{name}.{argument}")
+    assert slots > 100
+    assert taken == []
+    q = planar().domain.centre
+    np.testing.assert_array_equal(fitted().chart.phi(np.ma.array(q)), fitted().chart.phi(q))
+    for value in ([np.ma.array(q, mask=True), q], np.ma.masked):
+        with pytest.raises(InvalidValueError, match="masked entries"):
+            fitted().chart.phi(value)
+    with pytest.raises(InvalidValueError, match="viscous is an array with masked entries"):
+        simulation.Friction(np.ma.array(q, mask=True)).numbers(3)

@@ -194,7 +194,10 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["fit", PANDA, "--tip", "panda_hand", "--task", "grasp"], "unknown task 'grasp', known: position"),
         (["fit", PANDA, "--tip", "panda_hand", "--metric", "mass"], "unknown metric 'mass', known: euclidean, inertia"),
         (["fit", PANDA, "--tip", "panda_hand", "--half-width", "9"], "inside its limits"),
-        (["fit", PANDA, "--tip", "panda_hand", "--half-width", "-1"], "half_width is -1.0, expected positive numbers"),
+        (
+            ["fit", PANDA, "--tip", "panda_hand", "--half-width", "-1"],
+            "half_width is -1, expected numbers above 1e-09, up to 1e+06",
+        ),
         (["fit", PANDA, "--tip", "panda_hand", "--centre", "0,a"], "--centre is"),
         (["fit", PANDA, "--tip", "panda_hand", "--centre", "0,1"], "centre has shape (2,), expected (7,)"),
         (["fit", "iiwa", "--tip", "link_3"], "has its own robot: leave out --tip"),
@@ -382,3 +385,35 @@ def test_bad_grids_are_refused_before_any_work(run: Run, tmp_path: Path, words: 
     code, out, err = run(*words)
     assert (code, out) == (2, "")
     assert message in err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "code"), [("info planar_2r", 0), ("--version", 0), ("info nothing", 2), ("charts --json", 0)]
+)
+def test_closed_standard_streams_lead_nowhere(words: str, code: int, tmp_path: Path) -> None:
+    """Also all of them: a file that is opened next must not become standard output."""
+    for streams in (">&-", "<&- >&-", "<&- >&- 2>&-"):
+        command = ["sh", "-c", f'exec "$0" -m orthocas {words} {streams}', sys.executable]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+        assert done.returncode == code, done.stderr
+        assert done.stdout == ""
+        assert len(done.stderr.splitlines()) == (1 if code and "2>" not in streams else 0), done.stderr
+
+
+@pytest.mark.slow
+def test_what_libraries_print_to_a_closed_standard_output_goes_into_no_file(tmp_path: Path) -> None:
+    """The first file that is opened would get the number of standard output."""
+    code = """
+import os, sys
+from orthocas.cli.entry import open_closed_streams
+open_closed_streams()
+with open("file", "w") as stream:
+    stream.write("mine")
+    stream.flush()
+    os.write(1, b"printed by a library")
+    print("printed")
+"""
+    command = ["sh", "-c", 'exec "$0" -c "$1" >&-', sys.executable, code]
+    subprocess.run(command, check=True, cwd=tmp_path)
+    assert (tmp_path / "file").read_text() == "mine"

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import re
 import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -344,3 +345,21 @@ def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
     for settings in ({"seeds": 0}, {"jobs": 0}, {"held_out": 0}, {"weights": (0.0, 1.0)}):
         with pytest.raises(InvalidValueError):
             oc.compare(planar_x, [oc.Linear()], **settings)
+
+
+@pytest.mark.slow
+def test_scripts_without_a_main_guard_get_one_line_from_each_process(tmp_path: Path) -> None:
+    """Python prints twenty lines; and each process would start the whole script again."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import orthocas as oc\n"
+        "found = oc.compare(oc.problems.get('planar_3r_xy'), [oc.Linear()], jobs=1, held_out=100)\n"
+        "print(found.results[0].error)\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "a script that calls compare outside" in done.stdout
+    lines = done.stderr.splitlines()
+    assert 1 <= len(lines) <= 2
+    wanted = "orthocas: a script that starts processes needs `if __name__ == '__main__':` around its calls"
+    assert set(lines) == {wanted}

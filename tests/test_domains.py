@@ -117,7 +117,7 @@ def test_torus_with_a_prismatic_joint_is_refused() -> None:
         require_within_limits(robot, oc.Torus(robot.n))
 
 
-@pytest.mark.parametrize("half_width", [0.0, -1.0, [1.0, 0.0]])
+@pytest.mark.parametrize("half_width", [0.0, -1.0, [1.0, 0.0], 1e-9, [1.0, 1e-12], 1e-320])
 def test_half_width_must_be_positive(half_width: object) -> None:
     with pytest.raises(InvalidValueError, match="half_width"):
         oc.Box([0.0, 0.0], half_width)

@@ -5,10 +5,12 @@ from fuzz.atlases import atlases
 from fuzz.certificates import certificates
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
+from fuzz.libraries import libraries
 from fuzz.motions import motions
-from fuzz.paths import logs, paths
+from fuzz.paths import logs, paths, postures
 from fuzz.runs import runs
 from fuzz.steps import steps
+from programs import needs_c
 
 
 @pytest.mark.slow
@@ -31,6 +33,12 @@ def test_mutated_checkpoints_are_resumed_or_refused_in_one_line() -> None:
     assert checkpoints(30) == []
 
 
+@needs_c
+@pytest.mark.slow
+def test_mutated_libraries_are_not_loaded() -> None:
+    assert libraries(200) == []
+
+
 @pytest.mark.slow
 def test_mutated_motions_are_usable_or_refused_in_one_line() -> None:
     assert motions(100) == []
@@ -39,6 +47,11 @@ def test_mutated_motions_are_usable_or_refused_in_one_line() -> None:
 @pytest.mark.slow
 def test_mutated_paths_are_usable_or_refused_in_one_line() -> None:
     assert paths(60) == []
+
+
+@pytest.mark.slow
+def test_mutated_postures_are_usable_or_refused_in_one_line() -> None:
+    assert postures(100) == []
 
 
 @pytest.mark.slow

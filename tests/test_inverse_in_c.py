@@ -1,6 +1,8 @@
 """The inverse map in compiled C."""
 
+import os
 import pickle
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from programs import needs_c
 from public_objects import circle, clear
 
 import orthocas as oc
+from orthocas.codegen import compiled
 from orthocas.errors import CompileError, InvalidValueError, NoExpressionError
 from orthocas.fitting.fit import Fit
 
@@ -39,7 +42,8 @@ def test_compiled_c_gives_the_same_solutions(iiwa_fit: Fit, tmp_path: Path) -> N
 def test_a_library_is_compiled_once(planar_arm: oc.Chart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     first = oc.compile_inverse(planar_arm)
-    (library,) = (tmp_path / "orthocas").iterdir()
+    (library,) = (tmp_path / "orthocas" / "libraries").glob("*.so")
+    assert stat.S_IMODE(library.parent.stat().st_mode) == 0o700
     written = library.stat().st_mtime_ns
     again = oc.compile_inverse(planar_arm)
     assert (again.library, library.stat().st_mtime_ns) == (first.library, written)
@@ -61,12 +65,63 @@ def test_singular_solutions_of_compiled_c_are_named(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @needs_c
-def test_a_damaged_library_and_grown_charts_are_refused(planar_arm: oc.Chart, tmp_path: Path) -> None:
-    compiled = oc.compile_inverse(planar_arm, tmp_path)
-    compiled.library.write_bytes(b"damaged")
-    with pytest.raises(CompileError, match="delete it"):
-        oc.compile_inverse(planar_arm, tmp_path).solve(planar_arm.phi(planar_arm.problem.domain.centre))
+def test_damaged_libraries_are_compiled_again_and_grown_charts_refused(planar_arm: oc.Chart, tmp_path: Path) -> None:
+    """A library that is cut off would end the process with SIGBUS, in the middle of its first call."""
+    phi = planar_arm.phi(planar_arm.problem.domain.centre)
+    first = oc.compile_inverse(planar_arm, tmp_path)
+    content = first.library.read_bytes()
+    for damaged in (b"damaged", content[: len(content) // 2], b"", None):
+        first.library.unlink()  # it may be in use
+        if damaged is not None:
+            first.library.write_bytes(damaged)
+        with pytest.raises(CompileError, match="does not match its checksum"):
+            pickle.loads(pickle.dumps(first)).solve(phi)
+        assert oc.compile_inverse(planar_arm, tmp_path).solve(phi).found.all()
+    first.library.with_name(f"{first.library.name}.sha256").unlink()
+    assert oc.compile_inverse(planar_arm, tmp_path).solve(phi).found.all()
     with pytest.raises(NoExpressionError):
         oc.compile_inverse(circle(), tmp_path)
     with pytest.raises(InvalidValueError, match="local"):
         planar_arm.solve(planar_arm.phi(planar_arm.problem.domain.centre), local=3)  # type: ignore[arg-type]
+
+
+@needs_c
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="rights of POSIX")
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o707])
+def test_folders_that_others_may_write_to_are_refused(planar_arm: oc.Chart, tmp_path: Path, mode: int) -> None:
+    folder = tmp_path / "open"
+    folder.mkdir()
+    folder.chmod(mode)
+    with pytest.raises(CompileError, match="open: others may write there"):
+        oc.compile_inverse(planar_arm, folder)
+    assert not list(folder.iterdir())
+
+
+@needs_c
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="rights of POSIX")
+def test_folders_of_others_are_refused(planar_arm: oc.Chart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if somebody had made the folder before its user: root's own are trusted."""
+    if os.geteuid() == 0:
+        os.chown(tmp_path, 12345, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: 12345)
+    with pytest.raises(CompileError, match="it belongs to user"):
+        oc.compile_inverse(planar_arm, tmp_path)
+
+
+@pytest.mark.slow
+@needs_c
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="rights of POSIX")
+def test_libraries_that_others_may_write_to_are_refused(planar_arm: oc.Chart, tmp_path: Path) -> None:
+    first = oc.compile_inverse(planar_arm, tmp_path)
+    first.library.chmod(0o666)
+    with pytest.raises(CompileError, match="others may write there"):
+        first.solve(planar_arm.phi(planar_arm.problem.domain.centre))
+
+
+def test_a_relative_cache_does_not_count(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Otherwise libraries would come from whatever folder a program runs in."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for given, wanted in (("cache", tmp_path / ".cache"), ("", tmp_path / ".cache"), ("/var/tmp", Path("/var/tmp"))):
+        monkeypatch.setenv("XDG_CACHE_HOME", given)
+        assert compiled._cache() == wanted / "orthocas" / "libraries"

@@ -19,6 +19,7 @@ from orthocas.fitting.residuals import Loss
 from orthocas.fitting.starts import spectral_start
 from orthocas.fitting.terms import REGULAR_VOLUME, Sizes, Weights, mutual_cosines, pairs, task_cosines
 from orthocas.tasks.samples import Draw, Samples, sample_problem, samples_at
+from orthocas.tools.expressions import determinant
 
 WEIGHTS = Weights.of((1000.0, 30.0))
 REGULAR = Weights(1000.0, 30.0, 120.0)
@@ -279,3 +280,42 @@ def test_weights_of_a_command_line_have_terms_by_name() -> None:
     """Numbers stand for the terms in order; without any, those of the package keep their defaults."""
     assert parse_weights("1000,30, calm=3", None) == Weights(1000, 30, 0, 0, 0, {"calm": 3.0})
     assert parse_weights("calm=5", "metric") == Weights(extra={"calm": 5.0}, angles="metric")
+
+
+@pytest.mark.parametrize("rows", [1, 2, 5, 6, 7, 8])
+def test_determinants_and_their_gradients_are_those_of_numpy(rows: int) -> None:
+    """The gradient is det A times the transposed inverse."""
+    A = ca.SX.sym("A", rows, rows)
+    value = determinant(A)
+    function = ca.Function("det", [A], [value, ca.gradient(value, A)])
+    given = np.random.default_rng(7).normal(size=(rows, rows))
+    found, gradient = function(given)
+    wanted = np.linalg.det(given)
+    assert float(found) == pytest.approx(wanted, rel=1e-12)
+    np.testing.assert_allclose(np.asarray(gradient), wanted * np.linalg.inv(given).T, rtol=1e-9, atol=1e-12)
+    assert function.n_instructions() < 100 + 60 * rows * 2 ** (rows - 1)  # CasADi's own: 10^7 for 10 rows
+
+
+def many_joints(n: int) -> oc.Problem:
+    robot = oc.Robot.planar([1.0] * n, [1.0] * n)
+    return oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.1, *[0.4] * (n - 1)], 0.2))
+
+
+@pytest.mark.slow
+def test_eleven_joints_are_fitted() -> None:
+    """Nine coordinates: with r! terms in the determinant of the regularity, this did not end."""
+    fit = oc.fit(many_joints(11), oc.Polynomial(1), samples=200)
+    assert fit.chart.r == 9
+    assert fit.worst is not None
+    assert fit.worst.least > 0.1
+
+
+@pytest.mark.slow
+def test_fits_of_too_many_coordinates_name_the_size() -> None:
+    problem = many_joints(15)
+    with pytest.raises(
+        InvalidValueError, match="number of extra coordinates r is 13, expected at most 12 with the terms"
+    ):
+        oc.fit(problem, oc.Polynomial(1), samples=200)
+    fit = oc.fit(problem, oc.Polynomial(1), samples=200, weights=oc.Weights(regularity=0, folds=0))
+    assert fit.chart.r == 13

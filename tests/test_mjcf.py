@@ -374,3 +374,11 @@ def test_forces_of_one_sign_are_no_limit_of_effort(tmp_path: Path) -> None:
         '<mujoco><worldbody><body><joint actuatorfrcrange="0 10"/><geom size="1"/></body></worldbody></mujoco>'
     )
     assert np.isinf(oc.Robot.from_mjcf(path).effort_limits).all()
+
+
+def test_names_in_other_encodings_than_utf_8_are_refused(tmp_path: Path) -> None:
+    body = '<body><geom size="0.1"/><joint name="é" axis="0 1 0"/></body>'
+    text = f'<?xml version="1.0" encoding="iso-8859-1"?><mujoco><worldbody>{body}</worldbody></mujoco>'
+    (tmp_path / "arm.xml").write_text(text, encoding="iso-8859-1")
+    with pytest.raises(RobotError, match=r"arm.xml has names that are not UTF-8"):
+        oc.Robot.from_mjcf(tmp_path / "arm.xml")

@@ -42,6 +42,11 @@ def test_recipes_are_those_on_the_cards_and_licences_travel(name: str) -> None:
     assert ready_charts.up_to_date(name, ready_charts.DATA)
     licence = oc.charts.card(name).licence_text
     assert any(word in licence for word in ("Apache License", "Mozilla Public License", "Redistribution and use"))
+    model = oc.charts.card(name).model
+    head, _, rest = licence.partition(model.upstream)
+    assert head.endswith(f"[{model.licence}], ")
+    line = rest.split("\n\n")[0]
+    assert "Copyright " in line or "no copyright line. Authors: " in line or "no copyright line. Maintainer: " in line
 
 
 @pytest.mark.slow

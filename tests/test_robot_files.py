@@ -1,6 +1,7 @@
 """What robot files give, limits included, and what is refused in them."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import casadi as ca
@@ -13,6 +14,8 @@ import orthocas as oc
 from orthocas.errors import InvalidValueError, OrthocasError, RobotError, ShapeError, UnknownNameError
 from orthocas.robots import urdf
 from orthocas.robots.planar import planar_model
+
+XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
 
 
 def test_continuous_joints_are_one_angle_without_limits() -> None:
@@ -79,6 +82,9 @@ def test_branching_robot_needs_a_tip() -> None:
         ("<robot><lin", "not a URDF file"),
         ("<sdf/>", "root element is <sdf>"),
         ('<robot name="a"><link name="b"/><joint name="j" type="revolute"/></robot>', "not a usable URDF"),
+        (f'<robot name="a" {XACRO}><xacro:include filename="b"/></robot>', "is a xacro file, expected URDF: run xacro"),
+        (f'<robot name="a" {XACRO}><link name="b"/><xacro:arm/></robot>', "is a xacro file, expected URDF: run xacro"),
+        ('<robot name="a"><link name="${prefix}b"/></robot>', "is a xacro file, expected URDF: run xacro"),
     ],
 )
 def test_malformed_urdf_gets_one_clear_error(
@@ -95,6 +101,29 @@ def test_malformed_urdf_gets_one_clear_error(
 def test_broken_inertias_are_not_swallowed(tmp_path: Path, mass: str, message: str) -> None:
     with pytest.raises(RobotError, match=message):
         oc.Robot.from_urdf(one_joint(tmp_path, mass=mass), "a")
+
+
+def test_names_in_other_encodings_than_utf_8_are_refused(tmp_path: Path) -> None:
+    """Names reach Python as bytes; what is ASCII is the same in all these encodings."""
+    text = one_joint(tmp_path, joint="é").read_text()
+    for encoding in ("iso-8859-1", "windows-1252"):
+        path = tmp_path / f"{encoding}.urdf"
+        path.write_text(f'<?xml version="1.0" encoding="{encoding}"?>{text}', encoding=encoding)
+        with pytest.raises(
+            RobotError, match=r"urdf has names of joints or links that are not UTF-8, expected a file in"
+        ):
+            oc.Robot.from_urdf(path, "a")
+        path.write_text(f'<?xml version="1.0" encoding="{encoding}"?><!-- é -->{text}'.replace('"é"', '"j"'), encoding)
+        assert oc.Robot.from_urdf(path, "a").joint_names == ("j",)
+    assert oc.Robot.from_urdf(one_joint(tmp_path, joint="é"), "a").joint_names == ("é",)
+
+
+@pytest.mark.parametrize("number", ["1e200", "1e155", "1e21", "-1e308"])
+def test_axes_whose_squares_overflow_are_refused(tmp_path: Path, number: str) -> None:
+    path = one_joint(tmp_path)
+    path.write_text(re.sub('<axis xyz="[^"]*"', f'<axis xyz="{number} 0 1"', path.read_text()))
+    with pytest.raises(RobotError, match=r"expected 3 numbers up to 1e\+20"):
+        oc.Robot.from_urdf(path, "a")
 
 
 def test_link_and_joint_may_share_a_name(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Settings of the supervised law, integral action, stops, and references in C."""
 
+import ctypes
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from supervised import TICK, Arm, at_rest, run
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.codegen.library import GeneratedC
-from orthocas.control import Controller, Kinematic, Projector, Reference, Safety
+from orthocas.control import Controller, ControlStatus, Kinematic, Projector, Reference, Safety
 from orthocas.errors import InvalidValueError, ShapeError
 
 pytestmark = needs_c
@@ -149,3 +150,62 @@ def test_references_equal_those_of_python(supervised_library: CompiledLibrary, p
     h = 1e-5
     low, middle, high = (supervised_library.spline(moving, target, 0.8, 0.3 + t) for t in (-h, 0.0, h))
     np.testing.assert_allclose((high - low)[:6] / (2 * h), middle[3:], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [
+        *(("command_rate", bad) for bad in (np.nan, -np.inf, -1.0)),
+        *(("error_limit", np.nan), ("integral_limit", np.inf), ("brake_stiffness", np.inf), ("upper", np.nan)),
+        *(("fade_in", 0.0), ("damping", np.inf), ("near_margin", 0.5), ("hold_ticks", -1)),
+    ],
+)
+def test_settings_that_cannot_be_used_at_run_time_leave_the_last_good_ones(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart, name: str, bad: float
+) -> None:
+    """A supervisor whose settings go bad commands what one with good settings commands, and says so."""
+    settings = Safety.of(supervised_law, command_rate=300.0)
+    good, spoiled = (Supervisor(supervised_library, supervised_law, settings) for _ in range(2))
+    q = planar_for_control.problem.domain.centre
+    wanted = at_rest(planar_for_control, q)
+    far = wanted + 0.3 * np.eye(9)[0]
+    for supervisor in (good, spoiled):
+        supervisor.start(q)
+        for _ in range(50):
+            assert supervisor.step(q, np.zeros(3), wanted, TICK)[1] is ControlStatus.OK
+    struct = spoiled._safety.contents
+    value = getattr(struct, name)
+    if isinstance(value, ctypes.Array):
+        value[0] = bad
+    else:
+        setattr(struct, name, bad)
+    for k in range(100):
+        expected, status = good.step(q + 1e-9 * (k % 2), np.zeros(3), far, TICK)
+        command, told = spoiled.step(q + 1e-9 * (k % 2), np.zeros(3), far, TICK)
+        np.testing.assert_array_equal(command, expected)
+        assert status in (ControlStatus.OK, ControlStatus.SATURATED)
+        assert told is ControlStatus.BAD_INPUT
+
+
+@pytest.mark.parametrize("bad", [np.nan, 0.0, -1.0, -np.inf])
+def test_a_limit_that_cannot_be_used_leaves_the_last_good_one(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart, bad: float
+) -> None:
+    """The arm stays held: a limit of 0 was none of the torque against gravity before."""
+    supervisor = Supervisor(supervised_library, supervised_law)
+    q = planar_for_control.problem.domain.centre
+    wanted = at_rest(planar_for_control, q)
+    supervisor.start(q)
+    limit = np.array([55.0, 50.0, 45.0])
+    supervisor.gains = np.concatenate([supervisor.gains[:-3], limit])
+    for _ in range(100):
+        held, status = supervisor.step(q, np.zeros(3), wanted, TICK)
+        assert status in (ControlStatus.OK, ControlStatus.SATURATED)
+    supervisor.gains = np.concatenate([supervisor.gains[:-3], [limit[0], bad, limit[2]]])
+    for _ in range(100):
+        command, status = supervisor.step(q, np.zeros(3), wanted, TICK)
+        assert status is ControlStatus.BAD_INPUT
+    np.testing.assert_allclose(command, held, atol=1e-9)
+    assert np.abs(command).max() > 1.0
+    assert supervisor.mode == 0
+    np.testing.assert_array_equal(supervisor.limit, limit)

@@ -8,11 +8,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from public_objects import CONTROLLERS, OBJECTS, circle, fitted, numbers, planar
 
 import orthocas as oc
+from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array
 
 ROOT = Path(__file__).parent.parent
@@ -105,3 +107,19 @@ def test_objects_that_travel_keep_built_values_apart() -> None:
     assert len(sources) > 50
     users = [path.name for path in sources if re.search(r"from functools import .*cached_property", path.read_text())]
     assert users == []
+
+
+@pytest.mark.parametrize("name", ["problem", "task", "custom metric"])
+def test_pickles_that_this_casadi_cannot_read_get_one_line(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """CasADi's text begins with the version of its format; its own error has several lines of C++."""
+    content = pickle.dumps(OBJECTS[name]())
+    monkeypatch.setattr("casadi.CasadiMeta.version", lambda: "3.0.1")
+    older = pickle.dumps(pickle.loads(content))
+    monkeypatch.undo()
+
+    def refuse(text: str) -> ca.Function:
+        raise RuntimeError("Error in DeserializingStream at\n.../casadi/core/serializing_stream.cpp:157:\nmismatch")
+
+    monkeypatch.setattr("casadi.Function.deserialize", refuse)
+    with pytest.raises(InvalidValueError, match=r"^pickle is of CasADi 3.0.1, expected one of CasADi [^\n]*$"):
+        pickle.loads(older)

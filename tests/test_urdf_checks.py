@@ -89,3 +89,15 @@ def test_joint_with_the_name_of_the_world_cannot_be_locked(tmp_path: Path) -> No
     assert oc.Robot.from_urdf(path).joint_names == ("universe", "j")
     with pytest.raises(RobotError, match="a joint is called 'universe'"):
         oc.Robot.from_urdf(path, locked={"j": 0.0})
+
+
+@pytest.mark.parametrize("what", ["multiplier", "offset"])
+@pytest.mark.parametrize("text", ["1,5", "nan", "1e999", "1e21", "0x1", ""])
+def test_mimic_joints_follow_by_numbers(what: str, text: str, tmp_path: Path) -> None:
+    """The follower comes before its leader, so Pinocchio's parser does not read how it follows."""
+    mimic = f'<axis xyz="0 0 1"/><mimic joint="k" {what}="{text}"/>'
+    path = write(tmp_path, "revolute", mimic)
+    leader = '<link name="b"/><joint name="k" type="revolute"><parent link="base"/><child link="b"/></joint></robot>'
+    path.write_text(path.read_text().replace("</robot>", leader))
+    with pytest.raises(RobotError, match=f"{what} of <mimic> of joint 'j' is '{text}', expected a number up to 1e"):
+        oc.Robot.from_urdf(path, "b")

@@ -1,9 +1,11 @@
 """Who gets a page or a websocket of a view: forged headers and paths from raw clients, and pages in a real browser."""
 
+import gzip
 import http.client
 import http.server
 import socket
 import threading
+import urllib.request
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
@@ -114,6 +116,17 @@ def status(url: str, path: str, **headers: str) -> int:
     return found
 
 
+def title(url: str, packed: str) -> str:
+    """The title of a page that is asked for plain, or compressed."""
+    request = urllib.request.Request(url, headers={"Accept-Encoding": packed})
+    with urllib.request.urlopen(request, timeout=20) as answer:
+        assert answer.headers.get_all("Content-Encoding") == [packed]
+        body = answer.read()
+        assert answer.headers.get_all("Content-Length") == [str(len(body))]
+    text = (gzip.decompress(body) if packed == "gzip" else body).decode()
+    return text.partition("<title>")[2].partition("</title>")[0]
+
+
 def connected(url: str, path: str, origin: str | None, host: str | None = None) -> Any:
     """A websocket of viser's protocol; raises InvalidStatus if the server refuses it."""
     viser = import_module("viser")
@@ -132,6 +145,8 @@ def connected(url: str, path: str, origin: str | None, host: str | None = None) 
 def test_pages_are_served_to_those_with_the_address_only(view: oc.viewer.View) -> None:
     parts = urlsplit(view.url)
     assert status(view.url, parts.path) == 200
+    for packed in ("identity", "gzip"):
+        assert title(view.url, packed) == "orthocas"
     assert status(view.url, f"{parts.path}/?fixedDpr=0.3", Origin=f"http://{parts.netloc}") == 200
     assert status(view.url, parts.path, Host=f"localhost:{parts.port}") == 200
     assert status(view.url, "/") == 403
@@ -221,6 +236,7 @@ def test_pages_of_others_in_a_real_browser_get_no_websocket(view: oc.viewer.View
         page.open(view.url)  # the same script in the page's own origin, and the page itself
         page.wait("!!document.querySelector('canvas')")
         assert page.value(code) == "in"
+        assert page.value("document.title") == "orthocas"
         page.open(page.value("location.href"))  # viser adds to the address; it stays one that can be opened
         page.wait("!!document.querySelector('canvas')")
         evil.shutdown()

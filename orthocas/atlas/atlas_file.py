@@ -18,6 +18,7 @@ from orthocas.atlas.lattice import Lattice, Outcome, Result, Symmetries
 from orthocas.atlas.plan import AtlasSettings, Plan, lattice_of
 from orthocas.atlas.regions import Region, Surroundings, joint_range_of
 from orthocas.errors import AtlasFileError, InvalidValueError, OrthocasError
+from orthocas.tasks.domains import NARROWEST
 from orthocas.tasks.problem_file import FOREIGN, problem_from_data, problem_to_data
 from orthocas.tools.archive import Stored, from_npy, to_npy
 from orthocas.tools.block_file import BlockKind, Contents, append, scan
@@ -28,7 +29,6 @@ _CELL, _TURN = b"CELL", b"TURN"
 ATLAS = BlockKind("atlas", b"\x93ORTHOCASATLAS\n", 2, (_CELL, _TURN), AtlasFileError)
 _MODERATE = 1e50  # products of a few such numbers do not overflow
 _SAME = 1e-9  # of a tile
-_NARROWEST = 1e-9  # of tiles [rad] or [m]
 Records = NDArray[np.void]
 
 
@@ -236,8 +236,8 @@ def _maps(joints: tuple[int, ...], arrays: Mapping[str, Stored]) -> Symmetries:
 
 def _require_lattice(found: Lattice, wanted: Lattice) -> None:
     """Raise InvalidValueError unless the tiles are those of joint range, settings and symmetries."""
-    if not wanted.width.min() > _NARROWEST:
-        raise InvalidValueError("joint range", wanted.width.tolist(), f"tiles wider than {_NARROWEST:g}")
+    if not wanted.width.min() > 2 * NARROWEST:
+        raise InvalidValueError("joint range", wanted.width.tolist(), f"tiles wider than {2 * NARROWEST:g}")
     for name in ("low", "width", "counts", "endless"):
         has, wants = (np.asarray(getattr(lattice, name), dtype=float) for lattice in (found, wanted))
         if not (np.abs(has - wants) <= _SAME * wanted.width).all():

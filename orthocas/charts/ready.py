@@ -60,8 +60,9 @@ class Card(Shown):
 
     @property
     def licence_text(self) -> str:
-        """The licence of the robot's model."""
-        return (files(__package__) / "licences" / f"{self.model.licence}.txt").read_text(encoding="utf-8")
+        """The copyright lines of the robots of all ready charts, then the licence of this one's model."""
+        folder = files(__package__) / "licences"
+        return "\n".join((folder / f"{name}.txt").read_text("utf-8") for name in ("NOTICE", self.model.licence))
 
     def facts(self) -> dict[str, str]:
         """Quality, domain, proof, and where the chart comes from."""

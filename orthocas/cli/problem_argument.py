@@ -127,7 +127,7 @@ def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., N
 
 def is_robot_file(name: str) -> bool:
     """Whether a PROBLEM argument means a robot file."""
-    return Path(name).suffix.lower() in (".urdf", ".xml")
+    return Path(name).suffix.lower() in (".urdf", ".xml", ".xacro")
 
 
 def build_robot(path: str, options: ProblemOptions) -> Robot:

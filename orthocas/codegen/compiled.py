@@ -21,7 +21,7 @@ from orthocas.codegen.library import compilers
 from orthocas.errors import CompileError, SimulationError
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_path
-from orthocas.tools.files import draft_folder, made_folder, published
+from orthocas.tools.files import digest, draft_folder, made_folder, published
 from orthocas.tools.interrupts import deferred
 
 _FLAGS = ("-O2",)  # -O3 takes twice as long, and gains little
@@ -39,22 +39,25 @@ def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
         kind: begins the name of the library.
         sources: contents of the files by name.
         flags: of the compiler.
-        folder: where libraries are kept; default `orthocas` in $XDG_CACHE_HOME or ~/.cache.
+        folder: where libraries are kept; default `orthocas/libraries` in $XDG_CACHE_HOME or ~/.cache.
 
     Raises:
-        CompileError: if there is no C compiler, or it fails.
+        CompileError: if there is no C compiler, or it fails, or the folder is not the user's own.
         InvalidValueError: if the folder cannot be written.
     """
     compiler, options = compilers()[0], ("-std=c99", "-fPIC", "-shared", *flags)
     content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
     name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
-    library = made_folder("folder", _cache() if folder is None else as_path("folder", folder)).resolve() / name
-    if not library.exists():
+    place = _cache() if folder is None else as_path("folder", folder)
+    library = made_folder("folder", place, mode=0o700).resolve() / name
+    _require_own(library.parent)
+    if not _is_whole(library):
         with draft_folder() as place, published(library.parent) as drafts:
             for file, text in sources.items():
                 (place / file).write_text(text, encoding="utf-8")
             code = [str(place / file) for file in sources if file.endswith(".c")]
             _compile([compiler, *options, "-o", str(drafts / name), *code, "-lm"])
+            (drafts / f"{name}.sha256").write_text(digest(drafts / name))
     return library
 
 
@@ -62,12 +65,42 @@ def loaded(library: Path) -> ctypes.CDLL:
     """Load a library that was kept.
 
     Raises:
-        CompileError: if it is damaged.
+        CompileError: if it is damaged or missing, or others could have put it there.
     """
+    _require_own(library.parent)
+    if not _is_whole(library):
+        raise CompileError(f"cannot load {library}: it does not match its checksum; compile again")
+    _require_own(library)
     try:
         return ctypes.CDLL(str(library))
     except OSError as error:
         raise CompileError(f"cannot load {library}: {error}; delete it and compile again") from None
+
+
+def _require_own(place: Path) -> None:
+    """Refuse libraries that others could have written: they would run with our rights.
+
+    Raises:
+        CompileError: if a folder or file belongs to somebody else but root, or others may write there.
+    """
+    if not hasattr(os, "geteuid"):  # Windows: the rights of a folder come from the one above
+        return
+    try:
+        found = place.stat()
+    except OSError as error:
+        raise CompileError(f"cannot load {place}: {error.strerror}") from None
+    if found.st_uid not in (os.geteuid(), 0):
+        raise CompileError(f"no library is loaded from {place}: it belongs to user {found.st_uid}, expected your own")
+    if found.st_mode & 0o022:
+        raise CompileError(f"no library is loaded from {place}: others may write there, expected your own (chmod go-w)")
+
+
+def _is_whole(library: Path) -> bool:
+    """Whether a library is there as it was compiled: the system ends processes that load half of one."""
+    try:
+        return library.with_name(f"{library.name}.sha256").read_text() == digest(library)
+    except (OSError, ValueError):
+        return False
 
 
 def template(name: str) -> str:
@@ -82,7 +115,9 @@ def _compile(command: list[str]) -> None:
 
 
 def _cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "orthocas"
+    """Relative paths in XDG_CACHE_HOME do not count, as its specification demands."""
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (given if given.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
 
 
 class Kernel(ctypes.Structure):
@@ -114,7 +149,7 @@ class CompiledFunctions:
         folder: where compiled libraries are kept; default as in `orthocas.compile_inverse`.
 
     Raises:
-        CompileError: if there is no C compiler.
+        CompileError: as `kept_library`.
     """
 
     def __init__(self, functions: Sequence[ca.Function], folder: Path | None = None) -> None:

@@ -78,10 +78,11 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
 
     Args:
         chart: a chart with a closed expression.
-        folder: where compiled libraries are kept; default `orthocas` in $XDG_CACHE_HOME or ~/.cache.
+        folder: where compiled libraries are kept; default `orthocas/libraries` in $XDG_CACHE_HOME
+            or ~/.cache. Only the user and root may be able to write there.
 
     Raises:
-        CompileError: if there is no C compiler.
+        CompileError: if there is no C compiler, or others may write to the folder.
         NoExpressionError: if the chart is grown.
         InvalidValueError: if the folder cannot be written.
 

@@ -12,13 +12,16 @@ from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.precision import Precision, check_values
 from orthocas.control.controller import Controller
 from orthocas.control.errors import without_turns
-from orthocas.control.safety import Safety
+from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
 from orthocas.tasks.relative import Relative
 from orthocas.version import VERSION
 
 _TORQUE = """It compensates gravity, damps with the mass matrix,
  * holds the arm with a spring that gives way under too much force."""
 _VELOCITY = """It stops the arm and holds it."""
+_ORDER = "{0}catch_margin < {0}near_margin && {0}near_margin < {0}return_margin && {0}return_margin < 1.0".format(
+    "safety->"
+)
 _MAX_EVALUATIONS = 100  # largest number of chart evaluations in one call of the inverse map
 
 
@@ -60,6 +63,7 @@ def supervision_values(
         "turning": flags(endless),
         "safety_fields": "\n".join(_field(name, value) for name, value in settings.items()),
         "safety_values": ",\n".join(f"  {_literal(value)}" for value in settings.values()),
+        "safety_meant": "\n        && ".join([*(_meant(name, value) for name, value in settings.items()), _ORDER]),
         **_clearance_values(condition),
         "turn_reference": filled("turn_reference.c", known) if Relative(controller.problem.task).turned else "",
         "fallback_arguments": "\n".join(f"  arg[{1 + i}] = gains->{gain};" for i, gain in enumerate(controller.gains)),
@@ -83,6 +87,16 @@ def _field(name: str, value: object) -> str:
     size = f"[{value.size}]" if isinstance(value, np.ndarray) else ""
     kind = "int" if isinstance(value, int) else "double"
     return f"  {kind} {name}{size}; /* {Safety.meaning(name)} */"
+
+
+def _meant(name: str, value: object) -> str:
+    """What `Safety` requires of a setting, in C."""
+    place = f"safety->{name}"
+    if not isinstance(value, np.ndarray):
+        return f"{place} >= 0" if isinstance(value, int) else f"{place} > 0.0 && {place} <= LARGEST"
+    least = "-INFINITY" if name in SIGNED else "0.0"
+    found = f"all_from({least}, {place}, {value.size})"
+    return found if name in UNBOUNDED else f"{found} && all_within({place}, {value.size}, LARGEST)"
 
 
 def _literal(value: object) -> str:

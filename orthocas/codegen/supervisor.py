@@ -30,12 +30,12 @@ class Supervisor:
         self._n, self._k, self._library = library.n, len(controller.labels), library
         self._functions = {name: library.function(name) for name in ("start", "take_over", "resume", "step")}
         self._functions["step"].argtypes = [*[_POINTER] * 6, library.precision.c_type, _POINTER]
-        if safety is None:
-            self._safety = library.address("default_safety")
-        else:
+        if safety is not None:
             require_kind("safety", safety, Safety)
-            self._safety = _packed(safety.in_c(controller.command), library.precision)
-        self._state = _state_type(self._n, self._k, library.precision, library.of_atlas)()
+        values = (safety or Safety.of(controller)).in_c(controller.command)
+        settings = _settings_type(values, library.precision)
+        self._safety = library.address("default_safety") if safety is None else _packed(values, settings)
+        self._state = _state_type(self._n, self._k, library.precision, library.of_atlas, settings)()
         self._command = library.numbers(np.zeros(self._n))
         self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
 
@@ -100,7 +100,9 @@ class Supervisor:
         return ctypes.byref(self._state)
 
 
-def _state_type(n: int, k: int, precision: Precision, of_atlas: bool) -> type[ctypes.Structure]:
+def _state_type(
+    n: int, k: int, precision: Precision, of_atlas: bool, settings: type[ctypes.Structure]
+) -> type[ctypes.Structure]:
     joints, quantities = precision.c_type * n, precision.c_type * k
     names = ("q", "dq", "seen_q", "seen_dq", "command", "law", "anchor", "safe")
     layout = [
@@ -115,14 +117,21 @@ def _state_type(n: int, k: int, precision: Precision, of_atlas: bool) -> type[ct
         *((name, joints) for name in ("carry",) if of_atlas),
         *((name, quantities) for name in ("value", "velocity", "acceleration")),
         *((name, ctypes.c_int) for name in ("reference_chart",) if of_atlas),
+        ("safety", settings),
+        ("limit", joints),
     ]
     return type("State", (ctypes.Structure,), {"_fields_": layout})
 
 
-def _packed(values: dict[str, Any], precision: Precision) -> Any:
-    """The settings as the C struct."""
+def _settings_type(values: dict[str, Any], precision: Precision) -> type[ctypes.Structure]:
+    """The struct of settings in C."""
     layout = [(name, _kind(value, precision)) for name, value in values.items()]
-    struct = type("Safety", (ctypes.Structure,), {"_fields_": layout})()
+    return type("Safety", (ctypes.Structure,), {"_fields_": layout})
+
+
+def _packed(values: dict[str, Any], settings: type[ctypes.Structure]) -> Any:
+    """The settings as the C struct."""
+    struct: Any = settings()
     for name, value in values.items():
         setattr(struct, name, tuple(value.tolist()) if isinstance(value, np.ndarray) else value)
     return ctypes.pointer(struct)

@@ -17,6 +17,8 @@ from orthocas.tools.checks import Array, as_float_array, as_number, require_coun
 _SAMPLES, _SEED = 256, 0
 _RATE = {"torque": 1000.0, "velocity": 20.0}  # [N m/s] as on many arms, 1 N m in a millisecond; [rad/s^2]
 _TORQUE_ONLY = ("stop_zone", "stop_damping", "brake_stiffness", "brake_yield")  # velocity laws do not use them
+UNBOUNDED = ("command_rate", "speed_limit", "lower", "upper", "error_limit")  #: settings that may be infinite
+SIGNED = ("lower", "upper", "brake_stiffness")  #: those that may be negative
 _SPEED = 4 * np.pi  # [rad/s] or [m/s], of joints without a limit
 _CATCHER = 12.0  # [1/s] natural frequency and damping rate of the catcher
 _RETURN = 0.3  # [rad/s] or [m/s], on the way back
@@ -164,10 +166,9 @@ def _require_number(name: str, value: float) -> None:
 
 def _numbers(name: str, value: ArrayLike) -> Array:
     array = np.array(as_float_array(name, value))
-    may_be_infinite = name in ("command_rate", "speed_limit", "lower", "upper", "error_limit")
-    if array.ndim != 1 or np.isnan(array).any() or (not may_be_infinite and np.isinf(array).any()):
+    if array.ndim != 1 or np.isnan(array).any() or (name not in UNBOUNDED and np.isinf(array).any()):
         raise InvalidValueError(name, array.tolist(), "a list of numbers")
-    if name not in ("lower", "upper", "brake_stiffness") and array.size and array.min() < 0:
+    if name not in SIGNED and array.size and array.min() < 0:
         raise InvalidValueError(name, array.min(), "numbers >= 0")
     array.setflags(write=False)
     return array

@@ -17,6 +17,7 @@ from orthocas.tasks.problem import Problem, task_jacobians
 from orthocas.tasks.samples import samples_at
 from orthocas.tools.cached import building, cached_property
 from orthocas.tools.checks import Array, frozen_array, require_known
+from orthocas.tools.expressions import determinant
 from orthocas.tools.interrupts import deferred
 
 _STAGES = 8  # intermediate points on the way to the desired coordinates
@@ -235,7 +236,7 @@ def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, floa
     q, length = ca.SX.sym("q", problem.n), ca.SX.sym("length")
     J = problem.task.jacobian_function(q)
     others = [[k for k in range(problem.n) if k != i] for i in range(problem.n)]
-    across = ca.vertcat(*((-1) ** (i + 1) * ca.det(J[:, columns]) for i, columns in enumerate(others)))
+    across = ca.vertcat(*((-1) ** (i + 1) * determinant(J[:, columns]) for i, columns in enumerate(others)))
     home = J.T @ ca.solve(J @ J.T, problem.task.function(q) - level)
     rate = length * (across / ca.norm_2(across) - home)
     grid = np.linspace(0.0, 1.0, steps + 1)

@@ -10,6 +10,7 @@ from orthocas.charts.angles import pairs
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tasks.metric import Metric
 from orthocas.tools.checks import as_float_array, as_number, require_kind, require_known, require_shape
+from orthocas.tools.expressions import MOST_ROWS, determinant
 
 REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
 LEAST_CONDITIONING = 0.2  #: that fits aim at on the whole domain
@@ -256,13 +257,21 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
         null_basis: columns z_1..z_r, (n, r), oriented continuously over the domain.
         metric_inverse: A^-1, (n, n); None for the identity.
 
+    Raises:
+        InvalidValueError: for too many coordinates.
+
     Source:
         ours, docs/derivations.md#regularity.
     """
+    if coordinate_jacobian.shape[0] > MOST_ROWS:
+        wanted = (
+            f"at most {MOST_ROWS} with the terms regularity and folds; weights of 0 leave these out, locked joints help"
+        )
+        raise InvalidValueError("number of extra coordinates r", coordinate_jacobian.shape[0], wanted)
     J = coordinate_jacobian
     raised = J if metric_inverse is None else J @ metric_inverse
     lengths = ca.sqrt(ca.sum2(raised * J))
-    return ca.det((J @ null_basis) / ca.repmat(lengths, 1, J.shape[0]))
+    return determinant((J @ null_basis) / ca.repmat(lengths, 1, J.shape[0]))
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,10 @@ def _refuse_unread(compiled: Any, name: str) -> None:
         "jnt_range",
         "qpos0",
     )
+    try:
+        compiled.names.decode()
+    except UnicodeDecodeError:
+        raise RobotError(f"{name} has names that are not UTF-8, expected a file in UTF-8") from None
     if not all(np.isfinite(getattr(compiled, part)).all() for part in placed):
         raise RobotError(f"{name} holds numbers that are not finite")
     if compiled.nflex:

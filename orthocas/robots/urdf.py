@@ -1,5 +1,6 @@
 """URDF files: checks for errors that Pinocchio's parser accepts, reading, and locked joints."""
 
+import math
 import os
 import re
 import tempfile
@@ -40,7 +41,20 @@ def check_urdf(path: str | Path, root: ElementTree.Element) -> None:
         if axis is not None and joint.get("type") in _WITH_AXIS:
             _require_direction(path, f"<axis> of joint '{joint.get('name')}'", axis.get("xyz"))
         _require_limits(path, joint)
+        _require_mimics(path, joint)
     _require_tree(path, root)
+
+
+def _require_no_xacro(path: str | Path, root: ElementTree.Element) -> None:
+    """Refuse files of macros, which parsers of URDF skip without a word.
+
+    Raises:
+        RobotError: if there is a macro, or a name with an expression.
+    """
+    macros = (element.tag for element in root.iter() if element.tag.startswith("{") and "xacro}" in element.tag)
+    names = (element.get("name", "") for kind in ("link", "joint") for element in root.iter(kind))
+    if next(macros, None) is not None or any("${" in name for name in names):
+        raise RobotError(f"{path} is a xacro file, expected URDF: run xacro first (xacro {Path(path).name} > arm.urdf)")
 
 
 def _require_direction(path: str | Path, label: str, text: str | None) -> None:
@@ -51,10 +65,10 @@ def _require_direction(path: str | Path, label: str, text: str | None) -> None:
     unfit = f"{path}: xyz of {label} is '{text[:80]}', expected"
     if len(words) != 3 or not all(_NUMBER.fullmatch(word) for word in words):
         raise RobotError(f"{unfit} 3 numbers")
-    length = sum(float(word) ** 2 for word in words)
-    if not length <= _LARGEST**2:
+    length = math.hypot(*map(float, words))  # squares of numbers in words may overflow
+    if not length <= _LARGEST:
         raise RobotError(f"{unfit} 3 numbers up to {_LARGEST:g}")
-    if length < _SHORTEST**2:
+    if length < _SHORTEST:
         raise RobotError(f"{unfit} a vector that is not zero")
 
 
@@ -66,6 +80,16 @@ def _require_limits(path: str | Path, joint: ElementTree.Element) -> None:
         text = "" if limit is None else limit.get(what, "")
         if _is_negative(text):
             raise RobotError(f"{path}: {what} of {label} is '{text[:80]}', expected a number >= 0 (0: unlimited)")
+
+
+def _require_mimics(path: str | Path, joint: ElementTree.Element) -> None:
+    """How a joint follows its leader; Pinocchio's parser reads this only where the leader comes first."""
+    label = f"<mimic> of joint '{joint.get('name')}'"
+    for mimic in joint.findall("mimic"):
+        for what in ("multiplier", "offset"):
+            text = mimic.get(what, "0").strip()
+            if not _NUMBER.fullmatch(text) or abs(float(text)) > _LARGEST:
+                raise RobotError(f"{path}: {what} of {label} is '{text[:80]}', expected a number up to {_LARGEST:g}")
 
 
 def _is_negative(text: str) -> bool:
@@ -119,6 +143,7 @@ def read_urdf(path: str | Path, tip: str | None = None, locked: Mapping[str, flo
             be locked moves the tip and its leader is not in `locked`.
     """
     root = read_xml(path, "URDF", "robot")
+    _require_no_xacro(path, root)
     check_urdf(path, root)
     try:
         return _parsed(path, mimic=True)
@@ -138,6 +163,10 @@ def _parsed(path: str | Path, mimic: bool) -> pin.Model:
         complaints = _text(notes)
     if "Error:" in complaints:  # the parser skips what it cannot read, for example a mass
         raise RobotError(f"{path} is not a usable URDF model: {complaints}")
+    try:
+        _ = list(model.names), [frame.name for frame in model.frames]
+    except UnicodeDecodeError:
+        raise RobotError(f"{path} has names of joints or links that are not UTF-8, expected a file in UTF-8") from None
     return model
 
 

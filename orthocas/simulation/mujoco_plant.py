@@ -402,7 +402,7 @@ class MuJoCoPlant(Shown):
 
     def _checked(self, name: str, value: ArrayLike) -> Array:
         """Joint torques (n,). MuJoCo would take 0 in place of NaN and of larger ones."""
-        if not isinstance(value, np.ndarray) or value.shape != (self.robot.n,) or value.dtype != float:
+        if type(value) is not np.ndarray or value.shape != (self.robot.n,) or value.dtype != float:
             value = as_point(name, value, self.robot.n)
         if not np.abs(value).max() < _LARGEST:
             raise InvalidValueError(name, value.tolist(), f"numbers up to {_LARGEST:g}")

@@ -345,7 +345,7 @@ def simulate(
         tolerance: relative and absolute tolerance of the integrator.
         compiled: run law, robot and integrator in C (Dormand and Prince's method of order 8), with the same results
             within the tolerance. The first run with a law compiles it, which takes some seconds; libraries stay in
-            `orthocas` in $XDG_CACHE_HOME or ~/.cache. Needs a C compiler; not with `safety` or MuJoCo.
+            `orthocas/libraries` in $XDG_CACHE_HOME or ~/.cache. Needs a C compiler; not with `safety` or MuJoCo.
         monitor: called with progress.
 
     Returns:

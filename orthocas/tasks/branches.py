@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from orthocas.errors import SingularTaskError, UnknownNameError
+from orthocas.errors import InvalidValueError, SingularTaskError, UnknownNameError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.clear_box import row_scale
 from orthocas.tasks.domains import Box, sample_evenly
@@ -84,6 +84,8 @@ class Branches(Shown, Sequence[Branch]):
             if key not in names:
                 raise UnknownNameError("branch", key, names)
             return self.items[names.index(key)]
+        if not isinstance(key, int | np.integer) or not -len(self.items) <= key < len(self.items):
+            raise InvalidValueError("branch", repr(key)[:80], f"a name, or a place among {len(self.items)}")
         return self.items[key]
 
     def of(self, q: ArrayLike) -> Branch | None:
@@ -143,6 +145,8 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
         True
     """
     require_kind("robot", robot, Robot)
+    if task is not None:
+        require_kind("task", task, Task)
     whole = joint_range(robot, 0)
     arm = _Arm.of(robot, task, whole)
     cuts = tuple(cut for k in arm.inner for cut in arm.cuts(k))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.tasks.domains import Box, Domain, register_domain
+from orthocas.tasks.domains import NARROWEST, Box, Domain, register_domain
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_point_set, frozen_array, require_kind
@@ -34,7 +34,7 @@ class Corridor(Box):
     Args:
         box: a box; the corridor is that part of it.
         postures: the path, (N, n) [rad] or [m].
-        radius: one number, or one for each joint (n,), > 0 [rad] or [m].
+        radius: one number, or one for each joint (n,), > 1e-9 [rad] or [m].
 
     Raises:
         ShapeError, InvalidValueError: for arguments of the wrong shape or value.
@@ -62,8 +62,10 @@ class Corridor(Box):
         sizes = as_float_array("radius", radius)
         if sizes.shape not in ((), (n,)):
             raise ShapeError("radius", sizes.shape, (n,))
-        if not (sizes > 0).all() or np.isinf(sizes).all():
-            raise InvalidValueError("radius", sizes.tolist(), "positive numbers, at least one of them finite")
+        if not (sizes > NARROWEST).all() or np.isinf(sizes).all():
+            raise InvalidValueError(
+                "radius", sizes.tolist(), f"numbers above {NARROWEST:g}, at least one of them finite"
+            )
         sizes = np.array(np.broadcast_to(sizes, (n,)))
         sizes.setflags(write=False)
         for field, value in (("postures", path), ("radius", sizes)):

@@ -33,6 +33,7 @@ _MOST_SAMPLES = 10**12
 _POWERS = (1.0, 0.5, 0.25)  # of the distance from the middle: uniform, near faces, near corners
 _LEAST_SHARE, _TRIED = 1e-3, 10_000  # of the points of a box, at least so many, that have to lie in the domain
 _BLOCK = 1000  # fewest points to draw at once, after the first ones
+NARROWEST = 1e-9  #: [rad] or [m]; boxes of this half-width and less drown in rounding
 _WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes, and overflow later
 
 
@@ -272,7 +273,7 @@ class Box(Domain):
 
     Args:
         centre: (n,) [rad] or [m].
-        half_width: (n,) or one number for all joints, > 0 [rad] or [m].
+        half_width: (n,) or one number for all joints, > 1e-9 [rad] or [m].
         unbounded: indices of joints whose every position lies inside, such as a joint that turns without end. Samples
             still keep within their half-width.
 
@@ -299,9 +300,9 @@ class Box(Domain):
         widths = frozen_array("half_width", np.broadcast_to(widths, middle.shape), middle.shape)
         if widths.size == 0:
             raise InvalidValueError("centre", "empty", "at least one joint")
-        if widths.min() <= 0 or widths.max() > _WIDEST:
-            bad = widths.min() if widths.min() <= 0 else widths.max()
-            raise InvalidValueError("half_width", bad, f"positive numbers up to {_WIDEST:g}")
+        if widths.min() <= NARROWEST or widths.max() > _WIDEST:
+            bad = widths.min() if widths.min() <= NARROWEST else widths.max()
+            raise InvalidValueError("half_width", f"{bad:g}", f"numbers above {NARROWEST:g}, up to {_WIDEST:g}")
         object.__setattr__(self, "centre", middle)
         object.__setattr__(self, "half_width", widths)
         object.__setattr__(self, "unbounded", _joint_indices("unbounded", unbounded, len(middle)))

@@ -14,7 +14,7 @@ from orthocas.robots.robot import Robot
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, frozen_array, require_kind, require_known, require_text
-from orthocas.tools.expressions import expression_of
+from orthocas.tools.expressions import HoldsFunctions, expression_of
 
 METRIC_KINDS = ("euclidean", "inertia")
 MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` accepts
@@ -22,7 +22,7 @@ _SINGULAR = 1e-12  # eigenvalue, relative to the largest entry, that counts as z
 
 
 @dataclass(frozen=True, eq=False)
-class Metric:
+class Metric(HoldsFunctions):
     """A symmetric positive definite A(q), (n, n). Use `from_spec` or `custom` to build one."""
 
     name: str  #: euclidean, inertia, constant, custom, or a name of your own

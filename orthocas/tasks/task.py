@@ -25,7 +25,7 @@ from orthocas.tools.checks import (
 )
 from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.display import Shown, listed
-from orthocas.tools.expressions import expression_of
+from orthocas.tools.expressions import HoldsFunctions, expression_of
 
 TASK_KINDS = (
     "position",
@@ -43,7 +43,7 @@ TASK_KINDS = (
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Task(Shown):
+class Task(Shown, HoldsFunctions):
     """The task map h of a robot. Use the class methods to build one.
 
     Orientation, pose and axis tasks compare the tip with a reference orientation. If none is given, `Problem` uses the

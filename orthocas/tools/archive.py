@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.errors import ArchiveError
-from orthocas.tools.files import is_archive, published, require_replaceable, require_writable
+from orthocas.tools.files import is_archive, published, refuse_xml, require_replaceable, require_writable
 from orthocas.tools.json import from_strict_json
 
 _MOST_AXES = 32
@@ -148,6 +148,7 @@ def unpacking(source: Path, what: str, error: type[ArchiveError]) -> Iterator[Un
             archive = zipfile.ZipFile(stream)
             entries = archive.infolist()
         except _DAMAGE:
+            refuse_xml(source, f"a {what} file", error)
             raise error(f"{source} is truncated, damaged or not a {what} file") from None
         sizes = {entry.filename: entry.file_size for entry in entries}
         if len(sizes) < len(entries) or len(entries) > _MOST_ENTRIES:

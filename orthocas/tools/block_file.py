@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from orthocas.errors import ArchiveError
-from orthocas.tools.files import published, require_replaceable, require_writable
+from orthocas.tools.files import published, refuse_xml, require_replaceable, require_writable
 from orthocas.tools.json import from_strict_json
 
 try:
@@ -195,6 +195,7 @@ def scan(path: Path, kind: BlockKind) -> Contents:
 
 def _header(path: Path, prefix: bytes, stream: Any, kind: BlockKind) -> tuple[dict[str, Any], bytes, int, int]:
     if len(prefix) < _PREFIX.size or not prefix.startswith(kind.magic):
+        refuse_xml(path, f"an orthocas {kind.name} file", kind.error)
         raise kind.error(f"{path} is truncated, damaged or not an orthocas {kind.name} file")
     magic, length, digest = _PREFIX.unpack(prefix)
     if magic[-1] < 1:

@@ -101,8 +101,11 @@ def as_float_array(name: str, value: Any) -> Array:
     """Convert to a float array.
 
     Raises:
-        InvalidValueError: if the value is not real numbers: text (even "1.0"), complex numbers, None, expressions.
+        InvalidValueError: if the value is not real numbers: text (even "1.0"), complex numbers, None, expressions, or
+            masked entries: NumPy would hand over whatever is below the mask.
     """
+    if np.ma.is_masked(value) or (isinstance(value, list | tuple) and any(map(np.ma.is_masked, value))):
+        raise InvalidValueError(name, "an array with masked entries", "numbers everywhere")
     try:
         array = np.asarray(value)
         kind = array.dtype.kind

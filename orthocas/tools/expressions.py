@@ -1,6 +1,8 @@
 """SX expressions as data: tapes for files, their structure, scalar code, and users' functions of q."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
 from math import inf
 from typing import Any, TypeVar
 
@@ -31,10 +33,48 @@ BINARY = (  #: on two
     *("add", "sub", "mul", "div", "pow", "constpow", "atan2", "hypot", "fmod", "copysign", "fmin", "fmax"),
     *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
 )
+MOST_ROWS = 12  #: of a determinant
+_BY_CASADI = 5  # rows of determinants that CasADi writes out well
 _LINEAR = ("assign", "neg", "twice", "add", "sub")
 WRITTEN_OUT = 10  #: rows of the largest matrices whose products and inverses are written out
 Tape = dict[str, Any]
 Entry = TypeVar("Entry", ca.SX, ca.MX)
+
+
+class HoldsFunctions:
+    """Base of objects with CasADi functions among their fields: pickles say which CasADi wrote them."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields, with functions as text."""
+        version = ca.CasadiMeta.version()
+        return {
+            name: _Written(value.serialize(), version) if isinstance(value, ca.Function) else value
+            for name, value in vars(self).items()
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The object again.
+
+        Raises:
+            InvalidValueError: if this CasADi cannot read what another one wrote.
+        """
+        for name, value in state.items():
+            object.__setattr__(self, name, value.read() if isinstance(value, _Written) else value)
+
+
+@dataclass(frozen=True)
+class _Written:
+    """A function in a pickle."""
+
+    text: str
+    version: str  #: of CasADi
+
+    def read(self) -> ca.Function:
+        try:
+            return ca.Function.deserialize(self.text)
+        except RuntimeError:
+            wanted = f"one of CasADi {ca.CasadiMeta.version()}; files of charts outlive versions"
+            raise InvalidValueError("pickle", f"of CasADi {self.version}", wanted) from None
 
 
 #: CasADi's numbers of the operations
@@ -261,3 +301,27 @@ def expression_of(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function, q
     if free:
         raise InvalidValueError(what, f"using the free symbols {', '.join(free[:5])}", "an expression in q alone")
     return value
+
+
+def determinant(matrix: ca.SX) -> ca.SX:
+    """det A of a symbolic matrix (r, r), by cofactors, with r 2^(r-1) products.
+
+    Minors of the first k rows are made once for each choice of k columns. CasADi's own determinant makes them anew
+    everywhere, with r! products: a minute at r = 10, and nothing can interrupt it.
+
+    Args:
+        matrix: with at most `MOST_ROWS` rows.
+    """
+    rows = require_count("rows of a determinant", matrix.shape[0], least=1, most=MOST_ROWS)
+    if rows <= _BY_CASADI:
+        return ca.det(matrix)
+    minors: dict[tuple[int, ...], ca.SX] = {(): ca.SX(1)}
+    for k in range(rows):
+        minors = {
+            columns: sum(
+                (-1) ** (k + i) * matrix[k, column] * minors[columns[:i] + columns[i + 1 :]]
+                for i, column in enumerate(columns)
+            )
+            for columns in combinations(range(rows), k + 1)
+        }
+    return minors[tuple(range(rows))]

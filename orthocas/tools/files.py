@@ -88,6 +88,18 @@ def list_text(folder: Path, drafts: Iterable[Path]) -> str:
     return json.dumps({"format": "orthocas-list", "files": known}, indent=1) + "\n"
 
 
+def refuse_xml(path: Path, what: str, error: type[ArchiveError]) -> None:
+    """Say that a file of another kind than expected is XML, if it is: robot files are mistaken for charts.
+
+    Raises:
+        ArchiveError: the one given, if the file begins as XML does.
+    """
+    with path.open("rb") as stream:
+        begin = stream.read(200).removeprefix(b"\xef\xbb\xbf").lstrip()
+    if begin.startswith((b"<?xml", b"<robot", b"<mujoco", b"<!--")):
+        raise error(f"{path} is an XML file, such as of a robot (Robot.from_file), not {what}")
+
+
 def digest(path: Path) -> str:
     """SHA-256 of a file."""
     with path.open("rb") as stream:
@@ -228,15 +240,15 @@ def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) 
         raise error_type(f"cannot write {str(path)[:200]}: {error.strerror}") from None
 
 
-def made_folder(name: str, out: str | Path) -> Path:
-    """Create the output folder if needed, and check that files can be written there.
+def made_folder(name: str, out: str | Path, mode: int = 0o777) -> Path:
+    """Create the output folder if needed, with these rights less the umask; check that files can be written there.
 
     Raises:
         InvalidValueError: if they cannot. The message names the argument `name`.
     """
     folder = Path(out)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode, parents=True, exist_ok=True)
         sweep(folder)
         with tempfile.TemporaryFile(dir=folder):
             pass

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
-from multiprocessing import active_children, get_context, parent_process, resource_tracker
+from multiprocessing import active_children, current_process, get_context, parent_process, resource_tracker
 from multiprocessing.connection import wait
 from multiprocessing.synchronize import Event
 
@@ -24,9 +24,13 @@ _SPAWN = get_context("spawn")  # new interpreters: forked ones inherit the locks
 def worker_pool(size: int, begin: Callable[..., object], *arguments: object) -> ProcessPoolExecutor:
     """An executor whose processes call `begin(*arguments)` first; they start in blocks of `starting_workers`.
 
+    A script without a main guard would call this in its workers again, while they import it: they end with one line.
+
     Raises:
         ArchiveError: if the system's shared memory is full.
     """
+    if getattr(current_process(), "_inheriting", False):
+        raise SystemExit("orthocas: a script that starts processes needs `if __name__ == '__main__':` around its calls")
     with _shared_memory_named():
         return ProcessPoolExecutor(size, _SPAWN, begin, arguments)
 

@@ -7,12 +7,11 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
-from orthocas.errors import OrthocasError
 from orthocas.viewer.arm import GHOSTS, Arm, Ghosts
 from orthocas.viewer.looks import Look, chain_length
 from orthocas.viewer.panel import ChartPanel
 from orthocas.viewer.session import Session
-from orthocas.viewer.window import Loop, place_camera, place_floor, place_lights
+from orthocas.viewer.window import Loop, place_camera, place_floor, place_lights, show_error
 
 _STEP = 1e-3  # of the sliders
 _SWEEP = 6.0  # [s] there and back
@@ -236,7 +235,5 @@ class ChartPage:
                 self._ghosts.show(fan.spread(GHOSTS), fan.spread(4 * GHOSTS))
 
     def _failed(self, error: Exception) -> None:
-        """Tell an error to whoever looks at the page."""
-        text = str(error) if isinstance(error, OrthocasError) else f"{type(error).__name__}: {error}"
-        for client in self._server.get_clients().values():
-            client.add_notification("This did not work", text, color="red", auto_close_seconds=8.0)
+        self._rest()
+        show_error(self._server, error)

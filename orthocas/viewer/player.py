@@ -1,17 +1,19 @@
 """Pages without a chart: motions with a time slider, and one slider for each joint of a robot."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tools.checks import Array
 from orthocas.viewer.arm import Arm
 from orthocas.viewer.looks import Look, chain_length
 from orthocas.viewer.motion import Motion
 from orthocas.viewer.panel import PlayerPanel, RobotPanel
-from orthocas.viewer.window import Loop, direction_of_camera, place_camera, place_floor, place_lights, up_of
+from orthocas.viewer.window import Loop, direction_of_camera, place_camera, place_floor, place_lights, show_error, up_of
 
 PATHS = ((31, 95, 168), (217, 95, 2), (27, 158, 119))  #: colours of the tool paths
 _APART = 0.9  # of arms that are side by side, as a share of their length
@@ -58,7 +60,7 @@ class PlayerPage:
         self._server = server
         self._stage = Stage(server.scene, robot, look, motions)
         self._panel = PlayerPanel(robot, motions)
-        self._loop = Loop(lambda: None, lambda error: None)
+        self._loop = Loop(lambda: None, self._failed)
         self._now = 0.0
         place_floor(server, robot)
         place_lights(server, robot)
@@ -124,7 +126,14 @@ class PlayerPage:
 
     def _jump(self, seconds: float) -> None:
         self._pause()
-        self._show(seconds, slide=False)
+        if not np.isfinite(seconds):
+            self._show(self._now)  # moves the slider back
+            raise InvalidValueError("time", seconds, "a finite number of seconds")
+        self._show(min(max(seconds, 0.0), self._stage.duration), slide=False)
+
+    def _failed(self, error: Exception) -> None:
+        self._pause()
+        show_error(self._server, error)
 
     def _show(self, seconds: float, slide: bool = True) -> None:
         self._now = seconds
@@ -154,8 +163,8 @@ class RobotPage:
         self._server, self._panel = server, RobotPanel(robot)
         self._arm = Arm(server.scene, "/arm", robot, look)
         self._home = robot.tree.middle
-        self._robot = robot
-        self._loop = Loop(lambda: None, lambda error: None)
+        self._robot, self._q = robot, self._home
+        self._loop = Loop(lambda: None, partial(show_error, server))
         place_floor(server, robot)
         place_lights(server, robot)
         place_camera(server, robot, self._home[None])
@@ -197,6 +206,14 @@ class RobotPage:
 
     def _show(self) -> None:
         q = np.array([slider.value for slider in self._sliders])
+        good = np.isfinite(q)
+        for slider, value in zip(self._sliders, self._q.tolist(), strict=True):
+            if not np.isfinite(slider.value):
+                slider.value = value
+        self._q = np.where(good, q, self._q)
         with self._server.atomic():
-            self._arm.show(q)
-            self._readings.content = self._panel.html(q)
+            self._arm.show(self._q)
+            self._readings.content = self._panel.html(self._q)
+        if not good.all():
+            name = self._robot.joint_names[int(np.argmin(good))]
+            raise InvalidValueError(name, q[np.argmin(good)], "a finite joint position")

@@ -13,7 +13,16 @@ from orthocas.viewer.arm import GHOSTS, Arm, Ghosts
 from orthocas.viewer.looks import Look, chain_length
 from orthocas.viewer.motion import Motion
 from orthocas.viewer.player import Stage, few
-from orthocas.viewer.window import LOCAL, close_window, open_window, place_camera, place_floor, place_lights, up_of
+from orthocas.viewer.window import (
+    LOCAL,
+    TITLES,
+    close_window,
+    open_window,
+    place_camera,
+    place_floor,
+    place_lights,
+    up_of,
+)
 
 _RATE = 30  # pictures a second
 _SWEEP = 5.0  # [s] of one coordinate
@@ -34,7 +43,7 @@ def recorded(build: Scene) -> str:
         for t in np.linspace(0.0, duration, round(_RATE * duration) + 1)[: None if duration else 0]:
             show(float(t))
             serializer.insert_sleep(1 / _RATE)
-        return str(serializer.as_html())
+        return str(serializer.as_html()).replace(*TITLES, 1)
     finally:
         close_window(server)
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import gzip
 import hmac
 import io
 import ipaddress
@@ -14,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from http import HTTPStatus
 from importlib import import_module
 from threading import Lock
@@ -22,10 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.errors import InvalidValueError, ViewError
+from orthocas.errors import InvalidValueError, OrthocasError, ViewError
 from orthocas.robots.robot import Robot
 from orthocas.tools.checks import Array, of_extra, require_count
 from orthocas.viewer.looks import chain_length
+from orthocas.viewer.messages import Inbox, connections
 
 _FRAME = 1 / 30  # [s] between ticks; browsers without a graphics card fall behind more
 _QUIET = 0.25  # [s] without jobs, after which the page settles
@@ -33,6 +36,7 @@ _VISER = "viser.infra._infra"  # the module that starts the server
 _LARGEST = 2**20  # bytes of a message from a browser; sliders and cameras need hundreds
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[0-9a-z._-]+)(?::\d{1,5})?")
 LOCAL = "127.0.0.1"
+TITLES = ("<title>Viser</title>", "<title>orthocas</title>")  #: of the page: viser's and ours
 BRAND = (31, 95, 168)
 _VIEW_ANGLE = 0.7  # [rad] of the camera
 _ROOM = 1.1  # around the arms in the picture
@@ -110,9 +114,12 @@ class Loop:
 
     def _advance(self, tick: Tick) -> None:
         """One tick of an animation."""
-        if not tick(time.monotonic() - self._begun):
+        goes_on = False  # an error ends it, too
+        try:
+            goes_on = tick(time.monotonic() - self._begun)
+        finally:
             with self._wake:
-                self._tick = None if self._tick is tick else self._tick
+                self._tick = None if self._tick is tick and not goes_on else self._tick
 
     def _do(self, job: Job) -> None:
         try:
@@ -138,6 +145,7 @@ class Guard:
     host: str  #: the address that the server listens at
     token: str = field(default_factory=lambda: secrets.token_urlsafe(16))
     seen: list[bool] = field(default_factory=list)  #: not empty once a server is guarded
+    inbox: Inbox = field(default_factory=Inbox)  #: judges what comes through a websocket
 
     def admitted(self, path: str, hosts: list[str], origins: list[str]) -> str | None:
         """The path of a request behind the token; None if the request is refused.
@@ -221,11 +229,30 @@ def _with_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
                 text = b"Open the whole address that orthocas printed.\n"
                 told = headers_of({"Content-Type": "text/plain", "Content-Length": str(len(text))})
                 return answer_of(HTTPStatus.FORBIDDEN, "Forbidden", told, text)
-            return process_request(connection, replace(request, path=path))
+            return titled(process_request(connection, replace(request, path=path)))
 
-        return serve(handler, *arguments, process_request=judge, **{**options, "max_size": _LARGEST})
+        limits = {"max_size": _LARGEST, "logger": connections}
+        return serve(guard.inbox.guarded(handler), *arguments, process_request=judge, **{**options, **limits})
 
     return serve_guarded
+
+
+def titled(answer: Any) -> Any:
+    """An answer with viser's page, named after us; other answers stay as they are."""
+    if answer is None or "html" not in answer.headers.get("Content-Type", ""):
+        return answer
+    body = named_page(answer.body, answer.headers.get("Content-Encoding") == "gzip")
+    headers = answer.headers.copy()
+    del headers["Content-Length"]  # or there would be two
+    headers["Content-Length"] = str(len(body))
+    return replace(answer, headers=headers, body=body)
+
+
+@lru_cache(maxsize=2)
+def named_page(body: bytes, packed: bool = False) -> bytes:
+    """viser's page with our title."""
+    page = (gzip.decompress(body) if packed else body).replace(TITLES[0].encode(), TITLES[1].encode(), 1)
+    return gzip.compress(page) if packed else page
 
 
 def viser() -> ModuleType:
@@ -248,17 +275,26 @@ def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
     require_free(host, port)
     with guarded(host) as guard, contextlib.redirect_stdout(io.StringIO()):  # it announces itself
         server = package.ViserServer(host=host, port=port, label=title, verbose=False)
-    if not guard.seen:
+    inputs = getattr(server.gui, "_gui_input_handle_from_uuid", None)
+    if not guard.seen or inputs is None:
         close_window(server)
         raise ViewError("this version of viser starts its server in another way, expected one that can be guarded")
     if port not in (0, server.get_port()):  # somebody else was faster
         close_window(server)
         raise _taken(host, port)
+    guard.inbox.input_of = inputs.get
     server.request_share_url = _not_shared
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=BRAND)
     server.scene.configure_environment_map(None)
     server.scene.configure_default_lights(False)  # `place_lights` has lights without shadows
     return server, f"{url_of(host, server.get_port())}/{guard.token}"
+
+
+def show_error(server: Any, error: Exception) -> None:
+    """Tell an error to whoever looks at the page."""
+    text = str(error) if isinstance(error, OrthocasError) else f"{type(error).__name__}: {error}"
+    for client in server.get_clients().values():
+        client.add_notification("This did not work", text, color="red", auto_close_seconds=8.0)
 
 
 def close_window(server: Any) -> None:

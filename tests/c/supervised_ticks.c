@@ -1,12 +1,13 @@
 /* Hostile ticks of a supervised law: positions that wander through the domain and out of it, now and then NaN,
  * infinities, huge numbers, wrong turns, sensors that stand still, references that stand still and claim to move, targets
- * that are no numbers, and late ticks.
+ * that are no numbers, late ticks, and settings and limits that are wild or cannot be used.
  *
  * Compile with -DTICKS=, -DLIMIT= and, for a library in single precision, -DNUMBER=float. Prints how often each status
  * came. Exits with 1 at a wrong status, 2 at a command that is not finite or beyond the limit, 3 at a change beyond the
  * rate, 4 at a state that makes no sense, 5 at a reference that is not finite, 6 at a good status for sensors that stand still
  * for long while they claim a speed. */
 #include <math.h>
+#include <stddef.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <string.h>
@@ -85,6 +86,31 @@ static int references_stay_finite(arm_reference *reference) {
   return 1;
 }
 
+/* Another number among the settings, or in the limit of the gains. Returns 2 if it cannot be used, 1 if it can, 0 mostly. */
+static int spoil_settings(arm_safety *safety, arm_gains *gains) {
+  const NUMBER bad[] = {NAN, -INFINITY, -1}, wild[] = {0, INFINITY, (NUMBER)1e-30, (NUMBER)1e30, NAN, -INFINITY, -1};
+  const NUMBER other = bad[(int)((uniform() + 1.0) * 1.499)];
+  const int joint = (int)((uniform() + 1.0) * 0.4999 * N), first = (int)(offsetof(arm_safety, hold_ticks) / sizeof(NUMBER)),
+            later = (int)(offsetof(arm_safety, longest_period) / sizeof(NUMBER)),
+            all = (int)(sizeof *safety / sizeof(NUMBER));
+  int place = (int)((uniform() + 1.0) * 0.4999 * (first + all - later));
+  *safety = arm_default_safety;
+  *gains = arm_default_gains;
+  if (uniform() < 0.97) return 0;
+  switch ((int)((uniform() + 1.0) * 2.999)) {
+  case 0: safety->command_rate[joint] = other; return 2;
+  case 1: safety->speed_limit[joint] = other; return 2;
+  case 2: safety->hold_ticks = -1; return 2;
+  case 3: safety->near_margin = uniform() < 0.0 ? (NUMBER)0.5 : other; return 2;
+  case 4: gains->limit[joint] = uniform() < 0.0 ? 0 : other; return 2;
+  default:
+    if (uniform() < 0.96) return 0; /* they change much */
+    if (place >= first) place += later - first;
+    ((NUMBER *)safety)[place] = wild[(int)((uniform() + 1.0) * 3.499)];
+    return 1;
+  }
+}
+
 int main(void) {
   long k, counts[11] = {0};
   int still = 0;
@@ -93,7 +119,9 @@ int main(void) {
   NUMBER q[N], dq[N], command[N], before[N];
   arm_state state;
   arm_reference reference, led;
-  int i;
+  arm_safety safety;
+  arm_gains gains;
+  int i, spoiled;
   for (i = 0; i < N; ++i) q[i] = (NUMBER)MIDDLE_OF(i);
   memset(dq, 0, sizeof dq);
   arm_start(&state, q, 0);
@@ -136,17 +164,19 @@ int main(void) {
       referred = !spoil((NUMBER *)&seen, 3 * K);
       if (uniform() > 0.999) period = uniform() > 0.0 ? NAN : -period;
       if (!(period > 0.0)) measured = 0;
-      if (still > 12) measured = 0; /* five equal ticks, even with some spoiled ones among them */
-      status = (int)arm_step(&state, &arm_default_safety, measured_q, measured_dq, &seen, &arm_default_gains, period,
-                             command);
+      spoiled = spoil_settings(&safety, &gains);
+      if (spoiled == 2) referred = 0;
+      if (still > 12 && spoiled != 1) measured = 0; /* five equal ticks, even with some spoiled ones among them */
+      status = (int)arm_step(&state, &safety, measured_q, measured_dq, &seen, &gains, period, command);
     }
     if (status < 0 || status > 10 || !status_is_right(status, &state, measured, referred)) return 1;
-    if (still > 12 && status != ARM_BAD_INPUT) return 6;
+    if (still > 12 && spoiled != 1 && status != ARM_BAD_INPUT) return 6;
     counts[status]++;
     for (i = 0; i < N; ++i) {
-      const double time = period > 0.0 ? fmin(period, arm_default_safety.longest_period) : 0.0;
+      const double time = period > 0.0 ? fmin(period, state.safety.longest_period) : 0.0;
       if (!(fabs(command[i]) <= LIMIT)) return 2;
-      if (!(fabs(command[i] - before[i]) <= arm_default_safety.command_rate[i] * time * (1.0 + rounding) + rounding)) return 3;
+      const double rate = state.safety.command_rate[i]; /* may be infinite */
+      if (fabs(command[i] - before[i]) > rate * time * (1.0 + rounding) + rounding) return 3;
     }
     if (!state_makes_sense(&state)) return 4;
     memcpy(before, command, sizeof before);

@@ -3,7 +3,7 @@
 import sys
 import time
 
-from fuzz.campaigns import CAMPAIGNS
+from fuzz.campaigns import CAMPAIGNS, meaning
 
 
 def main(words: list[str]) -> int:
@@ -11,6 +11,7 @@ def main(words: list[str]) -> int:
     count, names = int(words[0]) if words else 1000, words[1:] or list(CAMPAIGNS)
     findings = 0
     for name in names:
+        print(f"{name}: {meaning(name)}")
         start = time.perf_counter()
         found = CAMPAIGNS[name](count)
         findings += len(found)

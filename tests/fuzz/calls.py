@@ -91,6 +91,7 @@ def _values() -> tuple[Any, ...]:
         np.full(3, np.nan),
         np.array(["1", "2", "3"]),
         np.array([None]),
+        np.ma.array(np.ones(3), mask=[True, False, False]),
         np.ones((4, 3), dtype=complex),
         np.eye(3) > 0,
     )

@@ -1,5 +1,6 @@
-"""The campaigns by name."""
+"""The campaigns by name, and what they cover."""
 
+import inspect
 from collections.abc import Callable
 
 from fuzz import signals
@@ -10,8 +11,10 @@ from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
 from fuzz.commands import commands
+from fuzz.libraries import libraries
+from fuzz.messages import messages
 from fuzz.motions import motions
-from fuzz.paths import logs, paths
+from fuzz.paths import logs, paths, postures
 from fuzz.robots import robots
 from fuzz.runs import runs
 from fuzz.steps import steps
@@ -24,12 +27,53 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "charts": charts,
     "checkpoints": checkpoints,
     "commands": commands,
+    "libraries": libraries,
     "logs": logs,
+    "messages": messages,
     "motions": motions,
     "paths": paths,
+    "postures": postures,
     "robots": robots,
     "runs": runs,
     "signals": signals.campaign,
     "steps": steps,
     "views": views,
 }
+
+READERS = {  #: functions that read files, by module and name, with the campaign that gives them mutants
+    "atlas.atlas.load": "atlases",
+    "atlas.atlas_file.read_stock": "atlases",
+    "charts.chart.load": "charts",
+    "charts.chart_file.read_chart": "charts",
+    "charts.ready.load": "calls",
+    "codegen.compiled.loaded": "libraries",
+    "paths.plan.read_path": "paths",
+    "robots.homes.read_postures": "postures",
+    "robots.homes.srdf_states": "robots",
+    "robots.robot.from_file": "robots",
+    "robots.robot.from_mjcf": "robots",
+    "robots.robot.from_urdf": "robots",
+    "robots.urdf.read_urdf": "robots",
+    "robots.xml.read_xml": "robots",
+    "simulation.steps_file.read_steps": "steps",
+    "simulation.trajectory.load": "runs",
+    "simulation.trajectory.read_run_file": "runs",
+    "tools.archive.read_archive": "checkpoints",
+    "tools.csv_table.read_table": "paths",
+    "tools.files.read_list": "signals",
+    "viewer.looks.urdf_look": "robots",
+    "viewer.motion.read_joint_motion": "motions",
+    "viewer.motion.read_run": "runs",
+}
+RESULTS = {  #: public classes whose objects only the library makes, with the campaign that makes and reads them
+    **dict.fromkeys(("Atlas", "Coverage"), "atlases"),
+    **dict.fromkeys(("Branch", "Branches", "Comparison", "Fit", "WideFit", "Involutivity", "Report"), "calls"),
+    **dict.fromkeys(("Solutions", "Tracker", "InverseStatus", "TrackerStatus"), "calls"),
+    "Certificate": "certificates",
+    "Domain": "calls",
+}
+
+
+def meaning(name: str) -> str:
+    """What a campaign covers, in one line."""
+    return (inspect.getmodule(CAMPAIGNS[name]).__doc__ or "").splitlines()[0]

@@ -1,6 +1,7 @@
 """Calls of the public functions, classes and methods that work, for the campaign that changes their arguments."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -39,7 +40,72 @@ Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments th
 def good_calls() -> dict[str, Call]:
     """What can be called, with arguments that work and take little time."""
     physics, laws = {**_physics(), **_supervised()}, {**_control(), **_on_atlas()}
-    return {**_makers(), **_functions(), **_methods(), **laws, **physics, **_views()}
+    return {**_makers(), **_functions(), **_methods(), **_searches(), **laws, **physics, **_views()}
+
+
+def _searches() -> dict[str, Call]:
+    """What looks for branches, wide charts and atlases, registers, or compiles."""
+    problem, chart, q = planar(), fitted().chart, np.array([0.3, 0.4, 0.5])
+    robot, task = problem.robot, problem.task
+    wide_box = oc.ClearBox(problem.domain, task, 0.1)
+    settings = oc.AtlasSettings(degree=1, leak_deg=20.0, half_width=0.5, splits=1)
+    return {
+        "branches": (oc.branches, {"robot": robot, "task": task}),
+        "build_atlas": (
+            _build_atlas,
+            {
+                "problem": problem,
+                "path": "a.orthocas-atlas",
+                "settings": settings,
+                "region": [[0.0, 0.9, 0.9]],
+                "radius": 0.1,
+                "margin_deg": 1.0,
+                "share": 0.1,
+                "time_limit": 1.0,
+                "force": False,
+            },
+        ),
+        "ClearBox": (
+            oc.ClearBox,
+            {"box": problem.domain, "task": task, "least_singular_value": 0.1, "scale": None, "rows": "frame"},
+        ),
+        "RegularPart": (
+            oc.RegularPart,
+            {"box": wide_box, "coordinates": chart.coordinates, "least_volume": 0.05},
+        ),
+        "fit_wide": (
+            oc.fit_wide,
+            {
+                "robot": robot,
+                "task": task,
+                "branch": problem.domain,
+                "metric": "euclidean",
+                "clearance": 0.1,
+                "parametrisation": oc.Polynomial(1),
+                "home": q,
+                "like": None,
+                "samples": 100,
+                "seed": 0,
+            },
+        ),
+        "chart.nearest_xi": (chart.nearest_xi, {"q_wish": q, "x": chart.task(q), "tolerance": 1e-9}),
+        "compile_inverse": (oc.compile_inverse, {"chart": chart, "folder": "kept"}),
+        "progress": (lambda monitor: oc.fit(problem, oc.Linear(), samples=50, monitor=monitor), {"monitor": None}),
+        "register_domain": (oc.register_domain, {"kind": oc.Box}),
+        "register_metric": (oc.register_metric, {"name": "euclidean", "build": None}),
+        "register_task": (oc.register_task, {"name": "pose", "build": None}),
+        "Motion": (
+            viewer.Motion,
+            {"name": "a", "times": [0.0, 1.0], "q": [q, q], "labels": ("x",), "values": [[0.0], [1.0]]},
+        ),
+        "export_page": (viewer.export_page, {"shown": robot, "path": "page.html", "robot": None, "force": False}),
+    }
+
+
+def _build_atlas(**given: Any) -> oc.Atlas:
+    """In a thread: processes would take a second each."""
+    with ThreadPoolExecutor(1) as executor:
+        return oc.build_atlas(**given, executor=executor)
 
 
 def _on_atlas() -> dict[str, Call]:

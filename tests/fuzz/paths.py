@@ -1,4 +1,4 @@
-"""Campaigns of path files and joint logs: finite numbers of the right shape, or an error that names file and line."""
+"""Campaigns of path files, postures and joint logs: finite numbers, or an error that names file and line."""
 
 from functools import partial
 from pathlib import Path
@@ -11,6 +11,7 @@ from fuzz.child import Finding, run
 from fuzz.mutants import TEXTS, Rng, flipped, pick
 from fuzz.sealed_files import judged
 from orthocas.paths.plan import read_path
+from orthocas.robots.homes import read_postures
 
 _CELLS = (
     "0",
@@ -33,6 +34,7 @@ _CELLS = (
 _NAMES = ("x", "xi1", "xi2", "xi3", "y", "X", "", " x ", '"x"', "x\ty")
 _PATHS = (["x"], ["x", "xi1", "xi2"], ["xi2", "x", "xi1"])
 _LOG_NAMES = ("time_s", "q1", "q2", "q3", "q4", "d_q1", "dd_q3", "desired_x", "desired_xi2", "desired_", "", "time")
+_POSTURES = (["q1", "q2", "q3"], ["q3", "time_s", "q1", "q2"], ["q1", "q2", "q3", "d_q1"])
 _LOGS = (["time_s", "q1", "q2", "q3"], ["time_s", "q3", "q1", "desired_x", "q2"], ["q1", "q2", "q3", "time_s", "d_q1"])
 
 
@@ -46,6 +48,11 @@ def logs(count: int) -> list[Finding]:
     return run("logs", judge_log, range(count))
 
 
+def postures(count: int) -> list[Finding]:
+    """Judge so many mutants of files of postures."""
+    return run("postures", judge_postures, range(count))
+
+
 def judge(seed: int) -> str | None:
     """What is wrong with the treatment of a mutant."""
     return judged(partial(_mutant, headers=_PATHS, cells=_NAMES), use, seed)
@@ -56,6 +63,11 @@ def judge_log(seed: int) -> str | None:
     return judged(partial(_mutant, headers=_LOGS, cells=_LOG_NAMES), use_log, seed)
 
 
+def judge_postures(seed: int) -> str | None:
+    """What is wrong with the treatment of a mutant of a file of postures."""
+    return judged(partial(_mutant, headers=_POSTURES, cells=_LOG_NAMES), use_postures, seed)
+
+
 def use(path: Path) -> None:
     """Read a path; its numbers have to be usable."""
     x, xi = read_path(path, public_objects.linear())
@@ -64,6 +76,14 @@ def use(path: Path) -> None:
     assert len(x) >= 2
     assert np.isfinite(x).all()
     assert xi is None or np.isfinite(xi).all()
+
+
+def use_postures(path: Path) -> None:
+    """Read postures, as the corridor of --corridor; its numbers have to be usable."""
+    found = read_postures(path, public_objects.linear().problem.robot)
+    assert found.shape[1] == 3
+    assert len(found) >= 1
+    assert np.isfinite(found).all()
 
 
 def use_log(path: Path) -> None:

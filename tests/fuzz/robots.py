@@ -104,6 +104,9 @@ def text_of(rng: Rng, root: Element) -> bytes:
         data = bytes(flipped)
     elif chance < 0.18:
         data = pick(rng, _HEADS).encode() + data
+    elif chance < 0.19:
+        head = '<?xml version="1.0" encoding="iso-8859-1"?>'
+        data = f"{head}{data.decode()}".replace("j1", "é").replace("l1", "ü").encode("iso-8859-1", "replace")
     elif chance < 0.20:
         data = data.decode().encode(pick(rng, ("utf-16", "utf-32", "cp037")), "replace")
     elif chance < 0.21:
