@@ -238,11 +238,6 @@ class AtlasTables:
         return cells or [(0.0, 0, _NO_CELL, _NO_CELL)], roots
 
     @property
-    def has_nearest(self) -> bool:
-        """Not in an atlas."""
-        return False
-
-    @property
     def _ranks(self) -> list[int]:
         """Number of each fitted chart in its tile."""
         firsts = np.searchsorted(self._orbit_of_fits, self._orbit_of_fits)
@@ -284,6 +279,7 @@ class AtlasSource:
     chart: Chart  #: the same, with functions that tables replace
     own_code: ClassVar[Mapping[str, str]] = MappingProxyType(TABLE_CODE)
     title: ClassVar[str] = "atlas"
+    has_nearest: ClassVar[bool] = False
 
     @classmethod
     def of(cls, part: "AtlasPart") -> Self:
