@@ -17,6 +17,7 @@ from self_motion_picture import robot_file, save_trimmed
 
 import orthocas as oc
 from orthocas.charts import Card, Model
+from orthocas.charts.chart_file import fingerprint
 from orthocas.charts.self_motion import fan_along
 from orthocas.viewer.looks import urdf_look
 from orthocas.viewer.rendering import fan_picture, widest_coordinate
@@ -134,6 +135,7 @@ ARMS = {
 WIDEST = "--domain auto --param polynomial:4:cyclic"  #: a leak of at most 8 deg, a conditioning of at least 0.2
 TIGHT = f"{WIDEST} --leak-deg 5 --conditioning 0.4"
 POSE = "--task pose --domain auto --leak-deg 5 --param polynomial:4:cyclic"
+BRANCH = "--task pose --domain branch"
 RECIPES = {  #: arm and options of `orthocas fit`
     "iiwa7-position": ("iiwa7", WIDEST),
     "iiwa7-pose": ("iiwa7", POSE),
@@ -151,6 +153,11 @@ RECIPES = {  #: arm and options of `orthocas fit`
     "pr2-left-pose": ("pr2-left", POSE),
     "tiago-pro-left-position": ("tiago-pro-left", TIGHT),
     "tiago-pro-left-pose": ("tiago-pro-left", POSE),
+    "iiwa7-wide": ("iiwa7", BRANCH),
+    "panda-wide": ("panda", f"--home default {BRANCH}"),
+    "xarm7-wide": ("xarm7", BRANCH),
+    "baxter-left-wide": ("baxter-left", BRANCH),
+    "pr2-left-wide": ("pr2-left", BRANCH),
 }
 
 
@@ -189,14 +196,28 @@ def commands(name: str) -> tuple[str, ...]:
     arm, options = RECIPES[name]
     known = ARMS[arm]
     words = " ".join(filter(None, (Path(known.file).name, known.options, options)))
-    return f"orthocas fit {words} --out {name}.orthocas", f"orthocas certify {name}.orthocas"
+    fit = f"orthocas fit {words} --out {name}.orthocas"
+    return (fit,) if is_wide(name) else (fit, f"orthocas certify {name}.orthocas")
+
+
+def is_wide(name: str) -> bool:
+    """Whether a chart holds on a whole branch. Its domain keeps folds out; a proof would be a megabyte."""
+    return RECIPES[name][1].endswith(BRANCH)
 
 
 def table(data: Path = DATA) -> list[str]:
-    """The rows of the table in docs/charts.md."""
+    """The rows of the tables in docs/charts.md: charts with a proof, then wide ones."""
     rows = []
     for name in RECIPES:
         card = Card.from_json((data / f"{name}.json").read_text(encoding="utf-8"))
+        if card.branch:
+            quality = card.quality
+            rows.append(
+                f"| `{name}` | {quality['n']}, {quality['m']}, {quality['r']} | {card.branch} "
+                f"| {card.regular_share:.2%} | {quality['leak_deg']['rms']:.0f} | {quality['conditioning']['mean']:.2f}, "
+                f"{quality['conditioning']['p01']:.2f} | {card.model.licence} |"
+            )
+            continue
         quality, width = card.quality, np.round(card.half_width, 2)
         mutual = "-" if quality["r"] == 1 else f"{quality['mutual_angle_deg']['std']:.2f}"
         rows.append(
@@ -232,9 +253,8 @@ def make(name: str, data: Path) -> Card:
 
 def card_of(name: str, chart: oc.Chart) -> Card:
     """The card of a chart that is proved."""
-    proof, domain = chart.certificate, chart.problem.domain
-    assert proof is not None
-    assert proof.proved
+    proof, domain, wide = chart.certificate, chart.problem.domain, is_wide(name)
+    assert wide or (proof is not None and proof.proved)
     return Card(
         name=name,
         model=ARMS[RECIPES[name][0]].model,
@@ -245,9 +265,11 @@ def card_of(name: str, chart: oc.Chart) -> Card:
         centre=tuple(domain.centre.tolist()),
         half_width=tuple(domain.half_width.tolist()),
         quality=oc.evaluate(chart, SAMPLES, SEED).as_dict(),
-        proved_parts=proof.regular.proved_count,
-        fingerprint=proof.fingerprint,
+        proved_parts=0 if proof is None else proof.regular.proved_count,
+        fingerprint=fingerprint(chart.problem, chart.coordinates),
         commands=commands(name),
+        branch=str(chart.notes.get("branch", "")),
+        regular_share=float(chart.notes.get("regular share", 1.0)),
     )
 
 

@@ -56,14 +56,14 @@ def test_matched_stiffness_is_exact_where_the_inertia_is_constant_and_diagonal()
 
 @pytest.mark.slow
 def test_default_gains_of_a_pose_bear_5_ms_of_delay_although_the_flange_has_hardly_any_inertia() -> None:
-    """Joint 7 moves 3e-4 kg m^2. Springs that ignore delay give it modes beyond 23 Hz, which 5 ms make unstable."""
+    """Joint 7 moves 3e-4 kg m^2, about an axis of the tip: its spring is a thirtieth of those of the tilts."""
     arm = oc.problems.get("iiwa")
     problem = oc.Problem(arm.robot, oc.Task.named(arm.robot, "pose", arm.domain.centre), "euclidean", arm.domain)
     chart = oc.fit(problem, oc.Polynomial(2), weights=(1000, 30, 150, 1)).chart
     others = sample_uniform(arm.domain, 1000, 7)
     assert PDPlus.on_chart(chart).modes(others).delays.min() > 5e-3
-    assert any("the task pose:AXIS" in remark for remark in PDPlus.on_chart(chart).remarks())
-    assert PDPlus(chart, matched_stiffness(chart, fastest=np.inf)).modes(others).delays.min() < 3e-3
+    stiffness = matched_stiffness(chart)
+    assert 30 * stiffness[5] < stiffness[3:5].min()
 
 
 @pytest.mark.parametrize(("coupling", "damping"), [("coupled", "square_root"), ("decoupled", "double_diagonal")])

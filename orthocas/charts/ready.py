@@ -39,9 +39,11 @@ class Card(Shown):
     centre: tuple[float, ...]
     half_width: tuple[float, ...]
     quality: Mapping[str, Any]  #: as printed by `orthocas evaluate --json`
-    proved_parts: int  #: parts of the domain in the proof that the chart does not fold
+    proved_parts: int  #: parts of the domain in the proof that the chart does not fold; 0 for wide charts
     fingerprint: str  #: of the chart
     commands: tuple[str, ...]  #: that made the chart
+    branch: str = ""  #: of wide charts
+    regular_share: float = 1.0  #: of the branch's clear positions, those in the domain
 
     @classmethod
     def from_json(cls, text: str) -> Self:
@@ -64,6 +66,12 @@ class Card(Shown):
         folder = files(__package__) / "licences"
         return "\n".join((folder / f"{name}.txt").read_text("utf-8") for name in ("NOTICE", self.model.licence))
 
+    def _of_the_domain(self) -> dict[str, str]:
+        if not self.branch:
+            return {"proof": f"no fold anywhere on the domain, {self.proved_parts} parts"}
+        told = f"{self.branch}; regular on {self.regular_share:.2%} of its clear positions, and the domain is this part"
+        return {"branch": told}
+
     def facts(self) -> dict[str, str]:
         """Quality, domain, proof, and where the chart comes from."""
         quality, model = self.quality, self.model
@@ -78,7 +86,7 @@ class Card(Shown):
             "conditioning": f"mean {conditioning['mean']:.3f}, least {conditioning['min']:.3f}",
             "domain": f"half-width {number_list(self.half_width)} around {number_list(self.centre)}",
             **cyclic,
-            "proof": f"no fold anywhere on the domain, {self.proved_parts} parts",
+            **self._of_the_domain(),
             "model": f"{model.file} of {model.package}; {model.licence}, {model.holder}",
             "samples": f"{quality['samples']} held out, seed {quality['seed']}",
             "coordinates": self.coordinates,
@@ -95,7 +103,7 @@ def names() -> tuple[str, ...]:
 
 
 def load(name: str) -> Chart:
-    """A ready chart. It includes the robot's model, and a proof that the chart does not fold.
+    """A ready chart. It includes the robot's model and, unless it is a wide one, a proof that it does not fold.
 
     Raises:
         UnknownNameError: if there is no chart of that name.

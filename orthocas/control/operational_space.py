@@ -37,7 +37,6 @@ from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, bloc
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
-from orthocas.robots.kinematics import TipTurn
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import Batched
@@ -249,8 +248,8 @@ class _OperationalSpace(Shown):
     def remarks(self) -> list[str]:
         """Warnings.
 
-        The metric does not decouple task and extra coordinates, a decoupled law has a chart that leaks much, D is not
-        positive semi-definite, or the task describes an orientation by a rotation vector.
+        The metric does not decouple task and extra coordinates, a decoupled law has a chart that leaks much, or D is
+        not positive semi-definite.
         """
         found, metric = [], self.problem.metric.name
         if metric != "inertia":
@@ -267,12 +266,6 @@ class _OperationalSpace(Shown):
             found.append(
                 f"the damping matrix (29) is indefinite in {share:.1%} of the domain with these gains; "
                 "the damping design double_diagonal never is"
-            )
-        turn = TipTurn.of_kind(kind := self.problem.task.recipe["kind"])
-        if turn is not None and turn.whole and turn.axis is None:
-            found.append(
-                f"all components of a rotation vector turn a light wrist; the task {kind}:AXIS, with AXIS along the "
-                "last joint, keeps that turn apart, and such arms then hold more unknown mass"
             )
         return found + self.model.remarks()
 

@@ -13,7 +13,7 @@ from orthocas.errors import InvalidValueError, PathError, PathFileError
 from orthocas.paths.joint_motion import JointMotion
 from orthocas.robots.robot import Robot
 from orthocas.simulation.trajectory import Trajectory
-from orthocas.tools.checks import Array, as_point_set, frozen_array, require_count, require_kind
+from orthocas.tools.checks import Array, as_float_array, as_point_set, frozen_array, require_count, require_kind
 from orthocas.tools.csv_table import column_places, read_table
 
 _MOST_INSTANTS = 1_000_000
@@ -38,6 +38,10 @@ class Motion:
     references: Array | None = None  #: (N, k)
     marked: NDArray[np.bool_] | None = None  #: (N,) where the controller used its fallback
     cycles: tuple[float, ...] = ()  #: ends of the cycles of a motion that repeats a path [s]
+
+    def __post_init__(self) -> None:
+        for name in ("times", "q", "values"):
+            object.__setattr__(self, name, as_float_array(name, getattr(self, name)))
 
     @classmethod
     def of_run(cls, run: Trajectory) -> "Motion":
