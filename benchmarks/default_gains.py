@@ -4,7 +4,7 @@ Three arms with cubic coordinates on boxes of about +-0.6 rad or the paper's. Th
 than the law's model, or carries 1 kg that the law does not know, at the tip. Five starts in the inner 60 % of each box:
 hold still for 1.5 s, then a step of 40 mm in x and one in the first extra coordinate, 1.5 s each, through the low pass
 of the paper; smaller ones, or in the other direction, where these leave the domain. The last table is the supervised
-law, which holds still, without and with integral action; poses as rotation vectors, which leave, are left out.
+law, which holds still, without and with integral action.
 """
 
 import argparse
@@ -197,9 +197,8 @@ def main(quick: bool = False, modes_alone: bool = False) -> list[str]:
     print("\n".join(rows), flush=True)
     for row in () if modes_alone else (sag_row, integral_row):
         for label, law in laws.items():
-            if row is sag_row or "pose," not in label:
-                rows.append(row(label, law, 1 if quick else 5))
-                print(rows[-1], flush=True)
+            rows.append(row(label, law, 1 if quick else 5))
+            print(rows[-1], flush=True)
     return rows
 
 

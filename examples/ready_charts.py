@@ -214,7 +214,8 @@ def table(data: Path = DATA) -> list[str]:
             quality = card.quality
             rows.append(
                 f"| `{name}` | {quality['n']}, {quality['m']}, {quality['r']} | {card.branch} "
-                f"| {card.regular_share:.2%} | {quality['leak_deg']['rms']:.0f} | {quality['conditioning']['mean']:.2f}, "
+                f"| {card.regular_share:.2%} | {quality['leak_deg']['rms']:.0f} "
+                f"| {quality['conditioning']['mean']:.2f}, "
                 f"{quality['conditioning']['p01']:.2f} | {card.model.licence} |"
             )
             continue
