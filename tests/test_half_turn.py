@@ -267,13 +267,12 @@ def test_springs_have_a_potential_half_a_turn_away() -> None:
 
 @needs_c
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["pose", "pose:z"])
-def test_c_does_not_depend_on_the_reference(kind: str, tmp_path: Path) -> None:
+def test_c_does_not_depend_on_the_reference(tmp_path: Path) -> None:
     """Inverse and supervised law in C over two turns, with an offset that fades from the start on."""
     path, commands = turning(1.0, 2001), []
     rate, bend = np.gradient(path, 1e-3, axis=0), np.zeros(7)
     for turned_deg in (0.0, 100.0):
-        known = chart(kind, turned_deg=turned_deg)
+        known = chart(turned_deg=turned_deg)
         law = control.PDPlus(known, np.linspace(30.0, 90.0, 7), 0.7, limit=1e4)
         out = tmp_path / f"c{turned_deg:.0f}"
         generated = oc.generate_c(known, out, law, "arm")
