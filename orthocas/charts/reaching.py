@@ -61,17 +61,7 @@ class ReachingTracker(Tracker):
         self.__init__(*(state[name] for name in names))  # type: ignore[misc]
 
     def step(self, phi: ArrayLike) -> Array:
-        """The q with phi(q) = phi, or the nearest that a search from the last q finds; see `status`.
-
-        Args:
-            phi: target values, (n,).
-
-        Returns:
-            q, (n,) [rad] or [m].
-
-        Raises:
-            ShapeError: if phi has another number of entries.
-        """
+        """As `Tracker.step`; where that stays, the nearest q (n,) that a search from the last one finds."""
         q = super().step(phi)
         if self.status in (TrackerStatus.OK, TrackerStatus.BAD_INPUT):
             return q
