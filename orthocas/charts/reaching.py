@@ -127,7 +127,10 @@ class ReachingTracker(Tracker):
 def parts_of(
     phi: ca.Function, rates: ca.Function, m: int, known: PhiMap, domain: Domain
 ) -> tuple[ca.Function, ca.Function]:
-    """Q, phi_d (n, 1) -> weighted errors (n, 1), their Jacobian (n, n) and the rooms of conditions; their slopes at q.
+    """The errors of phi and the rooms of the domain's conditions, for `ReachingTracker`.
+
+    Returns:
+        q, phi_d (n, 1) -> weighted errors (n, 1), their Jacobian (n, n), rooms (k, 1); and q -> slopes of rooms (k, n).
 
     Raises:
         DomainError: if the domain is neither a box nor clear of singular positions.

@@ -115,8 +115,8 @@ class ChartSource:
         if self.has_nearest:
             _, inwards = self.chart.reaching
             size = {"rooms": str(max(1, inwards.size1_out(0))), "zone": repr(ZONE), "inertia": repr(INERTIA)}
-            numbers_ = {**everything, **size, "descents": str(DESCENTS), "difference_step": precision.difference}
-            values |= {f"nearest_{kind}": filled(f"nearest.{kind}", numbers_) for kind in ("h", "c")}
+            filled_in = {**everything, **size, "descents": str(DESCENTS), "difference_step": precision.difference}
+            values |= {f"nearest_{kind}": filled(f"nearest.{kind}", filled_in) for kind in ("h", "c")}
         for place, template in _PARTS.items():
             values[place] = filled(template, everything)
         return values

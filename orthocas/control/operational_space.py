@@ -422,7 +422,7 @@ class _OperationalSpace(Shown):
         return B, Lambda, volume, D
 
     def _errors(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
-        """E, how fast it changes, and J = de/dq."""
+        """The error e, how fast it changes, and J = de/dq."""
         e, J = errors(self.chart, inputs["q"], inputs["reference"])
         velocity = J @ inputs["dq"]
         return e, velocity - self._drift(inputs) if self.feed_forward else velocity, J

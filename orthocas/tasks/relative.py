@@ -17,8 +17,9 @@ class Relative:
 
     For most tasks that is e = x - x_d. For orientation and pose tasks, with the tip's orientation R and the wanted one
     R_d, the rows of the orientation are 2 sin(angle / 2) axis of R_d^T R, so they do not depend on the reference of the
-    task; with an AXIS they are put into its order: tilt, tilt, turn. The error is continuous but where R is half a turn
-    from R_d. The rates are J(q) dq with d(e)/dt = J dq at e = 0: those rows are the angular velocity in the tip's axes.
+    task; with an AXIS they are put into its order: tilt, tilt, turn. The error is continuous except where R is half a
+    turn from R_d. The rates are J(q) dq with d(e)/dt = J dq at e = 0: those rows are the angular
+    velocity in the tip's axes.
 
     Args:
         task: the task.
@@ -51,7 +52,7 @@ class Relative:
         return BlockedFunction(self.rates) if self.turned else self.task.batched_jacobian
 
     def error(self, q: ca.MX, x_d: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """E (m, 1), and de/dq (m, n) for x_d at rest."""
+        """The error e (m, 1), and de/dq (m, n) for x_d at rest."""
         J = self.rates(q)
         if not self.turned:
             return self.task.function(q) - x_d, J
@@ -74,11 +75,10 @@ class Relative:
     def moved(self) -> ca.Function:
         """x, e, x_d, dx_d, ddx_d -> the value at e from x, in the sense of the error, and the derivatives it has there.
 
-        They are those of an orientation with the angular velocity and acceleration of x_d in its own axes.
+        They are those of an orientation with the angular velocity and acceleration of x_d in its own axes. For tasks of
+        a whole orientation only.
         """
         x, e, x_d, dx_d, ddx_d = symbols = self._symbols("x", "e", "x_d", "dx_d", "ddx_d")
-        if not self.turned:
-            return dense_function("moved", symbols, [x + e, dx_d, ddx_d])
         turn, first = self.task.turn, self.first
         assert turn is not None
         _, omega, alpha = self._wanted(x_d, dx_d, ddx_d)
