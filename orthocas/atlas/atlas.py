@@ -26,7 +26,6 @@ from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.relative import Relative
-from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
@@ -337,7 +336,7 @@ class Atlas(Shown):
         known = plan.problem
         if not is_turning(known.task):
             return self
-        task = Task.named(known.robot, known.task.recipe["kind"], at)
+        task = known.task.without_reference().with_reference_at(at)
         plan = replace(plan, problem=Problem(known.robot, task, known.metric, known.domain, known.name))
         return type(self)(replace(self._stock, plan=plan))
 

@@ -34,7 +34,7 @@ def local_problem(problem: Problem) -> Problem:
     """The same problem with a `LocalTask`, if its task compares orientations; the problem itself otherwise."""
     if not is_turning(problem.task):
         return problem
-    task = LocalTask.named(problem.robot, problem.task.recipe["kind"])
+    task = LocalTask.from_recipe(problem.robot, problem.task.without_reference().recipe)
     return Problem(problem.robot, task, problem.metric, problem.domain, problem.name)
 
 

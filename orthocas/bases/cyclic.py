@@ -173,6 +173,8 @@ def leaves_stay(problem: Problem, joint: int) -> bool:
 def _moves_the_task(task: Task, joint: int) -> bool:
     """Whether the kinematics show that h(q + t e_k) = g_t(h(q))."""
     tree, kind = task.robot.tree, task.recipe["kind"]
+    if not task.of_tip:
+        return False
     turn = TipTurn.of_kind(kind)
     if turn is not None and turn.whole and joint == tree.tip_parent:
         return True
@@ -199,7 +201,7 @@ def _metric_stays(metric: Metric, tree: KinematicTree, joint: int) -> bool:
 
 def _turns_the_rest(tree: KinematicTree, joint: int) -> bool:
     """Whether all joints below one in the tree are prismatic and, if it is revolute, exactly along its axis."""
-    below = _below(tree, joint)
+    below = tree.carriers(tree.parents[joint])
     if not all(tree.prismatic[i] for i in below):
         return False
     return bool(tree.prismatic[joint]) or all(_is_axis(_rotation(tree, joint, i)[:, 2], 2) for i in below)
@@ -212,15 +214,6 @@ def _turns_components(tree: KinematicTree, joint: int, kind: str) -> bool:
     if name != "position" or tree.prismatic[joint]:
         return False
     return not left_out or (len(left_out) == 1 and _is_axis(_rotation(tree, joint, -1)[:, 2], left_out[0]))
-
-
-def _below(tree: KinematicTree, joint: int) -> list[int]:
-    """The joints that carry a joint, the nearest first."""
-    found, i = [], tree.parents[joint]
-    while i >= 0:
-        found.append(i)
-        i = tree.parents[i]
-    return found
 
 
 def _rotation(tree: KinematicTree, joint: int, base: int) -> Array:

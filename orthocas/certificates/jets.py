@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.certificates.functions import sine_and_cosine
-from orthocas.certificates.task_rows import TipRows, chain_of, longest_reach, rotation_deviation
+from orthocas.certificates.task_rows import TipRows, longest_reach, rotation_deviation
 from orthocas.certificates.taylor import DEGREE, TINY, UP, Monomial, TaylorModel, Variables, above, monomials, sum_error
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.domains import Domain
@@ -154,7 +154,7 @@ class TipJets:
     def of(cls, rows: TipRows, tree: KinematicTree, columns: tuple[int, ...], domain: Domain) -> "TipJets":
         """For boxes within a domain."""
         doubt = 64 * (tree.n + 8) * rotation_deviation(tree) * longest_reach(tree, domain)
-        chain = chain_of(tree)
+        chain = tree.carriers(tree.tip_parent)
         slides = np.where(tree.prismatic, np.abs(domain.centre) + domain.half_width, 0.0)
         steps = np.linalg.norm(tree.translations, axis=1) + slides
         beyond = float(np.linalg.norm(tree.tip_translation))
@@ -169,7 +169,7 @@ class TipJets:
         """Jets at joint positions q (all joints, boxes), the columns of which are the middles of the boxes."""
         axes, arms, R = self._geometry(q)
         turning = np.array([not self.tree.prismatic[i] for i in self.columns])
-        carried = np.array([i in chain_of(self.tree) for i in self.columns])
+        carried = np.array([i in self.tree.carriers(self.tree.tip_parent) for i in self.columns])
         outer = axes * (turning & carried)[:, None, None]
         parts, rests = [], []
         if self.rows.position:
@@ -205,7 +205,7 @@ class TipJets:
         boxes = q.shape[1]
         R, p = np.broadcast_to(np.eye(3), (boxes, 3, 3)), np.zeros((boxes, 3))
         axes, origins = {}, {}
-        for i in chain_of(self.tree):
+        for i in self.tree.carriers(self.tree.tip_parent):
             p = p + R @ self.tree.translations[i]
             R = R @ self.tree.rotations[i]
             if self.tree.prismatic[i]:

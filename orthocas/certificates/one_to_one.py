@@ -31,7 +31,7 @@ from orthocas.certificates.judges import (
     singular_vectors,
 )
 from orthocas.certificates.product_rows import ProductRows
-from orthocas.certificates.task_rows import TipRows, chain_of
+from orthocas.certificates.task_rows import TipRows
 from orthocas.certificates.taylor import TINY, UNIT, UP, TaylorModel, above, sum_error
 from orthocas.charts.certificate import Subdivision
 from orthocas.charts.chart import Chart
@@ -202,7 +202,7 @@ def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToO
         assert isinstance(coordinates, Coordinates)
         assert isinstance(coordinates.family, ProductFamily)
         own = ProductJets(ProductRows.of(coordinates.family, coordinates.theta, ORDERS[-1] + 2))
-    leading = takewhile(lambda i: i not in rows.variables, chain_of(tree))
+    leading = takewhile(lambda i: i not in rows.variables, tree.carriers(tree.tip_parent))
     still = tuple(active.index(i) for i in leading if i in active)
     task = TipJets.of(tip, tree, active, chart.problem.domain)
     return OneToOneJudge(task, own, active, still, base.low, base.high)

@@ -39,9 +39,9 @@ class TipRows:
 
     @classmethod
     def of(cls, task: Task) -> "TipRows | None":
-        """Of a task; None for tasks of other kinds, and for a tip that does not move."""
+        """Of a task; None for tasks of other kinds or frames, and for a tip that does not move."""
         kind = task.recipe["kind"]
-        if task.robot.tree.tip_parent < 0:
+        if task.robot.tree.tip_parent < 0 or not task.of_tip:
             return None
         if kind == "polar":
             return cls((0, 1))
@@ -61,9 +61,9 @@ def task_rows(task: Task, domain: Domain) -> tuple[ca.Function, float]:
     q = ca.SX.sym("q", task.robot.n)
     parts = []
     if tip.position:
-        parts.append(_sparsest(q, [velocity_rows(tree, q, body)[:3, :] for body in chain_of(tree)]))
+        parts.append(_sparsest(q, [velocity_rows(tree, q, body)[:3, :] for body in tree.carriers(tree.tip_parent)]))
     if tip.rotation:
-        parts.append(_sparsest(q, [velocity_rows(tree, q, body)[3:, :] for body in chain_of(tree)]))
+        parts.append(_sparsest(q, [velocity_rows(tree, q, body)[3:, :] for body in tree.carriers(tree.tip_parent)]))
     if tip.axis is not None:
         parts.append(axis_rows(tree, q, tip.axis))
     return dense_function("task_rows", [q], [ca.vertcat(*parts)]), _allowance(tree, domain)
@@ -97,15 +97,6 @@ def tip_axes(tree: KinematicTree, axis: int) -> tuple[Array, Array]:
     return tree.tip_rotation[:, axis], tree.tip_rotation[:, [k for k in range(3) if k != axis]]
 
 
-def chain_of(tree: KinematicTree) -> list[int]:
-    """The bodies that carry the tip, from the base."""
-    bodies, i = [], tree.tip_parent
-    while i >= 0:
-        bodies.append(i)
-        i = tree.parents[i]
-    return bodies[::-1]
-
-
 def rotation_deviation(tree: KinematicTree) -> float:
     """A bound of how far a stored rotation, or one in floating-point numbers, is from a rotation."""
     stored = np.concatenate([tree.rotations, tree.tip_rotation[None]])
@@ -131,7 +122,7 @@ def _sparsest(q: ca.SX, choices: list[ca.SX]) -> ca.SX:
 
 def _poses_in(tree: KinematicTree, q: ca.SX, body: int) -> dict[int, Pose]:
     """Rotation and position of every body of the chain, in the frame of one of them."""
-    chain = chain_of(tree)
+    chain = tree.carriers(tree.tip_parent)
     here = chain.index(body)
     poses: dict[int, Pose] = {body: (ca.SX.eye(3), ca.SX.zeros(3))}
     for below, i in zip(chain[here:], chain[here + 1 :], strict=False):

@@ -323,7 +323,7 @@ class Coordinates:
         }
 
     @cached_property
-    def _point_by_point(self) -> BuiltOnUse[BlockedFunction]:
+    def _point_by_point(self) -> BuiltOnUse[str, BlockedFunction]:
         fast = (lambda graph: graph) if self.as_matrices else scalar_code
         return BuiltOnUse(lambda name: BlockedFunction(fast(self.functions[name])))
 
@@ -333,7 +333,7 @@ class Coordinates:
         return self.as_matrices or (len(self.offset) > 0 and isinstance(self.family, SelfDerivativeFamily))
 
     @cached_property
-    def _on_blocks(self) -> BuiltOnUse[Maker]:
+    def _on_blocks(self) -> BuiltOnUse[str, Maker]:
         """What makes functions of many joint positions side by side."""
         if self.as_matrices:
             return BuiltOnUse(lambda name: self._column_graphs[name].on_one_block)

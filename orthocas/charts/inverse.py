@@ -33,7 +33,7 @@ def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
     Never for tasks without a position of the tip, nor for arms with an unlimited prismatic joint.
     """
     columns = [k for k, label in enumerate(task.labels) if label in ("x", "y", "z") and task.units[k] == "m"]
-    if task.recipe["kind"] == "custom" or not columns:
+    if not task.of_tip or not columns:
         return np.zeros(len(x), dtype=bool)
     origin, length = _origin_and_length(task.robot.tree)
     away = x[:, columns] - origin[["xyz".index(task.labels[k]) for k in columns]]
@@ -42,19 +42,10 @@ def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
 
 def _origin_and_length(tree: KinematicTree) -> tuple[Array, float]:
     """Place of the first joint that moves the tip, (3,), and the largest distance of the tip from it [m]."""
-    chain = _chain(tree)
+    chain = tree.carriers(tree.tip_parent)
     offsets = [*tree.translations[chain], tree.tip_translation]
     strokes = np.maximum(np.abs(tree.lower[chain]), np.abs(tree.upper[chain]))[np.array(tree.prismatic)[chain]]
     return offsets[0], float(sum(np.linalg.norm(offset) for offset in offsets[1:]) + strokes.sum())
-
-
-def _chain(tree: KinematicTree) -> list[int]:
-    """Joints that move the tip, from the base on."""
-    found, body = [], tree.tip_parent
-    while body >= 0:
-        found.append(body)
-        body = tree.parents[body]
-    return found[::-1]
 
 
 @dataclass(eq=False)

@@ -29,7 +29,8 @@ from orthocas.tools.progress import Monitor
 
 _OPTIONS: dict[str, Any] = {
     "tip": Annotated[
-        str | None, typer.Option("--tip", help="Tip frame of a robot file; default: the end of its chain.")
+        str | None,
+        typer.Option("--tip", help="Tip frame of a robot file, or LEFT,RIGHT; default: the end of its chain."),
     ],
     "lock": Annotated[
         list[str] | None,
@@ -131,13 +132,14 @@ def is_robot_file(name: str) -> bool:
 
 
 def build_robot(path: str, options: ProblemOptions) -> Robot:
-    """Build the chain that a command line describes. Joints that do not move the tip are locked.
+    """Build the joints that a command line describes. Those that move no tip are locked.
 
     Raises:
         OrthocasError: if anything does not fit together.
     """
     tool = None if options.tool is None else parse_numbers("--tool", options.tool)
-    return Robot.from_file(path, options.tip, locked_joints(options.lock), tool)
+    tips = [name.strip() for name in (options.tip or "").split(",") if name.strip()]
+    return Robot.from_file(path, None, locked_joints(options.lock), tool, tips=tips)
 
 
 def build_problem(name: str, options: ProblemOptions) -> Problem:

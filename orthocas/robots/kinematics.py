@@ -21,7 +21,7 @@ from orthocas.robots.spatial import (
     turn,
     turn_about,
 )
-from orthocas.robots.tree import KinematicTree
+from orthocas.robots.tree import Frame, KinematicTree
 from orthocas.tools.checks import Array, as_float_array, frozen_array, require_finite, require_known
 
 _AXES = ("x", "y", "z")
@@ -40,37 +40,89 @@ def body_poses(tree: KinematicTree, q: ca.SX) -> list[Pose]:
     """Rotation and position of every body frame in the world, for q (n, 1)."""
     poses: list[Pose] = []
     for i, parent in enumerate(tree.parents):
-        R, p = poses[parent] if parent >= 0 else (ca.SX.eye(3), ca.SX.zeros(3))
-        R_joint = R @ constant(tree.rotations[i])
-        p_joint = p + R @ constant(tree.translations[i])
-        if tree.joint_kinds[i] == "prismatic":
-            poses.append((R_joint, p_joint + R_joint[:, 2] * q[i]))
-        else:
-            poses.append((R_joint @ turn(q[i]), p_joint))
+        poses.append(_next(tree, q, i, poses[parent] if parent >= 0 else (ca.SX.eye(3), ca.SX.zeros(3))))
     return poses
+
+
+def _next(tree: KinematicTree, q: ca.SX, i: int, pose: Pose) -> Pose:
+    """Pose of body i, from that of its parent."""
+    R, p = pose
+    R_joint, p_joint = R @ constant(tree.rotations[i]), p + R @ constant(tree.translations[i])
+    if tree.joint_kinds[i] == "prismatic":
+        return R_joint, p_joint + R_joint[:, 2] * q[i]
+    return R_joint @ turn(q[i]), p_joint
+
+
+def frame_pose(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> Pose:
+    """Rotation and position of a frame in the world, or in another frame, for q (n, 1).
+
+    Joints that carry both frames take no part.
+    """
+    shared = _shared(tree, frame, base)
+    R, p = _placed(tree, q, frame, shared)
+    if base is None:
+        return R, p
+    across, origin = _placed(tree, q, base, shared)
+    return across.T @ R, across.T @ (p - origin)
+
+
+def frame_jacobian(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> ca.SX:
+    """Geometric Jacobian of a frame, (6, n), in axes of the world, or of another frame and as seen from it.
+
+    d(position)/dt = J[:3] dq, angular velocity = J[3:] dq.
+    """
+    shared = _shared(tree, frame, base)
+    point = _placed(tree, q, frame, shared)[1]
+    J = _moving(tree, q, frame.parent, point, shared)
+    if base is None:
+        return J
+    across = _placed(tree, q, base, shared)[0]
+    J -= _moving(tree, q, base.parent, point, shared)
+    return ca.vertcat(across.T @ J[:3, :], across.T @ J[3:, :])
+
+
+def centre_of_mass(tree: KinematicTree, q: ca.SX) -> ca.SX:
+    """Centre of mass of all bodies that joints move, in the world, (3, 1)."""
+    places = [p + R @ constant(centre) for (R, p), centre in zip(body_poses(tree, q), tree.centres, strict=True)]
+    total: ca.SX = sum(mass * place for mass, place in zip(tree.masses, places, strict=True)) / tree.masses.sum()
+    return total
+
+
+def _shared(tree: KinematicTree, frame: Frame, base: Frame | None) -> list[int]:
+    """The bodies that carry two frames, from the base on; none if the second is the world."""
+    pairs = zip(tree.carriers(frame.parent), tree.carriers(-1 if base is None else base.parent), strict=False)
+    return [body for body, other in pairs if body == other]
+
+
+def _placed(tree: KinematicTree, q: ca.SX, frame: Frame, shared: list[int]) -> Pose:
+    """Pose of a frame in the last of the shared bodies that carry it, or in the world."""
+    R, p = ca.SX.eye(3), ca.SX.zeros(3)
+    for body in tree.carriers(frame.parent)[len(shared) :]:
+        R, p = _next(tree, q, body, (R, p))
+    return R @ constant(frame.rotation), p + R @ constant(frame.translation)
+
+
+def _moving(tree: KinematicTree, q: ca.SX, carrier: int, point: ca.SX, shared: list[int]) -> ca.SX:
+    """Jacobian (6, n) of a point and of the frames of a body, by the joints between it and the shared bodies."""
+    J, pose = ca.SX(6, tree.n), (ca.SX.eye(3), ca.SX.zeros(3))
+    for i in tree.carriers(carrier)[len(shared) :]:
+        pose = _next(tree, q, i, pose)
+        axis = pose[0][:, 2]
+        if tree.joint_kinds[i] == "prismatic":
+            J[:3, i] = axis
+        else:
+            J[:3, i], J[3:, i] = ca.cross(axis, point - pose[1]), axis
+    return J
 
 
 def tip_pose(tree: KinematicTree, q: ca.SX) -> Pose:
     """Rotation and position of the tip frame in the world, for q (n, 1)."""
-    R, p = body_poses(tree, q)[tree.tip_parent] if tree.tip_parent >= 0 else (ca.SX.eye(3), ca.SX.zeros(3))
-    return R @ constant(tree.tip_rotation), p + R @ constant(tree.tip_translation)
+    return frame_pose(tree, q, tree.tip)
 
 
 def tip_jacobian(tree: KinematicTree, q: ca.SX) -> ca.SX:
     """Geometric Jacobian of the tip in world axes, (6, n): d(position)/dt = J[:3] dq, angular velocity = J[3:] dq."""
-    poses = body_poses(tree, q)
-    _, p_tip = tip_pose(tree, q)
-    J = ca.SX(6, tree.n)
-    i = tree.tip_parent
-    while i >= 0:
-        R, p = poses[i]
-        axis = R[:, 2]
-        if tree.joint_kinds[i] == "prismatic":
-            J[:3, i] = axis
-        else:
-            J[:3, i], J[3:, i] = ca.cross(axis, p_tip - p), axis
-        i = tree.parents[i]
-    return J
+    return frame_jacobian(tree, q, tree.tip)
 
 
 def point_jacobian(tree: KinematicTree, q: ca.SX, body: int, point: Array) -> ca.SX:
@@ -88,13 +140,22 @@ def point_jacobian(tree: KinematicTree, q: ca.SX, body: int, point: Array) -> ca
 
 
 def joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
-    """Base, origins of the joints that move the tip, and the tip, (3, points), in the world."""
-    poses = body_poses(tree, q)
-    chain, i = [], tree.tip_parent
-    while i >= 0:
-        chain.append(poses[i][1])
-        i = tree.parents[i]
-    return ca.horzcat(ca.SX.zeros(3), *reversed(chain), tip_pose(tree, q)[1])
+    """Base, origins of the joints that move the tip, and the tip, (3, points), in the world: a line to draw.
+
+    With further tips, the line goes to these first, and back along their joints.
+    """
+    poses, here = body_poses(tree, q), list[int]()
+    points = [ca.SX.zeros(3)]
+    for name in (*reversed(tree.tips), tree.tip_name):
+        frame = tree.frame(name)
+        chain = tree.carriers(frame.parent)
+        back = [body for body in here if body not in chain]
+        shared = len(here) - len(back)
+        points += [poses[body][1] for body in [*reversed(back), *here[shared - 1 : shared]]]
+        points += [poses[body][1] for body in chain[shared:]]
+        points.append(frame_pose(tree, q, frame)[1])
+        here = chain
+    return ca.horzcat(*points)
 
 
 @dataclass(frozen=True)

@@ -8,21 +8,27 @@ from orthocas.robots.spatial import rotation_z_to, snap
 from orthocas.robots.tree import JointKind, KinematicTree
 from orthocas.tools.checks import Array, require_known
 
+_NAMED = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)  # links of URDF, bodies and sites of MJCF
 _UNLIMITED = 1e10  # Pinocchio uses the largest double for "no limit"
 
 
-def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
-    """Read joints, bodies, limits and the tip frame from a Pinocchio model.
+def tree_from_model(model: pin.Model, *tips: str) -> KinematicTree:
+    """Read joints, bodies, limits, tips and links from a Pinocchio model.
 
     Raises:
-        UnknownNameError: if there is no frame named `tip`.
+        UnknownNameError: if there is no frame with the name of a tip.
         RobotError: if a joint is not revolute, continuous or prismatic. The message names it.
     """
-    frame = model.frames[frame_index(model, tip)]
+    tip = model.frames[frame_index(model, tips[0])]
+    links = (frame.name for frame in model.frames if frame.type in _NAMED and frame.name.isprintable())
+    names = dict.fromkeys(name for name in (*tips, *links) if name != tips[0])
+    further = [model.frames[frame_index(model, name)] for name in names]
     axes = [joint_axis(model, i) for i in range(1, model.njoints)]
     turns = [np.eye(3)] + [rotation_z_to(axis) for _, axis in axes]  # body frame -> frame with the axis along z
     bodies = range(1, model.njoints)
-    carrier = frame.parentJoint
+    placed = [(turns[frame.parentJoint].T, frame.placement) for frame in (tip, *further)]
+    rotations = [snap(across @ place.rotation) for across, place in placed]
+    translations = [across @ place.translation for across, place in placed]
     continuous = [model.joints[i].nq == 2 for i in bodies]
     return KinematicTree(
         joint_names=tuple(model.names[i] for i in bodies),
@@ -40,11 +46,16 @@ def tree_from_model(model: pin.Model, tip: str) -> KinematicTree:
         upper=_limits(model, model.upperPositionLimit, continuous, np.inf),
         effort_limits=_largest(model, "effort", model.effortLimit),
         velocity_limits=_largest(model, "velocity", model.velocityLimit),
-        tip_name=tip,
-        tip_parent=carrier - 1,
-        tip_rotation=snap(turns[carrier].T @ frame.placement.rotation),
-        tip_translation=turns[carrier].T @ frame.placement.translation,
+        tip_name=tip.name,
+        tip_parent=tip.parentJoint - 1,
+        tip_rotation=rotations[0],
+        tip_translation=translations[0],
         gravity=np.array(model.gravity.linear),
+        tips=tuple(tips[1:]),
+        frame_names=tuple(frame.name for frame in further),
+        frame_parents=tuple(frame.parentJoint - 1 for frame in further),
+        frame_rotations=np.array(rotations[1:]).reshape(-1, 3, 3),
+        frame_translations=np.array(translations[1:]).reshape(-1, 3),
     )
 
 

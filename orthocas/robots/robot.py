@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import casadi as ca
 import numpy as np
@@ -34,10 +34,12 @@ from orthocas.tools.expressions import WRITTEN_OUT
 
 Locked = Mapping[str, float] | None  #: joint -> position at which it is locked [rad] or [m]
 Tool = ArrayLike | None
+_Key = tuple[str | None, ...]  # name of a function, then frames
+FrameQuantity = Literal["position", "rotation", "jacobian"]
 
 
 class Robot(Shown):
-    """A fixed-base robot with n revolute or prismatic joints and one tip frame.
+    """A fixed-base robot with n revolute or prismatic joints, one or more tip frames, and further frames by name.
 
     Methods take CasADi columns (n, 1), SX or MX, and return the same kind. Or they take NumPy arrays, one state (n,) or
     a set (N, n), and return NumPy arrays. Positions are in rad or m, velocities in rad/s or m/s, forces in N m or N.
@@ -64,12 +66,15 @@ class Robot(Shown):
         self.homes = {name: frozen_array(f"home '{name}'", q, (tree.n,)) for name, q in homes.items()}
 
     @classmethod
-    def from_model(cls, model: pin.Model, tip: str, locked: Locked = None) -> Self:
+    def from_model(
+        cls, model: pin.Model, tip: str | None = None, locked: Locked = None, *, tips: Sequence[str] = ()
+    ) -> Self:
         """Build from a Pinocchio model, with all its joints.
 
         Args:
             model: the model. Joints that are not locked must be revolute, continuous or prismatic.
-            tip: name of any frame of the model.
+            tip: name of any frame of the model. Default: the last frame of a robot with a single chain.
+            tips: names of several frames, such as two hands, in place of `tip`.
             locked: joints to lock, with their positions [rad] or [m].
 
         Raises:
@@ -77,25 +82,34 @@ class Robot(Shown):
             RobotError: if a joint that is not locked is of another type (floating base, spherical, mimic, ...).
         """
         require_kind("model", model, pin.Model)
-        frame_index(model, tip)
-        tree = tree_from_model(urdf.lock_joints(model, locked or {}), tip)
+        names = _names(tip, tips) or (urdf.default_tip(model),)
+        for name in names:
+            frame_index(model, name)
+        tree = tree_from_model(urdf.lock_joints(model, locked or {}), *names)
         return cls(tree, postures(model_states(model), tree.joint_names))
 
     @classmethod
     def from_file(
-        cls, path: str | PathLike[str], tip: str | None = None, locked: Locked = None, tool: Tool = None
+        cls,
+        path: str | PathLike[str],
+        tip: str | None = None,
+        locked: Locked = None,
+        tool: Tool = None,
+        *,
+        tips: Sequence[str] = (),
     ) -> Self:
-        """Build the chain that moves the tip from a robot file: MJCF if its name ends in .xml, otherwise URDF.
+        """Build the joints that move the tips from a robot file: MJCF if its name ends in .xml, otherwise URDF.
 
-        Every joint that does not move the tip, of any type, is locked at zero, or at the limit closest to zero.
+        Every joint that moves no tip, of any type, is locked at zero, or at the limit closest to zero.
 
         Args:
             path: the file. Named postures (`homes`) come from an SRDF file with the same stem, beside it or in ../srdf,
                 or from the keyframes of the MJCF file.
             tip: name of any frame. Default: the last frame of a robot with a single chain.
-            locked: joints to lock elsewhere, or on the chain to the tip, with their positions [rad] or [m]. Joints that
+            locked: joints to lock elsewhere, or on the chain to a tip, with their positions [rad] or [m]. Joints that
                 mimic them follow. A floating, spherical or planar joint is locked at its neutral position, given as 0.
-            tool: pose of the tip of a massless tool in the tip frame; see `with_tool`.
+            tool: pose of the tip of a massless tool in the (first) tip frame; see `with_tool`.
+            tips: names of several frames, such as two hands, in place of `tip`.
 
         Raises:
             RobotError: if the file cannot be read, the robot branches and no tip is given, or a joint on the chain to
@@ -103,24 +117,33 @@ class Robot(Shown):
             UnknownNameError: if the frame or a locked joint does not exist.
         """
         build = cls.from_mjcf if as_path("path", path).suffix.lower() == ".xml" else cls.from_urdf
-        return build(path, tip, locked, tool)
+        return build(path, tip, locked, tool, tips=tips)
 
     @classmethod
     def from_urdf(
-        cls, path: str | PathLike[str], tip: str | None = None, locked: Locked = None, tool: Tool = None
+        cls,
+        path: str | PathLike[str],
+        tip: str | None = None,
+        locked: Locked = None,
+        tool: Tool = None,
+        *,
+        tips: Sequence[str] = (),
     ) -> Self:
-        """Build the chain that moves the tip from a URDF file; see `from_file`."""
+        """Build the joints that move the tips from a URDF file; see `from_file`."""
         file = as_path("path", path)
-        robot = cls._chain(urdf.read_urdf(file, tip, locked), tip, locked, tool)
+        names = _names(tip, tips)
+        robot = cls._chain(urdf.read_urdf(file, names, locked), names, locked, tool)
         return cls(robot.tree, postures(srdf_states(file), robot.joint_names))
 
     @classmethod
-    def from_mjcf(cls, path: Any, tip: str | None = None, locked: Locked = None, tool: Tool = None) -> Self:
-        """Build the chain that moves the tip from a MuJoCo MJCF file, or from a `mujoco.MjModel`; see `from_file`.
+    def from_mjcf(
+        cls, path: Any, tip: str | None = None, locked: Locked = None, tool: Tool = None, *, tips: Sequence[str] = ()
+    ) -> Self:
+        """Build the joints that move the tips from a MuJoCo MJCF file, or from a `mujoco.MjModel`; see `from_file`.
 
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
-        return cls._chain(model_from_mjcf(path), tip, locked, tool)
+        return cls._chain(model_from_mjcf(path), _names(tip, tips), locked, tool)
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
@@ -174,16 +197,26 @@ class Robot(Shown):
         return self.homes[name]
 
     @classmethod
-    def _chain(cls, model: pin.Model, tip: str | None, locked: Locked, tool: Tool) -> Self:
-        """The robot of the joints that move the tip, without those that the user locks."""
-        tip = tip or urdf.default_tip(model)
-        robot = cls.from_model(urdf.lock_off_chain(urdf.lock_joints(model, locked or {}), tip), tip)
+    def _chain(cls, model: pin.Model, tips: tuple[str, ...], locked: Locked, tool: Tool) -> Self:
+        """The robot of the joints that move the tips, without those that the user locks."""
+        tips = tips or (urdf.default_tip(model),)
+        robot = cls.from_model(urdf.lock_off_chain(urdf.lock_joints(model, locked or {}), *tips), tips=tips)
         return robot if tool is None else robot.with_tool(tool)
 
     @property
     def n(self) -> int:
         """Number of joints."""
         return self.tree.n
+
+    @property
+    def tips(self) -> tuple[str, ...]:
+        """Names of the tip frames."""
+        return (self.tree.tip_name, *self.tree.tips)
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Names of all frames that the robot knows: tips and links."""
+        return (self.tree.tip_name, *self.tree.frame_names)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -213,9 +246,10 @@ class Robot(Shown):
     def facts(self) -> dict[str, str]:
         """Joints, limits, tip and mass. Limits of effort and velocity are left out if the file has none."""
         tree = self.tree
+        tips = f"tip {tree.tip_name}" if not tree.tips else f"tips {listed(self.tips)}"
         sliding = [name for name, slides in zip(tree.joint_names, tree.prismatic, strict=True) if slides]
         return {
-            "robot": f"{self.n} joints, tip {tree.tip_name}, {tree.masses.sum():.4g} kg",
+            "robot": f"{self.n} joints, {tips}, {tree.masses.sum():.4g} kg",
             "joints": listed(tree.joint_names),
             **({"prismatic": listed(sliding)} if sliding else {}),
             "lower": number_list(self.lower),
@@ -260,10 +294,58 @@ class Robot(Shown):
         """Geometric Jacobian of the tip in world axes, (6, n): linear rows, then angular rows."""
         return self._call("tip_jacobian", q)
 
+    def frame_position(self, q: Any, frame: str, relative_to: str | None = None) -> Any:
+        """Position of a frame in the world, or in another frame, (3,) [m].
+
+        Raises:
+            UnknownNameError: if there is no such frame.
+
+        Example:
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+            >>> robot.frame_position([0.0, 0.0], "tip").tolist()
+            [2.0, 0.0, 0.0]
+        """
+        return self._call(self._frame_key("position", frame, relative_to), q)
+
+    def frame_rotation(self, q: Any, frame: str, relative_to: str | None = None) -> Any:
+        """Rotation of a frame in the world, or in another frame, (3, 3)."""
+        return self._call(self._frame_key("rotation", frame, relative_to), q)
+
+    def frame_jacobian(self, q: Any, frame: str, relative_to: str | None = None) -> Any:
+        """Geometric Jacobian of a frame, (6, n): linear rows, then angular rows.
+
+        They are in axes of the world, or in those of another frame and as seen from it.
+        """
+        return self._call(self._frame_key("jacobian", frame, relative_to), q)
+
+    def centre_of_mass(self, q: Any) -> Any:
+        """Centre of mass of all that the joints move, in the world, (3,) [m]."""
+        return self._call("centre_of_mass", q)
+
+    def frame_function(
+        self, quantity: FrameQuantity, frame: str | None = None, relative_to: str | None = None
+    ) -> ca.Function:
+        """q (n, 1) -> position (3, 1), rotation (3, 3) or geometric Jacobian (6, n) of a frame, for larger graphs.
+
+        Args:
+            quantity: which of them.
+            frame: its name; None for the (first) tip.
+            relative_to: name of the frame in which it is described; None for the world.
+
+        Raises:
+            UnknownNameError: if there is no such quantity or frame.
+        """
+        require_known("quantity of a frame", quantity, ("position", "rotation", "jacobian"))
+        return self._functions[self._frame_key(quantity, frame, relative_to)]
+
     def joint_points(self, q: Any) -> Array:
-        """Base, joint origins and tip along the chain, for drawing: q (N, n) -> (N, points, 3) [m]."""
+        """A line to draw, along base, joint origins and tip: q (N, n) -> (N, points, 3) [m].
+
+        With several tips, it goes to the others first, and back along their joints.
+        """
         points, single = as_point_set("q", q, self.n)
-        flat = self._batched["joint_points"](points)[0].transpose(0, 2, 1)
+        flat = self._batched["joint_points",](points)[0].transpose(0, 2, 1)
         return flat[0] if single else flat
 
     def function(self, name: str) -> ca.Function:
@@ -275,33 +357,46 @@ class Robot(Shown):
         Raises:
             UnknownNameError: if there is no such function.
         """
-        require_known("robot function", name, _FUNCTIONS)
-        return self._functions[name]
+        require_known("robot function", name, [name for name in _FUNCTIONS if not name.startswith("frame_")])
+        return self._functions[name,]
 
     @cached_property
-    def _batched(self) -> BuiltOnUse[Batched]:
-        return BuiltOnUse(lambda name: Batched(self._functions[name]))
+    def _batched(self) -> BuiltOnUse[_Key, Batched]:
+        return BuiltOnUse(lambda key: Batched(self._functions[key]))
 
     @cached_property
-    def _functions(self) -> BuiltOnUse[ca.Function]:
+    def _functions(self) -> BuiltOnUse[_Key, ca.Function]:
         return BuiltOnUse(self._built_function)
 
-    def _built_function(self, name: str) -> ca.Function:
+    def _built_function(self, key: _Key) -> ca.Function:
+        name, *frames = key
         names, expression = _FUNCTIONS[name]
         by_bias = name.startswith("coriolis_product") and self.n > WRITTEN_OUT
         kind = ca.MX if by_bias else ca.SX
         arguments = [kind.sym(argument, PAYLOAD if argument == "payload" else self.n) for argument in names]
-        result = self._coriolis_product(*arguments) if by_bias else expression(self.tree, *arguments)
+        if by_bias:
+            result = self._coriolis_product(*arguments)
+        else:
+            result = expression(self.tree, *arguments, *(frame and self.tree.frame(frame) for frame in frames))
         return dense_function(name, arguments, [result], names)
 
     def _coriolis_product(self, q: Any, v: Any, w: Any, *payload: Any) -> Any:
         """C(q, v) w by two calls of the bias, in which gravity cancels: no further code in generated C."""
-        bias = self._functions["bias_with_payload" if payload else "bias"]
+        bias = self.function("bias_with_payload" if payload else "bias")
         return (bias(q, v + w, *payload) - bias(q, v - w, *payload)) / 4
 
-    def _call(self, name: str, *arguments: Any) -> Any:
+    def _frame_key(self, quantity: str, frame: str | None, relative_to: str | None) -> _Key:
+        """Key of a frame's function; that of the tip in the world has a name of its own."""
+        for name in (frame, relative_to):
+            if name is not None:
+                self.tree.frame(name)
+        of_tip = frame in (None, self.tree.tip_name) and relative_to is None
+        return (f"tip_{quantity}",) if of_tip else (f"frame_{quantity}", frame or self.tree.tip_name, relative_to)
+
+    def _call(self, name: str | _Key, *arguments: Any) -> Any:
         """Call a function with CasADi or NumPy arguments, and return the same kind."""
-        function = self._functions[name]
+        key = (name,) if isinstance(name, str) else name
+        function = self._functions[key]
         if any(isinstance(a, ca.SX | ca.MX) for a in arguments):
             for a in arguments:
                 shape = tuple(a.shape) if hasattr(a, "shape") else np.shape(as_float_array("a joint vector", a))
@@ -313,13 +408,31 @@ class Robot(Shown):
         if len({len(p) for p in points}) > 1:
             raise ShapeError("the second state set", points[1].shape, points[0].shape)
         rows, columns = function.size_out(0)
-        result = self._batched[name](*points)[0].reshape((-1, rows, columns) if name in _MATRICES else (-1, rows))
+        result = self._batched[key](*points)[0].reshape((-1, rows, columns) if columns > 1 else (-1, rows))
         return result[0] if all(single for _, single in sets) else result
+
+
+def _names(tip: str | None, tips: Sequence[str]) -> tuple[str, ...]:
+    """The names of the tips; none where the default is wanted.
+
+    Raises:
+        InvalidValueError: if they are no names, one appears twice, or both arguments are given.
+    """
+    if tip is not None and tips:
+        raise InvalidValueError("tips", repr(tips)[:80], "none beside tip: name all tips in tips")
+    known = not isinstance(tips, str) and isinstance(tips, Sequence) and all(isinstance(name, str) for name in tips)
+    if not known or len(set(tips)) < len(tips):
+        raise InvalidValueError("tips", repr(tips)[:80], "different names of frames")
+    return tuple(tips) if tip is None else (tip,)
 
 
 _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {  # arguments and expressions
     "mass_matrix": (("q",), dynamics.mass_matrix),
     "gravity": (("q",), lambda tree, q: dynamics.bias(tree, q, ca.SX(tree.n, 1), tree.gravity)),
+    "frame_position": (("q",), lambda tree, q, *frames: kinematics.frame_pose(tree, q, *frames)[1]),
+    "frame_rotation": (("q",), lambda tree, q, *frames: kinematics.frame_pose(tree, q, *frames)[0]),
+    "frame_jacobian": (("q",), kinematics.frame_jacobian),
+    "centre_of_mass": (("q",), kinematics.centre_of_mass),
     "tip_position": (("q",), lambda tree, q: kinematics.tip_pose(tree, q)[1]),
     "tip_rotation": (("q",), lambda tree, q: kinematics.tip_pose(tree, q)[0]),
     "tip_jacobian": (("q",), kinematics.tip_jacobian),
@@ -345,4 +458,3 @@ _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {  # argum
     ),
     "coriolis_product_with_payload": (("q", "v", "w", "payload"), dynamics.coriolis_product),
 }
-_MATRICES = ("mass_matrix", "tip_rotation", "tip_jacobian")

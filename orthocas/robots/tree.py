@@ -1,7 +1,7 @@
 """The numbers of a kinematic tree: Pinocchio's robot as plain data, which chart files store."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -10,6 +10,7 @@ from orthocas.errors import InvalidValueError, RobotError
 from orthocas.tools.checks import Array, as_float_array, frozen_array, require_known, require_shape, require_text
 
 MOST_JOINTS = 150  #: the work for a mass matrix grows with their square
+MOST_FRAMES = 1000  #: of a robot that anybody has
 _LARGEST = 1e30  # larger numbers overflow in products
 _NOT_TURNED = 1e-6  # |R R^T - 1| of a rotation in single precision
 _SYMMETRIC = 1e-6  # of the largest entry
@@ -82,8 +83,18 @@ JOINT_KINDS: tuple[JointKind, ...] = ("revolute", "prismatic")
 
 
 @dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame that is fixed in a body."""
+
+    name: str
+    parent: int  #: body that carries it, -1 for the base
+    rotation: Array  #: (3, 3) in that body's frame
+    translation: Array  #: (3,) [m]
+
+
+@dataclass(frozen=True, eq=False)
 class KinematicTree:
-    """Joints, bodies and one tip frame. Joint i moves body i, and parents come before children.
+    """Joints, bodies, tip frames and further frames by name. Joint i moves body i, and parents come before children.
 
     Body frames are rotated so that every joint axis is the body's z axis. Joint i places its body at
     `rotations[i] Rz(q_i), translations[i]` (revolute) or `rotations[i], translations[i] + q_i rotations[i] z`
@@ -111,6 +122,11 @@ class KinematicTree:
     tip_rotation: Array  #: (3, 3) in that body's frame
     tip_translation: Array  #: (3,) [m]
     gravity: Array  #: (3,) gravity acceleration in the world [m/s^2]
+    tips: tuple[str, ...] = ()  #: names of further tips among the frames
+    frame_names: tuple[str, ...] = ()  #: of k further frames that tasks may use
+    frame_parents: tuple[int, ...] = ()  #: bodies that carry them, -1 for the base
+    frame_rotations: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))  #: (k, 3, 3) in the body's frame
+    frame_translations: Array = field(default_factory=lambda: np.zeros((0, 3)))  #: (k, 3) [m]
 
     def __post_init__(self) -> None:
         n = self.n
@@ -128,10 +144,13 @@ class KinematicTree:
             "tip_rotation": (3, 3),
             "tip_translation": (3,),
             "gravity": (3,),
+            "frame_rotations": (len(self.frame_names), 3, 3),
+            "frame_translations": (len(self.frame_names), 3),
         }
         for name, shape in shapes.items():
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
-            require_bounded(name, getattr(self, name))
+            if getattr(self, name).size:
+                require_bounded(name, getattr(self, name))
         for name in ("lower", "upper", "effort_limits", "velocity_limits"):  # these may be infinite
             limits = as_float_array(name, getattr(self, name)).copy()
             require_shape(name, limits.shape, (n,))
@@ -153,6 +172,40 @@ class KinematicTree:
             require_rotation(f"rotations[{i}]", self.rotations[i])
         require_index("tip_parent", self.tip_parent, self.n - 1)
         require_rotation("tip_rotation", self.tip_rotation)
+        require_shape("frame_parents", (len(self.frame_parents),), (len(self.frame_names),))
+        if len(self.frame_names) > MOST_FRAMES:
+            raise RobotError(f"the robot has {len(self.frame_names)} frames, expected at most {MOST_FRAMES}")
+        for k, name in enumerate(self.frame_names):
+            require_text(f"frame_names[{k}]", name)
+            require_index(f"frame_parents[{k}]", self.frame_parents[k], self.n - 1)
+            require_rotation(f"frame_rotations[{k}]", self.frame_rotations[k])
+        for tip in self.tips:
+            require_known("tip", tip, self.frame_names)
+
+    @property
+    def tip(self) -> Frame:
+        """The first tip."""
+        return Frame(self.tip_name, self.tip_parent, self.tip_rotation, self.tip_translation)
+
+    def frame(self, name: str) -> Frame:
+        """The tip or a further frame by its name.
+
+        Raises:
+            UnknownNameError: if there is no such frame.
+        """
+        require_known("frame", name, (self.tip_name, *self.frame_names))
+        if name == self.tip_name:
+            return self.tip
+        k = self.frame_names.index(name)
+        return Frame(name, self.frame_parents[k], self.frame_rotations[k], self.frame_translations[k])
+
+    def carriers(self, body: int) -> list[int]:
+        """A body and those that carry it, from the base on; none for -1."""
+        found = []
+        while body >= 0:
+            found.append(body)
+            body = self.parents[body]
+        return found[::-1]
 
     @property
     def n(self) -> int:

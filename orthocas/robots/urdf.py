@@ -4,7 +4,7 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
@@ -127,7 +127,7 @@ def _link(joint: ElementTree.Element, end: str) -> str:
     return "" if element is None else element.get("link", "")
 
 
-def read_urdf(path: str | Path, tip: str | None = None, locked: Mapping[str, float] | None = None) -> pin.Model:
+def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, float] | None = None) -> pin.Model:
     """Read a URDF file. Mimic joints are kept, so that they can be refused or locked later.
 
     Pinocchio cannot keep joints that mimic a joint which comes later in its order. In files with such joints, all
@@ -135,7 +135,7 @@ def read_urdf(path: str | Path, tip: str | None = None, locked: Mapping[str, flo
 
     Args:
         path: the file.
-        tip: name of the frame that the robot moves; default: the last frame of a robot with a single chain.
+        tips: names of the frames that the robot moves; default: the last frame of a robot with a single chain.
         locked: positions of joints [rad] or [m] that are going to be locked.
 
     Raises:
@@ -150,7 +150,7 @@ def read_urdf(path: str | Path, tip: str | None = None, locked: Mapping[str, flo
     except RobotError as error:
         if _LATE_LEADER not in str(error):
             raise
-    return _with_locked_mimics(_parsed(path, mimic=False), root, tip, locked or {})
+    return _with_locked_mimics(_parsed(path, mimic=False), root, tips, locked or {})
 
 
 def _parsed(path: str | Path, mimic: bool) -> pin.Model:
@@ -171,11 +171,12 @@ def _parsed(path: str | Path, mimic: bool) -> pin.Model:
 
 
 def _with_locked_mimics(
-    model: pin.Model, root: ElementTree.Element, tip: str | None, locked: Mapping[str, float]
+    model: pin.Model, root: ElementTree.Element, tips: Sequence[str], locked: Mapping[str, float]
 ) -> pin.Model:
     """The model with every mimic joint locked at multiplier x position of its leader + offset."""
     leaders = {joint.get("name", ""): mimic for joint in root.findall("joint") for mimic in joint.findall("mimic")}
-    chain = model.supports[model.frames[frame_index(model, tip or default_tip(model))].parentJoint]
+    carriers = [model.frames[frame_index(model, tip)].parentJoint for tip in tips or (default_tip(model),)]
+    chain = {i for carrier in carriers for i in model.supports[carrier]}
     position, ids = pin.neutral(model), []
     for name, mimic in leaders.items():
         leader, i = mimic.get("joint", ""), model.getJointId(name)
@@ -240,14 +241,15 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
     return _without_joints(model, ids, position) if ids else model
 
 
-def lock_off_chain(model: pin.Model, tip: str) -> pin.Model:
-    """Lock every joint that does not move the tip, of any type, at neutral or at the limit closest to zero.
+def lock_off_chain(model: pin.Model, *tips: str) -> pin.Model:
+    """Lock every joint that moves no tip, of any type, at neutral or at the limit closest to zero.
 
     Raises:
-        UnknownNameError: if there is no frame named `tip`.
-        RobotError: if a joint that moves the tip is not revolute, continuous or prismatic. The message names it.
+        UnknownNameError: if there is no frame with the name of a tip.
+        RobotError: if a joint that moves a tip is not revolute, continuous or prismatic. The message names it.
     """
-    chain = [i for i in model.supports[model.frames[frame_index(model, tip)].parentJoint] if i > 0]
+    chains = [model.supports[model.frames[frame_index(model, tip)].parentJoint] for tip in tips]
+    chain = sorted({i for supports in chains for i in supports if i > 0})
     for i in chain:
         joint_axis(model, i)
     ids = [i for i in range(1, model.njoints) if i not in chain]

@@ -195,7 +195,7 @@ def relative_singular_values(problem: Problem, points: Array) -> Array:
         raise SingularTaskError(f"task component '{task.labels[idle[0]]}' does not depend on any joint")
     if domain.singular_bound is not None:
         return np.asarray(domain.singular_bound.singular_values(points))
-    if task.turn is not None:
+    if task.turn is not None or task.parts:
         J = task.batched_frame_jacobian(points)[0].reshape(J.shape)
     return np.asarray(np.linalg.svd(J / row_scale(J, task.units)[:, None], compute_uv=False)[:, -1])
 
@@ -208,10 +208,12 @@ def is_regular(problem: Problem, points: Array) -> NDArray[np.bool_]:
 
 def distance_from_half_a_turn(problem: Problem, points: Array) -> Array:
     """cos(angle / 2) of the tool's turn from the reference at points (N, n), (N,); 1 for tasks without a reference."""
-    task = problem.task
-    if task.turn is None:
-        return np.ones(len(points))
-    return task.turn.distance_from_half_a_turn(task.batched(points)[0].reshape(-1, task.m))
+    found = np.ones(len(points))
+    for task in problem.task.parts or (problem.task,):
+        if task.turn is not None:
+            x = task.batched(points)[0].reshape(-1, task.m)
+            found = np.minimum(found, task.turn.distance_from_half_a_turn(x))
+    return found
 
 
 def task_sizes(problem: Problem) -> Array:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.robots.kinematics import TipTurn, frame_along
-from orthocas.robots.robot import Robot
+from orthocas.robots.robot import FrameQuantity, Robot
 from orthocas.robots.spatial import quaternion_of, quaternion_product, rotation_matrix, rotations_of, skew
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
@@ -18,8 +18,10 @@ from orthocas.tools.checks import (
     Array,
     as_float_array,
     as_point_set,
+    frozen_array,
     require_finite,
     require_kind,
+    require_known,
     require_shape,
     require_text,
 )
@@ -39,7 +41,50 @@ TASK_KINDS = (
     "axis:AXIS",
     "position+axis",
     "position+axis:AXIS",
+    "relative_position",
+    "relative_position:AXES",
+    "relative_pose",
+    "relative_pose:AXIS",
+    "centre_of_mass",
+    "centre_of_mass:AXES",
 )
+_RELATIVE = "relative_"
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The frame that a task looks at, and the one in which it is described."""
+
+    frame: str | None = None  #: None: the tip
+    relative_to: str | None = None  #: None: the world
+
+    @classmethod
+    def of_recipe(cls, recipe: Mapping[str, Any]) -> Self:
+        """Those of a task's recipe."""
+        return cls(recipe.get("frame"), recipe.get("relative_to"))
+
+    @property
+    def recipe(self) -> dict[str, str]:
+        """What is not the default."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    @property
+    def suffix(self) -> str:
+        """What the name of a task adds."""
+        frame = "" if self.frame is None else f" of {self.frame}"
+        return frame if self.relative_to is None else f"{frame} in {self.relative_to}"
+
+    def function(self, robot: Robot, quantity: FrameQuantity) -> ca.Function:
+        """q (n, 1) -> position, rotation or geometric Jacobian of the frame."""
+        return robot.frame_function(quantity, self.frame, self.relative_to)
+
+    def rotation(self, robot: Robot, q: ArrayLike) -> Array:
+        """Rotation of the frame at q (n,), (3, 3)."""
+        frame = robot.tree.tip_name if self.frame is None else self.frame
+        return np.asarray(robot.frame_rotation(q, frame, self.relative_to))
+
+
+_OF_TIP = Frames()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,10 +101,19 @@ class Task(Shown, HoldsFunctions):
     units: tuple[str, ...]  #: units of the components: "m", "rad", or "" if unknown
     function: ca.Function  #: q (n, 1) -> x (m, 1), dense, SX
     recipe: dict[str, Any]  #: plain data that `from_recipe` turns into the same task
+    parts: tuple["Task", ...] = ()  #: of a stack of tasks
 
     @classmethod
-    def position(cls, robot: Robot, axes: str = "xyz") -> Self:
+    def position(
+        cls, robot: Robot, axes: str = "xyz", frame: str | None = None, relative_to: str | None = None
+    ) -> Self:
         """Position of the tip along the given world axes [m], for example axes="xy".
+
+        Args:
+            robot: the robot.
+            axes: different letters of "xyz".
+            frame: name of a frame of the robot, here and in other tasks; default: the (first) tip.
+            relative_to: name of the frame in which position and orientation are described; default: the world.
 
         Example:
             >>> import orthocas as oc
@@ -68,16 +122,15 @@ class Task(Shown, HoldsFunctions):
             >>> task.m, task.labels, task.units
             (2, ('x', 'y'), ('m', 'm'))
         """
-        require_kind("axes", axes, str)
-        if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
-            raise InvalidValueError("axes", repr(axes), "different letters of 'xyz'")
-        rows = ["xyz".index(a) for a in axes]
-        return cls._of_tip(robot, f"position:{axes}", tuple(axes), ("m",) * len(rows), lambda R, p: p[rows])
+        rows, frames = _rows_of(axes), Frames(frame, relative_to)
+        return cls._of_pose(
+            robot, f"position:{axes}", tuple(axes), ("m",) * len(rows), lambda R, p: p[rows], frames=frames
+        )
 
     @classmethod
     def polar(cls, robot: Robot) -> Self:
         """Radius [m] and angle [rad] of the tip in the x-y plane: axes="xy" in polar coordinates."""
-        return cls._of_tip(
+        return cls._of_pose(
             robot,
             "polar",
             ("radius", "angle"),
@@ -86,7 +139,14 @@ class Task(Shown, HoldsFunctions):
         )
 
     @classmethod
-    def orientation(cls, robot: Robot, reference: ArrayLike | None = None, axis: str | None = None) -> Self:
+    def orientation(
+        cls,
+        robot: Robot,
+        reference: ArrayLike | None = None,
+        axis: str | None = None,
+        frame: str | None = None,
+        relative_to: str | None = None,
+    ) -> Self:
         """Orientation of the tip relative to a reference, (3,): a rotation vector, or tilt and turn of an axis.
 
         By default x = 2 sin(angle / 2) axis of the rotation from the reference to the tip. Near the reference, it is
@@ -102,6 +162,8 @@ class Task(Shown, HoldsFunctions):
             robot: the robot.
             reference: reference rotation (3, 3) in the world. Default: the tip's at the centre of the problem's domain.
             axis: "x", "y" or "z" of the tip frame; None for the rotation vector.
+            frame: as in `position`.
+            relative_to: as in `position`.
 
         Example:
             >>> import orthocas as oc
@@ -109,15 +171,29 @@ class Task(Shown, HoldsFunctions):
             >>> oc.Task.orientation(robot, axis="z").labels
             ('tilt_x', 'tilt_y', 'turn_z')
         """
-        return cls._turned(robot, TipTurn(False, True, axis), reference)
+        return cls._turned(robot, TipTurn(False, True, axis), reference, Frames(frame, relative_to))
 
     @classmethod
-    def pose(cls, robot: Robot, reference: ArrayLike | None = None, axis: str | None = None) -> Self:
+    def pose(
+        cls,
+        robot: Robot,
+        reference: ArrayLike | None = None,
+        axis: str | None = None,
+        frame: str | None = None,
+        relative_to: str | None = None,
+    ) -> Self:
         """Position [m] and orientation of the tip, (6,); see `position` and `orientation`."""
-        return cls._turned(robot, TipTurn(True, True, axis), reference)
+        return cls._turned(robot, TipTurn(True, True, axis), reference, Frames(frame, relative_to))
 
     @classmethod
-    def axis(cls, robot: Robot, axis: str = "z", reference: ArrayLike | None = None) -> Self:
+    def axis(
+        cls,
+        robot: Robot,
+        axis: str = "z",
+        reference: ArrayLike | None = None,
+        frame: str | None = None,
+        relative_to: str | None = None,
+    ) -> Self:
         """Direction of one axis of the tip, (2,). It does not depend on the rotation about that axis.
 
         Let d be the axis, expressed in a frame whose own axis is the reference direction. Then
@@ -129,20 +205,128 @@ class Task(Shown, HoldsFunctions):
             robot: the robot.
             axis: "x", "y" or "z" of the tip frame.
             reference: direction (3,) in the world, of any length. Default: the axis at the centre of the domain.
+            frame: as in `position`.
+            relative_to: as in `position`.
 
         Source:
             Lambert's azimuthal equal-area map of the sphere of directions.
         """
         require_kind("axis", axis, str)
-        turn = TipTurn(False, False, axis)
-        return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis))
+        turn, frames = TipTurn(False, False, axis), Frames(frame, relative_to)
+        return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis), frames)
 
     @classmethod
-    def position_and_axis(cls, robot: Robot, axis: str = "z", reference: ArrayLike | None = None) -> Self:
+    def position_and_axis(
+        cls,
+        robot: Robot,
+        axis: str = "z",
+        reference: ArrayLike | None = None,
+        frame: str | None = None,
+        relative_to: str | None = None,
+    ) -> Self:
         """Position [m] and direction of one axis of the tip, (5,); see `position` and `axis`."""
         require_kind("axis", axis, str)
-        turn = TipTurn(True, False, axis)
-        return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis))
+        turn, frames = TipTurn(True, False, axis), Frames(frame, relative_to)
+        return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis), frames)
+
+    @classmethod
+    def relative_position(cls, robot: Robot, base: str, frame: str, axes: str = "xyz") -> Self:
+        """Position of one frame in the axes of another [m], such as one hand seen from the other.
+
+        Args:
+            robot: the robot.
+            base: name of the frame that observes.
+            frame: name of the frame that is observed.
+            axes: different letters of "xyz".
+        """
+        return cls.position(robot, axes, frame, base)
+
+    @classmethod
+    def relative_pose(
+        cls, robot: Robot, base: str, frame: str, reference: ArrayLike | None = None, axis: str | None = None
+    ) -> Self:
+        """Pose of one frame in another, (6,): what two hands that hold one object keep; see `pose`.
+
+        Args:
+            robot: the robot.
+            base: name of the frame that observes.
+            frame: name of the frame that is observed.
+            reference: reference rotation (3, 3) of the second frame in the first.
+            axis: "x", "y" or "z" of the second frame; None for the rotation vector.
+        """
+        return cls.pose(robot, reference, axis, frame, base)
+
+    @classmethod
+    def centre_of_mass(cls, robot: Robot, axes: str = "xyz") -> Self:
+        """Centre of mass of all that the joints move, along the given world axes [m]."""
+        rows = _rows_of(axes)
+        q, name = ca.SX.sym("q", robot.n), f"centre_of_mass:{axes}"
+        h = dense_function("h", [q], [robot.centre_of_mass(q)[rows]])
+        return cls(robot, name, tuple(f"com_{a}" for a in axes), ("m",) * len(rows), h, {"kind": name})
+
+    @classmethod
+    def pointing(cls, robot: Robot, camera: str, target: ArrayLike | str, axis: str = "z") -> Self:
+        """How far an axis of a camera points away from a target, (2,), 0 where it looks at it.
+
+        Let u be the unit vector from the camera to the target, in the camera's frame. Then
+        x = (u_i, u_j) sqrt(2 / (1 + u_axis)) has the length 2 sin(angle / 2), where angle lies between axis and u.
+
+        Args:
+            robot: the robot.
+            camera: name of a frame.
+            target: a point (3,) in the world [m], or the name of a frame.
+            axis: "x", "y" or "z" of the camera.
+
+        Source:
+            Lambert's azimuthal equal-area map, as in `axis`.
+        """
+        require_known("axis of the camera", axis, tuple("xyz"))
+        q, k = ca.SX.sym("q", robot.n), "xyz".index(axis)
+        place = target if isinstance(target, str) else frozen_array("target", target, (3,)).tolist()
+        to = robot.frame_position(q, place) if isinstance(place, str) else ca.SX(place)
+        u = robot.frame_rotation(q, camera).T @ (to - robot.frame_position(q, camera))
+        u /= ca.norm_2(u)
+        others = [i for i in range(3) if i != k]
+        x = u[others] * ca.sqrt(2 / (1 + u[k]))
+        recipe = {"kind": "pointing", "camera": camera, "target": place, "axis": axis}
+        labels = tuple(f"aim_{'xyz'[i]}" for i in others)
+        return cls(robot, f"pointing of {camera}", labels, ("rad", "rad"), dense_function("h", [q], [x]), recipe)
+
+    @classmethod
+    def stack(cls, *tasks: "Task") -> Self:
+        """Several tasks of one robot as one, such as the positions of two hands.
+
+        Labels that appear twice get a number. The components are compared as numbers: those of an orientation end half
+        a turn from their reference.
+
+        Args:
+            tasks: the tasks, in the order of the components.
+
+        Raises:
+            InvalidValueError: if there is none, or they are of different robots.
+
+        Example:
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+            >>> task = oc.Task.stack(oc.Task.position(robot, "x"), oc.Task.centre_of_mass(robot, "x"))
+            >>> task.labels
+            ('x', 'com_x')
+        """
+        for task in tasks:
+            require_kind("task", task, Task)
+            if task.robot is not tasks[0].robot:
+                raise InvalidValueError("tasks", "of different robots", "tasks of one robot")
+        if not tasks:
+            raise InvalidValueError("tasks", "none", "at least one")
+        labels = [label for task in tasks for label in task.labels]
+        numbered = (
+            f"{label}_{labels[:i].count(label) + 1}" if labels.count(label) > 1 else label
+            for i, label in enumerate(labels)
+        )
+        robot, units = tasks[0].robot, tuple(unit for task in tasks for unit in task.units)
+        recipe = {"kind": "stack", "parts": [task.recipe for task in tasks]}
+        name = " + ".join(task.name for task in tasks)
+        return cls(robot, name, tuple(numbered), units, _stacked(tasks, "function"), recipe, tasks)
 
     @classmethod
     def custom(
@@ -196,6 +380,7 @@ class Task(Shown, HoldsFunctions):
     def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> "Task":
         """A task by its short name: position, position:xy, polar, orientation, pose, pose:z, axis:x, position+axis.
 
+        Of a robot with two tips also relative_position and relative_pose, of the second tip in the first.
         `orthocas.register_task` adds names.
 
         Args:
@@ -204,9 +389,18 @@ class Task(Shown, HoldsFunctions):
             q_reference: posture (n,) that defines the reference of orientation, pose and axis tasks.
         """
         require_kind("kind", kind, str)
+        frames = _OF_TIP
+        if kind.startswith(_RELATIVE):
+            if len(robot.tips) != 2:
+                raise InvalidValueError("task", kind, f"a robot with two tips; this one has {listed(robot.tips)}")
+            kind, frames = kind.removeprefix(_RELATIVE), Frames(robot.tips[1], robot.tips[0])
         if (turn := TipTurn.of_kind(kind)) is not None:
-            return cls._turned(robot, turn, None if q_reference is None else robot.tip_rotation(q_reference))
+            return cls._turned(
+                robot, turn, None if q_reference is None else frames.rotation(robot, q_reference), frames
+            )
         name, _, words = kind.partition(":")
+        if name == "position":
+            return cls.position(robot, words or "xyz", frames.frame, frames.relative_to)
         if name not in _REGISTERED or (name == "polar" and words):
             raise UnknownNameError("task", kind, tuple(dict.fromkeys((*TASK_KINDS, *_REGISTERED))))
         return _REGISTERED[name](robot, words)
@@ -214,13 +408,29 @@ class Task(Shown, HoldsFunctions):
     @classmethod
     def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> "Task":
         """The task of a robot that `recipe` describes. Custom tasks have no such recipe."""
-        turn = TipTurn.of_kind(recipe["kind"])
-        return cls.named(robot, recipe["kind"]) if turn is None else cls._turned(robot, turn, recipe["reference"])
+        kind, frames = recipe["kind"], Frames.of_recipe(recipe)
+        if kind == "stack":
+            return cls.stack(*(cls.from_recipe(robot, part) for part in recipe["parts"]))
+        if kind == "pointing":
+            return cls.pointing(robot, recipe["camera"], recipe["target"], recipe["axis"])
+        if (turn := TipTurn.of_kind(kind)) is not None:
+            return cls._turned(robot, turn, recipe.get("reference"), frames)
+        if kind.startswith("position:"):
+            return cls.position(robot, kind.removeprefix("position:"), frames.frame, frames.relative_to)
+        return cls.named(robot, kind)
+
+    @property
+    def of_tip(self) -> bool:
+        """Whether the task is a function of the pose of the (first) tip in the world, of a kind that is known."""
+        kind = self.recipe["kind"]
+        known = TipTurn.of_kind(kind) is not None or kind == "polar" or kind.startswith("position:")
+        return known and Frames.of_recipe(self.recipe) == _OF_TIP
 
     @property
     def lacks_reference(self) -> bool:
         """Whether the task compares the tip's orientation with a reference that was not given."""
-        return self.turn is not None and "reference" not in self.recipe
+        own = self.turn is not None and "reference" not in self.recipe
+        return own or any(part.lacks_reference for part in self.parts)
 
     @property
     def turn(self) -> TipTurn | None:
@@ -229,7 +439,18 @@ class Task(Shown, HoldsFunctions):
 
     def with_reference_at(self, q: ArrayLike) -> "Task":
         """The task with the tip's orientation at q (n,) as its reference, or the task itself if it has one already."""
-        return self.named(self.robot, self.recipe["kind"], q) if self.lacks_reference else self
+        if not self.lacks_reference:
+            return self
+        if self.parts:
+            return self.stack(*(part.with_reference_at(q) for part in self.parts))
+        assert self.turn is not None
+        return self._turned(self.robot, self.turn, self._frames.rotation(self.robot, q), self._frames)
+
+    def without_reference(self) -> Self:
+        """The task of the same kind whose reference orientation is not given."""
+        if self.turn is None:
+            return self
+        return self._turned(self.robot, self.turn, None, self._frames)
 
     @property
     def m(self) -> int:
@@ -247,6 +468,8 @@ class Task(Shown, HoldsFunctions):
         For a rotation vector x = 2 v of the unit quaternion (w, v), dx/dt = w omega + v x omega with the angular
         velocity omega in the tip's axes, which also holds next to half a turn.
         """
+        if self.parts:
+            return _stacked(self.parts, "jacobian_function")
         q = ca.SX.sym("q", self.robot.n)
         if not self._has_rotation_vector:
             return dense_function("task_jacobian", [q], [ca.jacobian(self.smooth_function(q), q)])
@@ -265,7 +488,7 @@ class Task(Shown, HoldsFunctions):
         if turn is None or not turn.whole:
             return self.jacobian_function
         q = ca.SX.sym("q", self.robot.n)
-        J, R = self.robot.function("tip_jacobian")(q), self.robot.function("tip_rotation")(q)
+        J, R = self._frame("jacobian")(q), self._frame("rotation")(q)
         return dense_function("task_rates", [q], [ca.cse(turn.rates(R.T @ J[3:, :], J[:3, :]))])
 
     @cached_property
@@ -286,11 +509,13 @@ class Task(Shown, HoldsFunctions):
         across its axis. J_x loses rank half a turn from the reference, where x ends; these rows do not. For other tasks
         they are J_x itself.
         """
+        if self.parts:
+            return _stacked(self.parts, "frame_jacobian_function")
         turn = self.turn
         if turn is None:
             return self.jacobian_function
         q = ca.SX.sym("q", self.robot.n)
-        J, R = self.robot.function("tip_jacobian")(q), self.robot.function("tip_rotation")(q)
+        J, R = self._frame("jacobian")(q), self._frame("rotation")(q)
         return dense_function("frame_jacobian", [q], [ca.cse(turn.rates(R.T @ J[3:, :], R.T @ J[:3, :]))])
 
     @cached_property
@@ -314,7 +539,7 @@ class Task(Shown, HoldsFunctions):
         q, centre = (ca.SX.sym(name, self.robot.n) for name in ("q", "centre"))
         x, turn = self.smooth_function(q), self.turn
         if turn is not None and self.lacks_reference:
-            rotation, position = self.robot.function("tip_rotation"), self.robot.function("tip_position")
+            rotation, position = self._frame("rotation"), self._frame("position")
             x = turn.components(rotation(centre).T @ rotation(q), position(q), True)
         return dense_function("centred_jacobian", [q, centre], [ca.jacobian(x, q)], ["q", "centre"])
 
@@ -331,7 +556,8 @@ class Task(Shown, HoldsFunctions):
     @cached_property
     def batched_frame_jacobian(self) -> BlockedFunction:
         """Evaluates the rows of `frame_jacobian_function` at many points."""
-        return self.batched_jacobian if self.turn is None else BlockedFunction(self.frame_jacobian_function)
+        known = self.turn is None and not self.parts
+        return self.batched_jacobian if known else BlockedFunction(self.frame_jacobian_function)
 
     def value(self, position: ArrayLike | None, orientation: ArrayLike) -> Array:
         """The task value x, (m,) or (N, m), of a pose of the tip, for tasks of a whole orientation.
@@ -388,7 +614,15 @@ class Task(Shown, HoldsFunctions):
 
     def _quaternion(self, q: ca.SX) -> ca.SX:
         """The rotation from the reference to the tip, (4, 1)."""
-        return quaternion_of(ca.SX(ca.DM(self.reference.T)) @ self.robot.function("tip_rotation")(q))
+        return quaternion_of(ca.SX(ca.DM(self.reference.T)) @ self._frame("rotation")(q))
+
+    @property
+    def _frames(self) -> Frames:
+        return Frames.of_recipe(self.recipe)
+
+    def _frame(self, quantity: FrameQuantity) -> ca.Function:
+        """q (n, 1) -> position, rotation or geometric Jacobian of the frame that the task looks at."""
+        return self._frames.function(self.robot, quantity)
 
     def _whole_turn(self) -> TipTurn:
         if self.turn is None or not self.turn.whole:
@@ -405,47 +639,70 @@ class Task(Shown, HoldsFunctions):
         if self.turn is None:
             raise InvalidValueError("task", self.name, "one with an orientation")
         given = self.recipe.get("reference")
-        return self.robot.tip_rotation(self.robot.tree.middle) if given is None else np.array(given)
+        return self._frames.rotation(self.robot, self.robot.tree.middle) if given is None else np.array(given)
 
     @cached_property
     def smooth_function(self) -> ca.Function:
         """q (n, 1) -> x (m, 1) in the form to differentiate: without cases, but with few digits next to half a turn."""
         turn = self.turn
+        if self.parts:
+            return _stacked(self.parts, "smooth_function")
         if turn is None or turn.axis is not None:
             return self.function
         q = ca.SX.sym("q", self.robot.n)
-        rotation, position = self.robot.function("tip_rotation")(q), self.robot.function("tip_position")(q)
+        rotation, position = self._frame("rotation")(q), self._frame("position")(q)
         x = turn.components(ca.SX(ca.DM(self.reference.T)) @ rotation, position, True)
         return dense_function("h", [q], [x])
 
     @classmethod
-    def _turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None) -> Self:
-        """A task of the tip's rotation from a reference (3, 3), or from the default if it is None."""
+    def _turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None, frames: Frames = _OF_TIP) -> Self:
+        """A task of a frame's rotation from a reference (3, 3), or from the default if it is None."""
+        require_kind("robot", robot, Robot)
         if reference is None:
-            base, extra = robot.tip_rotation(robot.tree.middle), {}
+            base, extra = frames.rotation(robot, robot.tree.middle), {}
         else:
             base = rotation_matrix("reference", reference)
             extra = {"reference": base.tolist()}
         across = ca.SX(ca.DM(base.T))
-        return cls._of_tip(
-            robot, turn.kind, turn.labels, turn.units, lambda R, p: turn.components(across @ R, p), extra
+        return cls._of_pose(
+            robot, turn.kind, turn.labels, turn.units, lambda R, p: turn.components(across @ R, p), extra, frames
         )
 
     @classmethod
-    def _of_tip(
+    def _of_pose(
         cls,
         robot: Robot,
-        name: str,
+        kind: str,
         labels: tuple[str, ...],
         units: tuple[str, ...],
         components: Callable[[ca.SX, ca.SX], ca.SX],
         extra: Mapping[str, Any] | None = None,
+        frames: Frames = _OF_TIP,
     ) -> Self:
-        """A task that is a function of the tip's rotation and position."""
+        """A task that is a function of a frame's rotation and position."""
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
-        x = components(robot.function("tip_rotation")(q), robot.function("tip_position")(q))
-        return cls(robot, name, labels, units, dense_function("h", [q], [x]), {"kind": name, **(extra or {})})
+        x = components(frames.function(robot, "rotation")(q), frames.function(robot, "position")(q))
+        recipe = {"kind": kind, **frames.recipe, **(extra or {})}
+        return cls(robot, kind + frames.suffix, labels, units, dense_function("h", [q], [x]), recipe)
+
+
+def _rows_of(axes: str) -> list[int]:
+    """Places of different letters of "xyz".
+
+    Raises:
+        InvalidValueError: if they are no such letters.
+    """
+    require_kind("axes", axes, str)
+    if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
+        raise InvalidValueError("axes", repr(axes), "different letters of 'xyz'")
+    return ["xyz".index(a) for a in axes]
+
+
+def _stacked(tasks: Sequence[Task], name: str) -> ca.Function:
+    """Functions of q (n, 1) that each task has, one below the other."""
+    q = ca.SX.sym("q", tasks[0].robot.n)
+    return dense_function("h", [q], [ca.vertcat(*(getattr(task, name)(q) for task in tasks))])
 
 
 def _rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
@@ -465,8 +722,8 @@ def _rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
 
 
 _REGISTERED: dict[str, Callable[[Robot, str], Task]] = {
-    "position": lambda robot, axes: Task.position(robot, axes or "xyz"),
     "polar": lambda robot, _: Task.polar(robot),
+    "centre_of_mass": lambda robot, axes: Task.centre_of_mass(robot, axes or "xyz"),
 }
 
 

@@ -4,13 +4,14 @@ CasADi functions with nodes in Python, buffers and compiled libraries can be nei
 from the object's data, so a copy builds its own when needed.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from threading import RLock
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar, overload
 
 __all__ = ["BuiltOnUse", "building", "cached_property"]
 
 T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
 
 _PLACE = "_built"
 building = RLock()
@@ -66,14 +67,14 @@ else:
     cached_property = _CachedProperty
 
 
-class BuiltOnUse(Generic[T]):
+class BuiltOnUse(Generic[K, T]):
     """Values by name, each built on first use, once for all threads. A `cached_property` should hold it."""
 
-    def __init__(self, build: Callable[[str], T]) -> None:
+    def __init__(self, build: Callable[[K], T]) -> None:
         self._build = build
-        self._values: dict[str, T] = {}
+        self._values: dict[K, T] = {}
 
-    def __getitem__(self, name: str) -> T:
+    def __getitem__(self, name: K) -> T:
         if name not in self._values:
             with building:
                 if name not in self._values:

@@ -123,7 +123,7 @@ class ChartPage:
         chart = self._chart
         kind = str(chart.problem.task.recipe["kind"])
         axes = tuple(kind.startswith(("position", "pose")) and axis in chart.labels[: chart.m] for axis in "xyz")
-        if not any(axes):
+        if not any(axes) or not chart.problem.task.of_tip:
             return None
         size = _HANDLE * chain_length(chart.problem.robot.tree)
         handle = self._server.scene.add_transform_controls(

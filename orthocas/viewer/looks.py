@@ -186,7 +186,8 @@ def urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] | Non
         RobotError: if the file cannot be read, or its joints are not those of the robot.
     """
     root = read_xml(path, "URDF", "robot")
-    model = lock_off_chain(lock_joints(read_urdf(path, tree.tip_name, locked), locked or {}), tree.tip_name)
+    tips = (tree.tip_name, *tree.tips)
+    model = lock_off_chain(lock_joints(read_urdf(path, tips, locked), locked or {}), *tips)
     _require_same(path, model, tree)
     turns = [np.eye(3), *(rotation_z_to(joint_axis(model, i)[1]) for i in range(1, model.njoints))]
     colours = _materials(root)
