@@ -173,6 +173,6 @@ def test_notes_that_could_not_be_read_back_are_not_written(planar_fit: Fit, tmp_
 def test_robot_functions_are_built_when_they_are_used() -> None:
     robot = oc.Robot.planar([1.0] * 100, [1.0] * 100)
     assert robot.tip_position(np.zeros(100))[0] == pytest.approx(100)
-    assert list(robot._functions._values) == ["tip_position"]
+    assert list(robot._functions._values) == [("tip_position",)]
     with pytest.raises(OrthocasError, match="200 movable joints, expected at most 150"):
         oc.Robot.planar([1.0] * 200, [1.0] * 200)

@@ -15,10 +15,27 @@ from orthocas.fitting.array_objective import ArrayObjective
 from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.graph_objective import GraphObjective
-from orthocas.fitting.residuals import Loss
+from orthocas.fitting.residuals import (
+    Loss,
+    loss_columns,
+    loss_with_slopes,
+    residual_columns,
+    sample_loss,
+    value_columns,
+)
 from orthocas.fitting.starts import spectral_start
-from orthocas.fitting.terms import REGULAR_VOLUME, Sizes, Weights, mutual_cosines, pairs, task_cosines
+from orthocas.fitting.terms import (
+    REGULAR_VOLUME,
+    Sizes,
+    Weights,
+    gradient_volume,
+    mutual_cosines,
+    pairs,
+    task_cosines,
+    volume_hinges,
+)
 from orthocas.tasks.samples import Draw, Samples, sample_problem, samples_at
+from orthocas.tools import columns
 from orthocas.tools.expressions import determinant
 
 WEIGHTS = Weights.of((1000.0, 30.0))
@@ -311,11 +328,61 @@ def test_eleven_joints_are_fitted() -> None:
 
 
 @pytest.mark.slow
-def test_fits_of_too_many_coordinates_name_the_size() -> None:
-    problem = many_joints(15)
+def test_thirteen_coordinates_are_fitted() -> None:
+    fit = oc.fit(many_joints(15), oc.Polynomial(1), samples=200)
+    assert fit.chart.r == 13
+    assert fit.worst is not None
+    assert fit.worst.least > 0.1
+
+
+def test_expressions_of_too_many_coordinates_name_the_size() -> None:
+    loss = Loss.of(Sizes(15, 2, 13, True), {"regularity": 1.0})
     with pytest.raises(
         InvalidValueError, match="number of extra coordinates r is 13, expected at most 12 with the terms"
     ):
-        oc.fit(problem, oc.Polynomial(1), samples=200)
-    fit = oc.fit(problem, oc.Polynomial(1), samples=200, weights=oc.Weights(regularity=0, folds=0))
-    assert fit.chart.r == 13
+        sample_loss(loss)
+
+
+@pytest.mark.parametrize("identity", [True, False])
+def test_volumes_by_lapack_are_those_of_the_expression(identity: bool) -> None:
+    """Values and slopes of hinges at regular, folded and exactly singular samples."""
+    N, n, r = 12, 6, 4
+    rng = np.random.default_rng(3)
+    J, Z = rng.normal(size=(N, r, n)), np.linalg.qr(rng.normal(size=(N, n, r)))[0]
+    J[0, 1] = J[0, 0]  # no volume at all
+    J[1] = Z[1].T  # the largest one: no hinge for A = I
+    root = rng.normal(size=(N, n, n))
+    A = None if identity else root @ root.transpose(0, 2, 1) + np.eye(n)
+    hinges, slopes = volume_hinges(J, Z, A, 0.9)
+    symbol = ca.SX.sym("J", r, n)
+    for k in range(N):
+        volume = gradient_volume(symbol, ca.DM(Z[k]), None if A is None else ca.DM(A[k]))
+        hinge = ca.fmax(0.9 - volume, 0)
+        function = ca.Function("hinge", [symbol], [hinge, ca.gradient(hinge, symbol)])
+        value, slope = function(J[k])
+        assert hinges[k] == pytest.approx(float(value), abs=1e-12)
+        np.testing.assert_allclose(slopes[k], np.asarray(slope), atol=1e-10)
+    assert hinges[0] == pytest.approx(0.9)
+    assert hinges[1] == 0 or not identity
+
+
+def test_loss_with_volumes_is_the_loss() -> None:
+    """The parts written out and by LAPACK together, with exchanged components, against one expression."""
+    sizes, N = Sizes(11, 3, 8, False), 300
+    loss = Loss.of(sizes, {"task": 10.0, "mutual": 3.0, "regularity": 5.0, "folds": 7.0}, ((1, 4),))
+    assert len(loss.volume_terms) == 2
+    rng = np.random.default_rng(0)
+    data = [rng.normal(size=(N, *symbol.shape)) for symbol in loss.symbols()]
+    place = loss.data.index("metric_inverse")
+    data[place] = data[place] @ data[place].transpose(0, 2, 1) + np.eye(sizes.n)
+    inputs = [columns.blocked(rng.normal(size=(N, sizes.r, sizes.n))), *map(columns.blocked, data)]
+    value, slopes = loss_with_slopes(loss)(*inputs)
+    for found, wanted in zip(loss_columns(loss)(*inputs), (value, slopes), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-11, atol=1e-13 * np.abs(wanted).max())
+    np.testing.assert_allclose(value_columns(loss)(*inputs)[0], value, rtol=1e-11)
+    *rows, first, _, second, _ = residual_columns(loss)(*inputs)
+    assert len(rows) == sizes.r
+    only = Loss.of(sizes, {"regularity": 5.0, "folds": 7.0}, ((1, 4),))
+    (volumes,) = value_columns(only)(inputs[0], *(inputs[1 + loss.data.index(name)] for name in only.data))
+    np.testing.assert_allclose((first**2 + second**2) / 2, volumes, rtol=1e-12)
+    assert volumes.max() > 0

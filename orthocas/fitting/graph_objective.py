@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.bases.family import Family
-from orthocas.fitting.residuals import Loss, loss_columns
+from orthocas.fitting.residuals import Loss, loss_with_slopes
 from orthocas.fitting.terms import Sizes, Weights
 from orthocas.tasks.samples import Draw, Samples, even_parts
 from orthocas.tools.blas_graph import NumpyGraph
@@ -107,7 +107,7 @@ class _LossGraph:
         by_component = [ca.horzsplit(gradient.T) for gradient in gradients]  # r times n columns of samples
         entries = [column for by_joint in zip(*by_component, strict=True) for column in by_joint]
         r = loss.sizes.r
-        values, *slopes = replay(loss_columns(loss).tape, [*entries, *(ca.horzsplit(data) if loss.data else [])])
+        values, *slopes = replay(loss_with_slopes(loss).tape, [*entries, *(ca.horzsplit(data) if loss.data else [])])
         weighted = [ca.horzcat(*(share * slope for slope in slopes[j::r])) for j in range(r)]
         # chain rule, split at J_xi: the derivatives of the loss are one sample's graph, replayed on columns
         by_theta = ca.jtimes(ca.horzcat(*gradients), theta, ca.horzcat(*(part.T for part in weighted)), True)

@@ -1,17 +1,21 @@
 """The loss of one sample as least squares in J_xi, and its derivatives on columns of samples."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
-from orthocas.fitting.terms import SAMPLE_DATA, LossTerm, Sizes, term_of
+from orthocas.fitting.terms import SAMPLE_DATA, LossTerm, RegularityTerm, Sizes, term_of, volume_hinges
 from orthocas.tools.cached import cached_property
-from orthocas.tools.columns import ColumnFunction
+from orthocas.tools.checks import Array
+from orthocas.tools.columns import COLUMNS, ColumnFunction, Run
 
 Pairs = tuple[tuple[int, int], ...]
+_BY_LAPACK = 8  # coordinates from which determinants of numbers are faster than written-out ones
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,20 @@ class Loss:
         """Whether the loss needs a null basis with the orientation of the coordinates."""
         return "null_basis" in self.data
 
+    @cached_property
+    def volume_terms(self) -> tuple[tuple[float, RegularityTerm], ...]:
+        """Weights and terms whose determinants are too large to be written out."""
+        if self.sizes.r < _BY_LAPACK:
+            return ()
+        return tuple((weight, term) for term, weight in self.terms if isinstance(term, RegularityTerm))
+
+    @cached_property
+    def written_out(self) -> "Loss":
+        """The loss without its volume terms."""
+        names = {term.name for _, term in self.volume_terms}
+        kept = tuple(pair for pair in self.weights if pair[0] not in names)
+        return Loss(self.sizes, kept, self.exchanged) if names else self
+
     def symbols(self) -> list[ca.SX]:
         """Symbols of the data of one sample, in the order of `data`."""
         return [ca.SX.sym(name, *SAMPLE_DATA[name](self.sizes)) for name in self.data]
@@ -67,7 +85,7 @@ class Loss:
 
     @cached_property
     def smooth_rows(self) -> tuple[tuple[int, ...], ...]:
-        """For every coordinate j, the rows that depend on it, without hinge rows."""
+        """For every coordinate j, the rows of `written_out` that depend on it, without hinge rows."""
         touched = self._touched
         return tuple(
             tuple(row for row, coordinates in enumerate(touched) if j in coordinates and row not in self.hinge_rows)
@@ -87,7 +105,9 @@ class Loss:
 
     @cached_property
     def hinge_rows(self) -> range:
-        """Rows of the hinge terms, which are the last ones."""
+        """Rows of the hinge terms of `written_out`, which are the last ones."""
+        if self.volume_terms:
+            return self.written_out.hinge_rows
         J, data = self.arguments()
         named = dict(zip(self.data, data, strict=True))
         counts = [term.residuals(J, named, self.sizes).shape[0] for term, _ in self.terms if not term.hinge]
@@ -95,7 +115,9 @@ class Loss:
 
     @cached_property
     def _touched(self) -> list[list[int]]:
-        """The coordinates that each row depends on."""
+        """The coordinates that each row of `written_out` depends on."""
+        if self.volume_terms:
+            return self.written_out._touched
         J, data = self.arguments()
         by_entry = ca.jacobian(self.residuals(J, data), ca.vec(J)).sparsity()
         touched: list[set[int]] = [set() for _ in range(by_entry.size1())]
@@ -124,7 +146,7 @@ def sample_loss(loss: Loss) -> ca.Function:
 
 
 @cache
-def loss_columns(loss: Loss) -> ColumnFunction:
+def loss_with_slopes(loss: Loss) -> ColumnFunction:
     """Loss of one sample (1, 1) and its derivative dL/dJ_xi (r, n), with the inputs of `sample_loss`."""
     J, data = loss.arguments()
     value = ca.sumsqr(loss.residuals(J, data)) / 2
@@ -132,19 +154,31 @@ def loss_columns(loss: Loss) -> ColumnFunction:
 
 
 @cache
-def value_columns(loss: Loss) -> ColumnFunction:
-    """Loss of one sample, with the inputs of `sample_loss`."""
-    return ColumnFunction(sample_loss(loss))
+def loss_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
+    """Like `loss_with_slopes`, with volumes of many gradients by LAPACK."""
+    return LossWithVolumes(loss, loss_with_slopes) if loss.volume_terms else loss_with_slopes(loss)
 
 
 @cache
-def residual_columns(loss: Loss) -> ColumnFunction:
+def value_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
+    """Loss of one sample, with the inputs of `sample_loss`."""
+
+    def written(part: Loss) -> ColumnFunction:
+        return ColumnFunction(sample_loss(part))
+
+    return LossWithVolumes(loss, written, slopes=False) if loss.volume_terms else written(loss)
+
+
+@cache
+def residual_columns(loss: Loss) -> Callable[..., list[Array]]:
     """Derivatives of the residuals of one sample with respect to J_xi, for the Gauss-Newton matrix.
 
     The inputs are those of `sample_loss`. The outputs are, for every coordinate j, the derivative of `smooth_rows[j]`
-    with respect to row j of J_xi, (rows, n); then, for every hinge row, the residual (1, 1) and its derivative with
-    respect to J_xi, (r, n).
+    with respect to row j of J_xi, (rows, n); then, for every hinge row and every volume term, the residual (1, 1) and
+    its derivative with respect to J_xi, (r, n).
     """
+    if loss.volume_terms:
+        return LossWithVolumes(loss, residual_columns).residuals
     J, data = loss.arguments()
     r, n = loss.sizes.r, loss.sizes.n
     rho = loss.residuals(J, data)
@@ -166,3 +200,77 @@ def curvature_columns(loss: Loss) -> ColumnFunction:
     value = sample_loss(loss)(ca.reshape(column, loss.sizes.r, loss.sizes.n), *data)
     second = ca.Function("second", [column, *data], [ca.hessian(value, column)[0]])
     return ColumnFunction(ca.Function("curvature", [J, *data], [second(ca.vec(J), *data)]))
+
+
+class LossWithVolumes:
+    """A loss on columns of samples, like a `ColumnFunction`, whose volume terms are computed by LAPACK.
+
+    Args:
+        loss: with at least one volume term.
+        written: makes the function of the other terms.
+        slopes: whether outputs are values and slopes, or only values.
+    """
+
+    def __init__(self, loss: Loss, written: Callable[[Loss], Any], slopes: bool = True) -> None:
+        rest = loss.written_out
+        self._loss, self._slopes = loss, slopes
+        self._written = written(rest) if rest.weights else None
+        self._places = [loss.data.index(name) for name in rest.data]
+
+    def __call__(self, J: Array, *data: Array) -> list[Array]:
+        """Outputs (B, entries, c) for contiguous inputs (B, entries, c)."""
+        shapes = [(len(J), 1, COLUMNS), *([J.shape] if self._slopes else [])]
+        results = [np.empty(shape) for shape in shapes]
+        with self.borrowed(1) as (run,):
+            for b in range(len(J)):
+                run([J[b], *(array[b] for array in data)], [result[b] for result in results])
+        return results
+
+    @contextmanager
+    def borrowed(self, count: int) -> Iterator[list[Run]]:
+        """Functions of blocks for so many threads; see `ColumnFunction.borrowed`."""
+        with ExitStack() as stack:
+            written: Sequence[Run | None] = [None] * count
+            if self._written is not None:
+                written = stack.enter_context(self._written.borrowed(count))
+            yield [self._run(own) for own in written]
+
+    def residuals(self, J: Array, *data: Array) -> list[Array]:
+        """The outputs of `residual_columns`."""
+        if self._written is None:
+            found = [np.empty((len(J), 0, COLUMNS)) for _ in range(self._loss.sizes.r)]
+        else:
+            found = self._written(J, *(data[k] for k in self._places))
+        for weight, term in self._loss.volume_terms:
+            parts = [self._of_block(term, J[b], [array[b] for array in data]) for b in range(len(J))]
+            found.append(weight**0.5 * np.stack([rho[None] for rho, _ in parts]))
+            found.append(weight**0.5 * np.stack([slopes for _, slopes in parts]))
+        return found
+
+    def _run(self, written: Run | None) -> Run:
+        def run(arguments: Sequence[Array], results: Sequence[Array]) -> None:
+            if written is None:
+                for result in results:
+                    result[...] = 0.0
+            else:
+                written([arguments[0], *(arguments[1 + k] for k in self._places)], results)
+            for weight, term in self._loss.volume_terms:
+                rho, slope = self._of_block(term, arguments[0], arguments[1:])
+                results[0][...] += (weight / 2 * rho**2).reshape(results[0].shape)
+                if self._slopes:
+                    results[1][...] += (weight * rho * slope.reshape(-1, len(rho))).reshape(results[1].shape)
+
+        return run
+
+    def _of_block(self, term: RegularityTerm, J: Array, data: Sequence[Array]) -> tuple[Array, Array]:
+        """Residuals (c,) of one block (n r, c), and their derivatives (n r, c)."""
+        sizes, pairs = self._loss.sizes, self._loss.exchanged
+        named = dict(zip(self._loss.data, data, strict=True))
+        rows = list(J.reshape(sizes.n, sizes.r, -1).transpose(1, 2, 0))  # r times (c, n)
+        Z = named["null_basis"].reshape(sizes.r, sizes.n, -1).transpose(2, 1, 0)
+        A = named.get("metric_inverse")
+        metric_inverse = None if A is None else A.reshape(sizes.n, sizes.n, -1).transpose(2, 1, 0)
+        turned = np.stack(coordinates_of(rows, pairs), axis=1)
+        rho, slopes = volume_hinges(turned, Z, metric_inverse, term.bound)
+        back = coordinates_of(list(slopes.transpose(1, 0, 2)), tuple((j, i) for i, j in pairs))
+        return rho, np.ascontiguousarray(np.stack(back).transpose(2, 0, 1)).reshape(J.shape)

@@ -5,11 +5,12 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
 
 import casadi as ca
+import numpy as np
 
 from orthocas.charts.angles import pairs
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tasks.metric import Metric
-from orthocas.tools.checks import as_float_array, as_number, require_kind, require_known, require_shape
+from orthocas.tools.checks import Array, as_float_array, as_number, require_kind, require_known, require_shape
 from orthocas.tools.expressions import MOST_ROWS, determinant
 
 REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
@@ -272,6 +273,33 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
     raised = J if metric_inverse is None else J @ metric_inverse
     lengths = ca.sqrt(ca.sum2(raised * J))
     return determinant((J @ null_basis) / ca.repmat(lengths, 1, J.shape[0]))
+
+
+def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bound: float) -> tuple[Array, Array]:
+    """max(bound - det D, 0) of the `gradient_volume` det D, (N,), and its derivative with respect to J_xi, (N, r, n).
+
+    With the cofactors C of D, d(det D)/dv_j = sum_k C_jk z_k / |v_j| - det D A^-1 v_j / |v_j|^2. C comes from the
+    singular values, so it exists at folds too.
+
+    Args:
+        J: J_xi, (N, r, n).
+        null_basis: columns z_1..z_r, (N, n, r).
+        metric_inverse: A^-1, (N, n, n); None for the identity.
+        bound: of the volume.
+    """
+    raised = J if metric_inverse is None else J @ metric_inverse
+    lengths = np.sqrt((raised * J).sum(axis=2, keepdims=True))
+    D = J @ null_basis / lengths
+    volume = np.linalg.det(D)
+    hinges, slopes = np.maximum(bound - volume, 0.0), np.zeros(J.shape)
+    active = np.flatnonzero(hinges > 0)
+    U, s, Vt = np.linalg.svd(D[active])
+    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(s.shape[1])], axis=1)
+    cofactors = sign[:, None, None] * (U * others[:, None, :]) @ Vt
+    across = cofactors @ null_basis[active].transpose(0, 2, 1) / lengths[active]
+    slopes[active] = volume[active, None, None] * raised[active] / lengths[active] ** 2 - across
+    return hinges, slopes
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,217 @@
+"""Robots with several tips, frames by name, and tasks of one frame in another, against Pinocchio."""
+
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from conftest import robot_data
+
+import orthocas as oc
+from orthocas.errors import InvalidValueError, OrthocasError, UnknownNameError
+from orthocas.tools.checks import Array
+
+LEFT, RIGHT = "left_gripper", "right_gripper"
+
+
+@pytest.fixture(scope="module")
+def baxter_file() -> Path:
+    return robot_data("baxter_description/urdf/baxter.urdf")
+
+
+@pytest.fixture(scope="module")
+def baxter(baxter_file: Path) -> oc.Robot:
+    return oc.Robot.from_urdf(baxter_file, tips=[LEFT, RIGHT])
+
+
+class Reference:
+    """The whole robot in Pinocchio, at positions of some of its joints."""
+
+    def __init__(self, path: Path, joints: tuple[str, ...]) -> None:
+        self.model = pin.buildModelFromUrdf(str(path))
+        self.data = self.model.createData()
+        ids = [self.model.getJointId(name) for name in joints]
+        self.places = [self.model.joints[i].idx_q for i in ids]
+        self.columns = [self.model.joints[i].idx_v for i in ids]
+
+    def at(self, q: Array) -> "Reference":
+        whole = pin.neutral(self.model)
+        whole[self.places] = q
+        pin.computeJointJacobians(self.model, self.data, whole)
+        pin.updateFramePlacements(self.model, self.data)
+        return self
+
+    def pose(self, name: str) -> pin.SE3:
+        return self.data.oMf[self.model.getFrameId(name)]
+
+    def jacobian(self, name: str) -> Array:
+        frame = self.model.getFrameId(name)
+        whole = pin.getFrameJacobian(self.model, self.data, frame, pin.LOCAL_WORLD_ALIGNED)
+        return np.asarray(whole[:, self.columns])
+
+
+def postures(robot: oc.Robot, count: int = 6) -> Array:
+    return np.random.default_rng(1).uniform(-1, 1, (count, robot.n))
+
+
+def test_two_tips_keep_the_joints_of_both_arms(baxter: oc.Robot) -> None:
+    assert baxter.n == 14
+    assert baxter.tips == (LEFT, RIGHT)
+    assert "left_wrist" in baxter.frame_names
+    assert "tips left_gripper, right_gripper" in str(baxter)
+
+
+def test_frames_are_those_of_pinocchio(baxter: oc.Robot, baxter_file: Path) -> None:
+    reference = Reference(baxter_file, baxter.joint_names)
+    for q in postures(baxter):
+        reference.at(q)
+        for name in (LEFT, RIGHT, "left_wrist", "right_upper_forearm"):
+            pose = reference.pose(name)
+            np.testing.assert_allclose(baxter.frame_position(q, name), pose.translation, atol=1e-12)
+            np.testing.assert_allclose(baxter.frame_rotation(q, name), pose.rotation, atol=1e-12)
+            np.testing.assert_allclose(baxter.frame_jacobian(q, name), reference.jacobian(name), atol=1e-12)
+        between = reference.pose(LEFT).inverse() * reference.pose(RIGHT)
+        np.testing.assert_allclose(baxter.frame_position(q, RIGHT, LEFT), between.translation, atol=1e-12)
+        np.testing.assert_allclose(baxter.frame_rotation(q, RIGHT, LEFT), between.rotation, atol=1e-12)
+
+
+def test_jacobian_in_another_frame_is_the_rate_of_its_pose(baxter: oc.Robot) -> None:
+    q, step = postures(baxter, 1)[0], 1e-6
+    J, R = baxter.frame_jacobian(q, RIGHT, LEFT), baxter.frame_rotation(q, RIGHT, LEFT)
+    for k in range(baxter.n):
+        there, here = q + step * np.eye(baxter.n)[k], q - step * np.eye(baxter.n)[k]
+        moved = (baxter.frame_position(there, RIGHT, LEFT) - baxter.frame_position(here, RIGHT, LEFT)) / (2 * step)
+        turned = (baxter.frame_rotation(there, RIGHT, LEFT) - baxter.frame_rotation(here, RIGHT, LEFT)) / (2 * step)
+        turning = turned @ R.T
+        wanted = [*moved, turning[2, 1], turning[0, 2], turning[1, 0]]
+        np.testing.assert_allclose(J[:, k], wanted, atol=1e-8)
+
+
+def test_joints_that_carry_both_frames_take_no_part() -> None:
+    """The lift under two arms cancels exactly, so it is an idle joint of the relative pose."""
+    path = robot_data("pr2_description/urdf/pr2.urdf")
+    robot = oc.Robot.from_urdf(path, tips=["l_gripper_tool_frame", "r_gripper_tool_frame"])
+    lift = robot.joint_names.index("torso_lift_joint")
+    task = oc.Task.relative_pose(robot, *robot.tips)
+    q = ca.SX.sym("q", robot.n)
+    assert not ca.depends_on(task.function(q), q[lift])
+
+
+def test_centre_of_mass_is_that_of_pinocchio(baxter: oc.Robot) -> None:
+    tree = baxter.tree
+    assert tree.masses.sum() == pytest.approx(40.14, abs=0.01)
+    for q in postures(baxter, 3):
+        step = 1e-6
+        potential = [
+            -9.81 * tree.masses.sum() * -baxter.centre_of_mass(q + s * step * v)[2]
+            for v in np.eye(baxter.n)
+            for s in (1, -1)
+        ]
+        slopes = np.array(potential).reshape(-1, 2) @ [1, -1] / (2 * step)
+        np.testing.assert_allclose(slopes, baxter.gravity(q), atol=1e-5)  # which is held against Pinocchio elsewhere
+
+
+def test_line_to_draw_passes_all_joints_and_ends_at_the_first_tip(baxter: oc.Robot) -> None:
+    q = postures(baxter, 2)
+    points = baxter.joint_points(q)
+    np.testing.assert_allclose(points[:, -1], baxter.tip_position(q), atol=1e-14)
+    right = baxter.frame_position(q, RIGHT)
+    assert np.abs(points - right[:, None]).max(axis=2).min(axis=1).max() < 1e-14
+    lengths = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    assert lengths.max() < 0.6  # no line from one hand to the other shoulder
+
+
+def test_tasks_of_frames(baxter: oc.Robot) -> None:
+    q = postures(baxter)
+    task = oc.Task.relative_position(baxter, LEFT, RIGHT, "xz")
+    assert task.name == "position:xz of right_gripper in left_gripper"
+    np.testing.assert_allclose(task.batched(q)[0], baxter.frame_position(q, RIGHT, LEFT)[:, [0, 2]], atol=1e-14)
+    pose = oc.Task.relative_pose(baxter, LEFT, RIGHT).with_reference_at(q[0])
+    assert np.abs(pose.batched(q[:1])[0][0, 3:]).max() < 1e-12
+    assert pose.recipe["frame"] == RIGHT
+    both = oc.Task.stack(oc.Task.position(baxter), oc.Task.position(baxter, frame=RIGHT))
+    assert both.labels == ("x_1", "y_1", "z_1", "x_2", "y_2", "z_2")
+    np.testing.assert_allclose(both.batched(q)[0][:, 3:], baxter.frame_position(q, RIGHT), atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda robot: oc.Task.relative_pose(robot, LEFT, RIGHT),
+        lambda robot: oc.Task.relative_pose(robot, LEFT, RIGHT, axis="z"),
+        lambda robot: oc.Task.position_and_axis(robot, frame=RIGHT),
+        lambda robot: oc.Task.pointing(robot, LEFT, RIGHT),
+        lambda robot: oc.Task.stack(oc.Task.pose(robot), oc.Task.axis(robot, frame=RIGHT)),
+        lambda robot: oc.Task.centre_of_mass(robot, "xy"),
+    ],
+)
+def test_jacobians_of_tasks_are_their_rates(baxter: oc.Robot, make: object) -> None:
+    q, step = postures(baxter, 1)[0], 1e-6
+    task = make(baxter).with_reference_at(q + 0.1)  # type: ignore[operator]
+    J = np.asarray(task.jacobian_function(q))
+    for k in range(baxter.n):
+        v = step * np.eye(baxter.n)[k]
+        slope = (np.asarray(task.function(q + v)) - np.asarray(task.function(q - v))) / (2 * step)
+        np.testing.assert_allclose(J[:, [k]], slope, atol=2e-8)
+
+
+def test_a_camera_that_looks_at_its_target_has_no_error() -> None:
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    task = oc.Task.pointing(robot, "tip", [3.0, 0.0, 0.0], "x")
+    np.testing.assert_allclose(np.asarray(task.function([0.0, 0.0])).ravel(), [0, 0], atol=1e-15)
+    turned = np.asarray(task.function([0.0, 0.3])).ravel()  # the tip at (1 + cos 0.3, sin 0.3), which looks along 0.3
+    angle = np.arctan2(-np.sin(0.3), 2 - np.cos(0.3)) - 0.3
+    np.testing.assert_allclose(turned, [2 * np.sin(angle / 2), 0], atol=1e-14)
+
+
+def test_files_keep_frames_and_tasks(baxter: oc.Robot, tmp_path: Path) -> None:
+    centre = 0.5 * postures(baxter, 1)[0]
+    for task in (
+        oc.Task.relative_pose(baxter, LEFT, RIGHT),
+        oc.Task.stack(
+            oc.Task.pointing(baxter, LEFT, [1, 0, 1]),
+            oc.Task.custom(baxter, "height", lambda q: baxter.frame_position(q, RIGHT)[2]),
+        ),
+    ):
+        problem = oc.Problem(baxter, task, domain=oc.Box(centre, 0.1))
+        chart = oc.fit(problem, oc.Polynomial(1), samples=200, weights=oc.Weights(folds=0)).chart
+        chart.save(tmp_path / "arms.orthocas")
+        back = oc.Chart.load(tmp_path / "arms.orthocas")
+        assert back.problem.robot.tips == (LEFT, RIGHT)
+        q = centre + 0.05
+        np.testing.assert_array_equal(back.phi(q), chart.phi(q))
+        np.testing.assert_array_equal(
+            back.problem.robot.frame_position(q, "left_wrist"), baxter.frame_position(q, "left_wrist")
+        )
+
+
+def test_names_of_the_command_line(baxter: oc.Robot) -> None:
+    assert oc.Task.named(baxter, "relative_pose:z").recipe["relative_to"] == LEFT
+    assert oc.Task.named(baxter, "relative_position:xy").m == 2
+    one = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    with pytest.raises(InvalidValueError, match="a robot with two tips"):
+        oc.Task.named(one, "relative_pose")
+
+
+@pytest.mark.parametrize(
+    ("tip", "tips", "message"),
+    [
+        (LEFT, [RIGHT], "none beside tip"),
+        (None, [LEFT, LEFT], "different names"),
+        (None, "left_gripper", "different names"),
+        (None, [LEFT, "tail"], "unknown frame 'tail'"),
+    ],
+)
+def test_refused_tips(baxter_file: Path, tip: str | None, tips: list[str], message: str) -> None:
+    with pytest.raises(OrthocasError, match=message):
+        oc.Robot.from_urdf(baxter_file, tip, tips=tips)
+
+
+def test_unknown_frames_are_named(baxter: oc.Robot) -> None:
+    with pytest.raises(UnknownNameError, match="unknown frame 'elbow'"):
+        baxter.frame_position(np.zeros(14), "elbow")
+    with pytest.raises(UnknownNameError, match="unknown frame 'elbow'"):
+        oc.Task.position(baxter, frame="elbow")
+    with pytest.raises(UnknownNameError, match="unknown robot function 'frame_position'"):
+        baxter.function("frame_position")
