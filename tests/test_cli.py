@@ -190,7 +190,7 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         ),
         (["fit", "nowhere.urdf"], "cannot read URDF file nowhere.urdf: No such file or directory"),
         (["fit", PANDA, "--tip", "hand"], "unknown frame 'hand'"),
-        (["fit", PANDA], "name the tip frame"),
+        (["fit", str(robot_data("baxter_description/urdf/baxter.urdf"))], "name the tip frame"),
         (["fit", PANDA, "--tip", "panda_hand", "--task", "grasp"], "unknown task 'grasp', known: position"),
         (["fit", PANDA, "--tip", "panda_hand", "--metric", "mass"], "unknown metric 'mass', known: euclidean, inertia"),
         (["fit", PANDA, "--tip", "panda_hand", "--half-width", "9"], "inside its limits"),

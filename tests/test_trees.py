@@ -10,6 +10,8 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, OrthocasError, UnknownNameError
+from orthocas.robots.kinematics import point_jacobian
+from orthocas.simulation.disturbances import place_of
 from orthocas.tools.checks import Array
 
 LEFT, RIGHT = "left_gripper", "right_gripper"
@@ -215,3 +217,33 @@ def test_unknown_frames_are_named(baxter: oc.Robot) -> None:
         oc.Task.position(baxter, frame="elbow")
     with pytest.raises(UnknownNameError, match="unknown robot function 'frame_position'"):
         baxter.function("frame_position")
+
+
+@pytest.mark.parametrize(
+    ("file", "tip"),
+    [
+        ("so_arm_description/urdf/so101.urdf", "gripper_frame_link"),
+        ("so_arm_description/urdf/so100.urdf", "gripper"),
+        ("z1_description/urdf/z1.urdf", "gripperStator"),
+        ("talos_data/robots/talos_left_arm.urdf", "wrist_left_ft_tool_link"),
+        ("panda_description/urdf/panda.urdf", "panda_hand_tcp"),
+        ("finger_edu_description/robots/finger_edu.urdf", "finger_tip_link"),
+    ],
+)
+def test_default_tip_is_no_finger(file: str, tip: str) -> None:
+    robot = oc.Robot.from_urdf(robot_data(file))
+    assert robot.tips == (tip,)
+    assert not any("gripper" in name.lower() or "jaw" in name for name in robot.joint_names)
+
+
+def test_pushes_act_at_frames(baxter: oc.Robot) -> None:
+    """The generalised force of a push is J^T f with the Jacobian of the frame."""
+    place = place_of(baxter.tree, "right_wrist", np.array([0.1, 0.0, 0.0]))
+    tree = baxter.tree
+    q = postures(baxter, 1)[0]
+    symbol = ca.SX.sym("q", baxter.n)
+    J = ca.Function("J", [symbol], [point_jacobian(tree, symbol, place.body, np.array(place.point))])(q)
+    R, whole = baxter.frame_rotation(q, "right_wrist"), baxter.frame_jacobian(q, "right_wrist")
+    arm = R @ [0.1, 0.0, 0.0]
+    moved = whole[:3] + np.cross(whole[3:].T, arm).T
+    np.testing.assert_allclose(np.asarray(J), moved, atol=1e-12)

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from orthocas import problems
@@ -42,7 +43,7 @@ def info(
     """Show a chart file, a named problem, or a robot file."""
     if is_robot_file(target):
         robot = build_robot(target, words)
-        data = {**_robot(robot), **(_branches(robot, None) if branches else {})}
+        data = {**_robot(robot), **_redundancy(robot), **(_branches(robot, None) if branches else {})}
     elif target in problems.names():
         problem = build_problem(target, words)
         data = {**_problem(problem), **(_branches(problem.robot, problem.task) if branches else {})}
@@ -89,8 +90,23 @@ def _robot(robot: Robot) -> dict[str, Any]:
         "velocity_limits": plain(robot.velocity_limits),
         "homes": list(robot.homes),
         "tip": robot.tree.tip_name,
+        **({"tips": list(robot.tips)} if robot.tree.tips else {}),
         "mass_kg": float(robot.tree.masses.sum()),
     }
+
+
+def _redundancy(robot: Robot) -> dict[str, Any]:
+    """The number r = n - m of extra coordinates of each task that has some, and the joints that do not move it."""
+    kinds = ("position", "pose", *(("relative_position", "relative_pose") if len(robot.tips) == 2 else ()))
+    q = robot.tree.middle + 0.1 * np.arange(1, robot.n + 1)  # no posture in which joints happen to be parallel
+    found = {}
+    for kind in kinds:
+        task = Task.named(robot, kind, q)
+        J = task.batched_frame_jacobian(q[None])[0].reshape(task.m, robot.n)
+        if np.linalg.matrix_rank(J) == task.m < robot.n:
+            idle = [name for name, column in zip(robot.joint_names, J.T, strict=True) if not column.any()]
+            found[kind] = f"r = {robot.n - task.m}" + (f", of which {', '.join(idle)} move nothing" if idle else "")
+    return {"extra_coordinates": found}
 
 
 def _branches(robot: Robot, task: Task | None) -> dict[str, Any]:

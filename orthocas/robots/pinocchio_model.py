@@ -8,7 +8,7 @@ from orthocas.robots.spatial import rotation_z_to, snap
 from orthocas.robots.tree import JointKind, KinematicTree
 from orthocas.tools.checks import Array, require_known
 
-_NAMED = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)  # links of URDF, bodies and sites of MJCF
+LINKS = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)  #: links of URDF, bodies and sites of MJCF
 _UNLIMITED = 1e10  # Pinocchio uses the largest double for "no limit"
 
 
@@ -20,7 +20,7 @@ def tree_from_model(model: pin.Model, *tips: str) -> KinematicTree:
         RobotError: if a joint is not revolute, continuous or prismatic. The message names it.
     """
     tip = model.frames[frame_index(model, tips[0])]
-    links = (frame.name for frame in model.frames if frame.type in _NAMED and frame.name.isprintable())
+    links = (frame.name for frame in model.frames if frame.type in LINKS and frame.name.isprintable())
     names = dict.fromkeys(name for name in (*tips, *links) if name != tips[0])
     further = [model.frames[frame_index(model, name)] for name in names]
     axes = [joint_axis(model, i) for i in range(1, model.njoints)]

@@ -14,13 +14,16 @@ import numpy as np
 import pinocchio as pin
 
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.robots.pinocchio_model import frame_index, joint_axis, leader_of, remedy
+from orthocas.robots.pinocchio_model import LINKS, frame_index, joint_axis, leader_of, remedy
 from orthocas.robots.xml import MOST_LINKS, read_xml
 from orthocas.tools.checks import Array, require_known
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _LARGEST, _SHORTEST = 1e20, 1e-12  # of the vector along an axis
 _LATE_LEADER = "parent joint of the mimic joint is not in the kinematic tree"  # what Pinocchio says
+_GRIPPER = re.compile("gripper|finger|jaw", re.IGNORECASE)
+_FINGER = re.compile("finger|jaw", re.IGNORECASE)
+_TOOL = re.compile("tool|tcp|end_?effector|eef|(^|_)ee(_|$)", re.IGNORECASE)
 _WITH_AXIS = ("revolute", "continuous", "prismatic")
 WORLD = "universe"  #: Pinocchio's name for what does not move
 
@@ -263,17 +266,35 @@ def lock_off_chain(model: pin.Model, *tips: str) -> pin.Model:
 
 
 def default_tip(model: pin.Model) -> str:
-    """The last frame of a robot with a single chain.
+    """The end of the arm of a robot with a single chain, apart from joints of a gripper, which is not moved.
+
+    Of the frames there it is the last one that is called a tool or an end effector; otherwise the last one that is no
+    part of a finger.
 
     Raises:
         RobotError: if the robot branches. The message lists the frames to choose from.
     """
-    carriers = {model.parents[i] for i in range(1, model.njoints)}
-    leaves = [i for i in range(1, model.njoints) if i not in carriers]
-    last: dict[int, str] = {i: [frame.name for frame in model.frames if frame.parentJoint == i][-1] for i in leaves}
-    if len(leaves) != 1:
-        raise RobotError(f"the robot has {len(leaves)} chains, name the tip frame: {', '.join(last.values())}")
-    return last[leaves[0]]
+    ids = [i for i in range(1, model.njoints) if not _is_of_gripper(model, i)] or list(range(1, model.njoints))
+    carriers = {model.parents[i] for i in ids}
+    tips = [_end_of(model, i) for i in ids if i not in carriers]
+    if len(tips) != 1:
+        raise RobotError(f"the robot has {len(tips)} chains, name the tip frame: {', '.join(tips)}")
+    return tips[0]
+
+
+def _is_of_gripper(model: pin.Model, i: int) -> bool:
+    """Whether a joint is called after a gripper, or its link after a finger, as are all that it carries."""
+    link = next((frame.name for frame in model.frames if frame.parentJoint == i and frame.type in LINKS), "")
+    own = _GRIPPER.search(model.names[i]) or _FINGER.search(link)
+    return bool(own) and all(_is_of_gripper(model, k) for k in range(i + 1, model.njoints) if model.parents[k] == i)
+
+
+def _end_of(model: pin.Model, i: int) -> str:
+    """The frame of a body that stands for its end."""
+    frames = [frame for frame in model.frames if frame.parentJoint == i]
+    names = [frame.name for frame in frames if frame.type in LINKS] or [frame.name for frame in frames]
+    plain = [name for name in names if not _FINGER.search(name)]
+    return [*names, *plain, *(name for name in plain if _TOOL.search(name))][-1]
 
 
 @contextmanager

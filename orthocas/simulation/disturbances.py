@@ -17,7 +17,7 @@ from orthocas.tools.checks import Array, as_float_array, frozen_array, require_c
 
 _STICTION_SPEED = 0.01  # [rad/s] or [m/s]: above twice this speed, Coulomb friction is nearly at its full value
 
-Link = str | int | None  #: a link, by the name or the index of the joint that moves it; None: the tip
+Link = str | int | None  #: a link, by the joint that moves it (name or index), or a frame by its name; None: the tip
 
 
 class Place(NamedTuple):
@@ -37,6 +37,10 @@ def place_of(tree: KinematicTree, link: Link, point: Array) -> Place:
         x, y, z = tree.tip_translation + tree.tip_rotation @ point
         return Place(tree.tip_parent, (float(x), float(y), float(z)))
     if isinstance(link, str):
+        if link in tree.frame_names:
+            frame = tree.frame(link)
+            x, y, z = frame.translation + frame.rotation @ point
+            return Place(frame.parent, (float(x), float(y), float(z)))
         require_known("link, named by the joint that moves it,", link, tree.joint_names)
         link = tree.joint_names.index(link)
     require_link(link, tree.n)
@@ -62,9 +66,10 @@ class Push:
         duration: [s], > 0.
         force: in world axes, (3,) [N]; default no force.
         torque: at the joints, (n,) [N m] or [N]; default no torque.
-        link: where the force acts: a link, by the name or the index of the joint that moves it; default the tip.
-        point: where on the link, in its frame, or in that of the tip, (3,) [m]. Frames of links are those of
-            `Robot.tree`: the origin is on the joint's axis, which is z.
+        link: where the force acts: a link, by the name or the index of the joint that moves it, or a frame of the robot
+            by its name; default the tip.
+        point: where on the link, in its frame, (3,) [m]. Frames of links are those of `Robot.tree`: the origin is on
+            the joint's axis, which is z.
     """
 
     start: float
