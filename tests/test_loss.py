@@ -351,6 +351,7 @@ def test_volumes_by_lapack_are_those_of_the_expression(identity: bool) -> None:
     J, Z = rng.normal(size=(N, r, n)), np.linalg.qr(rng.normal(size=(N, n, r)))[0]
     J[0, 1] = J[0, 0]  # no volume at all
     J[1] = Z[1].T  # the largest one: no hinge for A = I
+    J[2, 1] = J[2, 0] + 1e-6  # next to a fold
     root = rng.normal(size=(N, n, n))
     A = None if identity else root @ root.transpose(0, 2, 1) + np.eye(n)
     hinges, slopes = volume_hinges(J, Z, A, 0.9)

@@ -345,7 +345,7 @@ def fit(
     Args:
         problem: robot, task, metric and domain.
         parametrisation: the family of coordinates. Default: polynomials of degree 5; of degree 4 for eight joints, or
-            with a bound on mutual angles; of degree 3 for more joints.
+            with a bound on mutual angles; of degree 3 for more joints, and of degree 2 from twelve.
         solver: the minimiser. Default: GaussNewton for families linear in their parameters, QuasiNewton if they have
             more than 300 basis functions or 8 joints, and LBFGS for other families.
         weights: weights of the loss, as `Weights` or as two to five numbers (lambda1, lambda2, ...). The field `angles`

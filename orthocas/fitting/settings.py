@@ -22,6 +22,7 @@ from orthocas.tools.checks import as_number, require_count, require_kind, requir
 Precision = Literal["double", "single"]
 PRECISIONS: tuple[Precision, ...] = ("double", "single")  #: of the large products of a fit
 _MANY_JOINTS = 8  # with more, coordinates are many as well, and the matrix grows with their square
+_DEGREES = ((8, 4), (9, 3), (12, 2))  # joints from which the default degree is lower
 _MANY_TERMS = 300  # where a Gauss-Newton matrix takes longer than ten gradients: degree 4 for seven joints
 _TELLTALE = (20, (0, 1000))  # number and seed of the samples that identify a problem
 _LEAST_BOUND = 1e-6  # deg; rounding hides smaller angles
@@ -108,8 +109,9 @@ class FitSettings:
 
 
 def default_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
-    """Polynomials of degree 5; of degree 4 with a bound or 8 joints, and of degree 3 with more: terms grow too many."""
-    return Polynomial(degree=3 if problem.n > _MANY_JOINTS else 4 if bounded or problem.n > 7 else 5)
+    """Polynomials of degree 5; of 4 with a bound or 8 joints, of 3 with more, of 2 from 12: terms grow too many."""
+    fewer = [degree for joints, degree in _DEGREES if problem.n >= joints]
+    return Polynomial(degree=min(4 if bounded else 5, *fewer, 5))
 
 
 def default_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:

@@ -275,7 +275,8 @@ def suggest_domain(
         leak_deg: largest leak: the root mean square angle, in the metric, between the gradients of the fitted
             coordinates and the space orthogonal to the task [deg]. 8 degrees couple accelerations by sin 8 = 14 %.
         conditioning: smallest conditioning, at samples of which two thirds lie near faces and corners; 0 to 1.
-        parametrisation: the family of the fit. Default: Polynomial(degree=4), of degree 3 for more than 8 joints.
+        parametrisation: the family of the fit. Default: Polynomial(degree=4); of degree 3 for more
+            than 8 joints, and of degree 2 from 12.
         seed: seed of the fit.
         monitor: called with progress.
 

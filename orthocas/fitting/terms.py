@@ -15,6 +15,7 @@ from orthocas.tools.expressions import MOST_ROWS, determinant
 
 REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
 LEAST_CONDITIONING = 0.2  #: that fits aim at on the whole domain
+_NEARLY_FOLDED = 1e-4  # volume below which an inverse loses digits
 _FOLD_VOLUME = 1.6 * LEAST_CONDITIONING  # enough for it: det D <= sqrt(e) times the conditioning
 Angles = Literal["paper", "metric"]
 ANGLES: tuple[Angles, ...] = ("paper", "metric")  #: kinds of angles in the loss
@@ -278,8 +279,7 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
 def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bound: float) -> tuple[Array, Array]:
     """max(bound - det D, 0) of the `gradient_volume` det D, (N,), and its derivative with respect to J_xi, (N, r, n).
 
-    With the cofactors C of D, d(det D)/dv_j = sum_k C_jk z_k / |v_j| - det D A^-1 v_j / |v_j|^2. C comes from the
-    singular values, so it exists at folds too.
+    With the cofactors C of D, d(det D)/dv_j = sum_k C_jk z_k / |v_j| - det D A^-1 v_j / |v_j|^2.
 
     Args:
         J: J_xi, (N, r, n).
@@ -293,13 +293,20 @@ def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bou
     volume = np.linalg.det(D)
     hinges, slopes = np.maximum(bound - volume, 0.0), np.zeros(J.shape)
     active = np.flatnonzero(hinges > 0)
-    U, s, Vt = np.linalg.svd(D[active])
-    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(s.shape[1])], axis=1)
-    cofactors = sign[:, None, None] * (U * others[:, None, :]) @ Vt
-    across = cofactors @ null_basis[active].transpose(0, 2, 1) / lengths[active]
+    across = _cofactors(D[active], volume[active]) @ null_basis[active].transpose(0, 2, 1) / lengths[active]
     slopes[active] = volume[active, None, None] * raised[active] / lengths[active] ** 2 - across
     return hinges, slopes
+
+
+def _cofactors(D: Array, volume: Array) -> Array:
+    """Cofactors of matrices (N, r, r) with these determinants: det D D^-T, or by singular values next to folds."""
+    cofactors, folded = np.empty(D.shape), np.abs(volume) < _NEARLY_FOLDED
+    cofactors[~folded] = volume[~folded, None, None] * np.linalg.inv(D[~folded]).transpose(0, 2, 1)
+    U, s, Vt = np.linalg.svd(D[folded])
+    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(D.shape[1])], axis=1)
+    cofactors[folded] = sign[:, None, None] * (U * others[:, None, :]) @ Vt
+    return cofactors
 
 
 @dataclass(frozen=True)
