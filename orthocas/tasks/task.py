@@ -259,6 +259,7 @@ class Task(Shown, HoldsFunctions):
     @classmethod
     def centre_of_mass(cls, robot: Robot, axes: str = "xyz") -> Self:
         """Centre of mass of all that the joints move, along the given world axes [m]."""
+        require_kind("robot", robot, Robot)
         rows = _rows_of(axes)
         q, name = ca.SX.sym("q", robot.n), f"centre_of_mass:{axes}"
         h = dense_function("h", [q], [robot.centre_of_mass(q)[rows]])
@@ -280,6 +281,8 @@ class Task(Shown, HoldsFunctions):
         Source:
             Lambert's azimuthal equal-area map, as in `axis`.
         """
+        require_kind("robot", robot, Robot)
+        require_kind("camera", camera, str)
         require_known("axis of the camera", axis, tuple("xyz"))
         q, k = ca.SX.sym("q", robot.n), "xyz".index(axis)
         place = target if isinstance(target, str) else frozen_array("target", target, (3,)).tolist()

@@ -206,8 +206,14 @@ def _makers() -> dict[str, Call]:
     column = ca.vertcat
     return {
         "Robot.planar": (oc.Robot.planar, {"lengths": [1.0, 1.0], "masses": [1.0, 2.0]}),
-        "Robot.from_urdf": (oc.Robot.from_urdf, {"path": "no.urdf", "tip": "a", "locked": {"a": 1.0}, "tool": q}),
-        "Robot.from_mjcf": (oc.Robot.from_mjcf, {"path": "no.xml", "tip": "a", "locked": {"a": 1.0}, "tool": q}),
+        "Robot.from_urdf": (
+            oc.Robot.from_urdf,
+            {"path": "no.urdf", "tip": "a", "locked": {"a": 1.0}, "tool": q, "tips": ["a"]},
+        ),
+        "Robot.from_mjcf": (
+            oc.Robot.from_mjcf,
+            {"path": "no.xml", "tip": "a", "locked": {"a": 1.0}, "tool": q, "tips": ["a"]},
+        ),
         "Robot.from_file": (oc.Robot.from_file, {"path": "no.xml", "tip": None}),
         "Robot.from_model": (oc.Robot.from_model, {"model": None, "tip": "tip", "locked": {}}),
         "Robot": (oc.Robot, {"tree": robot.tree, "homes": {"a": q}}),
@@ -247,6 +253,21 @@ def _makers() -> dict[str, Call]:
         "Task.pose": (oc.Task.pose, {"robot": robot, "reference": np.eye(3), "axis": "z"}),
         "Task.axis": (oc.Task.axis, {"robot": robot, "axis": "z", "reference": q}),
         "Task.position_and_axis": (oc.Task.position_and_axis, {"robot": robot, "axis": "z", "reference": q}),
+        "Task.relative_position": (
+            oc.Task.relative_position,
+            {"robot": robot, "base": "tip", "frame": "tip", "axes": "x"},
+        ),
+        "Task.relative_pose": (
+            oc.Task.relative_pose,
+            {"robot": robot, "base": "tip", "frame": "tip", "reference": np.eye(3), "axis": "z"},
+        ),
+        "Task.centre_of_mass": (oc.Task.centre_of_mass, {"robot": robot, "axes": "x"}),
+        "Task.pointing": (oc.Task.pointing, {"robot": robot, "camera": "tip", "target": q, "axis": "x"}),
+        "robot.frame_position": (robot.frame_position, {"q": q, "frame": "tip", "relative_to": "tip"}),
+        "robot.frame_function": (
+            robot.frame_function,
+            {"quantity": "rotation", "frame": "tip", "relative_to": "tip"},
+        ),
         "Task.named": (oc.Task.named, {"robot": robot, "kind": "position:x", "q_reference": q}),
         "Task.custom": (
             oc.Task.custom,
