@@ -22,6 +22,7 @@ from orthocas.bases.circle import Circle as Circle
 from orthocas.bases.cyclic import cyclic_joints as cyclic_joints
 from orthocas.bases.given import Given as Given
 from orthocas.bases.mlp import MLP as MLP
+from orthocas.bases.mobile import Mobile as Mobile
 from orthocas.bases.products import Fourier as Fourier
 from orthocas.bases.products import Linear as Linear
 from orthocas.bases.products import Polynomial as Polynomial

@@ -293,6 +293,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "Fourier": lambda: oc.Fourier(2),
     "network": oc.MLP,
     "circle-valued": lambda: oc.Circle(oc.Fourier(2)),
+    "mobile": lambda: oc.Mobile(oc.Polynomial(2)),
     "SEW": oc.SEW,
     "given coordinates": lambda: given().coordinates.parametrisation,  # type: ignore[attr-defined]
     "solver": solvers.GaussNewton,

@@ -20,6 +20,7 @@ from orthocas.bases.family import (
 )
 from orthocas.bases.given import Given
 from orthocas.bases.mlp import MLP
+from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import Fourier, Linear, Polynomial, ProductFamily, Term
 from orthocas.bases.registry import (
     parametrisation_from_data,
@@ -49,6 +50,7 @@ __all__ = [
     "JointSpace",
     "Linear",
     "LinearFamily",
+    "Mobile",
     "Parametrisation",
     "Polynomial",
     "ProductFamily",

@@ -11,6 +11,7 @@ from orthocas.bases.cyclic import Cyclic, parse_suffix
 from orthocas.bases.family import Parametrisation
 from orthocas.bases.given import Given
 from orthocas.bases.mlp import MLP
+from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import Fourier, Linear, Polynomial
 from orthocas.bases.sew import SEW, SEWKind
 from orthocas.errors import InvalidValueError, NotSavableWarning
@@ -173,4 +174,5 @@ register_parametrisation("fourier", Fourier, lambda text: Fourier(*_degree_and_c
 register_parametrisation("mlp", MLP, _mlp)
 register_parametrisation("sew", SEW, lambda text: SEW(cast(SEWKind, text or "stereographic")))
 register_parametrisation("circle", Circle, lambda text: Circle(parse_parametrisation(text)))
+register_parametrisation("mobile", Mobile, lambda text: Mobile(parse_parametrisation(text)))
 register_parametrisation("given", Given)

@@ -32,6 +32,9 @@ _OPTIONS: dict[str, Any] = {
         str | None,
         typer.Option("--tip", help="Tip frame of a robot file, or LEFT,RIGHT; default: the end of its chain."),
     ],
+    "base": Annotated[
+        str | None, typer.Option("--base", help="Moving base of a robot file: planar, rail:x, rail:y or rail:z.")
+    ],
     "lock": Annotated[
         list[str] | None,
         typer.Option(
@@ -68,7 +71,7 @@ _OPTIONS: dict[str, Any] = {
         ),
     ],
 }  #: command-line options of the fields of `ProblemOptions`
-ROBOT = ("tip", "lock", "tool")
+ROBOT = ("tip", "lock", "tool", "base")
 CHAIN = (*ROBOT, "task", "metric")
 DOMAIN = ("centre", "home", "half_width")
 _NUMBERS = ("task", "mutual", "regularity", "length", "folds")
@@ -102,6 +105,7 @@ class ProblemOptions:
     tip: str | None = None
     lock: tuple[str, ...] = ()
     tool: str | None = None
+    base: str | None = None
     task: str | None = None
     metric: str | None = None
     centre: str | None = None
@@ -115,7 +119,8 @@ class ProblemOptions:
 
     def require_no_robot(self, owner: str) -> None:
         """Raise OptionError if an option describes a robot, because `owner` has its own."""
-        for option, value in (("tip", self.tip), ("lock", ", ".join(self.lock) or None), ("tool", self.tool)):
+        locked = ", ".join(self.lock) or None
+        for option, value in (("tip", self.tip), ("lock", locked), ("tool", self.tool), ("base", self.base)):
             if value is not None:
                 raise OptionError(f"{owner} has its own robot: leave out --{option}")
 
@@ -139,7 +144,7 @@ def build_robot(path: str, options: ProblemOptions) -> Robot:
     """
     tool = None if options.tool is None else parse_numbers("--tool", options.tool)
     tips = [name.strip() for name in (options.tip or "").split(",") if name.strip()]
-    return Robot.from_file(path, None, locked_joints(options.lock), tool, tips=tips)
+    return Robot.from_file(path, None, locked_joints(options.lock), tool, tips=tips, base=options.base)
 
 
 def build_problem(name: str, options: ProblemOptions) -> Problem:

@@ -20,6 +20,7 @@ from orthocas.bases.family import (
     Parametrisation,
     ReorderableFamily,
 )
+from orthocas.bases.mobile import Mobile, anywhere
 from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
@@ -397,6 +398,8 @@ def fit(
     warn_unless_savable(settings.parametrisation)
     if isinstance(settings.parametrisation, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))
+    if isinstance(settings.parametrisation, Mobile):
+        problem = anywhere(problem, settings.parametrisation.base)
     with remembered() as pressed, using_threads(None if threads is None else require_count("threads", threads)):
         result = _fitted(problem, settings, monitor, checkpoint, align_to, start)
         if result.status is Status.INTERRUPTED or pressed():

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
+from orthocas.robots.tree import BASE_JOINTS
 from orthocas.robots.xml import read_xml
 from orthocas.tools.checks import Array
 from orthocas.tools.csv_table import column_places, read_table
@@ -59,10 +60,11 @@ def model_states(model: pin.Model) -> States:
 
 
 def postures(states: Mapping[str, Mapping[str, float]], joint_names: Sequence[str]) -> dict[str, Array]:
-    """States as joint positions (n,). States that lack a joint are skipped."""
+    """States as joint positions (n,), with a moving base at 0. States that lack another joint are skipped."""
+    placed = {name: {**dict.fromkeys(BASE_JOINTS, 0.0), **joints} for name, joints in states.items()}
     return {
         name: np.array([joints[joint] for joint in joint_names])
-        for name, joints in states.items()
+        for name, joints in placed.items()
         if all(joint in joints for joint in joint_names)
     }
 

@@ -5,15 +5,15 @@ import pinocchio as pin
 
 from orthocas.errors import RobotError
 from orthocas.robots.spatial import rotation_z_to, snap
-from orthocas.robots.tree import JointKind, KinematicTree
+from orthocas.robots.tree import JointKind, KinematicTree, on_moving_base
 from orthocas.tools.checks import Array, require_known
 
 LINKS = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)  #: links of URDF, bodies and sites of MJCF
 _UNLIMITED = 1e10  # Pinocchio uses the largest double for "no limit"
 
 
-def tree_from_model(model: pin.Model, *tips: str) -> KinematicTree:
-    """Read joints, bodies, limits, tips and links from a Pinocchio model.
+def tree_from_model(model: pin.Model, *tips: str, base: str | None = None) -> KinematicTree:
+    """Read joints, bodies, limits, tips and links from a Pinocchio model, whose base may move; see `on_moving_base`.
 
     Raises:
         UnknownNameError: if there is no frame with the name of a tip.
@@ -30,7 +30,7 @@ def tree_from_model(model: pin.Model, *tips: str) -> KinematicTree:
     rotations = [snap(across @ place.rotation) for across, place in placed]
     translations = [across @ place.translation for across, place in placed]
     continuous = [model.joints[i].nq == 2 for i in bodies]
-    return KinematicTree(
+    tree = KinematicTree(
         joint_names=tuple(model.names[i] for i in bodies),
         joint_kinds=tuple(kind for kind, _ in axes),
         parents=tuple(model.parents[i] - 1 for i in bodies),
@@ -57,6 +57,8 @@ def tree_from_model(model: pin.Model, *tips: str) -> KinematicTree:
         frame_rotations=np.array(rotations[1:]).reshape(-1, 3, 3),
         frame_translations=np.array(translations[1:]).reshape(-1, 3),
     )
+    own = model.inertias[0]  # links that no joint of the file moves
+    return tree if base is None else on_moving_base(tree, base, own.mass, own.lever, own.inertia)
 
 
 def frame_index(model: pin.Model, name: str) -> int:

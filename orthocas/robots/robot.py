@@ -39,7 +39,7 @@ FrameQuantity = Literal["position", "rotation", "jacobian"]
 
 
 class Robot(Shown):
-    """A fixed-base robot with n revolute or prismatic joints, one or more tip frames, and further frames by name.
+    """A robot with n revolute or prismatic joints, one or more tip frames, and further frames by name.
 
     Methods take CasADi columns (n, 1), SX or MX, and return the same kind. Or they take NumPy arrays, one state (n,) or
     a set (N, n), and return NumPy arrays. Positions are in rad or m, velocities in rad/s or m/s, forces in N m or N.
@@ -67,7 +67,13 @@ class Robot(Shown):
 
     @classmethod
     def from_model(
-        cls, model: pin.Model, tip: str | None = None, locked: Locked = None, *, tips: Sequence[str] = ()
+        cls,
+        model: pin.Model,
+        tip: str | None = None,
+        locked: Locked = None,
+        *,
+        tips: Sequence[str] = (),
+        base: str | None = None,
     ) -> Self:
         """Build from a Pinocchio model, with all its joints.
 
@@ -76,6 +82,7 @@ class Robot(Shown):
             tip: name of any frame of the model. Default: the last frame of a robot with a single chain.
             tips: names of several frames, such as two hands, in place of `tip`.
             locked: joints to lock, with their positions [rad] or [m].
+            base: as in `from_file`.
 
         Raises:
             UnknownNameError: if the frame or a locked joint does not exist.
@@ -85,7 +92,7 @@ class Robot(Shown):
         names = _names(tip, tips) or (urdf.default_tip(model),)
         for name in names:
             frame_index(model, name)
-        tree = tree_from_model(urdf.lock_joints(model, locked or {}), *names)
+        tree = tree_from_model(urdf.lock_joints(model, locked or {}), *names, base=base)
         return cls(tree, postures(model_states(model), tree.joint_names))
 
     @classmethod
@@ -97,6 +104,7 @@ class Robot(Shown):
         tool: Tool = None,
         *,
         tips: Sequence[str] = (),
+        base: str | None = None,
     ) -> Self:
         """Build the joints that move the tips from a robot file: MJCF if its name ends in .xml, otherwise URDF.
 
@@ -110,6 +118,9 @@ class Robot(Shown):
                 mimic them follow. A floating, spherical or planar joint is locked at its neutral position, given as 0.
             tool: pose of the tip of a massless tool in the (first) tip frame; see `with_tool`.
             tips: names of several frames, such as two hands, in place of `tip`.
+            base: "planar" for a base that slides along the world's x and y and turns about z, by the joints base_x,
+                base_y, base_heading; or "rail:x", "rail:y", "rail:z". They come first, and have no limits. Default: a
+                fixed base.
 
         Raises:
             RobotError: if the file cannot be read, the robot branches and no tip is given, or a joint on the chain to
@@ -117,7 +128,7 @@ class Robot(Shown):
             UnknownNameError: if the frame or a locked joint does not exist.
         """
         build = cls.from_mjcf if as_path("path", path).suffix.lower() == ".xml" else cls.from_urdf
-        return build(path, tip, locked, tool, tips=tips)
+        return build(path, tip, locked, tool, tips=tips, base=base)
 
     @classmethod
     def from_urdf(
@@ -128,22 +139,30 @@ class Robot(Shown):
         tool: Tool = None,
         *,
         tips: Sequence[str] = (),
+        base: str | None = None,
     ) -> Self:
         """Build the joints that move the tips from a URDF file; see `from_file`."""
         file = as_path("path", path)
         names = _names(tip, tips)
-        robot = cls._chain(urdf.read_urdf(file, names, locked), names, locked, tool)
+        robot = cls._chain(urdf.read_urdf(file, names, locked), names, locked, tool, base)
         return cls(robot.tree, postures(srdf_states(file), robot.joint_names))
 
     @classmethod
     def from_mjcf(
-        cls, path: Any, tip: str | None = None, locked: Locked = None, tool: Tool = None, *, tips: Sequence[str] = ()
+        cls,
+        path: Any,
+        tip: str | None = None,
+        locked: Locked = None,
+        tool: Tool = None,
+        *,
+        tips: Sequence[str] = (),
+        base: str | None = None,
     ) -> Self:
         """Build the joints that move the tips from a MuJoCo MJCF file, or from a `mujoco.MjModel`; see `from_file`.
 
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
-        return cls._chain(model_from_mjcf(path), _names(tip, tips), locked, tool)
+        return cls._chain(model_from_mjcf(path), _names(tip, tips), locked, tool, base)
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
@@ -197,10 +216,10 @@ class Robot(Shown):
         return self.homes[name]
 
     @classmethod
-    def _chain(cls, model: pin.Model, tips: tuple[str, ...], locked: Locked, tool: Tool) -> Self:
+    def _chain(cls, model: pin.Model, tips: tuple[str, ...], locked: Locked, tool: Tool, base: str | None) -> Self:
         """The robot of the joints that move the tips, without those that the user locks."""
         tips = tips or (urdf.default_tip(model),)
-        robot = cls.from_model(urdf.lock_off_chain(urdf.lock_joints(model, locked or {}), *tips), tips=tips)
+        robot = cls.from_model(urdf.lock_off_chain(urdf.lock_joints(model, locked or {}), *tips), tips=tips, base=base)
         return robot if tool is None else robot.with_tool(tool)
 
     @property

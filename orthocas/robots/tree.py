@@ -1,7 +1,7 @@
 """The numbers of a kinematic tree: Pinocchio's robot as plain data, which chart files store."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -229,3 +229,80 @@ class KinematicTree:
     def prismatic(self) -> tuple[bool, ...]:
         """Whether each joint is prismatic."""
         return tuple(kind == "prismatic" for kind in self.joint_kinds)
+
+
+_PLANAR = "planar"
+_RAIL = "rail:"
+_BASES = (_PLANAR, *(f"{_RAIL}{axis}" for axis in "xyz"))
+BASE_JOINTS = ("base_x", "base_y", "base_z", "base_heading")  #: that a moving base may have
+
+
+def on_moving_base(tree: KinematicTree, base: str, mass: float, centre: Array, inertia: Array) -> KinematicTree:
+    """A tree whose base slides along the world's x and y and turns about z, or slides along one axis.
+
+    The joints base_x, base_y, base_heading come first, without limits.
+
+    Args:
+        tree: the robot on a fixed base.
+        base: "planar", or "rail:x", "rail:y", "rail:z".
+        mass: of what the base carries and no joint of the robot moves [kg].
+        centre: its centre of mass, (3,) [m].
+        inertia: about that centre, (3, 3) [kg m^2].
+
+    Raises:
+        InvalidValueError: for another kind of base.
+        RobotError: if the robot has joints of these names.
+    """
+    if base not in _BASES:
+        wanted = (
+            f"one of {', '.join(_BASES)}. The place of wheels that cannot slide sideways is no function of joints: "
+        )
+        raise InvalidValueError("base", repr(base)[:80], wanted + "use planar, and let the base follow the motion")
+    axes = "xy" if base == _PLANAR else base.removeprefix(_RAIL)
+    names = [f"base_{axis}" for axis in axes] + (["base_heading"] if base == _PLANAR else [])
+    kinds: list[JointKind] = ["prismatic"] * len(axes)
+    along = [np.roll(np.eye(3), 2 - "xyz".index(axis), axis=1) for axis in axes]  # z becomes the axis
+    if base == _PLANAR:
+        kinds, along = [*kinds, "revolute"], [*along, np.eye(3)]
+    k, back = len(names), along[-1].T  # from the world's axes to those of the last body
+    free, first = np.full(k, np.inf), np.zeros((k, 3))
+
+    def carried(body: int) -> int:
+        return body + k
+
+    def seen(rotations: Array, translations: Array, parents: tuple[int, ...]) -> tuple[Array, Array]:
+        """Frames of the base in axes of the last body that moves it."""
+        on_base = np.array([parent < 0 for parent in parents], dtype=bool)
+        turned = np.where(on_base[:, None, None], back @ rotations, rotations)
+        return turned, np.where(on_base[:, None], translations @ back.T, translations)
+
+    rotations, translations = seen(tree.rotations, tree.translations, tree.parents)
+    frames, places = seen(tree.frame_rotations, tree.frame_translations, tree.frame_parents)
+    (tip,), (place,) = seen(tree.tip_rotation[None], tree.tip_translation[None], (tree.tip_parent,))
+    steps = [along[i - 1].T @ along[i] if i else along[i] for i in range(k)]
+    bodies = np.zeros((k, 3, 3))
+    bodies[-1] = back @ inertia @ back.T
+    centres = first.copy()
+    centres[-1] = back @ centre
+    return replace(
+        tree,
+        joint_names=(*names, *tree.joint_names),
+        joint_kinds=(*kinds, *tree.joint_kinds),
+        parents=(*range(-1, k - 1), *map(carried, tree.parents)),
+        rotations=np.concatenate([steps, rotations]),
+        translations=np.concatenate([first, translations]),
+        masses=np.concatenate([np.zeros(k - 1), [mass], tree.masses]),
+        centres=np.concatenate([centres, tree.centres]),
+        inertias=np.concatenate([bodies, tree.inertias]),
+        armatures=np.concatenate([np.zeros(k), tree.armatures]),
+        lower=np.concatenate([-free, tree.lower]),
+        upper=np.concatenate([free, tree.upper]),
+        effort_limits=np.concatenate([free, tree.effort_limits]),
+        velocity_limits=np.concatenate([free, tree.velocity_limits]),
+        tip_parent=carried(tree.tip_parent),
+        tip_rotation=tip,
+        tip_translation=place,
+        frame_parents=tuple(map(carried, tree.frame_parents)),
+        frame_rotations=frames,
+        frame_translations=places,
+    )

@@ -124,7 +124,7 @@ def _of_many_joints(original: Path, rng: Rng) -> bytes:
         header["coordinates"]["settings"] = pick(
             rng, ({"degree": huge}, {"hidden": [huge, huge]}, {"hidden": [2] * 10**5})
         )
-        header["coordinates"]["parametrisation"] = pick(rng, ("Polynomial", "Fourier", "MLP", "Circle"))
+        header["coordinates"]["parametrisation"] = pick(rng, ("Polynomial", "Fourier", "MLP", "Circle", "Mobile"))
         return packed(sealed(header, arrays))
     n = int(pick(rng, (20, 150, 1000, 10**5)))
     robot = oc.Robot.planar([1.0] * min(n, 150), [1.0] * min(n, 150)).tree

@@ -228,6 +228,7 @@ def _makers() -> dict[str, Call]:
         "Polynomial": (oc.Polynomial, {"degree": 2, "cyclic": ["q1"]}),
         "Fourier": (oc.Fourier, {"degree": 2, "cyclic": "auto"}),
         "MLP": (oc.MLP, {"hidden": (3, 3), "raw": True}),
+        "Mobile": (oc.Mobile, {"arm": oc.Polynomial(1), "base": ("a", "b", "c")}),
         "Circle": (oc.Circle, {"pairs": oc.Fourier(1)}),
         "SEW": (oc.SEW, {"kind": "stereographic"}),
         "Linear": (oc.Linear, {"base": (0.1, 0.2, 0.3), "normals": "orthonormal"}),
