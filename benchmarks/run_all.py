@@ -46,6 +46,7 @@ SCRIPTS = (
     "control_tick",
     "supervised_tick",
     "inverse",
+    "exported_inverse",
     "default_gains",
     "safety",
     "frozen_sensors",
