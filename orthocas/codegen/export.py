@@ -14,6 +14,8 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.codegen.export_forms import Form, form_of, function_code
 from orthocas.codegen.export_inverse import inverse_forms, statuses
+from orthocas.codegen.export_law import TORQUE_LAWS, law_form
+from orthocas.control.operational_space import Impedance, PDPlus
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.tools.checks import Array, as_path, require_kind, require_known
 from orthocas.tools.files import published, require_replaceable, require_writable
@@ -81,15 +83,18 @@ with torch.inference_mode(False):  # what is made in that mode has no derivative
 }
 
 
-def export(chart: Chart, to: str, path: str | Path, force: bool = False) -> Path:
+def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: bool = False) -> Path:
     """Write a chart as a Python module that needs one library only: "numpy", "torch" or "jax".
 
     The module has the functions `task`, `xi`, `phi` and `jacobian` of joint positions (n,) or (N, n), as a chart does,
     and `inverse` of phi from given starts. Numbers are those of the chart to rounding. With PyTorch and JAX they are
     differentiable, run on GPUs, and keep the precision of q; see docs/batches.md.
 
+    For `control.PDPlus` and `control.Impedance`, and PyTorch or JAX, the module of the law's chart also has `command`,
+    the torques of the law with their status.
+
     Args:
-        chart: a chart with a closed expression.
+        chart: a chart with a closed expression, or one of these laws on such a chart.
         to: the library.
         path: the file to write, NAME.py. It replaces an exported module of that name.
         force: replace any other file too.
@@ -100,7 +105,8 @@ def export(chart: Chart, to: str, path: str | Path, force: bool = False) -> Path
     Raises:
         NoExpressionError: if the chart is grown. `orthocas.distil` fits an expression to it.
         UnknownNameError: if there is no such library.
-        InvalidValueError: if the path is not that of a module, or has the name of the library.
+        InvalidValueError: if the path is not that of a module, or has the name of the library; for laws with inputs at
+            run time, and for laws with NumPy.
         ArchiveError: if the file cannot be written, or there is one that was not exported.
 
     Example:
@@ -112,7 +118,8 @@ def export(chart: Chart, to: str, path: str | Path, force: bool = False) -> Path
         ...     oc.export(chart, "torch", f"{folder}/arm.py").name
         'arm.py'
     """
-    require_kind("chart", chart, Chart)
+    if not isinstance(chart, TORQUE_LAWS):
+        require_kind("chart", chart, Chart)
     require_known("library", to, LIBRARIES)
     target = as_path("path", path)
     if target.suffix != ".py" or not target.stem.isidentifier() or target.stem in LIBRARIES:
@@ -128,10 +135,15 @@ def export(chart: Chart, to: str, path: str | Path, force: bool = False) -> Path
     return target
 
 
-def module_text(chart: Chart, to: str) -> str:
+def module_text(chart: Chart | Impedance | PDPlus, to: str) -> str:
     """The module as text."""
+    laws = []
+    if isinstance(chart, TORQUE_LAWS):
+        if to == "numpy":
+            raise InvalidValueError("library", "'numpy'", "'torch' or 'jax' for a law, which differentiates")
+        laws, chart = [law_form(chart)], chart.chart
     library, form, task = LIBRARIES[to], form_of(chart), chart.problem.task
-    others = inverse_forms(chart)
+    others = [*inverse_forms(chart), *laws]
     forms = [form, *others]
     parts = {
         "helpers": _template(to),
