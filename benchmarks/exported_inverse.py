@@ -52,7 +52,7 @@ def of_jax(module: Any, phi: Array, starts: Array) -> Solver:
     parts = [[jax.numpy.asarray(rows[k::PARTS]) for rows in (phi, starts)] for k in range(PARTS)]
 
     def solve() -> tuple[Any, Any]:
-        found = jax.block_until_ready([compiled(*part) for part in parts])
+        found = [jax.block_until_ready(compiled(*part)) for part in parts]
         return tuple(
             np.stack(column, axis=1).reshape(phi.shape[: column[0].ndim]) for column in zip(*found, strict=True)
         )

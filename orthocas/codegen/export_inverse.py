@@ -72,7 +72,8 @@ def _clear(chart: Chart, clear: SingularBound, fold: FoldBound | None) -> Form:
         "and_regular": "" if fold is None else ", and the coordinates do not fold",
         "fold": "" if fold is None else " & _is_regular(q, rows)",
     }
-    return Form("clear", values, code, {"row_scale": clear.scale[:, None]}, {})
+    tables = {"row_scale": clear.scale[:, None], "unit": np.eye(chart.m)}
+    return Form("clear", values, code, tables, {})
 
 
 def _unfolded(chart: Chart, fold: FoldBound) -> Form:
