@@ -53,6 +53,7 @@ SCRIPTS = (
     "following",
     "operational_space",
     "redundancy_peers",
+    "xi_in_qp",
     "metric_loss",
     "against_torch",
     "paper_network",
