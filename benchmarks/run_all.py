@@ -54,6 +54,7 @@ SCRIPTS = (
     "operational_space",
     "redundancy_peers",
     "xi_in_qp",
+    "random_walk",
     "metric_loss",
     "against_torch",
     "paper_network",
