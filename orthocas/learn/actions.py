@@ -94,7 +94,8 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         return wanted
 
     def _here(self) -> Array:
-        return np.asarray(self._positions(self.env), dtype=float)[self._joints]
+        positions: Array = np.asarray(self._positions(self.env), dtype=float)[self._joints]
+        return positions
 
     def _observed(self, observation: Array) -> Array:
         """An observation with xi and the distance to the boundary."""
