@@ -91,7 +91,9 @@ def charts() -> dict[str, oc.Chart]:
 def main(quick: bool = False) -> dict[str, float]:
     """Print a table, and return its numbers."""
     count, found = 1_000 if quick else 50_000, {}
-    header = "| chart | library | rows a second | us of a core a row | other status | largest difference [rad] |"
+    header = (
+        "| chart | library | rows a second | time of a core, a row [us] | other status | largest difference [rad] |"
+    )
     print(f"{header}\n| --- | --- | --- | --- | --- | --- |")
     with TemporaryDirectory() as folder:
         for name, chart in charts().items():
@@ -110,7 +112,10 @@ def main(quick: bool = False) -> dict[str, float]:
                     flush=True,
                 )
                 case = f"{name}, {library}"
-                found |= {f"{case}, rows a second": count / wall, f"{case}, us of a core a row": cpu / count * 1e6}
+                found |= {
+                    f"{case}, rows a second": count / wall,
+                    f"{case}, time of a core, a row [us]": cpu / count * 1e6,
+                }
                 found |= {f"{case}, other status": others, f"{case}, difference [rad]": worst}
             for library in SOLVERS:
                 Path(folder, f"arm_{library}.py").unlink(missing_ok=True)
