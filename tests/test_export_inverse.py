@@ -96,6 +96,7 @@ def require_same(found: tuple[Any, Any], chart: oc.Chart, phi: Array, starts: Ar
     np.testing.assert_allclose(q[solved], known.q[solved], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHARTS)
 def test_inverse_has_the_answers_of_the_chart(tmp_path: Path, name: str) -> None:
     chart = CHARTS[name]()
@@ -130,6 +131,7 @@ def test_limits_of_joints_are_told(tmp_path: Path) -> None:
     assert module.inverse(chart.phi(q), q)[1] == LIMIT == chart.solve(chart.phi(q), q).status[0]
 
 
+@pytest.mark.slow
 def test_poses_beyond_half_a_turn(tmp_path: Path) -> None:
     """Orientations near half a turn from the reference, where the components of x jump: against the pose itself."""
     chart = pose()

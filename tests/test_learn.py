@@ -66,6 +66,7 @@ def test_random_walks_break_no_joint_limit(name: str) -> None:
     assert np.ptp(q[-5000:], axis=0).max() > 0.05
 
 
+@pytest.mark.slow
 def test_an_action_moves_one_coordinate_with_the_tool_at_rest() -> None:
     """Against MuJoCo's kinematics; observations are those of the environment with xi and the room to the boundary."""
     chart = oc.fit(oc.problems.get("iiwa"), oc.Polynomial(2), samples=500).chart
