@@ -84,7 +84,7 @@ def test_python_blocks_of_the_page_on_batches_run(run: Run, tmp_path: Path) -> N
     page = (ROOT / "docs" / "batches.md").read_text()
     code = "\n".join(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL))
     printed = python(f"{code}\nchart.save('arm.orthocas')", tmp_path).splitlines()
-    assert printed == ["(100000, 3) (100000, 3, 3)", "True ('x', 'y', 'xi1')", "True"]
+    assert printed == ["(100000, 3) (100000, 3, 3)", "True ('x', 'y', 'xi1')", "True", "True True"]
     (line,) = re.findall(r"```sh\n(.*?)\n```", page, flags=re.DOTALL)
     assert run(*shlex.split(line)[1:])[0] == 0
     assert "import torch" in (tmp_path / "arm.py").read_text()

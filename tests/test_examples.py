@@ -12,6 +12,7 @@ import compare_parametrisations
 import distillation
 import domain_size
 import elbow_angle
+import exported_inverse
 import fits
 import folds
 import follow_path
@@ -33,6 +34,7 @@ import starts
 import suggested_domains
 import supervised_tick
 import wide_charts
+import xi_in_qp
 from paper.registry import FIGURES
 from PIL import Image
 from programs import needs_c
@@ -266,6 +268,21 @@ def test_benchmarks_of_networks_and_starts_print_rows(capsys: pytest.CaptureFixt
 def test_benchmark_of_batches_prints_rows() -> None:
     rows = batches.main(quick=True)
     assert [row.split("|")[1].strip() for row in rows[:3]] == ["orthocas", "NumPy, float64", "NumPy, float32"]
+
+
+@pytest.mark.slow
+def test_benchmark_of_exported_inverses_finds_the_answers_of_the_chart() -> None:
+    found = exported_inverse.main(quick=True)
+    assert found["panda, pose, wide, numpy, difference [rad]"] < 1e-9
+    assert found["iiwa, position, degree 4, numpy, other status"] == 0
+
+
+@pytest.mark.slow
+def test_benchmark_of_xi_in_a_quadratic_program_leaves_the_tool_alone() -> None:
+    pytest.importorskip("pink", reason="pink is in the extra `peers`")
+    found = xi_in_qp.main(quick=True)
+    assert found["xi, cost 0.1, error [m]"] < 2e-5 < found["posture, cost 0.1, error [m]"]
+    assert found["xi, cost 0.1, drift [rad]"] < 1e-5 < found["none, drift [rad]"]
 
 
 def test_gradients_agree_with_pytorch() -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -126,6 +126,16 @@ class RegularPart(ClearBox):
         points, single = as_point_set("q", q, len(self.centre))
         values: NDArray[np.float64] = self.orientation * self._batched_volume(points)[0][:, 0]
         return values[0] if single else values
+
+    @property
+    def fold_bound(self) -> Self:
+        """Itself."""
+        return self
+
+    @property
+    def gradients(self) -> ca.Function:
+        """q (n, 1) -> J_xi (r, n)."""
+        return self.coordinates.functions["jacobian"]
 
     @property
     def pivots(self) -> ca.Function:

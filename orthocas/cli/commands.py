@@ -22,7 +22,7 @@ COMMANDS = {
     "simulate": "Run a controller in a chart's coordinates; write the run, pictures, an animation and a report.",
     "follow": "Follow a tool path; write joint positions, velocities and accelerations on time stamps.",
     "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",
-    "export": "Write task, xi, phi and Jacobian of a chart as one Python module that needs the library only.",
+    "export": "Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only.",
     "view": "Show a chart, an atlas, a robot or a motion in the browser, until Ctrl-C.",
     "charts": "List the ready charts of known arms, show the card of one, or write it to a file.",
 }  #: names of our own commands, modules of this package, and the first lines of their help

@@ -18,10 +18,10 @@ def export(
     force: Force = False,
     json: AsJson = False,
 ) -> None:
-    """Write task, xi, phi and Jacobian of a chart as one Python module that needs the library only."""
+    """Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only."""
     loaded = Chart.load(chart)
     module = export_chart(loaded, to, out, force)
     if json:
         print_json({"module": str(module), "library": to, "joints": loaded.n, "labels": list(loaded.labels)})
     else:
-        print_rows({"module": f"{module}, with {to} alone", "functions": "task, xi, phi, jacobian"})
+        print_rows({"module": f"{module}, with {to} alone", "functions": "task, xi, phi, jacobian, inverse"})

@@ -12,7 +12,10 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
-from orthocas.codegen.export_forms import form_of, function_code
+from orthocas.codegen.export_forms import Form, form_of, function_code
+from orthocas.codegen.export_inverse import inverse_forms, statuses
+from orthocas.codegen.export_law import TORQUE_LAWS, law_form
+from orthocas.control.operational_space import Impedance, PDPlus
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.tools.checks import Array, as_path, require_kind, require_known
 from orthocas.tools.files import published, require_replaceable, require_writable
@@ -33,6 +36,7 @@ class Library:
     erf: tuple[str, str]  #: its error function, and what that imports
     constants: str
     note: str
+    tables: str = ""  #: what is made of the numbers when the module is imported
 
     def code(self, text: str) -> str:
         """Code for NumPy as code for this library."""
@@ -62,11 +66,16 @@ LIBRARIES = {
         erf=("torch.erf", "import torch"),
         constants="ROWS = 8192  # joint positions at once, so that memory stays bounded; raise it on a GPU\n",
         note="q is a floating-point tensor. Results have its precision and device, and are differentiable.",
+        tables="""
+with torch.inference_mode(False):  # what is made in that mode has no derivatives later
+    _TABLES = {name: _numbers(*parts) for name, parts in _NUMBERS.items()}
+    _TABLES |= {name: torch.tensor(values, dtype=torch.int64) for name, values in _INDICES.items()}
+""",
     ),
     "jax": Library(
         title="JAX",
         prefix="jnp",
-        imports=(*_COMMON, "", "import jax.numpy as jnp", "import numpy"),
+        imports=(*_COMMON, "", "import jax", "import jax.numpy as jnp", "import numpy"),
         erf=("jax.scipy.special.erf", "import jax"),
         constants="",
         note="Results have the precision of q, and are differentiable; `jax_enable_x64` allows double precision.",
@@ -74,15 +83,18 @@ LIBRARIES = {
 }
 
 
-def export(chart: Chart, to: str, path: str | Path, force: bool = False) -> Path:
+def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: bool = False) -> Path:
     """Write a chart as a Python module that needs one library only: "numpy", "torch" or "jax".
 
-    The module has the functions `task`, `xi`, `phi` and `jacobian` of joint positions (n,) or (N, n), as a chart does.
-    Its numbers are those of the chart to rounding. With PyTorch and JAX they are differentiable, run on GPUs, and keep
-    the precision of q; see docs/batches.md.
+    The module has the functions `task`, `xi`, `phi` and `jacobian` of joint positions (n,) or (N, n), as a chart does,
+    and `inverse` of phi from given starts. Numbers are those of the chart to rounding. With PyTorch and JAX they are
+    differentiable, run on GPUs, and keep the precision of q; see docs/batches.md.
+
+    For `control.PDPlus` and `control.Impedance`, and PyTorch or JAX, the module of the law's chart also has `command`,
+    the torques of the law with their status.
 
     Args:
-        chart: a chart with a closed expression.
+        chart: a chart with a closed expression, or one of these laws on such a chart.
         to: the library.
         path: the file to write, NAME.py. It replaces an exported module of that name.
         force: replace any other file too.
@@ -93,7 +105,8 @@ def export(chart: Chart, to: str, path: str | Path, force: bool = False) -> Path
     Raises:
         NoExpressionError: if the chart is grown. `orthocas.distil` fits an expression to it.
         UnknownNameError: if there is no such library.
-        InvalidValueError: if the path is not that of a module, or has the name of the library.
+        InvalidValueError: if the path is not that of a module, or has the name of the library; for laws with inputs at
+            run time, and for laws with NumPy.
         ArchiveError: if the file cannot be written, or there is one that was not exported.
 
     Example:
@@ -105,7 +118,8 @@ def export(chart: Chart, to: str, path: str | Path, force: bool = False) -> Path
         ...     oc.export(chart, "torch", f"{folder}/arm.py").name
         'arm.py'
     """
-    require_kind("chart", chart, Chart)
+    if not isinstance(chart, TORQUE_LAWS):
+        require_kind("chart", chart, Chart)
     require_known("library", to, LIBRARIES)
     target = as_path("path", path)
     if target.suffix != ".py" or not target.stem.isidentifier() or target.stem in LIBRARIES:
@@ -121,17 +135,25 @@ def export(chart: Chart, to: str, path: str | Path, force: bool = False) -> Path
     return target
 
 
-def module_text(chart: Chart, to: str) -> str:
+def module_text(chart: Chart | Impedance | PDPlus, to: str) -> str:
     """The module as text."""
+    laws = []
+    if isinstance(chart, TORQUE_LAWS):
+        if to == "numpy":
+            raise InvalidValueError("library", "'numpy'", "'torch' or 'jax' for a law, which differentiates")
+        laws, chart = [law_form(chart)], chart.chart
     library, form, task = LIBRARIES[to], form_of(chart), chart.problem.task
+    others = [*inverse_forms(chart), *laws]
+    forms = [form, *others]
     parts = {
         "helpers": _template(to),
-        "coordinates": f"{_filled(_template(form.template), form.values)}\n\n{form.functions}",
+        "coordinates": _text(form),
         "task": function_code("_task", "Task values, (m, N), of columns q (n, N).", task.function)
         + "\n\n"
         + function_code("_task_slopes", "Entries of their Jacobian row by row, (m n, N).", task.jacobian_function),
-        "numbers": "\n".join(_numbers(name, table) for name, table in form.tables.items()),
-        "indices": "\n".join(_indices(name, values) for name, values in form.indices.items()),
+        "inverse": "\n\n\n".join(_text(other).strip("\n") for other in others),
+        "numbers": "\n".join(_numbers(name, table) for one in forms for name, table in one.tables.items()),
+        "indices": "\n".join(_indices(name, values) for one in forms for name, values in one.indices.items()),
     }
     code = {name: library.code(part.strip("\n")) for name, part in parts.items()}
     values = {**code, **_facts(chart, library), "imports": library.imports_for("".join(code.values()))}
@@ -146,14 +168,21 @@ def _facts(chart: Chart, library: Library) -> dict[str, str]:
         "library": library.title,
         "note": library.note,
         "constants": library.constants,
+        "tables": library.tables.rstrip(),
         "names": f"{problem.name!a}, {chart.coordinates.label!a}",
         "fingerprint": fingerprint(problem, chart.coordinates),
         "joints": ascii(problem.robot.joint_names),
         "labels": ascii(chart.labels),
         "units": ascii(problem.task.units),
         "centre": repr(tuple(problem.domain.centre.tolist())),
+        "statuses": statuses(),
         "half_width": repr(tuple(problem.domain.half_width.tolist())),
     }
+
+
+def _text(form: Form) -> str:
+    """The functions of a form."""
+    return f"{_filled(_template(form.template), form.values)}\n\n{form.functions}"
 
 
 def _numbers(name: str, table: Array) -> str:

@@ -10,6 +10,7 @@ from orthocas.control.reference import Reference
 from orthocas.control.registry import law_names, law_of, register
 from orthocas.control.run_time_model import RunTimeModel
 from orthocas.control.safety import Safety
+from orthocas.control.xi_task import XiTask
 
 __all__ = [
     "ControlStatus",
@@ -26,6 +27,7 @@ __all__ = [
     "RunTimeModel",
     "Safety",
     "Setting",
+    "XiTask",
     "joint_path",
     "law_names",
     "law_of",

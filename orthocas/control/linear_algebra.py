@@ -14,9 +14,9 @@ from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.expressions import WRITTEN_OUT
 
 LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
-_ROUNDS = 8  # accurate to rounding up to a condition number of 1e6 (tests/test_control_algebra.py)
+ROUNDS = 8  #: accurate to rounding up to a condition number of 1e6 (tests/test_control_algebra.py)
 _SAMPLES, _SEED = 256, 0
-_SOFTEST = 1e-6  # smallest squared frequency in double_diagonal, relative to the largest: K_i = 0 divides by zero
+SOFTEST = 1e-6  #: smallest squared frequency in double_diagonal, relative to the largest: K_i = 0 divides by zero
 
 
 def spd_inverse(matrix: Expression) -> tuple[Any, Any]:
@@ -69,7 +69,7 @@ def square_root(matrix: Expression) -> Expression:
     if k == 1:
         return ca.sqrt(matrix)
     root, product = matrix, matrix
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         root, product = _newton_round(k)(root, product)
     return root
 
@@ -160,7 +160,7 @@ def _not_too_soft(stiffness: Expression, inertia: Expression) -> Expression:
     Squared frequencies K_i / M_ii are at least 1e-6 of the largest one, and 1e-12 1/s^2.
     """
     mass = ca.diag(inertia)
-    floor = mass * ca.fmax(_SOFTEST * ca.mmax(stiffness / mass), _SOFTEST**2)
+    floor = mass * ca.fmax(SOFTEST * ca.mmax(stiffness / mass), SOFTEST**2)
     return ca.if_else(stiffness < 0, stiffness, ca.if_else(stiffness < floor, floor, stiffness))
 
 

@@ -320,7 +320,7 @@ class _OperationalSpace(Shown):
         gravity = self.model.gravity_torque(robot, inputs)
         force, volume, J = self._force(inputs)
         torque = J.T @ force + gravity + self.model.feed_forward(robot, inputs)
-        relative = volume / self._median_volume
+        relative = volume / self.median_volume
         return guarded_graph(self.name, inputs, torque, gravity, relative, self.problem.domain)
 
     @cached_property
@@ -444,7 +444,8 @@ class _OperationalSpace(Shown):
         return force, volume, J
 
     @cached_property
-    def _median_volume(self) -> float:
+    def median_volume(self) -> float:
+        """Of the gradients over the domain, squared; in blocks if the law is decoupled."""
         return median_volume(self.problem, self.chart.rates, "inertia", self._blocks)
 
 

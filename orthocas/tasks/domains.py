@@ -86,6 +86,11 @@ class Domain(ABC):
         """
         return None
 
+    @property
+    def fold_bound(self) -> "FoldBound | None":
+        """What `room_to_fold` is made of, for code that evaluates it in other libraries."""
+        return None
+
     def require_bounds(self, what: str) -> None:
         """Raise DomainError unless proofs and C know the form of the condition."""
         if not (self.is_box or self.singular_bound or self.path_bound):
@@ -187,6 +192,25 @@ class SingularBound(Condition, Protocol):
 
     def singular_values(self, q: ArrayLike) -> Any:
         """s(q) at points (n,) or (N, n)."""
+        ...
+
+
+class FoldBound(Protocol):
+    """A condition orientation * v(q) > least_volume on the volume of coordinates, as `orthocas.fit_wide` makes it."""
+
+    @property
+    def gradients(self) -> ca.Function:
+        """q (n, 1) -> J_xi (r, n), of any lengths."""
+        ...
+
+    @property
+    def least_volume(self) -> float:
+        """The bound, > 0."""
+        ...
+
+    @property
+    def orientation(self) -> float:
+        """The sign of the volume at the centre."""
         ...
 
 

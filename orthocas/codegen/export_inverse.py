@@ -1,0 +1,111 @@
+"""The inverse of an exported module: errors of phi, how fast phi moves, and where solutions count as found."""
+
+import casadi as ca
+import numpy as np
+
+from orthocas.charts.chart import Chart
+from orthocas.charts.solutions import InverseStatus
+from orthocas.codegen.export_forms import Form, function_code
+from orthocas.tasks.domains import FoldBound, PathBound, SingularBound, bounds_of, sample_uniform
+from orthocas.tools.batch import dense_function
+from orthocas.tools.checks import Array
+
+STATUSES = ("FOUND", "OUTSIDE_DOMAIN", "LIMIT", "NOT_FOUND", "BAD_INPUT")  #: those of `InverseStatus` in modules
+_SLACK = 1e-9  # of the half-widths: rounding at boundaries and joint limits
+_PARALLEL, _POINTS = 1e-12, 8  # gradients that differ by less count as the same; where they are compared
+
+
+def statuses() -> str:
+    """Their numbers, as Python."""
+    return ", ".join(str(int(InverseStatus[name])) for name in STATUSES)
+
+
+def inverse_forms(chart: Chart) -> list[Form]:
+    """The function `_inverse` of columns phi and q_start (2 n, N), and what it calls beside the functions of phi."""
+    return [_newton(chart), *_condition(chart)]
+
+
+def _newton(chart: Chart) -> Form:
+    """Newton's method, with errors and rates as `chart.solve` has them."""
+    problem, n = chart.problem, chart.n
+    domain, robot = problem.domain, problem.robot
+    slack = _SLACK * domain.half_width
+    low, high = bounds_of(domain)
+    bounds = np.array([low - slack, high + slack, robot.lower - slack, robot.upper + slack])
+    target, value = ca.SX.sym("target", n), ca.SX.sym("value", n)
+    difference = chart.phi_map.difference(target, value)
+    functions = [
+        function_code(
+            "_difference",
+            "Targets less values of phi by the shorter way around, (n, N), of both in columns (2 n, N).",
+            dense_function("f", [ca.vertcat(target, value)], [difference]),
+        )
+    ]
+    rates = "_jacobian(q)"
+    if chart.relative.turned:
+        summary = "How fast task values move, with the tip's angular velocity in its axes, row by row, (m n, N)."
+        functions.append(function_code("_task_rates", summary, chart.relative.rates))
+        rates = "np.concatenate([_task_rates(q).reshape(len(UNITS), q.shape[0], q.shape[1]), _xi_jacobian(q)])"
+    tables = {"centre": domain.centre[:, None], "sizes": chart.phi_sizes[:, None], "bounds": bounds[:, :, None]}
+    return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
+
+
+def _condition(chart: Chart) -> list[Form]:
+    """The function `_meets_condition` of columns q (n, N) -> (N,), for what a domain asks beside its box."""
+    domain = chart.problem.domain
+    if domain.singular_bound is not None:
+        fold = domain.fold_bound
+        return [_clear(chart, domain.singular_bound, fold), *([] if fold is None else [_unfolded(chart, fold)])]
+    if domain.path_bound is not None:
+        return [_near_path(domain.path_bound)]
+    if domain.condition is None:
+        return [Form("box", {}, "", {}, {})]
+    summary = "Numbers (k, N) that are positive at columns q that meet the condition of the domain."
+    return [Form("condition", {}, function_code("_pivots", summary, domain.condition.pivots), {}, {})]
+
+
+def _clear(chart: Chart, clear: SingularBound, fold: FoldBound | None) -> Form:
+    own = clear.jacobian_function
+    code = function_code("_frame_rows", "Rows that must not be singular, one by one, (m n, N).", own)
+    values = {
+        "squared_bound": repr(clear.least_singular_value**2),
+        "and_regular": "" if fold is None else ", and the coordinates do not fold",
+        "fold": "" if fold is None else " & _is_regular(q, rows)",
+    }
+    tables = {"row_scale": clear.scale[:, None], "unit": np.eye(chart.m)}
+    return Form("clear", values, code, tables, {})
+
+
+def _unfolded(chart: Chart, fold: FoldBound) -> Form:
+    values = {
+        "least_volume": repr(fold.least_volume),
+        "orientation": "" if fold.orientation > 0 else "-",
+        "gradients": "_xi_jacobian(q)",
+    }
+    if _same_directions(chart, fold):
+        return Form("fold", values, "", {}, {})
+    code = function_code("_own_gradients", "Gradients of the domain's coordinates, (r n, N).", fold.gradients)
+    values["gradients"] = "_own_gradients(q).reshape(len(LABELS) - len(UNITS), q.shape[0], q.shape[1])"
+    return Form("fold", values, code, {}, {})
+
+
+def _same_directions(chart: Chart, fold: FoldBound) -> bool:
+    """Whether the domain's coordinates have the gradients of the chart, up to positive factors."""
+    points = sample_uniform(chart.problem.domain, _POINTS, 0)
+    theirs = np.array([np.array(fold.gradients(q)) for q in points])
+    return bool(np.abs(_unit(theirs) - _unit(chart.coordinates.jacobian(points))).max() < _PARALLEL)
+
+
+def _unit(rows: Array) -> Array:
+    return np.asarray(rows / np.linalg.norm(rows, axis=2, keepdims=True))
+
+
+def _near_path(corridor: PathBound) -> Form:
+    starts, axes, squares = corridor.lines
+    tables = {
+        "path_radius": corridor.radius[corridor.counted][:, None],
+        "path_starts": starts[:, :, None],
+        "path_axes": axes[:, :, None],
+        "path_lengths": np.sqrt(squares)[:, None],
+    }
+    return Form("path", {}, "", tables, {"path_joints": corridor.counted.tolist()})

@@ -1,0 +1,135 @@
+"""Coordinates xi as a task of pink and mink, beside their tasks, limits and barriers: `XiTask`."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.charts.chart import Chart
+from orthocas.charts.phi import shortest
+from orthocas.control.gains import non_negative_gains
+from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind
+from orthocas.tools.display import Shown, listed, number_list
+
+
+class XiTask(Shown):
+    """e = xi(q) - xi_d for differential inverse kinematics with pink or mink: J_xi dq = -gain e, at a cost.
+
+    It stands in their lists of tasks, or of constraints, in place of a posture task. The tool's own task does not
+    disturb xi, so both are met together; a posture pulls at the tool. It needs neither package: it has the methods that
+    both ask for, and finds joints in the `model` of their configurations by name, of Pinocchio or MuJoCo.
+
+    Args:
+        chart: a chart with a closed expression, of the arm in the model.
+        cost: for errors of xi, one number or (r,), >= 0, as in their tasks.
+        gain: share of the error that a step removes, 0 to 1.
+        lm_damping: their Levenberg-Marquardt damping, >= 0.
+        joints: names in the model of the chart's joints; default: those of the chart's robot.
+
+    Raises:
+        NoExpressionError: for grown charts.
+        InvalidValueError: if a number is out of range.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> task = oc.control.XiTask(chart, cost=1.0)
+        >>> task.set_target(chart.xi([0.6, 0.8, 0.8]))
+    """
+
+    def __init__(
+        self,
+        chart: Chart,
+        cost: ArrayLike,
+        gain: float = 1.0,
+        lm_damping: float = 0.0,
+        joints: tuple[str, ...] | None = None,
+    ) -> None:
+        require_kind("chart", chart, Chart)
+        chart.function("xi")  # raises for grown charts
+        require_at_least("gain", gain, 0)
+        require_at_least("lm_damping", lm_damping, 0)
+        if gain > 1:
+            raise InvalidValueError("gain", gain, "a number from 0 to 1")
+        self.chart = chart
+        self.cost = non_negative_gains("cost", cost, chart.r)
+        self.gain, self.lm_damping = float(gain), float(lm_damping)
+        self.joints = chart.problem.robot.joint_names if joints is None else tuple(joints)
+        if len(self.joints) != chart.n:
+            raise ShapeError("joints", (len(self.joints),), (chart.n,))
+        self.target_xi: Array | None = None
+        self._known: tuple[Any, list[tuple[Any, int]]] = (None, [])  # the last model, and the places of joints in it
+
+    def facts(self) -> dict[str, str]:
+        """Cost, gain and target."""
+        target = "none yet" if self.target_xi is None else number_list(self.target_xi)
+        labels = listed(self.chart.named_coordinates)
+        return {"task": f"{labels}, cost {number_list(self.cost)}, gain {self.gain:g}", "target": target}
+
+    def set_target(self, xi: ArrayLike) -> None:
+        """Wanted coordinates xi_d, (r,)."""
+        target = as_float_array("xi", xi)
+        if target.shape != (self.chart.r,):
+            raise ShapeError("xi", target.shape, (self.chart.r,))
+        self.target_xi = target.copy()
+
+    def set_target_from_configuration(self, configuration: Any) -> None:
+        """Keep the coordinates of a configuration."""
+        self.target_xi = self.chart.xi(self._position(configuration))
+
+    def compute_error(self, configuration: Any) -> Array:
+        """e (r,), by the shorter way around for circle-valued coordinates.
+
+        Raises:
+            InvalidValueError: before a target is set, or if the model has no joint of a name.
+        """
+        if self.target_xi is None:
+            raise InvalidValueError("target of the task", "none", "one from `set_target`")
+        error = self.chart.xi(self._position(configuration)) - self.target_xi
+        return np.asarray(shortest(error, self.chart.turns[self.chart.m :]))
+
+    def compute_jacobian(self, configuration: Any) -> Array:
+        """de/dq, (r, nv), with zeros for joints that the chart does not have."""
+        places = [place for _, place in self._places(configuration.model)]
+        J = np.zeros((self.chart.r, configuration.model.nv))
+        J[:, places] = self.chart.coordinates.jacobian(self._position(configuration)[None])[0]
+        return J
+
+    def compute_qp_residual(self, configuration: Any) -> tuple[Array, Array, float]:
+        """Weighted J, weighted -gain e, and the damping mu = lm_damping |that|^2; mink calls it."""
+        error = -self.gain * self.cost * self.compute_error(configuration)
+        J = self.cost[:, None] * self.compute_jacobian(configuration)
+        return J, error, self.lm_damping * float(error @ error)
+
+    def compute_qp_objective(self, configuration: Any) -> tuple[Array, Array]:
+        """H and c of the cost 1/2 dq^T H dq + c^T dq; pink calls it."""
+        J, error, damping = self.compute_qp_residual(configuration)
+        return J.T @ J + damping * np.eye(J.shape[1]), -error @ J
+
+    def _position(self, configuration: Any) -> Array:
+        """The chart's joint positions, (n,)."""
+        q = configuration.q
+        values = (q[place] for place, _ in self._places(configuration.model))
+        return np.array([value if np.ndim(value) == 0 else np.arctan2(value[1], value[0]) for value in values])
+
+    def _places(self, model: Any) -> list[tuple[Any, int]]:
+        """The places of joints; looking them up takes longer than xi."""
+        if model is not self._known[0]:
+            self._known = model, self._looked_up(model)
+        return self._known[1]
+
+    def _looked_up(self, model: Any) -> list[tuple[Any, int]]:
+        """For each joint its place in q, a slice for joints that Pinocchio stores as cosine and sine, and in dq."""
+        if not hasattr(model, "getJointId"):
+            joints = [model.joint(name) for name in self.joints]  # MuJoCo's error lists the names that it knows
+            return [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in joints]
+        missing = [name for name in self.joints if not model.existJointName(name)]
+        if missing:
+            raise InvalidValueError("model", f"without a joint '{missing[0]}'", f"one of {', '.join(model.names)}")
+        found = []
+        for name in self.joints:
+            joint = model.joints[model.getJointId(name)]
+            found.append((joint.idx_q if joint.nq == 1 else slice(joint.idx_q, joint.idx_q + joint.nq), joint.idx_v))
+        return found
