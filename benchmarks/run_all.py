@@ -48,7 +48,7 @@ SCRIPTS = (
     "inverse",
     "default_gains",
     "safety",
-    "frozen_sensors",
+    "faults",
     "following",
     "operational_space",
     "redundancy_peers",
