@@ -49,7 +49,7 @@ SCRIPTS = (
     "exported_inverse",
     "default_gains",
     "safety",
-    "frozen_sensors",
+    "faults",
     "following",
     "operational_space",
     "redundancy_peers",

@@ -29,7 +29,7 @@ from orthocas.simulation import MuJoCoPlant
 from orthocas.tools.checks import Array
 
 TICK = 1e-3
-OMEGA = 8.0  # with which xi comes to rest after a hand-over [rad/s]
+OMEGA = 12.0  # with which xi comes to rest after a hand-over [rad/s]
 FADE_IN = 0.5  # [s]
 
 
@@ -111,14 +111,15 @@ def ticks(
     for k in range(round(case.seconds * (len(corners) - 1) / TICK)):
         x = way(corners, case.seconds, (k + 1) * TICK)
         plant.step(torque, TICK)
-        library.low_pass(reference.values, target, OMEGA, 1.0, TICK)
+        target[:m] = x[0]
+        supervisor.stream(reference, target, OMEGA, TICK)
         for place, values in zip((0, n, 2 * n), x, strict=True):
             reference.values[place : place + m] = values
         before, chart, last = reference.values.copy(), reference.chart, torque
         torque, status = supervisor.step(plant.q, plant.dq, reference, TICK)
         jumps = None
         if reference.chart != chart:
-            target = reference.values[:n] + reference.values[n : 2 * n] / OMEGA  # where xi comes to rest
+            target = reference.values[:n] + 2 * reference.values[n : 2 * n] / OMEGA  # where xi comes to rest
             then, now = asked(part, plant.q, before, chart), asked(part, plant.q, reference.values, reference.chart)
             jumps = (float(np.abs(now[0] - then[0]).max()), float(np.abs(now[1] - then[1]).max()))
         error = float(np.linalg.norm(problem.task.batched(plant.q[None])[0][0] - x[0]))

@@ -283,7 +283,8 @@ def test_c_does_not_depend_on_the_reference(tmp_path: Path) -> None:
             q, status = library.inverse(phi, q)
             assert status == 0
             np.testing.assert_allclose(q, wanted, atol=1e-6)
-        supervisor = Supervisor(library, law, control.Safety.of(law, speed_limit=np.full(7, 100.0)))
+        free = control.Safety.of(law, speed_limit=100.0, reference_speed=np.inf, reference_acceleration=np.inf)
+        supervisor = Supervisor(library, law, free)
         arm_path = path + np.array([0.01, -0.02, 0.01, 0.02, 0, 0.01, 0.03])
         supervisor.start(arm_path[0])
         supervisor.resume()

@@ -28,7 +28,7 @@ def test_program_in_c_is_pushed_out_of_the_domain_and_comes_back(tmp_path: Path)
     assert found["settled_s"] < 0.5
     assert found["back_s"] < 8
     assert found["flange_mm"] < 0.05
-    assert 60 < found["wall_N"] < 120
+    assert 30 < found["wall_N"] < 60  # the stream stops where its posture comes near the boundary
     assert found["end_inside"] == 1
     assert found["end_speed"] < 0.01
     assert found["end_error"] < 1e-4

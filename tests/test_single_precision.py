@@ -249,14 +249,14 @@ def test_the_closed_loop_moves_like_the_double_one(
 
 
 @pytest.mark.slow
-def test_the_low_pass_comes_to_rest_and_is_never_stale(library: CompiledLibrary, law: Controller) -> None:
+def test_the_stream_comes_to_rest_and_is_never_stale(library: CompiledLibrary, law: Controller) -> None:
     q = law.problem.domain.centre
     supervisor = Supervisor(library, law, Safety.of(law, stale_ticks=10_000))  # measurements stand still here
     supervisor.start(q)
     reference = np.concatenate([law.chart.phi(q), np.zeros(6)])
     target = reference[:3] + np.array([1e-2, 0.0, -0.1])
     for _ in range(8_000):
-        library.low_pass(reference, target, 3.0, 0.7, TICK)
+        supervisor.stream(reference, target, 3.0, TICK)
         assert supervisor.step(q, np.zeros(3), reference, TICK)[1] is not ControlStatus.BAD_INPUT
     np.testing.assert_allclose(reference[:3], target, atol=1e-4)
 

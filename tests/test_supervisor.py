@@ -83,12 +83,15 @@ def test_the_catcher_takes_energy_and_never_adds_any(supervisor: Supervisor, pla
     q = domain.centre + 0.85 * domain.half_width
     supervisor.take_over(q, robot.gravity(q))
     arm, reference = Arm(robot, q, np.full(3, 1.2)), at_rest(planar_for_control, q)
-    stiffness, law = Safety.of(PDPlus.on_chart(planar_for_control)).brake_stiffness.reshape(3, 3), []
+    stiffness, law = Safety.of(PDPlus.on_chart(planar_for_control)).brake_stiffness, []
     for _ in range(1600):
         command, _ = supervisor.step(arm.q, arm.dq, reference, TICK)
         if supervisor.mode == 1 and supervisor.weight == 0.0:
             e = arm.q - supervisor.anchor
-            law.append(0.5 * arm.dq @ robot.mass_matrix(arm.q) @ arm.dq + 0.5 * e @ stiffness @ e)
+            law.append(
+                0.5 * arm.dq @ robot.mass_matrix(arm.q) @ arm.dq
+                + 0.5 * stiffness * e @ supervisor.inertia.reshape(3, 3) @ e
+            )
         arm.move(command, steps=20)
     energy = np.array(law)
     assert len(energy) > 1000
@@ -109,7 +112,7 @@ def test_a_start_outside_is_caught_and_brought_back_only_when_asked(
     assert set(statuses) == {ControlStatus.CAUGHT}
     np.testing.assert_allclose(arm.q, q, atol=1e-3)
     supervisor.resume()
-    statuses, _, speeds = run(supervisor, arm, at_rest(planar_for_control, domain.centre), 3.0)
+    statuses, _, speeds = run(supervisor, arm, at_rest(planar_for_control, supervisor.safe), 3.0)
     assert ControlStatus.RETURNING in statuses
     assert statuses[-1] is ControlStatus.OK
     assert domain.contains(arm.q)

@@ -27,7 +27,7 @@ def test_the_bound_on_singular_values_is_a_boundary_with_a_zone_before_it(tmp_pa
     law = PDPlus.on_chart(chart)
     generated = oc.generate_c(chart, tmp_path, law, "arm")
     library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3)
-    supervisor = Supervisor(library, law, Safety.of(law, command_rate=np.inf))
+    supervisor = Supervisor(library, law, Safety.of(law, command_rate=np.inf, reference_acceleration=np.inf))
     straight, speed = np.array([0.6, 0.0, 0.1]), np.array([0.0, -0.2, -0.175])
     start = straight - 2 * speed
     arm = Arm(robot, start)
@@ -89,7 +89,7 @@ def test_the_distance_to_the_path_of_a_corridor_is_a_boundary_with_a_zone_before
     law, library = in_corridor
     chart, speed = law.chart, np.array([0.1, 0.2, -0.2])
     start = PATH.mean(axis=0) + 0.8 * speed
-    supervisor = Supervisor(library, law, Safety.of(law, command_rate=np.inf))
+    supervisor = Supervisor(library, law, Safety.of(law, command_rate=np.inf, reference_acceleration=np.inf))
     assert library.check() < 1e-9
     supervisor.start(start)
     for _ in range(100):

@@ -11,7 +11,7 @@ from supervised import TICK, Arm, at_rest, run
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.codegen.library import GeneratedC
-from orthocas.control import Controller, ControlStatus, Kinematic, Projector, Reference, Safety
+from orthocas.control import Controller, ControlStatus, Kinematic, Projector, Safety
 from orthocas.errors import InvalidValueError, ShapeError
 
 pytestmark = needs_c
@@ -113,10 +113,10 @@ def test_integral_action_removes_sag_and_does_not_wind_up(
 def test_springs_and_dampers_keep_away_from_joint_limits(
     supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
 ) -> None:
-    q, speed = planar_for_control.problem.domain.centre, np.array([0.0, 0.1, 0.0])
+    q, speed = planar_for_control.problem.domain.centre, np.array([0.0, 0.02, 0.0])
     upper = q + np.array([1.0, 0.02, 1.0])
     settings, commands = Safety.of(supervised_law, stale_ticks=1000), []
-    for safety in (settings, Safety.of(supervised_law, stale_ticks=1000, upper=upper, stop_zone=0.05)):
+    for safety in (settings, Safety.of(supervised_law, stale_ticks=1000, upper=upper, stop_zone=0.025)):
         supervisor = Supervisor(supervised_library, supervised_law, safety)
         supervisor.take_over(q, planar_for_control.problem.robot.gravity(q))
         for _ in range(400):  # until the limit of change is no matter any more
@@ -124,26 +124,30 @@ def test_springs_and_dampers_keep_away_from_joint_limits(
         for _ in range(400):
             away, _ = supervisor.step(q, -speed, at_rest(planar_for_control, q), TICK)
         commands += [towards, away]
-    spring, damper = settings.stop_stiffness[1] * 0.03, settings.stop_damping[1] * 0.1
-    np.testing.assert_allclose(commands[0] - commands[2], [0.0, spring + damper, 0.0], atol=1e-9)
-    np.testing.assert_allclose(commands[1] - commands[3], [0.0, spring, 0.0], atol=1e-9)
+    inertia = planar_for_control.problem.robot.mass_matrix(q)[1]  # an acceleration of joint 1 alone, in [N m]
+    spring, damper = settings.stop_stiffness[1] * 0.005, settings.stop_damping[1] * 0.02
+    np.testing.assert_allclose(commands[0] - commands[2], inertia * (spring + damper), atol=1e-9)
+    np.testing.assert_allclose(commands[1] - commands[3], inertia * spring, atol=1e-9)
 
 
-def test_references_equal_those_of_python(supervised_library: CompiledLibrary, planar_for_control: oc.Chart) -> None:
-    start, target = planar_for_control.phi(planar_for_control.problem.domain.centre), np.array([0.3, -0.1, 0.2])
-    for zeta in (0.4, 1.0, 1.6):
-        reference = np.concatenate([start, np.zeros(6)])
-        wanted = Reference.steps(
-            planar_for_control.labels,
-            start,
-            [(0.0, dict(zip(planar_for_control.labels, target, strict=True)))],
-            1.0,
-            6.0,
-            zeta,
-        )
-        for _ in range(500):
-            supervised_library.low_pass(reference, target, 6.0, zeta, TICK)
-        np.testing.assert_allclose(reference, np.hstack(wanted.sample([0.5])).ravel(), atol=1e-9)
+def test_references_equal_those_of_python(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
+) -> None:
+    """Without limits, a stream has three equal poles; the spline ends in its target."""
+    chart = planar_for_control
+    free = Safety.of(supervised_law, reference_speed=np.inf, reference_acceleration=np.inf)
+    supervisor, q = Supervisor(supervised_library, supervised_law, free), chart.problem.domain.centre
+    start = chart.phi(q)
+    supervisor.start(q)
+    supervisor.step(q, np.zeros(3), at_rest(chart, q), TICK)
+    target = start + np.array([0.1, -0.1, 0.05])
+    reference, t = at_rest(chart, q), 6.0 * 0.5
+    for _ in range(500):
+        supervisor.stream(reference, target, 6.0, TICK)
+    left, rate, change = 1 + t + t**2 / 2, 6.0 * t**2 / 2, 36.0 * (t - t**2 / 2)  # times exp(-t)
+    shares = np.array([1 - left * np.exp(-t), rate * np.exp(-t), change * np.exp(-t)])
+    wanted = np.concatenate([start, np.zeros(6)]) + np.outer(shares, target - start).ravel()
+    np.testing.assert_allclose(reference, wanted, atol=1e-9)
     moving = np.array([0.1, 0.2, 0.3, 1.0, -1.0, 0.5, 2.0, 0.0, -3.0])
     for time, want in ((0.0, moving), (0.8, np.concatenate([target, np.zeros(6)]))):
         np.testing.assert_allclose(supervised_library.spline(moving, target, 0.8, time), want, atol=1e-12)
@@ -156,7 +160,13 @@ def test_references_equal_those_of_python(supervised_library: CompiledLibrary, p
     ("name", "bad"),
     [
         *(("command_rate", bad) for bad in (np.nan, -np.inf, -1.0)),
-        *(("error_limit", np.nan), ("integral_limit", np.inf), ("brake_stiffness", np.inf), ("upper", np.nan)),
+        *(
+            ("error_limit", np.nan),
+            ("integral_limit", np.inf),
+            ("brake_stiffness", np.inf),
+            ("reference_speed", np.nan),
+            ("upper", np.nan),
+        ),
         *(("fade_in", 0.0), ("damping", np.inf), ("near_margin", 0.5), ("hold_ticks", -1)),
     ],
 )

@@ -22,7 +22,7 @@
 
 #define N ARM_JOINTS
 #define PERIOD 0.001   /* [s] */
-#define SMOOTHNESS 4.0 /* natural frequency of the low pass of the reference [rad/s] */
+#define SMOOTHNESS 6.0 /* poles of the stream of references [1/s] */
 #define STEP 0.04      /* of the first extra coordinate, there and back */
 #define BETWEEN 1000   /* ticks between two steps */
 #define BINS 24        /* of the histogram, each twice as wide as the previous one */
@@ -123,7 +123,7 @@ int main(int argc, char **argv) {
     read_robot(q, dq);
     /* Move the first extra coordinate there and back; the task stays. */
     if (tick % BETWEEN == BETWEEN / 2) target[ARM_TASK] += tick % (2 * BETWEEN) < BETWEEN ? STEP : -STEP;
-    arm_reference_low_pass(&reference, target, SMOOTHNESS, 1.0, PERIOD);
+    arm_reference_stream(&state, &reference, target, SMOOTHNESS, PERIOD);
     switch (arm_step(&state, &arm_default_safety, q, dq, &reference, &arm_default_gains, PERIOD, torque)) {
       case ARM_OK: ++good; break;
       case ARM_SATURATED: ++cut; break;

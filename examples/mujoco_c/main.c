@@ -19,7 +19,7 @@
 #define N ARM_JOINTS
 #define K ARM_REFERENCE
 #define PERIOD 0.001   /* [s] */
-#define SMOOTHNESS 3.0 /* natural frequency of the reference's low pass [rad/s] */
+#define SMOOTHNESS 4.5 /* poles of the stream of references [1/s] */
 #define QUIET 0.05     /* joint speed at which a caught arm counts as at rest [rad/s] ... */
 #define PATIENCE 1000  /* ... and for how many ticks, before the program asks for the law again */
 #define WAY_HOME 4.0   /* duration of the way to the start after the arm was caught [s] */
@@ -143,8 +143,8 @@ static double fastest(const double dq[N]) {
 }
 
 /* The next reference. While the law does not command, it stays where the arm is, so that the motion goes on from there
- * as soon as the law is back. Then a spline leads to the start. Otherwise, a low pass follows the steps. */
-static void move_reference(plan *wanted, double time, arm_status last, const double q[N]) {
+ * as soon as the law is back. Then a spline leads to the start. Otherwise, a stream follows the steps. */
+static void move_reference(plan *wanted, const arm_state *state, double time, arm_status last, const double q[N]) {
   int i;
   if (last == ARM_CAUGHT || last == ARM_RETURNING) {
     arm_reference_at(q, &wanted->reference);
@@ -158,7 +158,7 @@ static void move_reference(plan *wanted, double time, arm_status last, const dou
       for (i = 0; i < K; ++i) wanted->target[i] = wanted->start[i] + STEPS[wanted->done].change[i];
       ++wanted->done;
     }
-    arm_reference_low_pass(&wanted->reference, wanted->target, SMOOTHNESS, 1.0, PERIOD);
+    arm_reference_stream(state, &wanted->reference, wanted->target, SMOOTHNESS, PERIOD);
   }
 }
 
@@ -233,7 +233,7 @@ int main(int argc, char **argv) {
   for (tick = 0; PERIOD * (double)tick < END; ++tick) {
     const double time = PERIOD * (double)tick, push = disturb(&arm, time);
     read_robot(&arm, q, dq);
-    move_reference(&wanted, time, status, q);
+    move_reference(&wanted, &state, time, status, q);
     status = arm_step(&state, safety, q, dq, &wanted.reference, &arm_default_gains, PERIOD, torque);
     answer(&wanted, &state, status, dq);
     (void)arm_chart(q, phi, jacobian);

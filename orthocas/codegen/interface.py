@@ -19,29 +19,79 @@ from orthocas.version import VERSION
 _TORQUE = """It compensates gravity, damps with the mass matrix,
  * holds the arm with a spring that gives way under too much force."""
 _VELOCITY = """It stops the arm and holds it."""
+_INERTIA = "  double inertia[{n}];       /* mass matrix of the catcher's spring, row by row */\n"
 _ORDER = "{0}catch_margin < {0}near_margin && {0}near_margin < {0}return_margin && {0}return_margin < 1.0".format(
     "safety->"
 )
+_UNIT = 1.001  # squared length of a quaternion, to rounding
+_DAMPED = 1e-6  # of least squares: joint motions of single quantities, and of more quantities than joints
 _MAX_EVALUATIONS = 100  # largest number of chart evaluations in one call of the inverse map
 
 
 def supervision_kernels(controller: Controller, condition: BoundaryCondition | None) -> list[ca.Function]:
-    """Fallback(q, gains) -> command, and deviation(q, reference) -> quantities, reference - quantities."""
+    """What the supervised law and its references compute besides the law itself.
+
+    - fallback(q, gains) -> command;
+    - deviation(q, reference) -> quantities, reference - quantities;
+    - gap(reference with two derivatives, value) -> value - reference, rates of the reference as errors count;
+    - implied(q, dq, reference with two derivatives, change) -> A (n, n) row by row and B (n, 3), such that A^-1 B are
+      the change, velocity and acceleration of the joints that follow; dq is about that velocity.
+    """
     n, k = controller.problem.n, len(controller.labels)
     fallback, q, reference = controller.fallback, ca.MX.sym("q", n), ca.MX.sym("reference", k)
     inputs = fallback.mx_in()
-    measured = controller.measured(q)
-    m, relative = controller.problem.m, Relative(controller.problem.task)
-    error = ca.vertcat(relative.difference(reference[:m], measured[:m]), reference[m:] - measured[m:])
-    if controller.chart is not None and controller.labels == controller.chart.labels:
-        error = without_turns(controller.chart, error)
+    measured, relative = controller.measured(q), Relative(controller.problem.task)
+    start, velocity, acceleration, end = (ca.MX.sym(name, k) for name in ("start", "velocity", "acceleration", "end"))
+    m, gap = controller.problem.m, _apart(controller, relative, end, start)
+    turned = relative.rates_of(start[:m], velocity[:m], acceleration[:m])
+    rates = [ca.vertcat(*parts) for parts in zip(turned, (velocity[m:], acceleration[m:]), strict=True)]
     found = [
         ca.Function("fallback", inputs, fallback.call(inputs)),
-        ca.Function("deviation", [q, reference], [ca.densify(measured), ca.densify(error)]),
+        ca.Function(
+            "deviation", [q, reference], [ca.densify(measured), _apart(controller, relative, reference, measured)]
+        ),
+        ca.Function("gap", [start, velocity, acceleration, end], [gap, *map(ca.densify, rates)]),
+        _implied(controller, relative),
     ]
     if relative.turned:
-        found.append(relative.moved)
+        found += [relative.moved, relative.turned_by]
     return found if condition is None else [*found, *condition.kernels]
+
+
+def _apart(controller: Controller, relative: Relative, end: ca.MX, start: ca.MX) -> ca.MX:
+    """The difference of two values of the controlled quantities, (k, 1), by the shorter turns. NaN: end is no value."""
+    m = controller.problem.m
+    difference = ca.vertcat(relative.difference(end[:m], start[:m]), end[m:] - start[m:])
+    if relative.turned:  # sines of half an angle
+        unit = ca.sumsqr(relative.task.quaternion_function(end[:m])) < _UNIT
+        difference = ca.if_else(unit, difference, ca.MX.nan(len(controller.labels)))
+    if controller.chart is not None and controller.labels == controller.chart.labels:
+        difference = without_turns(controller.chart, difference)
+    return ca.densify(difference)
+
+
+def _implied(controller: Controller, relative: Relative) -> ca.Function:
+    """A and B of the joint motions that a reference implies; of damped least squares where k is not n."""
+    n, m, k = controller.problem.n, controller.problem.m, len(controller.labels)
+    names = ("value", "velocity", "acceleration", "change")
+    q, dq, value, *rates, change = (
+        *(ca.MX.sym(name, n) for name in ("q", "dq")),
+        *(ca.MX.sym(name, k) for name in names),
+    )
+    slope = relative.error(q, value[:m])[1]
+    if controller.chart is not None and controller.labels == controller.chart.labels:
+        own = controller.chart.coordinates.functions
+        J, bend = ca.vertcat(slope, own["jacobian"](q)), own["second_derivative"](q, dq, dq)
+    else:
+        J_2 = ca.jacobian(controller.measured(q)[m:], q)
+        J, bend = ca.vertcat(slope, J_2), ca.jtimes(J_2 @ dq, q, dq)
+    bend = ca.vertcat(controller.problem.task.rates_derivative_function(q, dq, dq), bend)
+    turned = relative.rates_of(value[:m], rates[0][:m], rates[1][:m])
+    velocity, acceleration = (ca.vertcat(a, b[m:]) for a, b in zip(turned, rates, strict=True))
+    B = ca.horzcat(change, velocity, acceleration - bend)
+    if k != n:
+        J, B = J.T @ J + _DAMPED * ca.trace(J.T @ J) * ca.MX.eye(n), J.T @ B
+    return ca.Function("implied", [q, dq, value, *rates, change], [ca.densify(J.T), ca.densify(B)])
 
 
 def supervision_values(
@@ -61,13 +111,20 @@ def supervision_values(
     return {
         "catcher": _TORQUE if torque else _VELOCITY,
         "turning": flags(endless),
+        "state_inertia": _INERTIA.format(n=robot.n**2) if torque else "",
         "safety_fields": "\n".join(_field(name, value) for name, value in settings.items()),
         "safety_values": ",\n".join(f"  {_literal(value)}" for value in settings.values()),
         "safety_meant": "\n        && ".join([*(_meant(name, value) for name, value in settings.items()), _ORDER]),
         **_clearance_values(condition),
-        "turn_reference": filled("turn_reference.c", known) if Relative(controller.problem.task).turned else "",
+        **_turning(controller, known),
         "fallback_arguments": "\n".join(f"  arg[{1 + i}] = gains->{gain};" for i, gain in enumerate(controller.gains)),
     }
+
+
+def _turning(controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
+    """Code for references with an orientation."""
+    turned = Relative(controller.problem.task).turned
+    return {place: filled(f"{place}.c", known) if turned else "" for place in ("turn_reference", "turn_step")}
 
 
 def _clearance_values(condition: BoundaryCondition | None) -> dict[str, str]:

@@ -135,14 +135,6 @@ class CompiledLibrary:
         command = self._zeros(self.n)
         return command, self._call("control", [q, dq, reference, gains], [command], which)
 
-    def low_pass(self, reference: Array, target: Array, omega: float, zeta: float, period: float) -> int:
-        """Move a reference (3 k,) by one step of the low pass towards a target (k,); the status."""
-        run, here, there = self.function("reference_low_pass"), self.numbers(reference), self.numbers(target)
-        run.argtypes, run.restype = [ctypes.c_void_p] * 2 + [self.precision.c_type] * 3, ctypes.c_int
-        status = run(here.ctypes.data, there.ctypes.data, omega, zeta, period)
-        reference[:] = here
-        return int(status)
-
     def spline(self, start: Array, target: Array, duration: float, time: float, last: Array | None = None) -> Array:
         """The reference (3 k,) at a time on the spline from a reference to rest at a target (k,).
 

@@ -28,8 +28,14 @@ class Supervisor:
         require_kind("library", library, CompiledLibrary)
         require_controller(controller)
         self._n, self._k, self._library = library.n, len(controller.labels), library
-        self._functions = {name: library.function(name) for name in ("start", "take_over", "resume", "step")}
+        self._functions = {
+            name: library.function(name) for name in ("start", "take_over", "resume", "hold", "release", "step")
+        }
         self._functions["step"].argtypes = [*[_POINTER] * 6, library.precision.c_type, _POINTER]
+        stream, pace = (library.function(f"reference_{name}") for name in ("stream", "pace"))
+        stream.argtypes = [*[_POINTER] * 3, *[library.precision.c_type] * 2]
+        pace.argtypes, pace.restype = [_POINTER, _POINTER, library.precision.c_type], library.precision.c_type
+        self._functions |= {"stream": stream, "pace": pace}
         if safety is not None:
             require_kind("safety", safety, Safety)
         values = (safety or Safety.of(controller)).in_c(controller.command)
@@ -41,8 +47,7 @@ class Supervisor:
 
     def start(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
         """Begin at joint positions (n,), with the command (n,) that the robot executes now; default the fallback."""
-        given = None if command is None else _pointer(self._point("command", command))
-        self._functions["start"](self._here, _pointer(self._point("q", q)), given)
+        self._begin("start", q, command)
 
     def take_over(self, q: ArrayLike, command: ArrayLike) -> None:
         """Take over from another controller while the arm moves."""
@@ -52,6 +57,14 @@ class Supervisor:
     def resume(self) -> None:
         """Ask for the law again."""
         self._functions["resume"](self._here)
+
+    def hold(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
+        """Brakes hold the arm at joint positions (n,); what the motors do now (n,), default the last command."""
+        self._begin("hold", q, command)
+
+    def release(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
+        """Brakes open: the catcher holds the arm until `resume`."""
+        self._begin("release", q, command)
 
     def step(
         self, q: Array, dq: Array, reference: Array | ChartReference, period: float = 1e-3
@@ -67,17 +80,31 @@ class Supervisor:
         """
         inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("dq", dq))]
         gains, time = self._library.numbers(self.gains), as_number("period", period)
-        if self._library.of_atlas:
-            require_kind("reference", reference, ChartReference)
-        if isinstance(reference, ChartReference):
-            asked = reference.address
-        else:
-            inputs.append(self._numbers("reference", reference, 3 * self._k))
-            asked = _pointer(inputs[2])
+        numbers, asked = self._asked(reference)
         status = self._functions["step"](
-            self._here, self._safety, *map(_pointer, inputs[:2]), asked, _pointer(gains), time, _pointer(self._command)
+            self._here, self._safety, *map(_pointer, inputs), asked, _pointer(gains), time, _pointer(self._command)
         )
+        del numbers  # C has read them
         return self._command.copy(), ControlStatus(status)
+
+    def stream(
+        self, reference: Array | ChartReference, target: ArrayLike, omega: float, period: float = 1e-3
+    ) -> ControlStatus:
+        """Move a reference by one tick towards a target (k,), with poles at omega [1/s]; the status."""
+        numbers, asked = self._asked(reference)
+        wanted = self._numbers("target", target, self._k)
+        status = self._functions["stream"](self._here, asked, _pointer(wanted), omega, period)
+        if isinstance(reference, np.ndarray):
+            reference[:] = numbers
+        return ControlStatus(status)
+
+    def pace(self, reference: Array | ChartReference, period: float = 1e-3) -> float:
+        """Scale the derivatives of a reference to what joints can follow; the pace at which time goes on, 0 to 1."""
+        numbers, asked = self._asked(reference)
+        pace = float(self._functions["pace"](self._here, asked, period))
+        if isinstance(reference, np.ndarray):
+            reference[:] = numbers
+        return pace
 
     def __getattr__(self, name: str) -> Any:
         """The fields of the state in C: mode, cause, weight, anchor, ..."""
@@ -85,6 +112,19 @@ class Supervisor:
             raise AttributeError(name)
         value = getattr(self._state, name)
         return np.array(value) if isinstance(value, ctypes.Array) else value
+
+    def _asked(self, reference: Array | ChartReference) -> tuple[Array, Any]:
+        """Numbers of a reference in the library's type, and their address in C."""
+        if self._library.of_atlas:
+            require_kind("reference", reference, ChartReference)
+        if isinstance(reference, ChartReference):
+            return reference.values, reference.address
+        numbers = self._numbers("reference", reference, 3 * self._k)
+        return numbers, _pointer(numbers)
+
+    def _begin(self, name: str, q: ArrayLike, command: ArrayLike | None) -> None:
+        given = None if command is None else self._point("command", command)  # lives until C has read it
+        self._functions[name](self._here, _pointer(self._point("q", q)), None if given is None else _pointer(given))
 
     def _numbers(self, name: str, values: ArrayLike, size: int) -> Array:
         """Numbers of the library's type, which may be NaN or infinite."""
@@ -104,16 +144,18 @@ def _state_type(
     n: int, k: int, precision: Precision, of_atlas: bool, settings: type[ctypes.Structure]
 ) -> type[ctypes.Structure]:
     joints, quantities = precision.c_type * n, precision.c_type * k
-    names = ("q", "dq", "seen_q", "seen_dq", "command", "law", "anchor", "safe")
+    names = ("q", "dq", "seen_q", "seen_dq", "command", "led", "impulse", "impulse_from", "law", "anchor", "safe")
+    has_spring = any(field[0] == "brake_stiffness" for field in settings._fields_)
     layout = [
         *(
             (name, ctypes.c_int)
             for name in ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")
         ),
         *((name, ctypes.c_int) for name in ("chart", "hand_overs") if of_atlas),
-        *((name, precision.c_type) for name in ("weight", "brake", "drawn")),
+        *((name, precision.c_type) for name in ("weight", "brake", "unseen")),
         *((name, joints) for name in names),
-        *((name, quantities) for name in ("offset", "integral", "drawn_from")),
+        *((name, quantities) for name in ("offset", "integral")),
+        *(("inertia", precision.c_type * n**2) for _ in range(has_spring)),
         *((name, joints) for name in ("carry",) if of_atlas),
         *((name, quantities) for name in ("value", "velocity", "acceleration")),
         *((name, ctypes.c_int) for name in ("reference_chart",) if of_atlas),

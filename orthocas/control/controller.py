@@ -42,6 +42,7 @@ class ControlStatus(IntEnum):
     BAD_INPUT = 8
     TOO_FAST = 9  #: why the catcher took over: a joint was faster than its limit
     LATE = 10  #: why the catcher took over: a tick came too late
+    HELD = 11  #: why the catcher took over: brakes held the arm
 
     @property
     def words(self) -> str:

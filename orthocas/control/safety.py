@@ -17,13 +17,19 @@ from orthocas.tools.checks import Array, as_float_array, as_number, require_coun
 _SAMPLES, _SEED = 256, 0
 _RATE = {"torque": 1000.0, "velocity": 20.0}  # [N m/s] as on many arms, 1 N m in a millisecond; [rad/s^2]
 _TORQUE_ONLY = ("stop_zone", "stop_damping", "brake_stiffness", "brake_yield")  # velocity laws do not use them
-UNBOUNDED = ("command_rate", "speed_limit", "lower", "upper", "error_limit")  #: settings that may be infinite
-SIGNED = ("lower", "upper", "brake_stiffness")  #: those that may be negative
+UNBOUNDED = (  #: settings that may be infinite
+    *("command_rate", "speed_limit", "stuck_impulse", "lower", "upper", "error_limit"),
+    *("reference_speed", "reference_acceleration"),
+)
+SIGNED = ("lower", "upper")  #: settings that may be negative
 _SPEED = 4 * np.pi  # [rad/s] or [m/s], of joints without a limit
-_CATCHER = 12.0  # [1/s] natural frequency and damping rate of the catcher
+_SHARE = 0.7  # of the speed limit, for references
+_STARTING = 0.25  # [s] in which a reference may reach the speed limit
+_CATCHER = 12.0  # [1/s] natural frequency and damping rate of the catcher, stable with delays up to 59 ms
 _RETURN = 0.3  # [rad/s] or [m/s], on the way back
 _STOPS = 30.0  # [rad/s] natural frequency at the joint limits
 _ZONE = 0.05  # [rad] or [m], at most this share of the range of a joint
+_STUCK = 0.3, 0.03  # [rad/s] that a torque must have given an arm whose sensors stand still; [rad] of velocity laws
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +43,21 @@ class Safety:
     """
 
     command_rate: Annotated[Array, "largest change of the command [N m/s], [rad/s^2]; in a tick: times its period"]
-    speed_limit: Annotated[Array, "joint speed at which the catcher takes over; 30 times that is a bad one [rad/s]"]
+    speed_limit: Annotated[
+        Array, "joint speed at which the catcher takes over; 30 times that is a bad one unless q moves alike [rad/s]"
+    ]
     rest_speed: Annotated[Array, "joint speed below which the arm counts as slow [rad/s]"]
     near_margin: Annotated[float, "distance to the boundary at which NEAR_BOUNDARY and additional damping begin"]
     catch_margin: Annotated[float, "where the catcher takes over, also if the arm gets there while the law fades out"]
     return_margin: Annotated[float, "where the arm must be before the law takes over again"]
     fade_in: Annotated[float, "time in which the law takes over [s]"]
     fade_out: Annotated[float, "time in which the law gives way to the catcher [s]"]
-    return_speed: Annotated[float, "of the fastest joint on the way back [rad/s]"]
+    return_speed: Annotated[
+        float, "of the fastest joint on the way back, but at most a third of its speed limit [rad/s]"
+    ]
     error_limit: Annotated[Array, "largest error that the law gets to see (k,)"]
+    reference_speed: Annotated[Array, "largest joint speed that the reference may imply [rad/s]"]
+    reference_acceleration: Annotated[Array, "and its largest growth [rad/s^2]"]
     offset_rate: Annotated[Array, "speed at which the reference goes from the arm to what is asked (k,) [1/s]"]
     integral_rate: Annotated[Array, "integral action: growth of the reference's shift per error (k,) [1/s]; 0: none"]
     integral_limit: Annotated[Array, "largest shift (k,)"]
@@ -53,14 +65,15 @@ class Safety:
     stale_ticks: Annotated[
         int, "ticks for which a moving arm may measure the same, bit by bit; more are a bad measurement"
     ]
+    stuck_impulse: Annotated[Array, "momentum that an arm which measures the same may get [N m s]; velocity laws: way"]
     longest_period: Annotated[float, "between two ticks; later ones call the catcher [s]"]
     lower: Annotated[Array, "joint limits [rad] or [m]"]
     upper: Annotated[Array, "joint limits [rad] or [m]"]
     stop_zone: Annotated[Array, "where springs and dampers near the joint limits begin [rad] or [m]"]
-    stop_stiffness: Annotated[Array, "of these springs [N m/rad]; velocity laws: largest speed per distance [1/s]"]
-    stop_damping: Annotated[Array, "against motion towards the limit [N m s/rad]"]
+    stop_stiffness: Annotated[Array, "of these springs, per inertia [1/s^2]; velocity laws: speed per distance [1/s]"]
+    stop_damping: Annotated[Array, "against motion towards the limit, per inertia [1/s]"]
     damping: Annotated[float, "rate of the catcher's damping -d M dq [1/s]; velocity laws: of the way to the anchor"]
-    brake_stiffness: Annotated[Array, "spring of the catcher, symmetric, row by row (n * n) [N m/rad]"]
+    brake_stiffness: Annotated[float, "spring of the catcher, per inertia [1/s^2]"]
     brake_yield: Annotated[Array, "largest torque of that spring, which gives way slowly beyond it [N m]"]
 
     def __post_init__(self) -> None:
@@ -105,9 +118,11 @@ class Safety:
         measured = Batched(controller.measured)(points)[0]
         span = np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0)
         torque, free = controller.command == "torque", 1 / np.diag(np.linalg.inv(M))
+        speed_limit = np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, _SPEED)
+        slow = np.minimum(_RETURN, speed_limit / 3)
         settings = {
             "command_rate": np.full(n, _RATE[controller.command]),
-            "speed_limit": np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, _SPEED),
+            "speed_limit": speed_limit,
             "rest_speed": np.full(n, 0.5),
             "near_margin": 0.06,
             "catch_margin": 0.01,
@@ -116,19 +131,22 @@ class Safety:
             "fade_out": 0.03,
             "return_speed": _RETURN,
             "error_limit": 0.15 * span,
-            "offset_rate": _RETURN / _joint_motion(controller, points),
+            "reference_speed": _SHARE * speed_limit,
+            "reference_acceleration": speed_limit / _STARTING,
+            "offset_rate": 1 / _joint_motion(controller, points, slow),
             "integral_rate": 0 * span,
             "integral_limit": 0.05 * span,
             "hold_ticks": 10,
             "stale_ticks": 5,
+            "stuck_impulse": _STUCK[0] * free if torque else np.full(n, _STUCK[1]),
             "longest_period": 0.02,
             "lower": robot.lower,
             "upper": robot.upper,
             "stop_zone": np.fmin(_ZONE, _ZONE * (robot.upper - robot.lower)),
-            "stop_stiffness": _STOPS**2 * free if torque else np.full(n, _STOPS),
-            "stop_damping": 2 * _STOPS * free if torque else np.zeros(n),
+            "stop_stiffness": np.full(n, _STOPS**2 if torque else _STOPS),
+            "stop_damping": np.full(n, 2 * _STOPS),
             "damping": _CATCHER if torque else 5.0,
-            "brake_stiffness": (_CATCHER**2 * M).ravel() if torque else np.zeros(n * n),
+            "brake_stiffness": _CATCHER**2,
             "brake_yield": 0.5 * gravity + 10 * np.diag(M),
         }
         unknown = sorted(set(changes) - set(settings))
@@ -138,14 +156,14 @@ class Safety:
         return cls(**{**settings, **spread})
 
 
-def _joint_motion(controller: Controller, points: Array) -> Array:
-    """How far the fastest joint moves per unit of each controlled quantity, at 90 % of the points (k,)."""
+def _joint_motion(controller: Controller, points: Array, slow: Array) -> Array:
+    """Time that joints take at slow speeds (n,) per unit of each controlled quantity, at 90 % of the points (k,)."""
     q = ca.MX.sym("q", controller.problem.n)
     m, relative = controller.problem.m, Relative(controller.problem.task)
     moving = ca.vertcat(relative.rates(q), ca.jacobian(controller.measured(q)[m:], q))
     rows = Batched(dense_function("J", [q], [moving]))(points)[0]
     J = rows.reshape(len(points), -1, q.shape[0])
-    largest = np.abs(np.linalg.pinv(J[np.isfinite(J).all(axis=(1, 2))])).max(axis=1)
+    largest = (np.abs(np.linalg.pinv(J[np.isfinite(J).all(axis=(1, 2))])) / slow[:, None]).max(axis=1)
     return np.asarray(np.quantile(largest, 0.9, axis=0))
 
 

@@ -79,10 +79,18 @@ class Relative:
         a whole orientation only.
         """
         x, e, x_d, dx_d, ddx_d = symbols = self._symbols("x", "e", "x_d", "dx_d", "ddx_d")
+        return dense_function("moved", symbols, list(self.turned_by(x, e, *self._turning(x_d, dx_d, ddx_d))))
+
+    @cached_property
+    def turned_by(self) -> ca.Function:
+        """x, e, rates, their derivatives -> the value at e from x, and its derivatives. Rates are those of the error.
+
+        For tasks of a whole orientation only.
+        """
+        x, e, rates, changes = symbols = self._symbols("x", "e", "rates", "changes")
         turn, first = self.task.turn, self.first
         assert turn is not None
-        _, omega, alpha = self._wanted(x_d, dx_d, ddx_d)
-        half = self._order.T @ e[first:] / 2
+        half, omega, alpha = (self._order.T @ part[first:] for part in (e / 2, rates, changes))
         step = ca.vertcat(ca.sqrt(ca.fmax(1 - ca.sumsqr(half), 0)), half)
         p = quaternion_product(self._quaternion(x), step)
         dp = quaternion_product(p, ca.vertcat(0, omega)) / 2
@@ -92,10 +100,24 @@ class Relative:
         rate = ca.jtimes(value, at, dp)
         found = [value, rate, ca.jtimes(rate, at, dp) + ca.jtimes(value, at, ddp)]
         found = ca.substitute(found, [at], [p])
-        whole = [
-            ca.vertcat(a, b) for a, b in zip((x[:first] + e[:first], dx_d[:first], ddx_d[:first]), found, strict=True)
-        ]
-        return dense_function("moved", symbols, [ca.cse(part) for part in whole])
+        straight = (x[:first] + e[:first], rates[:first], changes[:first])
+        whole = [ca.vertcat(a, b) for a, b in zip(straight, found, strict=True)]
+        return dense_function("turned_by", symbols, [ca.cse(part) for part in whole])
+
+    def rates_of(self, x_d: ca.MX, dx_d: ca.MX, ddx_d: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """Rates of a wanted value as the error counts, (m, 1), about its own axes, and their derivatives."""
+        if not self.turned:
+            return dx_d, ddx_d
+        rate, change = self._turning(x_d, dx_d, ddx_d)
+        return rate, change
+
+    @cached_property
+    def _turning(self) -> ca.Function:
+        x_d, dx_d, ddx_d = symbols = self._symbols("x_d", "dx_d", "ddx_d")
+        _, omega, alpha = self._wanted(x_d, dx_d, ddx_d)
+        parts = ((dx_d, omega), (ddx_d, alpha))
+        rates = [ca.vertcat(straight[: self.first], self._order @ turning) for straight, turning in parts]
+        return dense_function("turning", symbols, rates)
 
     @cached_property
     def _batched_error(self) -> Batched:

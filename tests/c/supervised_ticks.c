@@ -62,22 +62,24 @@ static int state_makes_sense(const arm_state *state) {
 
 static int status_is_right(int status, const arm_state *state, int measured, int referred) {
   if (!measured) return status == ARM_BAD_INPUT;
-  if (state->mode == ARM_CATCHER) return status == ARM_CAUGHT || status == ARM_BAD_INPUT;
+  if (state->mode == ARM_CATCHER || state->mode == ARM_HOLD) return status == ARM_CAUGHT || status == ARM_BAD_INPUT;
   if (state->mode == ARM_RETURN) return status == ARM_RETURNING || status == ARM_BAD_INPUT;
   if (!referred) return status == ARM_BAD_INPUT;
   return status == ARM_OK || status == ARM_SATURATED || status == ARM_NEAR_BOUNDARY || status == ARM_BAD_INPUT;
 }
 
 /* Targets around a reference, some of which cannot be used: it stays finite, and good ones are followed again. */
-static int references_stay_finite(arm_reference *reference) {
+static int references_stay_finite(const arm_state *state, arm_reference *reference) {
   NUMBER target[K];
-  arm_reference spline = *reference;
+  arm_reference spline = *reference, paced = *reference;
+  const double pace = arm_reference_pace(state, &paced, (NUMBER)1e-3);
   int i, status, spoiled;
+  if (!(pace >= 0.0 && pace <= 1.0)) return 0;
   for (i = 0; i < K; ++i) target[i] = reference->value[i] + (NUMBER)(1e-4 * uniform());
   spoiled = spoil(target, K);
   status = (int)arm_reference_spline(reference, target, 2.0, uniform(), &spline);
   if (!spoiled && status != ARM_OK) return 0;
-  status = (int)arm_reference_low_pass(reference, target, 5.0, 1.0, 1e-3);
+  status = (int)arm_reference_stream(state, reference, target, 5.0, (NUMBER)1e-3);
   if (status != (spoiled ? ARM_NOT_FINITE : ARM_OK)) return 0;
   for (i = 0; i < K; ++i)
     if (!isfinite(reference->value[i]) || !isfinite(reference->velocity[i]) || !isfinite(reference->acceleration[i]) ||
@@ -138,13 +140,15 @@ int main(void) {
     }
     if (k % 1000 == 0) REFERENCE_AT(q, &reference);
     if (k % 1000 == 0) led = reference;
-    if (!references_stay_finite(&led)) return 5;
+    if (!references_stay_finite(&state, &led)) return 5;
     for (i = 0; i < K; ++i) reference.velocity[i] = k % 7000 < 100 ? 0.1 : 0.0; /* stands still and claims to move */
     if (k % 1500 == 0) arm_resume(&state);
     if (k % 50000 == 49999) {
       arm_take_over(&state, q, before);
       still = 0;
     }
+    if (k % 5000 == 2000) arm_hold(&state, q, 0); /* brakes */
+    if (k % 5000 == 2300) arm_release(&state, q, uniform() > 0.0 ? before : 0);
     if (uniform() > 0.999) measured_q[0] += 6.283185307179586;
     if (k % 9000 >= 8970) { /* sensors stand still while the arm goes on */
       if (still == 0) {

@@ -189,6 +189,13 @@ def _supervised() -> dict[str, Call]:
         "supervisor": (Supervisor, {"library": library, "controller": law, "safety": control.Safety.of(law)}),
         "supervisor.start": (supervisor.start, {"q": q, "command": q}),
         "supervisor.take_over": (supervisor.take_over, {"q": q, "command": q}),
+        "supervisor.hold": (supervisor.hold, {"q": q, "command": q}),
+        "supervisor.release": (supervisor.release, {"q": q, "command": q}),
+        "supervisor.stream": (
+            supervisor.stream,
+            {"reference": reference, "target": np.zeros(3), "omega": 3.0, "period": 1e-3},
+        ),
+        "supervisor.pace": (supervisor.pace, {"reference": reference, "period": 1e-3}),
         "supervisor.step": (supervisor.step, {"q": q, "dq": q, "reference": reference, "period": 1e-3}),
     }
 

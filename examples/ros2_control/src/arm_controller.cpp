@@ -20,13 +20,12 @@ using controller_interface::return_type;
 namespace {
 constexpr const char *COMMAND =
     ARM_COMMANDS_TORQUE ? hardware_interface::HW_IF_EFFORT : hardware_interface::HW_IF_VELOCITY;
-constexpr double DAMPING = 1.0;  // of the low pass
 }  // namespace
 
 CallbackReturn ArmController::on_init() {
   try {
     auto_declare<std::vector<std::string>>("joints", {});
-    auto_declare<double>("smoothness", 3.0);
+    auto_declare<double>("smoothness", 4.5);
   } catch (const std::exception &error) {
     RCLCPP_ERROR(get_node()->get_logger(), "cannot declare parameters: %s", error.what());
     return CallbackReturn::ERROR;
@@ -121,7 +120,7 @@ void ArmController::read_robot(double *q, double *dq) const {
   }
 }
 
-// A low pass follows the targets while the law commands. Otherwise, the reference stays where the arm is.
+// A stream follows the targets while the law commands. Otherwise, the reference stays where the arm is.
 void ArmController::move_reference(const double *q, double period) {
   const int last = status_;
   const auto latest = box_.try_get();
@@ -133,7 +132,7 @@ void ArmController::move_reference(const double *q, double period) {
     return;
   }
   if (fresh) target_ = *latest;
-  arm_reference_low_pass(&reference_, target_.value.data(), smoothness_, DAMPING, period);
+  arm_reference_stream(&state_, &reference_, target_.value.data(), smoothness_, period);
 }
 
 return_type ArmController::update(const rclcpp::Time & /*time*/, const rclcpp::Duration &period) {

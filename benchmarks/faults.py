@@ -1,0 +1,256 @@
+"""What goes wrong around the supervised law, in MuJoCo: sensors, blows, references, delays, brakes (10 min).
+
+PD+ coupled of ready charts with default gains and settings, in C at 1 kHz, on arms without rotor inertia. Each case
+runs 13 times, from random postures in the inner half of the domain:
+
+- Sensors stand still: those of an arm that moves (its joints follow sines that begin at 0.2 rad/s), of one on its way
+  back, of one at rest whose reference then moves at 2 cm/s, and of one with masses 20 % off and integral action. The
+  fastest joint within 200 ms counts.
+- Blows: the last joint turns at 32 to 60 times its limit.
+- References: targets of 1e6, jumps to random postures, 5 a second along all quantities, such velocities without a
+  motion, and streams at 50 Hz of random postures and of targets around 1e6, one in ten NaN. The fastest joint counts,
+  in its limits.
+- Delays of 0, 1, 3 and 5 ms from the measurement to the torque: the catcher holds arms anywhere in the joint range (at
+  most half a turn) that move at up to 0.5 rad/s.
+- Brakes hold for 2 s while the reference goes on.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from benchmark import run, table
+
+import orthocas as oc
+from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
+from orthocas.control import ControlStatus, PDPlus, Safety
+from orthocas.simulation import MuJoCoPlant
+from orthocas.tools.checks import Array
+
+ARMS = ("iiwa7-position", "panda-position", "xarm7-position", "tiago-pro-left-position", "panda-pose")
+RUNS, TICK, SETTLED = 13, 1e-3, 400
+LOOK = 200  # ticks after sensors stand still
+REST = 0.05  # [rad/s]
+HEADER = (
+    "| chart | sensors stand still [rad/s] | blow, at once and 1.5 s later [rad/s] | references [speed limit] "
+    "| caught with 0 to 5 ms: at rest after, back | brakes open [rad/s] |\n| --- | --- | --- | --- | --- | --- |"
+)
+
+
+@dataclass
+class Arm:
+    """A chart, its law in C, and random numbers."""
+
+    chart: oc.Chart
+    law: PDPlus
+    library: CompiledLibrary
+    safety: Safety
+    rng: np.random.Generator
+
+    @property
+    def robot(self) -> oc.Robot:
+        """The robot of the chart."""
+        return self.chart.problem.robot
+
+    @property
+    def limits(self) -> Array:
+        """Of speed, (n,)."""
+        return self.safety.speed_limit
+
+    def posture(self, share: float = 0.5) -> Array:
+        """Within a share of the domain, and of 1.5 rad around its centre, (n,)."""
+        domain = self.chart.problem.domain
+        while True:
+            q = domain.centre + share * np.minimum(domain.half_width, 1.5) * self.rng.uniform(-1, 1, self.chart.n)
+            if domain.contains(q):
+                return q
+
+    def resting(self, q: Array) -> Array:
+        """The reference at rest at q (n,), (3 n,)."""
+        return np.concatenate([self.chart.phi(q), np.zeros(2 * self.chart.n)])
+
+    def started(self, q: Array, robot: oc.Robot | None = None, **settings: Any) -> tuple[Supervisor, MuJoCoPlant]:
+        """The law and its arm at rest at q (n,)."""
+        supervisor = Supervisor(self.library, self.law, replace(self.safety, **settings))
+        plant = MuJoCoPlant(self.robot if robot is None else robot)
+        plant.reset(q)
+        supervisor.start(q)
+        return supervisor, plant
+
+
+def main(quick: bool = False) -> list[str]:
+    """Print the table."""
+    return table(HEADER, rows(ARMS[:1] if quick else ARMS, 1 if quick else RUNS))
+
+
+def rows(arms: tuple[str, ...], runs: int) -> Iterator[str]:
+    """A row for each arm: the worst of all runs of each case."""
+    for name in arms:
+        chart = oc.charts.load(name)
+        law = PDPlus.on_chart(chart)
+        with TemporaryDirectory() as folder:
+            path = compile_shared(oc.generate_c(chart, Path(folder), law, "arm"), Path(folder), ("-O1",))
+            library = CompiledLibrary(path, "arm", chart.n)
+            arm = Arm(chart, law, library, Safety.of(law), np.random.default_rng(7))
+            frozen = [max(stands_still(arm, case) for _ in range(runs)) for case in STANDING]
+            blown = np.array([blow(arm) for _ in range(runs)]).max(axis=0)
+            asked = [max(led(arm, case) for _ in range(runs)) for case in ASKED]
+            held = np.array([caught(arm, delay) for delay in (0, 1, 3, 5) for _ in range(runs)])
+            opened = max(brakes(arm) for _ in range(runs))
+        yield (
+            f"| {name} | {', '.join(f'{speed:.1f}' for speed in frozen)} | {blown[0]:.0f}, {blown[1]:.2f} "
+            f"| {', '.join(f'{share:.2f}' for share in asked)} | {held[:, 0].max():.2f} s, "
+            f"{int(held[:, 1].sum())} of {len(held)} | {opened:.3f} |"
+        )
+
+
+STANDING = ("moving", "way back", "reference", "integral")
+
+
+def stands_still(arm: Arm, case: str) -> float:
+    """The fastest joint within 200 ms after the sensors stood still [rad/s]."""
+    wrong = case == "integral"
+    q, domain = arm.posture(), arm.chart.problem.domain
+    if case == "way back":
+        q[1] = domain.centre[1] + 1.25 * min(domain.half_width[1], 2.0)
+    supervisor, plant = arm.started(
+        q,
+        arm.robot.with_scaled_masses(1.2) if wrong else None,
+        integral_rate=np.full(arm.chart.n, 3.0 if wrong else 0.0),
+    )
+    reference, signs, most = arm.resting(q), arm.rng.choice([-1.0, 1.0], arm.chart.n), 0.0
+    for k in range(SETTLED + LOOK):
+        if k <= SETTLED:
+            seen = plant.q, plant.dq if case == "moving" else (k < SETTLED) * plant.dq
+        if case == "moving":
+            angle = 2 * k * TICK
+            reference = motion(arm.chart, q + 0.1 * signs * (1 - np.cos(angle)), 0.2 * signs * np.sin(angle))
+        if k == SETTLED and case == "way back":
+            supervisor.resume()
+        if k >= SETTLED and case == "reference":
+            reference[0] += 0.02 * TICK
+        plant.step(supervisor.step(*seen, reference, TICK)[0], TICK)
+        most = max(most, float(np.abs(plant.dq).max())) if k >= SETTLED else 0.0
+    return most
+
+
+def motion(chart: oc.Chart, q: Array, dq: Array) -> Array:
+    """The reference of a joint motion, without acceleration of the joints."""
+    curvature = chart.function("second_derivative")(q, dq, dq).full().ravel()
+    return np.concatenate([chart.phi(q), chart.jacobian(q) @ dq, curvature])
+
+
+def blow(arm: Arm) -> tuple[float, float]:
+    """The fastest joint of all times, and the last one [rad/s]."""
+    q, dq = arm.posture(), np.zeros(arm.chart.n)
+    dq[-1] = arm.rng.uniform(32, 60) * arm.limits[-1]
+    supervisor, plant = arm.started(q)
+    speeds = []
+    for k in range(SETTLED + 1500):
+        if k == SETTLED:
+            plant.reset(plant.q, dq)
+        plant.step(supervisor.step(plant.q, plant.dq, arm.resting(q), TICK)[0], TICK)
+        speeds.append(np.abs(plant.dq).max())
+    return max(speeds), speeds[-1]
+
+
+Asking = Callable[
+    [Arm, Supervisor, int, Array, Array, Array], None
+]  # changes the reference, and the target of a stream
+
+
+def _far(arm: Arm, _law: Supervisor, _k: int, reference: Array, target: Array, home: Array) -> None:
+    reference[: arm.chart.n] = home + 1e6 * np.sign(target - home + 1e-9)
+
+
+def _jumps(arm: Arm, _law: Supervisor, k: int, reference: Array, _target: Array, _home: Array) -> None:
+    if k % 300 == 0:
+        reference[: arm.chart.n] = arm.chart.phi(arm.posture(0.8))
+
+
+def _fast(arm: Arm, _law: Supervisor, _k: int, reference: Array, target: Array, home: Array) -> None:
+    n, rate = arm.chart.n, 5 * np.sign(target - home + 1e-9)
+    reference[:n] += rate * TICK
+    reference[n : 2 * n] = rate
+
+
+def _claimed(arm: Arm, _law: Supervisor, k: int, reference: Array, target: Array, home: Array) -> None:
+    n = arm.chart.n
+    reference[:n] = home + 1e-6 * (k % 2)
+    reference[n : 2 * n] = 5 * np.sign(target - home + 1e-9)
+
+
+def _streamed(far: float) -> Asking:
+    def ask(arm: Arm, law: Supervisor, k: int, reference: Array, target: Array, home: Array) -> None:
+        if k % 20 == 0:
+            target[:] = arm.chart.phi(arm.posture(0.8)) if far == 0 else home + far * arm.rng.normal(size=arm.chart.n)
+            if arm.rng.uniform() < 0.1:
+                target[:] = np.nan
+        law.stream(reference, target, 6.0, TICK)
+
+    return ask
+
+
+ASKED: tuple[Asking, ...] = (_far, _jumps, _fast, _claimed, _streamed(0.0), _streamed(1e6))
+
+
+def led(arm: Arm, ask: Asking) -> float:
+    """The fastest joint, in its limit of speed."""
+    q = arm.posture()
+    supervisor, plant = arm.started(q)
+    reference, worst = arm.resting(q), 0.0
+    home, target = arm.chart.phi(q), arm.chart.phi(arm.posture())
+    for k in range(SETTLED + 1600):
+        if k >= SETTLED:
+            ask(arm, supervisor, k, reference, target, home)
+        plant.step(supervisor.step(plant.q, plant.dq, reference, TICK)[0], TICK)
+        worst = max(worst, float((np.abs(plant.dq) / arm.limits).max()))
+    return worst
+
+
+def caught(arm: Arm, delay: int) -> tuple[float, bool]:
+    """The time until all joints rest [s], and whether the catcher then goes on when asked."""
+    robot, n = arm.robot, arm.chart.n
+    q = arm.rng.uniform(np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi))
+    supervisor, plant = arm.started(q, return_margin=0.99, near_margin=0.98)  # as if nothing were inside
+    plant.reset(q, arm.rng.uniform(-0.5, 0.5, n))
+    late, last, asked = deque([robot.gravity(q)] * delay), 0, arm.resting(arm.chart.problem.domain.centre)
+    for k in range(3000):
+        if k == 2500:
+            supervisor.resume()
+        command, status = supervisor.step(plant.q, plant.dq, asked, TICK)
+        late.append(command)
+        plant.step(late.popleft(), TICK)
+        if k < 2500 and np.abs(plant.dq).max() > REST:
+            last = k + 1
+    return last * TICK, status is not ControlStatus.CAUGHT
+
+
+def brakes(arm: Arm) -> float:
+    """The fastest joint in the second after brakes open [rad/s]."""
+    q = arm.posture()
+    supervisor, plant = arm.started(q)
+    reference, target, most = arm.resting(q), arm.chart.phi(arm.posture()), 0.0
+    for k in range(SETTLED + 3000):
+        holds = SETTLED <= k < SETTLED + 2000
+        if k == SETTLED:
+            supervisor.hold(plant.q)
+        if k == SETTLED + 2000:
+            supervisor.release(plant.q)
+        if k >= SETTLED:
+            supervisor.stream(reference, target, 6.0, TICK)
+        command, _ = supervisor.step(plant.q, plant.dq, reference, TICK)
+        if holds:
+            plant.reset(plant.q)
+        else:
+            plant.step(command, TICK)
+        most = max(most, float(np.abs(plant.dq).max())) if k > SETTLED + 2000 else 0.0
+    return most
+
+
+if __name__ == "__main__":
+    run(main, __doc__)
