@@ -388,7 +388,7 @@ class Robot(Shown):
         return BuiltOnUse(self._built_function)
 
     def _built_function(self, key: _Key) -> ca.Function:
-        name, *frames = key
+        name, frames = str(key[0]), key[1:]
         names, expression = _FUNCTIONS[name]
         by_bias = name.startswith("coriolis_product") and self.n > WRITTEN_OUT
         kind = ca.MX if by_bias else ca.SX

@@ -292,7 +292,7 @@ def _is_of_gripper(model: pin.Model, i: int) -> bool:
 def _end_of(model: pin.Model, i: int) -> str:
     """The frame of a body that stands for its end."""
     frames = [frame for frame in model.frames if frame.parentJoint == i]
-    names = [frame.name for frame in frames if frame.type in LINKS] or [frame.name for frame in frames]
+    names: list[str] = [frame.name for frame in frames if frame.type in LINKS] or [frame.name for frame in frames]
     plain = [name for name in names if not _FINGER.search(name)]
     return [*names, *plain, *(name for name in plain if _TOOL.search(name))][-1]
 
