@@ -26,7 +26,7 @@ from public_objects import (
 )
 
 import orthocas as oc
-from orthocas import bases, control, plotting, problems, simulation, solvers, viewer
+from orthocas import bases, control, learn, plotting, problems, simulation, solvers, viewer
 from orthocas.atlas.laws import BlendedImpedance, HandedOver
 from orthocas.atlas.simulate import AtlasControl
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
@@ -464,6 +464,12 @@ def _control() -> dict[str, Call]:
         "Safety.of": (
             control.Safety.of,
             {"controller": law, "fade_in": 0.1, "command_rate": 100.0, "error_limit": [0.1, 0.1, 0.1], "hold_ticks": 5},
+        ),
+        "XiTask": (control.XiTask, {"chart": chart, "cost": 1.0, "gain": 0.5, "lm_damping": 0.1}),
+        "coordinates_of": (learn.coordinates_of, {"chart": chart, "q": np.array([[0.6, 0.8, 0.8]])}),
+        "joints_of": (
+            learn.joints_of,
+            {"chart": chart, "phi": chart.phi([[0.6, 0.8, 0.8]]), "q_start": np.array([0.6, 0.8, 0.8])},
         ),
         "PDPlus": (control.PDPlus, {**gains, "limit": [1.0, 2.0, 3.0]}),
         "Kinematic": (control.Kinematic, {"chart": chart, "feedback": 1.0, "limit": None}),
