@@ -92,8 +92,12 @@ class Supervisor:
     ) -> ControlStatus:
         """Move a reference by one tick towards a target (k,), with poles at omega [1/s]; the status."""
         numbers, asked = self._asked(reference)
-        wanted = self._numbers("target", target, self._k)
-        status = self._functions["stream"](self._here, asked, _pointer(wanted), omega, period)
+        wanted, speed, time = (
+            self._numbers("target", target, self._k),
+            as_number("omega", omega),
+            as_number("period", period),
+        )
+        status = self._functions["stream"](self._here, asked, _pointer(wanted), speed, time)
         if isinstance(reference, np.ndarray):
             reference[:] = numbers
         return ControlStatus(status)
@@ -101,7 +105,7 @@ class Supervisor:
     def pace(self, reference: Array | ChartReference, period: float = 1e-3) -> float:
         """Scale the derivatives of a reference to what joints can follow; the pace at which time goes on, 0 to 1."""
         numbers, asked = self._asked(reference)
-        pace = float(self._functions["pace"](self._here, asked, period))
+        pace = float(self._functions["pace"](self._here, asked, as_number("period", period)))
         if isinstance(reference, np.ndarray):
             reference[:] = numbers
         return pace
