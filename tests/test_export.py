@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -78,6 +79,8 @@ OTHERS: dict[str, Callable[[], oc.Chart]] = {
 
 def arm_with(kind: str) -> tuple[oc.Robot, oc.Task]:
     robot = problems.get("iiwa").robot
+    if kind.startswith("relative_"):
+        robot = oc.Robot(replace(robot.tree, tips=(robot.frame_names[3],)))
     return robot, oc.Task.named(robot, kind, problems.get("iiwa").domain.centre)
 
 

@@ -247,3 +247,11 @@ def test_pushes_act_at_frames(baxter: oc.Robot) -> None:
     arm = R @ [0.1, 0.0, 0.0]
     moved = whole[:3] + np.cross(whole[3:].T, arm).T
     np.testing.assert_allclose(np.asarray(J), moved, atol=1e-12)
+
+
+def test_matrices_of_one_joint_are_matrices() -> None:
+    robot = oc.Robot.planar([1.0], [1.0])
+    assert robot.mass_matrix([0.3]).shape == (1, 1)
+    assert robot.tip_jacobian(np.zeros((5, 1))).shape == (5, 6, 1)
+    assert robot.frame_jacobian([0.3], "tip").shape == (6, 1)
+    assert robot.gravity([0.3]).shape == (1,)

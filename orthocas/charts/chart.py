@@ -83,9 +83,10 @@ class Chart(InverseMethods, Shown):
 
     @property
     def named_coordinates(self) -> tuple[str, ...]:
-        """Labels of the coordinates, with what they mean where `fit_wide` gave them a meaning: 'xi1: swivel [rad]'."""
+        """Labels of the coordinates, with what a fit made the first ones mean: 'xi1: swivel [rad]'."""
         labels, meaning = self.labels[self.m :], self.notes.get("meaning")
-        return (f"{labels[0]}: {meaning}",) if isinstance(meaning, str) and self.r == 1 else labels
+        named = meaning.split("; ") if isinstance(meaning, str) else []
+        return (*(f"{label}: {name}" for label, name in zip(labels, named, strict=False)), *labels[len(named) :])
 
     def quality(self, q: ArrayLike) -> PointQuality:
         """How good the chart is at one joint position (n,), or at each of a set or a path (N, n).

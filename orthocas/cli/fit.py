@@ -123,9 +123,8 @@ def fit(
     """Fit extra coordinates to a problem and save the chart."""
     bounds = _bounds(domain, leak_deg, conditioning, corridor)
     wide = domain == BRANCH
-    for option, value in {"--branch": branch, "--like": like}.items():
-        if value is not None and not wide:
-            raise OptionError(f"{option} requires --domain branch")
+    if branch is not None and not wide:
+        raise OptionError("--branch requires --domain branch")
     if wide:
         usual_loss = weights == WEIGHTS_TEXT and angles is None and precision == PRECISIONS[0]
         _require_none({"solver": solver, "max-mutual-deg": max_mutual_deg, "checkpoint": checkpoint})
@@ -145,8 +144,8 @@ def fit(
             if built is None:
                 result: Fit = wide_fit(problem, words, branch, like, parametrisation, samples, seed, monitor)
             else:
-                others = (minimiser, samples, max_mutual_deg, checkpoint)
-                usual = others == (None,) * 4 and loss == Weights() and precision == PRECISIONS[0]
+                others = (minimiser, samples, max_mutual_deg, checkpoint, like)
+                usual = others == (None,) * 5 and loss == Weights() and precision == PRECISIONS[0]
                 result = (_confirming(suggestion, built, parametrisation) if usual else None) or fit_chart(
                     built,
                     parametrisation,
@@ -158,6 +157,7 @@ def fit(
                     max_mutual_deg=max_mutual_deg,
                     checkpoint=checkpoint,
                     precision=cast(Precision, precision),
+                    like=None if like is None else [word.strip() for word in like.split(",")],
                 )
     except Interrupted as stop:
         result = stop.result
@@ -217,6 +217,8 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
         rows["regular"] = f"{result.regular_share:.3%} of the clear positions of the branch, which are the domain"
         if (error := result.chart.notes.get("error of its meaning")) is not None:
             rows["meaning"] = f"xi1 is what was asked, but for {float(error):.2g} rms along the home's self-motion"
+    if result.like:
+        rows["like"] = ", ".join(f"{name} {angle:.3g} deg off" for name, angle in result.like.items())
     if result.idle_joints:
         rows["exact"] = f"joints that do not move the task: {', '.join(result.idle_joints)}"
     if result.cyclic_joints:

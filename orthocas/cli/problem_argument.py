@@ -92,7 +92,7 @@ BranchName = Annotated[
 LikeName = Annotated[
     str | None,
     typer.Option(
-        "--like", help="What xi of a wide chart means along the self-motion of the home: a joint, or swivel (r = 1)."
+        "--like", help="What the first coordinates mean: a joint or swivel; several: NAME,NAME (not for wide charts)."
     ),
 ]
 BRANCH = "branch"  #: the word of --domain for wide charts

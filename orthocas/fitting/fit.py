@@ -1,8 +1,8 @@
 """`fit`: fits coordinates to a problem, along stages, and fixes what the loss leaves free."""
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.worst_points import WorstPoints
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.checkpoint import Checkpoint, Stage
+from orthocas.fitting.like import Likeness
 from orthocas.fitting.settings import FitSettings, Precision, default_parametrisation
 from orthocas.fitting.stages import FoldSearch, Plan, StageRunner
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, LEAST_CONDITIONING, WeightNumbers, Weights
@@ -287,6 +288,7 @@ class Fit(Shown):
     idle_joints: tuple[str, ...]  #: names of joints that are exact coordinates themselves
     worst: WorstPoints | None  #: result of the last search for folds; None if there was none
     seconds: float  #: of this run; the seconds of stages include earlier runs of a checkpoint
+    like: Mapping[str, float] = field(default_factory=dict)  #: root mean square angle to each quantity's gradient [deg]
     clear_part: ClearPart | None = None  #: a smaller domain to fit on, if this one touches near-singular positions
 
     @property
@@ -303,6 +305,7 @@ class Fit(Shown):
 
     def facts(self) -> dict[str, str]:
         """Status, time, stages and the chart."""
+        meant = [f"{name} {angle:.3g} deg off" for name, angle in self.like.items()]
         stages = [f"{stage.label} {stage.result.value:.4g}" for stage in self.stages]
         return {
             "fit": f"{self.chart.coordinates.label}, {self.status.value} after {self.seconds:.3g} s",
@@ -311,6 +314,7 @@ class Fit(Shown):
             "samples": str(self.chart.notes.get("samples", "")),
             "idle joints": listed(self.idle_joints) or "none",
             "least conditioning": "not searched" if self.worst is None else self.worst.explained,
+            **({"like": listed(meant)} if meant else {}),
             **({"cyclic joints": listed(self.cyclic_joints)} if self.cyclic_joints else {}),
             "near singular": f"{self.problem_check.singular_share:.3%} of the domain",
             **({"offer": f"a {self.clear_part.explained}"} if self.clear_part else {}),
@@ -332,6 +336,7 @@ def fit(
     threads: int | None = None,
     split_idle: bool = True,
     precision: Precision = "double",
+    like: Likeness | None = None,
 ) -> Fit:
     """Find coordinates xi(q) of a family that are nearly orthogonal to the task.
 
@@ -366,6 +371,9 @@ def fit(
         precision: 'double', or 'single' for the large products of loss and gradient: those of a network, and those with
             the gradients of a basis, which then take half of the memory. Losses and angles change by less than 1e-5 of
             their size at the same parameters. Parameters and charts are double.
+        like: quantities that the first coordinates follow as far as they can be orthogonal to the task: a joint's name,
+            "swivel", a function of an SX column q, several of these, or a task of lower priority. Each has the units of
+            its quantity, and its value at the centre of the domain.
 
     Returns:
         The chart, the result of each stage, and the seconds.
@@ -393,7 +401,7 @@ def fit(
         default_parametrisation(problem, max_mutual_deg is not None) if parametrisation is None else parametrisation
     )
     settings = FitSettings.checked(
-        problem, wanted, solver, weights, samples, seed, max_mutual_deg, split_idle, precision
+        problem, wanted, solver, weights, samples, seed, max_mutual_deg, split_idle, precision, like
     )
     warn_unless_savable(settings.parametrisation)
     if isinstance(settings.parametrisation, CyclicParametrisation):
@@ -428,8 +436,7 @@ def _fitted(
         file = Checkpoint(None if checkpoint is None else as_path("checkpoint", checkpoint), settings.identity(problem))
         stages, coordinates, worst = _minimised(problem, settings, idle, monitor, file, first)
         if stages:
-            centre = problem.domain.centre
-            coordinates = in_gauge(coordinates, centre) if align_to is None else aligned(coordinates, align_to, first)
+            coordinates = _arranged(coordinates, problem, settings, align_to, first)
     return Fit(
         chart=Chart(problem, coordinates, _notes(stages, settings, worst)),
         stages=stages,
@@ -437,6 +444,7 @@ def _fitted(
         idle_joints=tuple(problem.robot.joint_names[i] for i in idle),
         worst=worst,
         seconds=time.perf_counter() - start,
+        like={} if settings.like is None else settings.like.distances(problem, coordinates, settings.seed),
         clear_part=clear_part(problem, found, worst),
     )
 
@@ -454,10 +462,21 @@ def _minimised(
     if r == 0:
         return (), Coordinates(settings.parametrisation, space, idle, np.zeros(0), np.zeros(0), np.zeros(0)), None
     active = [i for i in range(problem.n) if i not in idle]
+    like = None if settings.like is None else settings.like.term(problem, active)
+    settings = settings if like is None else settings.with_term(like)
     folds = FoldSearch(problem, active, settings.fold_weight(problem))
-    solved = Continuation(StageRunner(problem, settings, active, monitor, checkpoint, folds), r).run()
+    solved = Continuation(StageRunner(problem, settings, active, monitor, checkpoint, folds, like), r).run()
     raw = Coordinates(solved.parametrisation, space, idle, solved.theta, np.zeros(r), np.ones(r))
     return solved.stages, normalised(raw, problem.domain.centre, samples), solved.worst
+
+
+def _arranged(
+    coordinates: Coordinates, problem: Problem, settings: FitSettings, align_to: Chart | None, samples: Samples
+) -> Coordinates:
+    """Coordinates in their order, with their signs: by what they follow, by another chart, or by the joints."""
+    if settings.like is not None:
+        return settings.like.named(coordinates, problem)
+    return in_gauge(coordinates, problem.domain.centre) if align_to is None else aligned(coordinates, align_to, samples)
 
 
 def _notes(stages: Sequence[Stage], settings: FitSettings, worst: WorstPoints | None) -> dict[str, str | float]:
@@ -478,4 +497,5 @@ def _notes(stages: Sequence[Stage], settings: FitSettings, worst: WorstPoints | 
         "lambda5": weights.folds,
         **extra,
         "angles": weights.angles or "paper",
+        **({} if settings.like is None else {"meaning": "; ".join(settings.like.names)}),
     }

@@ -1,15 +1,16 @@
 """The settings of one fit, checked once."""
 
 import hashlib
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, Self
 
 import numpy as np
 
 from orthocas.bases.family import GradedParametrisation, Parametrisation
 from orthocas.bases.products import Polynomial
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.terms import WeightNumbers, Weights
+from orthocas.fitting.like import WEIGHT, Like, Likeness, LikeTerm
+from orthocas.fitting.terms import WeightNumbers, Weights, register_loss_term
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.ipopt import Ipopt
 from orthocas.solvers.lbfgs import LBFGS
@@ -40,6 +41,7 @@ class FitSettings:
     max_mutual_deg: float | None
     split_idle: bool = True
     precision: Precision = "double"
+    like: Like | None = None
 
     @classmethod
     def checked(
@@ -53,6 +55,7 @@ class FitSettings:
         max_mutual_deg: float | None,
         split_idle: bool = True,
         precision: Precision = "double",
+        like: Likeness | None = None,
     ) -> "FitSettings":
         """Check the settings, and fill in the default solver and the default angles.
 
@@ -76,7 +79,15 @@ class FitSettings:
         if precision == "single" and max_mutual_deg is not None:
             raise InvalidValueError("precision", "'single' with max_mutual_deg", "double: Ipopt needs its digits")
         tag = require_count("seed", seed, least=0)
-        return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision)
+        if like is not None and max_mutual_deg is not None:
+            raise InvalidValueError("like", "given with max_mutual_deg", "one of them")
+        known = None if like is None else Like.of(problem.robot, like)
+        return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, known)
+
+    def with_term(self, term: LikeTerm) -> Self:
+        """The settings with the term that holds coordinates to quantities among the weights."""
+        register_loss_term(term)
+        return replace(self, weights=replace(self.weights, extra={**self.weights.extra, term.name: WEIGHT}))
 
     @property
     def single(self) -> bool:
@@ -105,6 +116,7 @@ class FitSettings:
             "max_mutual_deg": repr(self.max_mutual_deg),
             **({} if self.split_idle else {"split_idle": "False"}),
             **({"precision": self.precision} if self.single else {}),
+            **({} if self.like is None else {"like": self.like.digest}),
         }
 
 

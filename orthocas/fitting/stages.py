@@ -19,6 +19,7 @@ from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.basis_objective import STRIDE, BasisObjective, BoundedMutual, expanded
 from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.graph_objective import GraphObjective
+from orthocas.fitting.like import LikeTerm
 from orthocas.fitting.settings import FitSettings
 from orthocas.fitting.starts import Mirror, find_mirror, spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, FOLD_TERM, LEAST_CONDITIONING
@@ -163,6 +164,7 @@ class StageRunner:
     monitor: Monitor
     checkpoint: Checkpoint
     folds: FoldSearch
+    like: LikeTerm | None = None  #: what the first coordinates follow
 
     @property
     def space(self) -> JointSpace:
@@ -171,11 +173,12 @@ class StageRunner:
 
     @cached_property
     def mirror(self) -> Mirror | None:
-        """The symmetry that halves the coefficients; a bound on mutual angles is met without one.
+        """The symmetry that halves the coefficients; a bound on mutual angles, or a meaning, is met without one.
 
         Of the coordinates that it allows, those with the least loss at degree 3 are chosen.
         """
-        found = None if self.settings.max_mutual is not None else find_mirror(self.problem, self.active)
+        free = self.settings.max_mutual is None and self.like is None
+        found = find_mirror(self.problem, self.active) if free else None
         target = self.settings.parametrisation
         if found is None or not isinstance(target, GradedParametrisation):
             return found
@@ -327,7 +330,10 @@ class StageRunner:
         if key not in self._starts:
             points = sample_evenly(self.problem.domain, count, _START_SEED)
             samples = samples_at(self.problem, points).restricted_to(self.active)
-            self._starts[key] = spectral_start(family, samples, kept, self._gradients(family))
+            start = spectral_start(family, samples, kept, self._gradients(family))
+            if self.like is not None:
+                start = self.like.turned(family, start, samples, self._gradients(family))
+            self._starts[key] = start
         return self._starts[key]
 
     def _samples(self, count: int, tag: int) -> Samples:

@@ -1,7 +1,7 @@
 """Wide charts: coordinates that are regular on a whole branch of the joint range."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -20,7 +20,6 @@ from orthocas.bases.family import (
     Parametrisation,
 )
 from orthocas.bases.products import Polynomial
-from orthocas.bases.sew import sew_angle
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.regular_part import RegularPart
@@ -29,6 +28,7 @@ from orthocas.errors import DomainError, Interrupted, InvalidValueError, RobotEr
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.checkpoint import Stage
 from orthocas.fitting.fit import Fit, fit, in_gauge, normalised
+from orthocas.fitting.like import SWIVEL, Quantity, quantity_of
 from orthocas.fitting.settings import require_parametrisation
 from orthocas.robots.robot import Robot
 from orthocas.solvers.protocol import SolveResult, Status
@@ -40,14 +40,10 @@ from orthocas.tasks.regular_box import home_posture
 from orthocas.tasks.samples import sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
-from orthocas.tools.checks import Array, as_number, require_count, require_kind, require_known, require_shape
-from orthocas.tools.expressions import expression_of
+from orthocas.tools.checks import Array, as_number, require_count, require_kind
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, Progress, silent
 
-Quantity = Callable[[ca.SX], ca.SX]  #: a function of an SX column q
-
-SWIVEL = "swivel"  #: the name of the angle of the elbow
 CLEARANCE = 0.1  #: default least relative singular value
 LEAST_VOLUME = 0.05  #: over r, of the coordinates in domains of wide charts; see `RegularPart`
 DEGREE = 6
@@ -234,25 +230,6 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     )
 
 
-def _quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
-    """Its name with a unit, and q (n, 1) -> the quantity (1, 1)."""
-    q = ca.SX.sym("q", robot.n)
-    if isinstance(like, str):
-        require_known("like", like, (SWIVEL, *robot.joint_names))
-        if like == SWIVEL:
-            return f"{SWIVEL} [rad]", sew_angle(robot, "conventional")
-        k = robot.joint_names.index(like)
-        return f"{like} [{'m' if robot.tree.prismatic[k] else 'rad'}]", _of(q, q[k])
-    found = expression_of("like", like, q)
-    require_shape("like", found.shape, (1, 1))
-    name = str(getattr(like, "__name__", ""))
-    return name if name.isidentifier() else "a function of q", _of(q, found)
-
-
-def _of(q: ca.SX, value: ca.SX) -> ca.Function:
-    return dense_function("like", [q], [value])
-
-
 @dataclass(frozen=True, eq=False)
 class Meaning:
     """Values that a coordinate is to have along the self-motion of a posture."""
@@ -279,10 +256,10 @@ class Meaning:
         Raises:
             InvalidValueError: if r > 1, or the quantity stands still there.
         """
-        name, quantity = _quantity(problem.robot, like)
+        name, quantity = quantity_of(problem.robot, like)
         if problem.r != 1:
             raise InvalidValueError(
-                "like", f"given with r = {problem.r}", "none: a meaning for all coordinates but one"
+                "like", f"given with r = {problem.r}", "none for a wide chart with several coordinates; fit has like"
             )
         sides = [_followed(problem, posture, sign * _STEP) for sign in (-1.0, 1.0)]
         points = np.concatenate([sides[0][:0:-1], sides[1]])

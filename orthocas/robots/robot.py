@@ -427,7 +427,7 @@ class Robot(Shown):
         if len({len(p) for p in points}) > 1:
             raise ShapeError("the second state set", points[1].shape, points[0].shape)
         rows, columns = function.size_out(0)
-        result = self._batched[key](*points)[0].reshape((-1, rows, columns) if columns > 1 else (-1, rows))
+        result = self._batched[key](*points)[0].reshape((-1, rows, columns) if key[0] in _MATRICES else (-1, rows))
         return result[0] if all(single for _, single in sets) else result
 
 
@@ -477,3 +477,4 @@ _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {  # argum
     ),
     "coriolis_product_with_payload": (("q", "v", "w", "payload"), dynamics.coriolis_product),
 }
+_MATRICES = ("mass_matrix", *(f"{of}_{quantity}" for of in ("tip", "frame") for quantity in ("rotation", "jacobian")))
