@@ -30,6 +30,7 @@ SCRIPTS = (
     "atlas",
     "atlas_c",
     "suggested_domains",
+    "many_joints",
     "wide_charts",
     "choices",
     "elbow_angle",

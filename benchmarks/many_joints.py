@@ -1,0 +1,165 @@
+"""Two arms, humanoid upper bodies, long planar arms and a mobile base: fits, generated C, and a push in MuJoCo.
+
+Boxes have the half-width 0.3 around the postures below (0.1 for the longest arm, pr2's lift). The leak is that of
+coordinates that are not joints themselves, on 20,000 samples of another seed; the least conditioning comes from a
+search by descent. `--quick` takes one case.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from benchmark import run, table
+
+import orthocas as oc
+from orthocas.codegen import CompiledLibrary, compile_shared, generate_c
+from orthocas.codegen.ticks import time_ticks
+from orthocas.tools.checks import Array
+
+BAXTER = [0.3, -0.4, -0.5, 1.2, 0.2, 0.8, 0.1, -0.3, -0.4, 0.5, 1.2, -0.2, 0.8, -0.1]
+G1 = {"shoulder_pitch": -0.4, "elbow": 0.6, "wrist_pitch": 0.3}
+G1_MIRRORED = {"shoulder_roll": 0.4, "shoulder_yaw": 0.3, "wrist_yaw": 0.3}
+PR2 = {"shoulder_lift": 0.3, "elbow_flex": -1.2, "wrist_flex": -0.9, "torso": 0.15}
+PR2_MIRRORED = {"shoulder_pan": 0.5, "upper_arm_roll": 0.6, "forearm_roll": 0.4}
+TALOS = {"_4_": -1.3, "_6_": 0.1}
+TALOS_MIRRORED = {"_1_": 0.3, "_2_": 0.5, "_3_": -0.5, "_5_": 0.2, "_7_": 0.3}
+HALF_WIDTH = 0.3
+
+
+@dataclass(frozen=True)
+class Case:
+    """A problem, the parametrisation, and how rows call it."""
+
+    name: str
+    problem: oc.Problem
+    parametrisation: oc.bases.Parametrisation
+
+
+def robot(file: str, *tips: str, base: str | None = None) -> oc.Robot:
+    """A robot of example-robot-data."""
+    path = next(path.locate() for path in files("example-robot-data") or [] if path.name == file)
+    return oc.Robot.from_urdf(str(path), tips=tips, base=base)
+
+
+def posture(arms: oc.Robot, same: dict[str, float], mirrored: dict[str, float], left: str) -> Array:
+    """Positions of joints by parts of their names; those of the right side have the other sign where mirrored."""
+    q = np.zeros(arms.n)
+    for k, name in enumerate(arms.joint_names):
+        sign = 1 if left in name else -1
+        q[k] = next((value for part, value in same.items() if part in name), 0.0)
+        q[k] += next((sign * value for part, value in mirrored.items() if part in name and "waist" not in name), 0.0)
+    return q
+
+
+def cases(quick: bool) -> Iterator[Case]:
+    """Of the table."""
+    two = robot("baxter.urdf", "left_gripper", "right_gripper")
+    grip = oc.Problem(two, oc.Task.relative_pose(two, *two.tips), domain=oc.Box(BAXTER, HALF_WIDTH))
+    yield Case("baxter, relative pose of the hands", grip, oc.Polynomial(2))
+    if quick:
+        return
+    yield Case("baxter, relative pose of the hands", grip, oc.Polynomial(3))
+    apart = oc.Problem(two, oc.Task.relative_position(two, *two.tips), domain=grip.domain)
+    yield Case("baxter, relative position of the hands", apart, oc.Polynomial(2))
+    for name, arms, centre in (
+        ("g1", robot("g1_29dof_rev_1_0.urdf", "left_rubber_hand", "right_rubber_hand"), (G1, G1_MIRRORED, "left")),
+        (
+            "talos",
+            robot("talos_reduced.urdf", "gripper_left_base_link", "gripper_right_base_link"),
+            (TALOS, TALOS_MIRRORED, "left"),
+        ),
+        ("pr2", robot("pr2.urdf", "l_gripper_tool_frame", "r_gripper_tool_frame"), (PR2, PR2_MIRRORED, "l_")),
+    ):
+        widths = np.array(
+            [0.1 if "lift_joint" in joint and "torso" in joint else HALF_WIDTH for joint in arms.joint_names]
+        )
+        box = oc.Box(np.clip(posture(arms, *centre), arms.lower + widths, arms.upper - widths), widths)
+        both = oc.Task.stack(oc.Task.position(arms), oc.Task.position(arms, frame=arms.tips[1]))
+        yield Case(
+            f"{name}, relative pose of the hands",
+            oc.Problem(arms, oc.Task.relative_pose(arms, *arms.tips), domain=box),
+            oc.Polynomial(2),
+        )
+        yield Case(f"{name}, both hands", oc.Problem(arms, both, domain=box), oc.Polynomial(2))
+    for n, width in ((12, HALF_WIDTH), (20, 0.1)):
+        arm = oc.Robot.planar([3.0 / n] * n, [1.0] * n)
+        box = oc.Box([HALF_WIDTH] * n, width)
+        yield Case(f"planar, {n} joints", oc.Problem(arm, oc.Task.position(arm, "xy"), domain=box), oc.Polynomial(2))
+    mobile = robot("panda.urdf", base="planar")
+    home = np.array([0, 0, 0, 0, -0.6, 0, -2.1, 0, 1.5, 0.78])
+    for task in (oc.Task.position(mobile), oc.Task.pose(mobile).with_reference_at(home)):
+        everywhere = oc.Problem(mobile, task, domain=oc.Box(home, HALF_WIDTH))
+        yield Case(f"mobile panda, {task.name.partition(':')[0]}", everywhere, oc.Mobile(oc.Polynomial(2)))
+
+
+def fits(quick: bool) -> Iterator[tuple[str, oc.Chart]]:
+    """Rows, and their charts."""
+    for case in cases(quick):
+        began = time.process_time()
+        fit = oc.fit(case.problem, case.parametrisation)
+        seconds = time.process_time() - began
+        report = oc.evaluate(fit.chart, samples=20_000)
+        leak = (report if report.without_idle is None else report.without_idle).leak.rms
+        sizes = f"{case.problem.n}, {case.problem.m}, {case.problem.r}"
+        least = report.worst.least if report.worst is not None else float("nan")
+        yield (
+            f"| {case.name} | {sizes} | {case.parametrisation.label} | {seconds:.1f} | {leak:.1f} | {least:.2f} |",
+            fit.chart,
+        )
+
+
+def in_c(chart: oc.Chart) -> str:
+    """Time to compile the library of PD+, and of a tick."""
+    law = oc.control.PDPlus(chart, stiffness=oc.control.matched_stiffness(chart))
+    with TemporaryDirectory() as folder:
+        generated = generate_c(chart, Path(folder) / "c", law, "arms")
+        began = time.perf_counter()
+        library = CompiledLibrary(compile_shared(generated, Path(folder)), "arms", chart.n)
+        compiled = time.perf_counter() - began
+        (ticks,) = time_ticks([(law, library)], 2_000)
+    return f"| {chart.n} | {compiled:.1f} | {ticks.median:.1f} |"
+
+
+def pushed(chart: oc.Chart, link: str) -> str:
+    """A push of 15 N at a link for 0.2 s under PD+ in MuJoCo at 1 kHz: how far the hands are off each other."""
+    robot, home = chart.problem.robot, chart.problem.domain.centre
+    law = oc.control.PDPlus(chart, stiffness=oc.control.matched_stiffness(chart))
+    stay = oc.control.Reference.steps(law.labels, chart.phi(home), [], duration=2.0)
+    push = oc.simulation.Push(start=0.2, duration=0.2, force=(0, 12, 9), link=link)
+    motion = oc.simulate(law, stay, home, control_rate=1000.0, pushes=[push], plant="mujoco")
+    p, R = (
+        function(motion.q, robot.tips[1], robot.tips[0]) for function in (robot.frame_position, robot.frame_rotation)
+    )
+    off = 1e3 * np.linalg.norm(p - p[0], axis=1)
+    angle = np.degrees(np.arccos(np.clip((np.einsum("nij,ij->n", R, R[0]) - 1) / 2, -1, 1)))
+    later = np.searchsorted(motion.times, 1.4)
+    return f"| {link} | {off.max():.1f} | {angle.max():.2f} | {off[later]:.2f} | {angle[later]:.3f} |"
+
+
+def main(quick: bool = False) -> None:
+    """Print the tables."""
+    charts: list[oc.Chart] = []
+
+    def rows() -> Iterator[str]:
+        for row, chart in fits(quick):
+            charts.append(chart)
+            yield row
+
+    table(
+        "| robot and task | n, m, r | fit | time of a core [s] | leak rms [deg] | least conditioning |\n"
+        + "|"
+        + " --- |" * 6,
+        rows(),
+    )
+    table("\n| joints | compile [s] | PD+ tick [us] |\n" + "|" + " --- |" * 3, [in_c(charts[0])])
+    links = ["right_gripper"] if quick else ["right_gripper", "right_lower_forearm", "right_lower_elbow"]
+    header = "\n| pushed at | largest error [mm] | [deg] | 1 s later [mm] | [deg] |\n"
+    table(header + "|" + " --- |" * 5, [pushed(charts[0], link) for link in links])
+
+
+if __name__ == "__main__":
+    run(main, __doc__)
