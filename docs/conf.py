@@ -17,6 +17,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "plain_formulas",
     "native_math",
+    "sphinx_copybutton",
     "command_line",
     "table_index",
 ]
@@ -34,6 +35,9 @@ autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_class_signature = "mixed"
 python_maximum_signature_line_length = 88
+
+copybutton_prompt_text = r"\$ |>>> |\.\.\. "
+copybutton_prompt_is_regexp = True
 
 html_theme = "furo"
 html_title = f"orthocas {release}"
