@@ -1,5 +1,9 @@
 """Coordinates that are like given quantities, against projected gradients and closed forms."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -119,6 +123,26 @@ def test_refused_meanings(like: object, message: str) -> None:
         oc.fit(problems.get("iiwa"), oc.Polynomial(1), like=like, samples=200)  # type: ignore[arg-type]
 
 
-def test_a_bound_on_mutual_angles_excludes_a_meaning() -> None:
-    with pytest.raises(InvalidValueError, match="given with max_mutual_deg"):
-        oc.fit(problems.get("iiwa"), oc.Polynomial(1), like="A3", max_mutual_deg=1.0, samples=200)
+@pytest.mark.parametrize(
+    ("parametrisation", "settings", "message"),
+    [
+        (oc.Polynomial(1), {"max_mutual_deg": 1.0}, "given with max_mutual_deg"),
+        (oc.Linear(), {}, "given with linear"),
+        (oc.Polynomial(1), {"align_to": 0}, "given with align_to"),
+    ],
+)
+def test_what_excludes_a_meaning(parametrisation: oc.Polynomial, settings: dict[str, object], message: str) -> None:
+    problem = problems.get("iiwa")
+    if "align_to" in settings:
+        settings = {"align_to": oc.fit(problem, oc.Linear()).chart}
+    with pytest.raises(InvalidValueError, match=message):
+        oc.fit(problem, parametrisation, like="A3", samples=200, **settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_the_command_takes_meanings(tmp_path: Path) -> None:
+    out = tmp_path / "a.orthocas"
+    words = ["fit", "iiwa", "--param", "polynomial:2", "--like", "A3,A1", "--samples", "600", "--out", str(out)]
+    done = subprocess.run([sys.executable, "-m", "orthocas", *words], capture_output=True, text=True, check=True)
+    assert "A3 [rad]" in done.stdout
+    assert oc.Chart.load(out).named_coordinates[:2] == ("xi1: A3 [rad]", "xi2: A1 [rad]")

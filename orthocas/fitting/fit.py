@@ -403,6 +403,8 @@ def fit(
     settings = FitSettings.checked(
         problem, wanted, solver, weights, samples, seed, max_mutual_deg, split_idle, precision, like
     )
+    if like is not None and align_to is not None:
+        raise InvalidValueError("like", "given with align_to", "one of them: both define order and signs")
     warn_unless_savable(settings.parametrisation)
     if isinstance(settings.parametrisation, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))

@@ -79,8 +79,9 @@ class FitSettings:
         if precision == "single" and max_mutual_deg is not None:
             raise InvalidValueError("precision", "'single' with max_mutual_deg", "double: Ipopt needs its digits")
         tag = require_count("seed", seed, least=0)
-        if like is not None and max_mutual_deg is not None:
-            raise InvalidValueError("like", "given with max_mutual_deg", "one of them")
+        if like is not None and (max_mutual_deg is not None or bound.closed_form is not None):
+            other = bound.label if max_mutual_deg is None else "max_mutual_deg"
+            raise InvalidValueError("like", f"given with {other}", "a fit of the weighted loss")
         known = None if like is None else Like.of(problem.robot, like)
         return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, known)
 
