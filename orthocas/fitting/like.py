@@ -47,6 +47,10 @@ def quantity_of(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
     return name if name.isidentifier() else "a function of q", dense_function("like", [q], [found])
 
 
+def _digest(function: ca.Function) -> str:
+    return hashlib.sha256(json.dumps(to_tape(function)).encode()).hexdigest()[:12]
+
+
 @dataclass(frozen=True, eq=False)
 class Like:
     """Quantities y(q) (k, 1) that the first k coordinates follow.
@@ -81,7 +85,7 @@ class Like:
     @cached_property
     def digest(self) -> str:
         """A name for the quantities, the same in every process."""
-        return hashlib.sha256(json.dumps(to_tape(self.function)).encode()).hexdigest()[:12]
+        return _digest(self.function)
 
     def term(self, problem: Problem, active: list[int]) -> "LikeTerm":
         """The term of the loss for coordinates of the active joints; the others stay at the centre of the domain.
@@ -97,7 +101,7 @@ class Like:
         whole[active] = q
         values = self.function(whole)
         slopes = dense_function("like_jacobian", [q], [ca.cse(ca.jacobian(values, q))])
-        return LikeTerm(f"like {self.digest} of {active}", len(self.names), slopes)
+        return LikeTerm(f"like {_digest(slopes)}", len(self.names), slopes)  # functions of a loss are kept by names
 
     def named(self, coordinates: Coordinates, problem: Problem) -> Coordinates:
         """Coordinates in the units of their quantities, with their values at the centre of the domain."""
@@ -136,7 +140,6 @@ class LikeTerm:
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Differences over sqrt(k), quantity by quantity, (k r, 1)."""
-        A, Z = data.get("metric_inverse"), data["null_basis"]
         A, Z = data.get("metric_inverse"), data["null_basis"]
         wanted = self.slopes(data["points"])
         whole = ca.repmat(metric_lengths(wanted, A) + _STILL, 1, sizes.r)
