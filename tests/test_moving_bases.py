@@ -1,7 +1,9 @@
 """Robots on moving bases against Pinocchio, and coordinates that hold at every place and heading."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -9,7 +11,7 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas.codegen import check_c, generate_c
-from orthocas.errors import InvalidValueError, OrthocasError
+from orthocas.errors import CertifyError, InvalidValueError, OrthocasError
 from orthocas.tools.checks import Array
 
 PANDA = robot_data("panda_description/urdf/panda.urdf")
@@ -103,6 +105,49 @@ def test_closed_paths_bring_the_base_back(chart: oc.Chart) -> None:
         furthest = max(furthest, abs(tracker.q[0]))
     assert furthest > 3.9
     np.testing.assert_allclose(tracker.q, HOME, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_no_fold_is_proved_for_every_place_and_heading(robot: oc.Robot, chart: oc.Chart) -> None:
+    """And determinants by the tip's velocities have one sign at 20,000 places, half of the arms near the boundary."""
+    certificate = oc.certify(chart, time_limit=60)
+    assert certificate.proved
+    assert oc.check_certificate(chart, certificate)
+    assert certificate.injective is None
+    rng = np.random.default_rng(8)
+    u = rng.uniform(-1, 1, (20_000, 7))
+    u[::2] = np.sign(u[::2]) * np.abs(u[::2]) ** 0.05
+    q = HOME + np.concatenate([np.zeros((len(u), 3)), 0.2 * u], axis=1)
+    q[:, :2], q[:, 2] = rng.uniform(-90, 90, (len(u), 2)), rng.uniform(-20, 20, len(u))
+    J = np.concatenate([robot.tip_jacobian(q), chart.jacobian(q)[:, 6:]], axis=1)
+    volumes = np.linalg.det(J)
+    assert volumes.min() * volumes.max() > 0
+    with pytest.raises(CertifyError, match="on a moving base, expected 0"):
+        oc.certify(chart, 0.1)
+
+
+@pytest.mark.slow
+def test_a_base_that_turns_about_another_axis_is_no_base_for_a_proof(chart: oc.Chart) -> None:
+    """A file may name joints of the base that do not move on a plane."""
+    tree = chart.problem.robot.tree
+    rotations = tree.rotations.copy()
+    rotations[2] = rotations[2] @ np.array([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]])
+    tilted = oc.Robot(replace(tree, rotations=rotations))
+    task = oc.Task.pose(tilted).with_reference_at(HOME)
+    forged = oc.Chart(oc.Problem(tilted, task, domain=chart.problem.domain), chart.coordinates)
+    with pytest.raises(CertifyError, match="the base of the chart is none"):
+        oc.certify(forged)
+
+
+@pytest.mark.slow
+def test_tasks_that_do_not_turn_with_the_base_are_not_proved_so(robot: oc.Robot) -> None:
+    task = oc.Task.custom(
+        robot, "reach", lambda q: ca.vertcat(robot.tip_position(q)[0] ** 3 / 3 + robot.tip_position(q)[1], q[3] + q[4])
+    )
+    problem = oc.Problem(robot, task, domain=oc.Box(HOME, 0.1))
+    chart = oc.fit(problem, oc.Mobile(oc.Polynomial(1)), samples=300, weights=oc.Weights(folds=0)).chart
+    with pytest.raises(CertifyError, match="is unbounded and J depends on it"):
+        oc.certify(chart)
 
 
 @pytest.mark.slow

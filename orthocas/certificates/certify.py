@@ -172,6 +172,8 @@ def checked_bound(chart: Chart, bound: float) -> float:
     bound = as_number("bound", bound)
     if not 0 <= bound < 1:
         raise InvalidValueError("bound", bound, "a number from 0 to below 1")
+    if bound > 0 and chart_rows(chart).base:
+        raise CertifyError(f"bound is {bound:g} on a moving base, expected 0: the sign of det J is proved there")
     if bound > 0 and not chart.problem.metric.is_identity:
         metric = chart.problem.metric.name
         raise CertifyError(

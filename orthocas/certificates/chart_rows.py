@@ -8,16 +8,17 @@ import casadi as ca
 import numpy as np
 
 from orthocas.bases.mlp import MLPFamily
+from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import ProductFamily
 from orthocas.certificates.functions import cosine, sine, square, tanh
 from orthocas.certificates.graph import DerivativeGraph, TaylorGraph
 from orthocas.certificates.product_rows import ProductRows
-from orthocas.certificates.task_rows import task_rows
+from orthocas.certificates.task_rows import TipRows, task_rows
 from orthocas.certificates.taylor import TINY, UNIT, TaylorModel, Variables, above, stacked
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
-from orthocas.errors import CertifyError
-from orthocas.tasks.domains import Domain
+from orthocas.errors import CertifyError, InvalidValueError
+from orthocas.tasks.domains import Box, Domain
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
@@ -93,6 +94,7 @@ class ChartRows:
     """J on boxes, without idle joints: their rows and columns are those of the identity.
 
     The rows of the task may be rotated, and those of the coordinates lack their scale, so that det J keeps its sign.
+    Where a base moves, J stands for that at one place and heading, see `_base_of`.
     """
 
     n: int
@@ -102,6 +104,7 @@ class ChartRows:
     task: "GraphRows"  #: of the active joints
     coordinates: CoordinateRows | None
     turns: Array  #: periods of the rows; 0 for those that have none
+    base: Variables = ()  #: joints of a moving base on which J depends, but det J does not
 
     def __call__(self, low: Array, high: Array) -> TaylorModel:
         """Models (active, active, boxes) for the boxes between corners (boxes, n)."""
@@ -153,12 +156,37 @@ def chart_rows(chart: Chart) -> ChartRows:
     active = tuple(coordinates.active)
     task, moved_by = task_gradients(chart.problem.task, chart.problem.domain, active)
     own, depends = _coordinate_rows(coordinates)
-    variables = tuple(sorted({*moved_by, *depends}))
+    base = _base_of(chart)
+    variables = tuple(sorted({*moved_by, *depends} - {*base}))
     if len(variables) > MOST_VARIABLES:
         raise CertifyError(f"the chart depends on {len(variables)} joints, expected at most {MOST_VARIABLES}")
     periods = coordinates.turns[: len(coordinates.offset)] / np.abs(coordinates.scale)
     turns = np.concatenate([np.zeros(chart.m), periods])
-    return ChartRows(chart.n, chart.m, active, variables, task, own, turns)
+    return ChartRows(chart.n, chart.m, active, variables, task, own, turns, base)
+
+
+def _base_of(chart: Chart) -> Variables:
+    """The joints of a planar base at whose positions det J is the same, because `Mobile` coordinates move with it.
+
+    With the place p, the heading t and the arm's joints a, J(p, t, a) = D J(0, 0, a) E. D turns the rows of x and y and
+    those of xi_1 and xi_2 by R(t); E turns the columns of p by R(-t); both have the determinant 1. Rows of the
+    orientation in axes of the tip, z, and all other coordinates stay as they are. This holds for tasks of the tip's
+    whole position and of its orientation, if the base carries the tip: no word of a file is taken for that.
+    """
+    coordinates, problem = chart.coordinates, chart.problem
+    assert isinstance(coordinates, Coordinates)
+    chosen, tip = coordinates.parametrisation, TipRows.of(problem.task)
+    if not isinstance(chosen, Mobile) or tip is None or tip.position not in ((), (0, 1, 2)):
+        return ()
+    try:
+        chosen.for_problem(problem)
+    except InvalidValueError as error:
+        raise CertifyError(f"the base of the chart is none: {error}") from None
+    tree = problem.robot.tree
+    places = tuple(tree.joint_names.index(name) for name in chosen.base)
+    if tree.carriers(tree.tip_parent)[: len(places)] != list(places) or not isinstance(problem.domain, Box):
+        return ()
+    return places
 
 
 def task_gradients(task: Task, domain: Domain, joints: Sequence[int]) -> tuple[GraphRows, set[int]]:

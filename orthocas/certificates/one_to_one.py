@@ -186,11 +186,12 @@ class ConvexJudge:
 def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneJudge | ConvexJudge | None:
     """The judge for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
 
-    None if the other rows depend on an idle joint, which then is none, or jump where an arc tangent begins a new turn.
+    None if the other rows depend on an idle joint, which then is none, or jump where an arc tangent begins a new turn,
+    or stand for those at another heading of a moving base.
     """
     tip, tree, active = TipRows.of(chart.problem.task), chart.problem.robot.tree, rows.active
     coordinates, known = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
-    if {*rows.variables} - {*active} or _jumps(chart, rows):
+    if rows.base or {*rows.variables} - {*active} or _jumps(chart, rows):
         return None
     if tip is None or not known:
         true = replace(rows, task=true_gradients(chart.problem.task, active)[0])
