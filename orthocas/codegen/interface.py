@@ -123,8 +123,10 @@ def supervision_values(
 
 def _turning(controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
     """Code for references with an orientation."""
-    turned = Relative(controller.problem.task).turned
-    return {place: filled(f"{place}.c", known) if turned else "" for place in ("turn_reference", "turn_step")}
+    relative, m = Relative(controller.problem.task), controller.problem.m
+    places = ("turn_reference", "turn_step")
+    found = {place: filled(f"{place}.c", known) if relative.turned else "" for place in places}
+    return {"turned_first": str(relative.first), "turned_end": str(m), **found}
 
 
 def _clearance_values(condition: BoundaryCondition | None) -> dict[str, str]:
