@@ -299,3 +299,35 @@ def test_c_does_not_depend_on_the_reference(tmp_path: Path) -> None:
     np.testing.assert_allclose(commands[0], commands[1], atol=1e-4 * scale)  # error limits follow the range of x
     jumps = np.abs(np.diff(commands[0], axis=0)).max()
     assert jumps < 0.02 * scale
+
+
+@needs_c
+@pytest.mark.slow
+def test_jumps_of_orientations_do_not_lead_the_law(tmp_path: Path) -> None:
+    """Wanted orientations jump every tick. What leads the law, error and offset, stays: errors by their definition."""
+    known = chart()
+    law = control.PDPlus(known, np.linspace(30.0, 90.0, 7), 0.7, limit=1e4)
+    generated = oc.generate_c(known, tmp_path / "c", law, "arm")
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 7)
+    still = control.Safety.of(law, stuck_impulse=np.inf, stale_ticks=1000, offset_rate=1e-9, error_limit=100.0)
+    supervisor = Supervisor(library, law, still)
+    q = known.problem.domain.centre
+    supervisor.start(q)
+    supervisor.resume()
+    home, task = known.phi(q), known.problem.task
+    R, position = task.orientation_of(home[:6]), home[:3]
+
+    def led(value: np.ndarray) -> np.ndarray:
+        error = np.concatenate([known.relative.difference(value[:6], home[:6]), value[6:] - home[6:]])
+        return error + supervisor.offset
+
+    for _ in range(300):  # the law takes over
+        supervisor.step(q, np.zeros(7), np.concatenate([home, np.zeros(14)]))
+    before = led(home)
+    for k, axis in enumerate(np.random.default_rng(1).normal(size=(6, 3))):
+        turn = Rotation.from_rotvec((0.4 + 0.2 * k) * axis / np.linalg.norm(axis)).as_matrix()
+        value = np.concatenate([task.value(position, R @ turn), home[6:]])
+        status = supervisor.step(q, np.zeros(7), np.concatenate([value, np.zeros(14)]))[1]
+        assert status in (ControlStatus.OK, ControlStatus.SATURATED)
+        np.testing.assert_allclose(led(value), before, atol=2e-3)
+        before = led(value)
