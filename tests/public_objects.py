@@ -20,6 +20,7 @@ from orthocas.atlas.simulate import AtlasControl
 from orthocas.control import Controller, Reference
 from orthocas.fitting.comparison import Comparison
 from orthocas.fitting.fit import ClearPart, Fit
+from orthocas.robots.tree import on_moving_base
 from orthocas.simulation import (
     Elasticity,
     Friction,
@@ -293,6 +294,11 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "Fourier": lambda: oc.Fourier(2),
     "network": oc.MLP,
     "circle-valued": lambda: oc.Circle(oc.Fourier(2)),
+    "task of a frame in another": lambda: oc.Task.relative_pose(planar().robot, "tip", "tip"),
+    "stacked tasks": lambda: oc.Task.stack(oc.Task.position(planar().robot, "x"), oc.Task.axis(planar().robot)),
+    "fit with a meaning": lambda: oc.fit(planar(), oc.Polynomial(1), like="q3", samples=200),
+    "robot on a rail": lambda: oc.Robot(on_moving_base(planar().robot.tree, "rail:x", 1.0, np.zeros(3), np.eye(3))),
+    "task of a quadratic program": lambda: oc.control.XiTask(fitted().chart, cost=1.0),
     "mobile": lambda: oc.Mobile(oc.Polynomial(2)),
     "SEW": oc.SEW,
     "given coordinates": lambda: given().coordinates.parametrisation,  # type: ignore[attr-defined]

@@ -194,6 +194,15 @@ def test_names_of_the_command_line(baxter: oc.Robot) -> None:
     one = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
     with pytest.raises(InvalidValueError, match="a robot with two tips"):
         oc.Task.named(one, "relative_pose")
+    with pytest.raises(UnknownNameError, match="unknown task 'relative_centre_of_mass'"):
+        oc.Task.named(baxter, "relative_centre_of_mass")
+
+
+def test_a_stack_of_stacks_is_a_stack(baxter: oc.Robot) -> None:
+    first, second = oc.Task.pose(baxter), oc.Task.axis(baxter, frame=RIGHT)
+    whole = oc.Task.stack(oc.Task.stack(first, second), oc.Task.position(baxter, "x"))
+    assert [part.name for part in whole.parts] == [first.name, second.name, "position:x"]
+    assert whole.labels[0] == "x_1"
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Coordinates of an arm on a mobile base, as good at every place and heading as at one."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -9,10 +8,8 @@ import numpy as np
 from orthocas.bases.family import Expression, Family, JointSpace, Parametrisation, component_gradients
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import Box
+from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array
-
-if TYPE_CHECKING:
-    from orthocas.tasks.problem import Problem
 
 _START = 0.03  # of the arm's own start
 _ON_PLANE = 3  # coordinates that move with the base: two of its place, and the heading
@@ -68,7 +65,7 @@ class Mobile:
         """'mobile:' and the label of the arm's functions."""
         return f"mobile:{self.arm.label}"
 
-    def for_problem(self, problem: "Problem") -> "Mobile":
+    def for_problem(self, problem: Problem) -> "Mobile":
         """The parametrisation with functions for this problem.
 
         Raises:
@@ -156,7 +153,7 @@ class MobileFamily:
         return np.concatenate([_START * self.arm.initial(seed), np.zeros(self.size - self.arm.size)])
 
 
-def anywhere(problem: "Problem", base: tuple[str, ...]) -> "Problem":
+def anywhere(problem: Problem, base: tuple[str, ...]) -> Problem:
     """The problem on a domain without ends in those joints of the base that have no limits."""
     robot, domain = problem.robot, problem.domain
     places = [robot.joint_names.index(name) for name in base]
@@ -164,4 +161,4 @@ def anywhere(problem: "Problem", base: tuple[str, ...]) -> "Problem":
     if free <= {*domain.unbounded}:
         return problem
     wider = domain.within(Box(domain.centre, domain.half_width, sorted(free | {*domain.unbounded})))
-    return type(problem)(robot, problem.task, problem.metric, wider, problem.name)
+    return Problem(robot, problem.task, problem.metric, wider, problem.name)

@@ -105,7 +105,7 @@ def _redundancy(robot: Robot) -> dict[str, Any]:
         J = task.batched_frame_jacobian(q[None])[0].reshape(task.m, robot.n)
         if np.linalg.matrix_rank(J) == task.m < robot.n:
             idle = [name for name, column in zip(robot.joint_names, J.T, strict=True) if not column.any()]
-            found[kind] = f"r = {robot.n - task.m}" + (f", of which {', '.join(idle)} move nothing" if idle else "")
+            found[kind] = f"r = {robot.n - task.m}" + (f", idle: {', '.join(idle)}" if idle else "")
     return {"extra_coordinates": found}
 
 

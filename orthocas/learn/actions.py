@@ -77,7 +77,8 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
 
     def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
         """Move the wanted phi; `info["tracker"]` has the tracker's status."""
-        assert self._tracker is not None, "reset comes first"
+        if self._tracker is None:
+            raise gymnasium.error.ResetNeeded("step before reset, expected reset first")
         before = self._tracker.q
         self._tracker.step(self._wanted(before, self._step * np.clip(action, -1.0, 1.0)))
         status = self._tracker.status

@@ -127,16 +127,7 @@ def tip_jacobian(tree: KinematicTree, q: ca.SX) -> ca.SX:
 
 def point_jacobian(tree: KinematicTree, q: ca.SX, body: int, point: Array) -> ca.SX:
     """Jacobian (3, n) of a point (3,) [m] that is fixed in a body's frame: d(position in the world)/dt = J dq."""
-    poses = body_poses(tree, q)
-    J = ca.SX(3, tree.n)
-    if body >= 0:
-        R, p = poses[body]
-        position = p + R @ constant(point)
-    while body >= 0:
-        R, p = poses[body]
-        J[:, body] = R[:, 2] if tree.joint_kinds[body] == "prismatic" else ca.cross(R[:, 2], position - p)
-        body = tree.parents[body]
-    return J
+    return frame_jacobian(tree, q, Frame("point", body, np.eye(3), point))[:3, :]
 
 
 def joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
@@ -144,8 +135,8 @@ def joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
 
     With further tips, the line goes to these first, and back along their joints.
     """
-    poses, here = body_poses(tree, q), list[int]()
-    points = [ca.SX.zeros(3)]
+    poses, points = body_poses(tree, q), [ca.SX.zeros(3)]
+    here: list[int] = []
     for name in (*reversed(tree.tips), tree.tip_name):
         frame = tree.frame(name)
         chain = tree.carriers(frame.parent)

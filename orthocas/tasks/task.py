@@ -321,6 +321,7 @@ class Task(Shown, HoldsFunctions):
                 raise InvalidValueError("tasks", "of different robots", "tasks of one robot")
         if not tasks:
             raise InvalidValueError("tasks", "none", "at least one")
+        tasks = tuple(single for task in tasks for single in task.parts or (task,))  # a stack of stacks is one
         labels = [label for task in tasks for label in task.labels]
         numbered = (
             f"{label}_{labels[:i].count(label) + 1}" if labels.count(label) > 1 else label
@@ -392,28 +393,25 @@ class Task(Shown, HoldsFunctions):
             q_reference: posture (n,) that defines the reference of orientation, pose and axis tasks.
         """
         require_kind("kind", kind, str)
-        frames = _OF_TIP
+        frames, asked = _OF_TIP, kind
         if kind.startswith(_RELATIVE):
             if len(robot.tips) != 2:
                 raise InvalidValueError("task", kind, f"a robot with two tips; this one has {listed(robot.tips)}")
-            kind, frames = kind.removeprefix(_RELATIVE), Frames(robot.tips[1], robot.tips[0])
-        if (turn := TipTurn.of_kind(kind)) is not None:
-            return cls._turned(
-                robot, turn, None if q_reference is None else frames.rotation(robot, q_reference), frames
-            )
+            asked, frames = kind.removeprefix(_RELATIVE), Frames(robot.tips[1], robot.tips[0])
+        if (turn := TipTurn.of_kind(asked)) is not None:
+            reference = None if q_reference is None else frames.rotation(robot, q_reference)
+            return cls._turned(robot, turn, reference, frames)
+        if asked.partition(":")[0] == "position":
+            return cls.position(robot, asked.partition(":")[2] or "xyz", frames.frame, frames.relative_to)
         name, _, words = kind.partition(":")
-        if name == "position":
-            return cls.position(robot, words or "xyz", frames.frame, frames.relative_to)
         if name not in _REGISTERED or (name == "polar" and words):
             raise UnknownNameError("task", kind, tuple(dict.fromkeys((*TASK_KINDS, *_REGISTERED))))
         return _REGISTERED[name](robot, words)
 
     @classmethod
     def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> "Task":
-        """The task of a robot that `recipe` describes. Custom tasks have no such recipe."""
+        """The task of a robot that `recipe` describes. Custom tasks and stacks have no such recipe."""
         kind, frames = recipe["kind"], Frames.of_recipe(recipe)
-        if kind == "stack":
-            return cls.stack(*(cls.from_recipe(robot, part) for part in recipe["parts"]))
         if kind == "pointing":
             return cls.pointing(robot, recipe["camera"], recipe["target"], recipe["axis"])
         if (turn := TipTurn.of_kind(kind)) is not None:
