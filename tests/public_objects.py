@@ -8,6 +8,7 @@ from enum import Enum
 from functools import cache, partial, singledispatch
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -452,6 +453,25 @@ def _of_distances(distances: oc.obstacles.LinkDistances) -> Iterator[Any]:
 @_numbers.register
 def _of_reference(reference: Reference) -> Iterator[Any]:
     yield from (*reference.sample(reference.grid()), reference.labels)
+
+
+class _Configuration:
+    """What MuJoCo and mink show of a robot, for `XiTask`."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self.names, self.nv, self.model = names, len(names), self
+        self.q = np.linspace(0.6, 0.8, self.nv)
+
+    def joint(self, name: str) -> Any:
+        place = np.array([self.names.index(name)])
+        return SimpleNamespace(qposadr=place, dofadr=place)
+
+
+@_numbers.register
+def _of_xi_task(task: oc.control.XiTask) -> Iterator[Any]:
+    configuration = _Configuration(task.joints)
+    task.set_target(np.zeros(task.chart.r))
+    yield from (*task.compute_qp_objective(configuration), task.cost, task.gain, task.lm_damping, task.joints)
 
 
 @_numbers.register
