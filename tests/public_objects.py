@@ -244,6 +244,8 @@ CONTROLLERS: dict[str, Callable[[], Controller]] = {
     "PD+": lambda: control.PDPlus(fitted().chart, 60.0, coupling="decoupled", damping="double_diagonal"),
     "PD+ with inputs": lambda: control.PDPlus(fitted().chart, 60.0, damping_stiffness=50.0, model=run_time_model()),
     "PD+ of a given model": lambda: control.PDPlus(fitted().chart, 60.0, model=control.RunTimeModel("given", "robot")),
+    "PD+ with a memory": lambda: control.PDPlus(fitted().chart, 60.0, limit=50.0, remembers=control.MomentumObserver()),
+    "PD+ that adapts": lambda: control.PDPlus(fitted().chart, 60.0, limit=50.0, remembers=control.Adaptation()),
     "PD+ of a network": lambda: control.PDPlus(network(), 60.0),
     "kinematic": lambda: control.Kinematic(fitted().chart, 1.0),
     "projector": lambda: control.Projector(planar(), 80.0, 10.0),
@@ -270,6 +272,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "robot": lambda: planar().robot,
     "task": lambda: planar().task,
     "run-time model": run_time_model,
+    "momentum observer": control.MomentumObserver,
+    "law in ticks": lambda: control.Remembering(CONTROLLERS["PD+ with a memory"]()),
     "safety": lambda: control.Safety.of(impedance(), fade_in=0.1),
     "modes": lambda: impedance().modes(),
     "custom task": lambda: with_idle_joint().problem.task,
@@ -453,6 +457,14 @@ def _of_distances(distances: oc.obstacles.LinkDistances) -> Iterator[Any]:
 @_numbers.register
 def _of_reference(reference: Reference) -> Iterator[Any]:
     yield from (*reference.sample(reference.grid()), reference.labels)
+
+
+@_numbers.register
+def _of_ticks(ticks: control.Remembering) -> Iterator[Any]:
+    mine, q = copy.deepcopy(ticks), planar().domain.centre  # threads share the object, and each tick changes it
+    for _ in range(3):
+        yield mine.tick(q, 0.1 + 0 * q, np.zeros((3, 3)), 1e-3)[0]
+    yield from mine.fields.values()
 
 
 class _Configuration:

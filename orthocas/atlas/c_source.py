@@ -21,6 +21,7 @@ from orthocas.codegen.kernels import Kernels, generate_kernels
 from orthocas.codegen.precision import Precision
 from orthocas.codegen.rows import TABLE_CODE, TableCoordinates
 from orthocas.control.controller import Controller, without_boundary
+from orthocas.control.memory import memory_of
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import Box, Domain
@@ -314,6 +315,8 @@ class AtlasSource:
         same = (own.robot, own.task, own.metric) == (problem.robot, problem.task, problem.metric)
         if law.chart is None or law.labels != self.chart.labels or not same:
             raise InvalidValueError("controller", f"a {law.name} of something else", "a law on a chart of the atlas")
+        if memory_of(controller) is not None:
+            raise InvalidValueError("memory", controller.settings["memory"], "none for an atlas")
         found: Controller = replace(law, chart=self.chart)
         return found
 

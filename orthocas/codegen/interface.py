@@ -1,6 +1,7 @@
 """The interface of generated C: functions, supervised laws, and the text of the header."""
 
 from collections.abc import Mapping
+from string import Template
 
 import casadi as ca
 import numpy as np
@@ -12,6 +13,7 @@ from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.precision import Precision, check_values
 from orthocas.control.controller import Controller
 from orthocas.control.errors import without_turns
+from orthocas.control.memory import memory_of
 from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
 from orthocas.tasks.relative import Relative
 from orthocas.version import VERSION
@@ -20,6 +22,23 @@ _TORQUE = """It compensates gravity, damps with the mass matrix,
  * holds the arm with a spring that gives way under too much force."""
 _VELOCITY = """It stops the arm and holds it."""
 _INERTIA = "  double inertia[{n}];       /* mass matrix of the catcher's spring, row by row */\n"
+_OF_MEMORY = {  # code of laws that remember, by its place in the templates of the supervised law
+    "memory_type": "",
+    "state_memory": "  ${name}_memory memory;\n",
+    "memory_c": "",
+    "forget": "  state->memory = nothing_remembered;\n",
+    "given_gains": "  const ${name}_gains *given = gains;\n",
+    "since_memory": ", known",
+    "known_memory": "  known = !state->fresh && state->bad_ticks == 0;\n",
+    "use_memory": "",
+    "remember": "  remember(state, &shifted, given, cut ? 0.0 : state->weight,\n"
+    "           known && state->mode == ${NAME}_LAW ? since : 0.0);\n",
+}
+_OF_CORRECTION = {  # and of those whose memory is a torque
+    "correct_command": "    correct(state, command);\n",
+    "correct_fallback": "  correct(state, fallback);\n",
+    "learn_from_start": "  learn_from(state, command);\n",
+}
 _ORDER = "{0}catch_margin < {0}near_margin && {0}near_margin < {0}return_margin && {0}return_margin < 1.0".format(
     "safety->"
 )
@@ -34,6 +53,7 @@ def supervision_kernels(controller: Controller, condition: BoundaryCondition | N
     - fallback(q, gains) -> command;
     - deviation(q, reference) -> quantities, reference - quantities;
     - gap(reference with two derivatives, value) -> value - reference, rates of the reference as errors count;
+    - memory(q, dq, reference with two derivatives, gains, command, active, period, fields) -> fields, if it has one;
     - implied(q, dq, reference with two derivatives, change) -> A (n, n) row by row and B (n, 3), such that A^-1 B are
       the change, velocity and acceleration of the joints that follow; dq is about that velocity.
     """
@@ -55,6 +75,9 @@ def supervision_kernels(controller: Controller, condition: BoundaryCondition | N
     ]
     if relative.turned:
         found += [relative.moved, relative.turned_by]
+    if (memory := memory_of(controller)) is not None:
+        inputs = memory.step.mx_in()
+        found.append(ca.Function("memory", inputs, [ca.densify(out) for out in memory.step.call(inputs)]))
     return found if condition is None else [*found, *condition.kernels]
 
 
@@ -117,6 +140,7 @@ def supervision_values(
         "safety_meant": "\n        && ".join([*(_meant(name, value) for name, value in settings.items()), _ORDER]),
         **_clearance_values(condition),
         **_turning(controller, known),
+        **_memory_values(controller, known),
         "fallback_arguments": "\n".join(f"  arg[{1 + i}] = gains->{gain};" for i, gain in enumerate(controller.gains)),
     }
 
@@ -127,6 +151,49 @@ def _turning(controller: Controller, known: Mapping[str, str]) -> dict[str, str]
     places = ("turn_reference", "turn_step")
     found = {place: filled(f"{place}.c", known) if relative.turned else "" for place in places}
     return {"turned_first": str(relative.first), "turned_end": str(m), **found}
+
+
+def _memory_values(controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
+    """Code of a law that remembers, for `_OF_MEMORY`; empty for others."""
+    memory = memory_of(controller)
+    if memory is None:
+        return dict.fromkeys([*_OF_MEMORY, *_OF_CORRECTION], "")
+    first = 5 + len(controller.gains)
+    pointers = [
+        f"  arg[{first + 3 + i}] = last.{field};\n  res[{i}] = state->memory.{field};"
+        for i, field in enumerate(memory.start)
+    ]
+    values = {
+        **known,
+        **control_values(controller),
+        "fields": "\n".join(f"  double {field}[{len(value)}];" for field, value in memory.start.items()),
+        "start": ",\n".join(f"  {{{numbers(value)}}}" for value in memory.start.values()),
+        "after_gains": str(first),
+        "pointers": "\n".join(pointers),
+        "corrections": "",
+        "start_meaning": "",
+    }
+    of_torque = dict.fromkeys(_OF_CORRECTION, "")
+    if memory.torque is not None:
+        of_torque = _OF_CORRECTION
+        values["corrections"] = filled("corrections.c", {**known, "torque": memory.torque})
+        values["start_meaning"] = (
+            f"\n * The command of {known['name']}_start must hold the arm: it shows what torque the model lacks."
+        )
+    added = (
+        f"  for (i = 0; i < {len(controller.gains[gain])}; ++i) used.{gain}[i] += state->memory.{field}[i];\n"
+        for gain, field in memory.adds.items()
+    )
+    pieces = {place: Template(text).substitute(known) for place, text in _OF_MEMORY.items()}
+    return (
+        pieces
+        | of_torque
+        | {
+            "memory_type": filled("memory.h", values),
+            "memory_c": filled("memory.c", values),
+            "use_memory": "".join(added),
+        }
+    )
 
 
 def _clearance_values(condition: BoundaryCondition | None) -> dict[str, str]:

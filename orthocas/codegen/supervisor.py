@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from orthocas.codegen.library import ChartReference, CompiledLibrary, gain_numbers
 from orthocas.codegen.precision import Precision
 from orthocas.control.controller import Controller, ControlStatus, require_controller
+from orthocas.control.memory import memory_of
 from orthocas.control.safety import Safety
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 
@@ -41,7 +42,9 @@ class Supervisor:
         values = (safety or Safety.of(controller)).in_c(controller.command)
         settings = _settings_type(values, library.precision)
         self._safety = library.address("default_safety") if safety is None else _packed(values, settings)
-        self._state = _state_type(self._n, self._k, library.precision, library.of_atlas, settings)()
+        memory = memory_of(controller)
+        remembered = {} if memory is None else {name: len(value) for name, value in memory.start.items()}
+        self._state = _state_type(self._n, self._k, library.precision, library.of_atlas, settings, remembered)()
         self._command = library.numbers(np.zeros(self._n))
         self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
 
@@ -111,7 +114,7 @@ class Supervisor:
         return pace
 
     def __getattr__(self, name: str) -> Any:
-        """The fields of the state in C: mode, cause, weight, anchor, ..."""
+        """The fields of the state in C: mode, cause, weight, anchor, ..., and those of its memory."""
         if name.startswith("_"):
             raise AttributeError(name)
         value = getattr(self._state, name)
@@ -145,7 +148,12 @@ class Supervisor:
 
 
 def _state_type(
-    n: int, k: int, precision: Precision, of_atlas: bool, settings: type[ctypes.Structure]
+    n: int,
+    k: int,
+    precision: Precision,
+    of_atlas: bool,
+    settings: type[ctypes.Structure],
+    remembered: dict[str, int],
 ) -> type[ctypes.Structure]:
     joints, quantities = precision.c_type * n, precision.c_type * k
     names = ("q", "dq", "seen_q", "seen_dq", "command", "led", "impulse", "impulse_from", "law", "anchor", "safe")
@@ -161,6 +169,7 @@ def _state_type(
         *((name, quantities) for name in ("offset", "integral")),
         *(("inertia", precision.c_type * n**2) for _ in range(has_spring)),
         *((name, joints) for name in ("carry",) if of_atlas),
+        *((name, precision.c_type * size) for name, size in remembered.items()),  # the struct `memory`
         *((name, quantities) for name in ("value", "velocity", "acceleration")),
         *((name, ctypes.c_int) for name in ("reference_chart",) if of_atlas),
         ("safety", settings),

@@ -3,6 +3,7 @@
 from orthocas.control.controller import Controller, ControlStatus, Law
 from orthocas.control.gains import Setting, matched_posture_stiffness, matched_stiffness
 from orthocas.control.kinematic import Kinematic
+from orthocas.control.memory import Adaptation, Memory, MomentumObserver, Remembering
 from orthocas.control.operational_space import DampingCheck, Impedance, Modes, PDPlus
 from orthocas.control.posture import joint_path, posture_reference
 from orthocas.control.projector import KinematicProjector, Projector
@@ -13,6 +14,7 @@ from orthocas.control.safety import Safety
 from orthocas.control.xi_task import XiTask
 
 __all__ = [
+    "Adaptation",
     "ControlStatus",
     "Controller",
     "DampingCheck",
@@ -20,10 +22,13 @@ __all__ = [
     "Kinematic",
     "KinematicProjector",
     "Law",
+    "Memory",
     "Modes",
+    "MomentumObserver",
     "PDPlus",
     "Projector",
     "Reference",
+    "Remembering",
     "RunTimeModel",
     "Safety",
     "Setting",

@@ -1,7 +1,7 @@
 """Impedance and PD+ control in phi ([AS2023] Sec. 8), and their modes of decoupling."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
 
 import casadi as ca
@@ -34,9 +34,11 @@ from orthocas.control.gains import (
     positive_gains,
 )
 from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, block_inertia, damping_matrix, median_volume
+from orthocas.control.memory import MEMORIES, Memory, Remembers
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
+from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import Batched
@@ -127,6 +129,9 @@ class _OperationalSpace(Shown):
         damping_stiffness: damping is designed as if this were the stiffness, > 0, (n,) or one number. So a coordinate
             without a spring, K_i = 0, is free, but does not swing. Default: damping follows the stiffness.
         model: where the law gets the robot's model from, and its additional inputs. Default: the model of the problem.
+        remembers: integral action against a wrong model: `MomentumObserver()` or `Adaptation()`. It needs the input
+            `extra_torque`, which it adds to `model`, and ticks: a `control_rate` in simulations, the supervised law
+            in C, `Remembering` in programs of your own. Default: none.
 
     Raises:
         ShapeError, InvalidValueError, UnknownNameError: for settings of the wrong shape, value or name.
@@ -141,6 +146,7 @@ class _OperationalSpace(Shown):
     limit: Array
     damping_stiffness: Array | None
     model: RunTimeModel
+    remembers: Remembers | None
 
     feed_forward: ClassVar[bool]
     name: ClassVar[str]
@@ -161,6 +167,10 @@ class _OperationalSpace(Shown):
         "inputs": Setting(
             "Additional inputs: payload, wrench, extra_torque, with commas between.", is_word=True, codegen_only=True
         ),
+        "memory": Setting(
+            "none (default), momentum or adaptive: integral action against a wrong model; simulations need a rate.",
+            is_word=True,
+        ),
     }
 
     def __init__(
@@ -173,12 +183,19 @@ class _OperationalSpace(Shown):
         limit: ArrayLike | None = None,
         damping_stiffness: ArrayLike | None = None,
         model: RunTimeModel | None = None,
+        remembers: Remembers | None = None,
     ) -> None:
         require_known("coupling", coupling, COUPLINGS)
         require_known("damping", damping, DAMPING_DESIGNS)
         require_kind("chart", chart, Chart)
         model = RunTimeModel() if model is None else model
         require_kind("model", model, RunTimeModel)
+        if remembers is not None and not callable(getattr(remembers, "of", None)):
+            raise InvalidValueError(
+                "remembers", repr(remembers)[:80], "what makes a memory, such as MomentumObserver()"
+            )
+        if remembers is not None and model.extra_torque is None:
+            model = replace(model, extra_torque=0.0)
         chart.function("xi")  # raises for grown charts
         n, as_stiffness = chart.n, damping_stiffness is None
         model.gains(chart.problem, self.feed_forward)  # raises for values of another size
@@ -191,8 +208,10 @@ class _OperationalSpace(Shown):
             "coupling": coupling,
             "damping": damping,
             "limit": command_limit("limit", limit, chart.problem.robot.effort_limits),
+            "remembers": remembers,
         }.items():
             object.__setattr__(self, name, value)
+        _ = self.memory  # raises for bounds of another size
 
     @classmethod
     def on_chart(
@@ -208,6 +227,7 @@ class _OperationalSpace(Shown):
         model: Source = "own",
         gravity: Gravity = "law",
         inputs: str = "",
+        memory: Literal["none", "momentum", "adaptive"] = "none",
     ) -> Self:
         """Build the law on a chart.
 
@@ -222,15 +242,24 @@ class _OperationalSpace(Shown):
             model: the source of the `RunTimeModel`.
             gravity: its gravity.
             inputs: its inputs, such as "payload,wrench,extra_torque".
+            memory: none, momentum for a `MomentumObserver`, or adaptive for an `Adaptation`.
         """
+        require_known("memory", memory, ("none", *MEMORIES))
+        remembers = None if memory == "none" else MEMORIES[memory]()
         stiffness = matched_stiffness(chart) if stiffness is None else stiffness
         run_time = RunTimeModel.with_inputs(model, gravity, inputs.split(",") if inputs else ())
-        return cls(chart, stiffness, damping_ratio, coupling, damping, limit, damping_stiffness, run_time)
+        return cls(chart, stiffness, damping_ratio, coupling, damping, limit, damping_stiffness, run_time, remembers)
+
+    @cached_property
+    def memory(self) -> Memory | None:
+        """What the law remembers from tick to tick."""
+        return None if self.remembers is None else self.remembers.of(self)
 
     @property
     def settings(self) -> Mapping[str, str]:
         """Coupling and damping design, and choices of the model that differ from the default."""
-        return {"coupling": self.coupling, "damping": self.damping, **self.model.settings}
+        memory = {} if self.remembers is None else {"memory": self.remembers.name}
+        return {"coupling": self.coupling, "damping": self.damping, **self.model.settings, **memory}
 
     @property
     def formula(self) -> str:

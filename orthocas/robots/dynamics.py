@@ -219,6 +219,20 @@ def inertial_numbers(tree: KinematicTree) -> Array:
     return np.concatenate(numbers)
 
 
+def first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]:
+    """Places among `inertial_numbers` of what gravity acts on, and the joint that carries each.
+
+    These are mass times centre across the axis for revolute joints, and the mass for prismatic ones.
+    """
+    found: list[tuple[int, int]] = []
+    start = 0
+    for joint, kind in enumerate(tree.joint_kinds):
+        wanted = (0,) if kind == "prismatic" else (1, 2)
+        found += [(start + i, joint) for i, place in enumerate(_OF_BODY[kind]) if place in wanted]
+        start += len(_OF_BODY[kind])
+    return [place for place, _ in found], tuple(joint for _, joint in found)
+
+
 def _given_bodies(tree: KinematicTree, inertials: ca.SX) -> list[_Inertials]:
     """Bodies with the numbers of `inertial_numbers`."""
     bodies, start = [], 0

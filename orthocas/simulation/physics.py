@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from orthocas.control.controller import Controller
+from orthocas.control.controller import Controller, ControlStatus
+from orthocas.control.memory import Remembering, memory_of
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
@@ -66,6 +67,32 @@ class SupervisedLaw:
         return np.concatenate([command, [status, self._law.cause]])
 
 
+class LawWithMemory:
+    """A law and its memory in Python.
+
+    Args:
+        controller: a law with a memory.
+        period: of the ticks [s].
+    """
+
+    def __init__(self, controller: Controller, period: float) -> None:
+        self._ticks, self._period = Remembering(controller), period
+
+    def start(self, q: Array) -> None:
+        """Begin, at any joint positions."""
+        self._ticks.start()
+
+    def tick(self, q: Array, dq: Array, reference: Array) -> Array:
+        """[command; status; no cause], (n + 2,), for a reference with two derivatives (3 k,)."""
+        command, status = self._ticks.tick(q, dq, reference.reshape(3, -1), self._period)
+        return np.concatenate([command, [status, ControlStatus.OK]])
+
+
+def law_in_ticks(controller: Controller, period: float) -> LawWithMemory | None:
+    """What runs a law that has a memory; None for others, which are functions."""
+    return None if memory_of(controller) is None else LawWithMemory(controller, period)
+
+
 def _compiled(controller: Controller, safety: Safety) -> "Supervisor":
     """The supervised law in C. It stays loaded when its folder is gone."""
     from orthocas import codegen  # few runs need a code generator and a compiler
@@ -87,7 +114,7 @@ def run_supervised(
     rate: float,
     noise: Noise,
     tolerance: float,
-    law: SupervisedLaw,
+    law: SupervisedLaw | LawWithMemory,
 ) -> Iterator[Piece]:
     """Yield pieces of 50 ticks, with the commands that were held while CVODES integrated the plant.
 
@@ -120,7 +147,7 @@ def run_physics(
     rate: float,
     noise: Noise,
     scene: MuJoCo,
-    supervised: SupervisedLaw | None = None,
+    supervised: SupervisedLaw | LawWithMemory | None = None,
 ) -> Iterator[Piece]:
     """Yield pieces of 50 ticks, with the commands that were held: those of the law, or of the supervised law.
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.phi import shortest
 from orthocas.control.controller import Controller, require_controller
+from orthocas.control.memory import memory_of
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
@@ -20,7 +21,7 @@ from orthocas.simulation.closed_loop import ClosedLoop, Piece
 from orthocas.simulation.disturbances import Friction, Loads, Noise, Push, Stops
 from orthocas.simulation.loops import CompiledLoop, integrate, run_ticks
 from orthocas.simulation.mujoco_scene import MUJOCO, MuJoCo
-from orthocas.simulation.physics import SupervisedLaw, run_physics, run_supervised
+from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, law_in_ticks, run_physics, run_supervised
 from orthocas.simulation.trajectory import Outcome, Trajectory
 from orthocas.tools.batch import THREADS, Batched
 from orthocas.tools.checks import Array, as_number, as_point, require_executor, require_kind, require_known
@@ -151,6 +152,9 @@ def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, se
     settings.require_numbers()
     require_fitting(loop, reference, friction, noise, rate, scene is not None, settings.safety)
     _require_compilable(settings, scene)
+    if memory_of(controller) is not None and (rate is None or settings.compiled):
+        what = "control_rate" if rate is None else "compiled"
+        raise InvalidValueError(what, getattr(settings, what), f"{_FOR_MEMORY[what]} for a law with a memory")
     start = _start_state(loop, q_start, settings.dq_start)
     if settings.must_be_reachable:
         controller.require_reachable(reference, start[: loop.n])
@@ -158,12 +162,15 @@ def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, se
     if rate is None:
         pieces = partial(integrate, step=settings.step, tolerance=settings.tolerance, compiled=compiled)
     else:
-        law = None
+        law: SupervisedLaw | LawWithMemory | None = law_in_ticks(controller, 1 / rate)
         if settings.safety is not None:
             law = SupervisedLaw(controller, settings.safety, settings.resume_after, 1 / rate)
         ticks = _ticks(scene, settings.tolerance, law, compiled)
         pieces = partial(ticks, rate=rate, noise=noise or Noise())
     return Prepared(loop, reference, start, pieces, compiled)
+
+
+_FOR_MEMORY = {"control_rate": "a rate, such as 1000.0,", "compiled": "False"}
 
 
 def _require_compilable(settings: Settings, scene: MuJoCo | None) -> None:
@@ -264,7 +271,7 @@ class Prepared:
 
 
 def _ticks(
-    scene: MuJoCo | None, tolerance: float, law: SupervisedLaw | None, compiled: CompiledLoop | None
+    scene: MuJoCo | None, tolerance: float, law: SupervisedLaw | LawWithMemory | None, compiled: CompiledLoop | None
 ) -> Callable[..., Iterator[Piece]]:
     """What runs a sampled controller: MuJoCo, CVODES or compiled C, with the law alone or the supervised one."""
     if scene is not None:

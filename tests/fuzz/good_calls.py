@@ -465,6 +465,16 @@ def _control() -> dict[str, Call]:
             control.Safety.of,
             {"controller": law, "fade_in": 0.1, "command_rate": 100.0, "error_limit": [0.1, 0.1, 0.1], "hold_ticks": 5},
         ),
+        "MomentumObserver": (control.MomentumObserver, {"rate": 5.0, "bound": [1.0, 2.0, 3.0]}),
+        "Adaptation": (control.Adaptation, {"rate": 5.0, "bound": 2.0}),
+        "PDPlus with a memory": (
+            control.PDPlus,
+            {**gains, "limit": [1.0, 2.0, 3.0], "remembers": control.MomentumObserver(bound=[1.0, 2.0, 3.0])},
+        ),
+        "Remembering.tick": (
+            control.Remembering(control.PDPlus(chart, 50.0, limit=9.0, remembers=control.Adaptation())).tick,
+            {"q": centre, "dq": 0 * centre, "reference": np.zeros((3, 3)), "period": 1e-3},
+        ),
         "XiTask": (control.XiTask, {"chart": chart, "cost": 1.0, "gain": 0.5, "lm_damping": 0.1}),
         "coordinates_of": (learn.coordinates_of, {"chart": chart, "q": np.array([[0.6, 0.8, 0.8]])}),
         "joints_of": (

@@ -1,0 +1,325 @@
+"""Laws with a state: what a law remembers from tick to tick, and the two memories that come with orthocas."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.control.controller import LARGEST, Controller, ControlStatus, named_function, named_inputs
+from orthocas.control.errors import bend
+from orthocas.control.linear_algebra import block_inertia
+from orthocas.errors import InvalidValueError
+from orthocas.robots import dynamics
+from orthocas.robots.tree import KinematicTree
+from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
+
+if TYPE_CHECKING:
+    from orthocas.control.operational_space import _OperationalSpace
+
+_SHARE = 0.5  # of the law's limit that a correction may use, by default
+_GRAVITY = 9.81  # [m/s^2]
+_CROSSED = 5.0  # weight [1/s] of the error in the filtered error J^-1 (de + weight e)
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What a law remembers from tick to tick, in Python, and in the state of the supervised law in C.
+
+    The law itself stays a function of state, reference and gains. Fields of its memory are added to some of these
+    gains, and are brought up to date after each tick, with the command that was sent.
+
+    Args:
+        start: the fields, and their values after a start.
+        adds: for each gain that the memory changes, the field that is added to it. What is added to `extra_torque`
+            also corrects the fallback of the supervised law, as far as its catcher can hold against it, and begins
+            with the difference between the command that held the arm before the start and the fallback.
+        step: q, dq, reference and two derivatives, the law's gains, command, active, period, and the fields -> the
+            fields, each called next_NAME there. `active` is the weight of the law in the command, and 0 while a limit
+            cuts it. `period` is the time since the last tick [s], and 0 in the first one after a start or after missing
+            measurements.
+
+    Raises:
+        InvalidValueError: if a gain is none of the step, or the fields are not its last inputs and its outputs.
+    """
+
+    start: Mapping[str, Array]
+    adds: Mapping[str, str]
+    step: ca.Function
+
+    def __post_init__(self) -> None:
+        require_kind("step", self.step, ca.Function)
+        start = {name: as_float_array(name, value) for name, value in self.start.items()}
+        object.__setattr__(self, "start", start)
+        wanted = {name: len(value) for name, value in start.items()}
+        known = self.step.name_in()
+        found = {name.removeprefix("next_"): self.step.size1_out(name) for name in self.step.name_out()}
+        last = {name: self.step.size1_in(name) for name in known[len(known) - len(start) :]}
+        if found != wanted or last != wanted:
+            raise InvalidValueError("outputs and last inputs of step", f"{found} and {last}", str(wanted))
+        for gain, name in self.adds.items():
+            if name not in start or gain not in known:
+                raise InvalidValueError("adds", f"{name} to {gain}", "a field, and a gain that is an input of step")
+
+    @property
+    def torque(self) -> str | None:
+        """The field that is added to `extra_torque`."""
+        return self.adds.get("extra_torque")
+
+
+class Remembers(Protocol):
+    """What makes the memory of a law."""
+
+    name: ClassVar[str]  #: for commands and displays
+
+    def of(self, law: "_OperationalSpace") -> Memory:
+        """The memory of a law that has the input `extra_torque`."""
+        ...
+
+
+def memory_of(controller: Controller) -> Memory | None:
+    """The memory of a law; None for laws without one."""
+    return getattr(controller, "memory", None)
+
+
+class Remembering:
+    """A law with its memory, tick by tick, in Python; the supervised law does the same in C.
+
+    Args:
+        controller: a law with a memory.
+
+    Raises:
+        InvalidValueError: for a law without one.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> problem = problems.get("planar_3r_xy")
+        >>> chart = oc.fit(problem, oc.Polynomial(degree=2), samples=300).chart
+        >>> law = oc.control.PDPlus(chart, 50.0, limit=90.0, memory=oc.control.MomentumObserver())
+        >>> ticks, q = oc.control.Remembering(law), problem.domain.centre
+        >>> command, status = ticks.tick(q, 0 * q, [chart.phi(q), 0 * q, 0 * q], period=1e-3)
+        >>> status.name, ticks.fields["correction"].round(3).tolist()
+        ('OK', [0.0, 0.0, 0.0])
+    """
+
+    def __init__(self, controller: Controller) -> None:
+        memory = memory_of(controller)
+        if memory is None:
+            raise InvalidValueError("controller", controller.name, "a law with a memory")
+        self._controller, self._memory = controller, memory
+        self.fields: dict[str, Array] = {}  #: what it remembers
+        self.start()
+
+    def start(self, q: ArrayLike | None = None, command: ArrayLike | None = None) -> None:
+        """Begin anew, at joint positions (n,) that a command (n,) has held until now, if both are given."""
+        law, memory, n = self._controller, self._memory, self._controller.problem.n
+        self.fields = {name: value.copy() for name, value in memory.start.items()}
+        if memory.torque is not None and q is not None and command is not None:
+            fallback = law.fallback(as_point("q", q, n), *law.gains.values()).full().ravel()
+            self.fields[memory.torque] = as_point("command", command, n) - fallback
+        self._fresh = True
+
+    def tick(self, q: ArrayLike, dq: ArrayLike, reference: ArrayLike, period: float) -> tuple[Array, ControlStatus]:
+        """Command (n,) and status at a measured state.
+
+        Args:
+            q: joint positions (n,).
+            dq: joint velocities (n,).
+            reference: value, velocity and acceleration, (3, k).
+            period: time since the last tick [s].
+        """
+        law, memory, n = self._controller, self._memory, self._controller.problem.n
+        wanted = as_float_array("reference", reference)
+        require_shape("reference", wanted.shape, (3, len(law.labels)))
+        state = as_point("q", q, n), as_point("dq", dq, n), *wanted
+        gains = law.gains
+        used = gains | {gain: gains[gain] + self.fields[name] for gain, name in memory.adds.items()}
+        command, status = law.function(*state, *used.values())
+        active, since = float(status == ControlStatus.OK), 0.0 if self._fresh else as_number("period", period)
+        found = memory.step.call([*state, *gains.values(), command, active, since, *self.fields.values()])
+        self.fields = {name: value.full().ravel() for name, value in zip(self.fields, found, strict=True)}
+        self._fresh = False
+        return command.full().ravel(), ControlStatus(int(status))
+
+
+@dataclass(frozen=True)
+class MomentumObserver:
+    """Finds the torque that the model does not explain from the momentum p = M dq, and takes it off the command.
+
+    With M ddq + C dq + g = tau + tau_ext, the momentum obeys dp/dt = tau + C^T dq - g + tau_ext. The observer
+    r = rate (p - integral of (tau + C^T dq - g + r)) follows tau_ext with the time constant 1 / rate in any motion,
+    and needs no acceleration. The law gets the `extra_torque` -r, cut at a bound: integral action against wrong masses,
+    payloads, friction and offsets of torque sensors. It holds against people as well; what it finds is also what shows
+    a collision.
+
+    Args:
+        rate: > 0 [1/s].
+        bound: largest correction of each joint, > 0, (n,) or one number [N m] or [N]; default half of the law's limit.
+
+    Source:
+        De Luca, Albu-Schaeffer, Haddadin, Hirzinger, "Collision detection and safe reaction with the DLR-III
+        lightweight manipulator arm", IROS 2006.
+    """
+
+    rate: float = 5.0
+    bound: ArrayLike | None = None
+    name: ClassVar[str] = "momentum"
+
+    def __post_init__(self) -> None:
+        _require_positive("rate", self.rate)
+
+    def of(self, law: "_OperationalSpace") -> Memory:
+        """The memory of a law: expected momentum, its rate, and the correction.
+
+        Raises:
+            ShapeError, InvalidValueError: for a bound of another shape or value, none for a law without a limit, and
+                laws whose model is given.
+        """
+        n, model = law.problem.n, law.model
+        bound = _bound(self.bound, law)
+        fields = {name: np.zeros(n) for name in ("expected", "drive", "correction")}
+        inputs = _inputs(law, fields)
+        q, dq, period = inputs["q"], inputs["dq"], inputs["period"]
+        payload = [inputs["payload"]] if "payload" in inputs else []
+        p, rate = _momentum(law.problem.robot.tree, bool(payload), model.gravity == "law")(q, dq, *payload)
+        anew, later = p + inputs["correction"] / self.rate, inputs["expected"] + period * inputs["drive"]
+        expected = ca.if_else(ca.logic_and(period > 0, ca.fabs(later) <= LARGEST), later, anew)
+        r = self.rate * (p - expected)
+        drive = inputs["command"] - model.feed_forward(law.problem.robot, inputs) + rate + r
+        found = {"expected": expected, "drive": drive, "correction": _cut(-r, bound)}
+        return _of_torque(fields, inputs, found)
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """Adaptive PD+: first moments of the links and of what the arm carries are learned from the tracking error.
+
+    Inverse dynamics are linear in the errors p of the first moments (mass times centre) of the links. The law gets
+    the `extra_torque` Y p with Y = Y(q, dq, w, a) at the desired velocity w and acceleration a of the joints, and
+    dp/dt = -rate gain Y^T J^-1 (de / 5 s^-1 + e) in phi, with a gain for each moment by the law's own stiffness.
+    Moments stay within bounds. Torque that no moment explains (offsets, friction) is known from the start only.
+
+    Args:
+        rate: about how fast moments are learned, > 0 [1/s].
+        bound: largest correction of each joint, > 0, (n,) or one number [N m] or [N]; default half of the law's limit.
+
+    Source:
+        Slotine, Li, "On the adaptive control of robot manipulators", IJRR 6(3), 1987; here in the coordinates phi,
+        with the gradient of PD+ and the crossed error of Tomei, "Adaptive PD controller for robot manipulators",
+        IEEE T-RA 7(4), 1991.
+    """
+
+    rate: float = 5.0
+    bound: ArrayLike | None = None
+    name: ClassVar[str] = "adaptive"
+
+    def __post_init__(self) -> None:
+        _require_positive("rate", self.rate)
+
+    def of(self, law: "_OperationalSpace") -> Memory:
+        """The memory of a law: errors of first moments [kg m] (masses [kg] for sliding joints), offset, correction.
+
+        Raises:
+            ShapeError, InvalidValueError: for a bound of another shape or value, none for a law without a limit, and
+                laws whose model is given.
+        """
+        problem, chart = law.problem, law.chart
+        bound, tree = _bound(self.bound, law), problem.robot.tree
+        regressor, joints = _regressor(tree)
+        fields = {"moments": np.zeros(len(joints)), "offset": np.zeros(problem.n), "correction": np.zeros(problem.n)}
+        inputs = _inputs(law, fields)
+        q, dq = inputs["q"], inputs["dq"]
+        e, de, J = law._errors(inputs)
+        B, Lambda, _ = block_inertia(chart.n, (chart.n,))(J, law.model.own_mass_matrix(problem.robot, inputs))
+        w = B @ (Lambda @ law._drift(inputs))
+        wanted = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
+        a = -B @ (Lambda @ bend(chart, q, dq, w, wanted))
+        Y = regressor(q, dq, w, a)
+        springs = self._springs(law)[list(joints)] / _GRAVITY**2
+        slope = -self.rate * springs * (Y.T @ (B @ (Lambda @ (de / _CROSSED + e))))
+        change = ca.if_else(inputs["active"] > 0, inputs["active"] * inputs["period"] * slope, 0)
+        largest = np.full(len(joints), float(bound.max()) / _GRAVITY)
+        moments = _cut(inputs["moments"] + _known(change), largest)
+        offset = ca.if_else(inputs["period"] > 0, inputs["offset"], inputs["correction"] - Y @ moments)
+        found = {"moments": moments, "offset": _known(offset), "correction": _cut(Y @ moments + offset, bound)}
+        return _of_torque(fields, inputs, found)
+
+    def _springs(self, law: "_OperationalSpace") -> Array:
+        """Stiffness of the law at the joints, the diagonal of J^T K J in the middle of the domain, (n,)."""
+        J = law.chart.batched_rates(law.problem.domain.centre[None])[0]
+        return np.asarray((J**2 * law.stiffness[:, None]).sum(axis=0))
+
+
+MEMORIES: Mapping[str, type[MomentumObserver] | type[Adaptation]] = {
+    kind.name: kind for kind in (MomentumObserver, Adaptation)
+}
+
+
+def _require_positive(name: str, value: float) -> None:
+    if not 0 < as_number(name, value) < np.inf:
+        raise InvalidValueError(name, value, "a finite number > 0")
+
+
+def _bound(bound: ArrayLike | None, law: "_OperationalSpace") -> Array:
+    """Largest corrections (n,)."""
+    if law.model.source == "given":
+        raise InvalidValueError("model of a law with a memory", "given", "own, because it needs the momentum")
+    given = _SHARE * law.limit if bound is None else as_float_array("bound", bound)
+    if given.ndim:
+        require_shape("bound", given.shape, (law.problem.n,))
+    found = np.broadcast_to(given, (law.problem.n,))
+    if not (np.isfinite(found) & (found > 0)).all():
+        raise InvalidValueError("bound of the correction", found.tolist(), "finite numbers > 0, or a finite limit")
+    return np.asarray(found)
+
+
+def _inputs(law: "_OperationalSpace", fields: Mapping[str, Array]) -> dict[str, ca.MX]:
+    """Symbols for the inputs of a step, in order."""
+    further = {"command": law.problem.n, "active": 1, "period": 1} | {name: len(fields[name]) for name in fields}
+    symbols = {name: ca.MX.sym(name, size) for name, size in further.items()}
+    return named_inputs(law.problem.n, law.gains, len(law.labels)) | symbols
+
+
+def _of_torque(fields: Mapping[str, Array], inputs: dict[str, ca.MX], found: Mapping[str, ca.MX]) -> Memory:
+    """A memory whose `correction` is a torque."""
+    outputs = {f"next_{name}": value for name, value in found.items()}
+    return Memory(fields, {"extra_torque": "correction"}, named_function("memory", inputs, outputs))
+
+
+def _cut(values: ca.MX, bound: Array) -> Any:
+    """Values within +- bound; 0 where they are no numbers."""
+    return ca.fmin(ca.fmax(_known(values), -ca.DM(bound)), ca.DM(bound))
+
+
+def _known(values: ca.MX) -> Any:
+    return ca.if_else(ca.fabs(values) <= LARGEST, values, 0)
+
+
+def _momentum(tree: KinematicTree, with_payload: bool, with_gravity: bool) -> ca.Function:
+    """q, dq, and the payload if there is one -> p = M dq and C^T dq - g, (n, 1) each, without g if the robot adds it.
+
+    C^T dq is the gradient of the kinetic energy dq^T M dq / 2 by q: dM/dt dq = C dq + C^T dq.
+    """
+    q, dq, rest = ca.SX.sym("q", tree.n), ca.SX.sym("dq", tree.n), ca.SX(tree.n, 1)
+    payload = [ca.SX.sym("payload", dynamics.PAYLOAD)] if with_payload else []
+    p = dynamics.inverse_dynamics(tree, q, rest, dq, np.zeros(3), *payload)
+    rate = ca.gradient(ca.dot(dq, p) / 2, q)
+    if with_gravity:
+        rate -= dynamics.bias(tree, q, rest, tree.gravity, *payload)
+    return ca.Function("momentum", [q, dq, *payload], [ca.densify(p), ca.densify(rate)])
+
+
+def _regressor(tree: KinematicTree) -> tuple[ca.Function, tuple[int, ...]]:
+    """q, dq, w, a -> Y (n, k) of M a + C(q, dq) w + g in the first moments, and the joint whose link has each."""
+    q, dq, w, a = (ca.SX.sym(name, tree.n) for name in ("q", "dq", "w", "a"))
+    numbers = ca.SX.sym("numbers", len(dynamics.inertial_numbers(tree)))
+    rest, weightless = ca.SX(tree.n, 1), np.zeros(3)
+    force = dynamics.inverse_dynamics(tree, q, rest, a, tree.gravity, inertials=numbers)
+    for sign in (1, -1):  # C(q, dq) w by polarisation, as in `dynamics.coriolis_product`
+        force += sign / 4 * dynamics.bias(tree, q, dq + sign * w, weightless, inertials=numbers)
+    places, joints = dynamics.first_moments(tree)
+    Y = ca.jacobian(force, numbers)[:, places]  # linear, but for the rotors' inertias, which do not depend on them
+    return ca.Function("regressor", [q, dq, w, a], [ca.densify(Y)]), joints
