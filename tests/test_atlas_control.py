@@ -1,5 +1,7 @@
 """Laws on atlases: smooth weights of charts, hand-overs without a jump, and a blended potential that is passive."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -115,6 +117,26 @@ def test_posture_asked_for_and_torque_do_not_jump_at_hand_overs(atlas: oc.Atlas)
     assert bends(run).max() < 0.1
     assert np.abs(run.x - run.x_asked).max() < 2e-3
     assert not run.fell_back.any()
+
+
+def test_motions_that_repeat_through_charts_are_reported_once(atlas: oc.Atlas) -> None:
+    """Around a rectangle; a motion there and back leaves the same behind, and is not the same hand-over."""
+    x = x_of(atlas, START)
+    corners = x + np.array([[0, 0], [-0.3, 0], [-0.3, -0.5], [0, -0.5], [0, 0]])
+    once = Reference.through(atlas.problem.task.labels, np.linspace(0, 2, 5), corners)
+    asked, said = AskedPosture(atlas), []
+    asked.start(START)
+    changes = 0
+    for k in range(2400):
+        asked.move(k * 5e-3, np.stack([part[0] for part in once.sample(np.array([k * 5e-3 % 2]))]))
+        if (number := asked.wanted_at(asked.q)) != asked.number:
+            with warnings.catch_warnings(record=True) as found:
+                warnings.simplefilter("always")
+                asked.hand_over(number)
+            said += [(changes, str(one.message)) for one in found]
+            changes += 1
+    assert changes > 4
+    assert [("are not" in text, count >= 2) for count, text in said] == [(True, True)]
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Control across the charts of an atlas: the posture asked for, and laws that are handed over."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -21,6 +22,8 @@ _ENOUGH = 1e-12  # of phi, relative to its sizes
 _ITERATIONS = 12
 _SINGULAR = 1e12  # condition number of J
 _RATE = 10.0  # [1/s] at which xi comes to rest after a hand-over
+_ALIKE = 0.05  # difference of two hand-overs at one place of the tool, in sizes of the task values
+_DRIFT = 1e-3  # [rad] or [m] that motions which repeat may leave behind without a word
 _LAWS = 16  # built for charts, the last ones
 
 
@@ -33,6 +36,9 @@ class AskedPosture:
 
     A chart is left where the position lies in the outer half of the overlap of its box, if another chart's cell holds
     it. A cell ends where that overlap begins, so charts do not alternate.
+
+    Every hand-over begins a new xi_d, so motions that repeat through several charts are not cyclic. A RuntimeWarning
+    says so once, when a hand-over comes again with the tool at the same place and other joints.
 
     Args:
         atlas: the atlas.
@@ -63,6 +69,8 @@ class AskedPosture:
         self.q, self.dq, self.ddq = q.copy(), 0 * q, 0 * q
         self.chart = self.atlas.chart(self.number, q)
         self.phi = np.stack([self.chart.phi(q), self.dq, self.ddq])
+        self._passed: list[tuple[tuple[int, int], Array, Array]] = []
+        self._warned = False
 
     def move(self, time: float, x: Array) -> None:
         """Go on to a time and the task values with two derivatives of that time, (3, m), in the same chart.
@@ -98,10 +106,28 @@ class AskedPosture:
 
     def hand_over(self, number: int) -> None:
         """Go on in another chart with the same motion of the joints."""
+        self._watch_drift(number)
         phi = np.stack(self.atlas.handed_over(self.q, self.dq, self.ddq, number))
         self.chart = self.atlas.chart(number, self.q)
         self.number, self._since, self._xi = number, self._time, phi[:, self.atlas.problem.m :]
         self.move(self._time, self._x)
+
+    def _watch_drift(self, number: int) -> None:
+        """Warn if the same hand-over comes again with other joints."""
+        charts, x = (self.number, number), self._x[0]
+        sizes = self.chart.phi_sizes[: len(x)]
+        alike = (q for known, there, q in self._passed if known == charts and (abs(x - there) < _ALIKE * sizes).all())
+        before = next(alike, None)
+        if before is None:
+            self._passed.append((charts, x.copy(), self.q.copy()))
+        elif not self._warned and (drift := float(np.abs(self.q - before).max())) > _DRIFT:
+            self._warned = True
+            warnings.warn(
+                f"this motion repeats through several charts, and its joints are {drift:.2g} off since it passed here "
+                "first: wide charts and corridors are cyclic, hand-overs are not (docs/atlas.md)",
+                RuntimeWarning,
+                stacklevel=3,
+            )
 
     def _held(self, t: float) -> Array:
         """xi_d with two derivatives, (3, r), t after the last hand-over."""
