@@ -67,5 +67,5 @@ def test_formulas_of_docstrings_become_markup() -> None:
     markup = import_module("plain_formulas").markup
     assert markup("J_x A^-1 J_xi^T = 0") == r"J\ :sub:`x`\  A\ :sup:`-1`\  J\ :sub:`ξ`\ \ :sup:`T`\  = 0"
     assert markup("`xi_1` and lambda1 |dxi_j|, see [AS2023]") == (
-        r"``xi_1`` and λ1 \|dξ\ :sub:`j`\ \|, see :doc:`[AS2023] </references>`"
+        r"``xi_1`` and λ1 \|dξ\ :sub:`j`\ \|, see :doc:`[AS2023] </reference/references>`"
     )

@@ -260,7 +260,7 @@ class _OperationalSpace(Shown):
         if self.coupling == "decoupled" and (leak := self._leak_deg()) > _MUCH_DEG:
             found.append(
                 f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull at "
-                "both, which coupled ones do not; see docs/wide.md"
+                "both, which coupled ones do not; see docs/how-to/wide.md"
             )
         if share := self.check_damping().indefinite_share:
             found.append(

@@ -440,7 +440,7 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
     converge faster than with independent points. Domains that draw points themselves get independent ones.
 
     Source:
-        M. Roberts, docs/references.md [R2018]. The use for training is ours.
+        M. Roberts, docs/reference/references.md [R2018]. The use for training is ours.
     """
     if domain.draws_itself:
         return sample_uniform(domain, samples, seed)
