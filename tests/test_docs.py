@@ -57,7 +57,7 @@ def test_newcomers_path_from_a_urdf_to_c_runs(run: Run) -> None:
 
 @pytest.mark.slow
 def test_python_block_of_the_page_on_control_runs(tmp_path: Path) -> None:
-    (code,) = blocks("python", "explanation/control.md")
+    code, _ = blocks("python", "how-to/simulate.md")
     first, coupling = printed_here(code, tmp_path).splitlines()
     assert first.endswith("] 0")  # no status but OK
     assert float(coupling) < 0.005
@@ -75,7 +75,7 @@ def test_python_blocks_of_the_page_on_domains_run(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_python_blocks_of_the_page_on_atlases_run(tmp_path: Path) -> None:
-    code, corridor = blocks("python", "how-to/atlas.md")
+    corridor, code = blocks("python", "how-to/atlas.md")
     (tmp_path / "program.py").write_text(code)  # processes start by importing it
     assert output_of(sys.executable, "program.py", folder=tmp_path).splitlines() == ["('x', 'y', 'xi1') (1,)", "1.0"]
     assert printed_here(corridor, tmp_path) == "True True\n"

@@ -156,7 +156,7 @@ def test_command_lists_charts_shows_cards_and_writes_files(run: Run) -> None:
 
 
 def test_page_shows_the_figures_of_the_cards() -> None:
-    page = (ROOT / "docs" / "how-to" / "ready_charts.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "ready_charts.md").read_text(encoding="utf-8")
     for line in ready_charts.table():
         assert line in page
     pictures = re.findall(r"\]\(\.\./(figures/charts/[^)]+)\)", page)

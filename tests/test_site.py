@@ -3,6 +3,7 @@
 import re
 import sys
 from importlib import import_module
+from os.path import normpath
 from pathlib import Path
 from types import ModuleType
 
@@ -25,7 +26,7 @@ def contents(page: str) -> set[str]:
     folder = Path(page).parent
     trees = re.findall(r"```\{toctree\}\n(.*?)```", PAGES[page], flags=re.DOTALL)
     names = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
-    return {str(folder / name) for name in names}
+    return {normpath(folder / name) for name in names}
 
 
 def test_every_public_name_is_in_the_reference_once() -> None:

@@ -149,7 +149,7 @@ def log_lengths(coordinate_jacobian: ca.SX) -> ca.SX:
     Angles do not fix how fast a coordinate grows along itself: xi^7 is as orthogonal as xi, but flat at 0.
 
     Source:
-        ours, docs/explanation/derivations.md#lengths.
+        ours, docs/explanation/derivations_fits.md#lengths.
     """
     return ca.log(ca.sum2(coordinate_jacobian**2)) / 2
 
@@ -263,7 +263,7 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
         InvalidValueError: for too many coordinates.
 
     Source:
-        ours, docs/explanation/derivations.md#regularity.
+        ours, docs/explanation/derivations_fits.md#regularity.
     """
     if coordinate_jacobian.shape[0] > MOST_ROWS:
         wanted = (

@@ -186,7 +186,7 @@ class MuJoCoPlant(Shown):
 
     M ddq + C dq + g = clip(torque) + loads + pushes - friction, with stops at the joint limits. The physics takes steps
     of fourth order (RK4), shorter ones where viscous friction is stiff for the inertia of a joint
-    (docs/how-to/simulate.md). Not for several threads at once. Needs the extra `orthocas[mujoco]`.
+    (docs/reference/simulation.md). Not for several threads at once. Needs the extra `orthocas[mujoco]`.
 
     Args:
         robot: the true robot.
