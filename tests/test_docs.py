@@ -28,16 +28,16 @@ def checkout(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_python_quickstart_runs(checkout: Path) -> None:
-    code = blocks("python")[0]
-    assert float(python(code, checkout).split()[0]) < 2.06
-    assert (checkout / "arm.orthocas").exists()
+def test_python_quickstart_runs(tmp_path: Path) -> None:
+    """In an empty folder."""
+    assert float(python(blocks("python")[0], tmp_path).split()[0]) < 2.06
+    assert (tmp_path / "arm.orthocas").exists()
+    assert (tmp_path / "arm.png").exists()
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("checkout")
 def test_newcomers_path_from_a_urdf_to_c_runs(run: Run) -> None:
-    """Every command of the README after the first, which installs; ten are enough."""
+    """Every command of the README after the first, which installs, in an empty folder; ten are enough."""
     install, find, *commands = blocks("sh")[1].splitlines()
     assert install.startswith("pip install . ")
     assert len(commands) <= 8
@@ -47,9 +47,12 @@ def test_newcomers_path_from_a_urdf_to_c_runs(run: Run) -> None:
     assert asked.startswith("$(python ")
     for line in commands:
         program, *words = shlex.split(line.replace(f"${name}", found))
+        if program == "echo":
+            output_of("bash", "-c", line)
+            continue
         assert program == "orthocas"
         code, printed, err = run(*words)
-        assert (code, err) == (0, ""), line
+        assert (code, re.sub(r"note: .*, \d+%: .*\n", "", err)) == (0, ""), line  # but for progress, if it is slow
         if words[0] == "certify":
             assert "no fold everywhere on the domain" in printed
     assert Path("c/panda.c").exists()

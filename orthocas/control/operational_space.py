@@ -1,5 +1,6 @@
 """Impedance and PD+ control in phi ([AS2023] Sec. 8), and their modes of decoupling."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
@@ -37,6 +38,7 @@ from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, bloc
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
+from orthocas.errors import LawWarning
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import Batched
@@ -46,6 +48,7 @@ from orthocas.tools.display import Shown, number_list
 
 _MODE_SAMPLES = 256
 _MUCH_DEG = 15.0  # leak from which on decoupled laws are warned of
+_LARGE_RATIO = 5.0  # damping ratio from which on a percentage is suspected
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -193,6 +196,11 @@ class _OperationalSpace(Shown):
             "limit": command_limit("limit", limit, chart.problem.robot.effort_limits),
         }.items():
             object.__setattr__(self, name, value)
+        doubts = _like_a_percentage(self.damping_ratio)
+        if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
+            doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")
+        for doubt in doubts:
+            warnings.warn(doubt, LawWarning, stacklevel=2)
 
     @classmethod
     def on_chart(
@@ -248,8 +256,8 @@ class _OperationalSpace(Shown):
     def remarks(self) -> list[str]:
         """Warnings.
 
-        The metric does not decouple task and extra coordinates, a decoupled law has a chart that leaks much, or D is
-        not positive semi-definite.
+        The metric does not decouple task and extra coordinates, a damping ratio looks like a percentage, a decoupled
+        law has a chart that leaks much, or D is not positive semi-definite.
         """
         found, metric = [], self.problem.metric.name
         if metric != "inertia":
@@ -257,6 +265,7 @@ class _OperationalSpace(Shown):
                 f"the metric of this chart is {metric}, but task and extra coordinates are decoupled only for A = M "
                 "(inertia)"
             )
+        found += _like_a_percentage(self.damping_ratio)
         if self.coupling == "decoupled" and (leak := self._leak_deg()) > _MUCH_DEG:
             found.append(
                 f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull at "
@@ -447,6 +456,14 @@ class _OperationalSpace(Shown):
     def median_volume(self) -> float:
         """Of the gradients over the domain, squared; in blocks if the law is decoupled."""
         return median_volume(self.problem, self.chart.rates, "inertia", self._blocks)
+
+
+def _like_a_percentage(damping_ratio: Array) -> list[str]:
+    """A remark on damping ratios that are far above 1."""
+    largest = float(damping_ratio.max())
+    if largest <= _LARGE_RATIO:
+        return []
+    return [f"damping_ratio = {largest:g} is far above critical damping, which is 1; 0.7 is usual"]
 
 
 class Impedance(_OperationalSpace):
