@@ -70,3 +70,18 @@ def test_formulas_of_docstrings_become_markup() -> None:
     assert markup("`xi_1` and lambda1 |dxi_j|, see [AS2023]") == (
         r"``xi_1`` and λ1 \|dξ\ :sub:`j`\ \|, see :doc:`[AS2023] </reference/references>`"
     )
+
+
+HOW_TO = [name for name in PAGES if name.startswith("how-to/")]
+
+
+@pytest.mark.parametrize("name", HOW_TO)
+def test_how_to_pages_are_short(name: str) -> None:
+    """At most 800 words beside their code; explanations and tables of measurements have other pages."""
+    text = re.sub(r"^( *)```.*?^\1```$", "", PAGES[name], flags=re.DOTALL | re.MULTILINE)
+    assert len(text.split()) <= 800
+
+
+def test_the_navigation_has_about_thirty_pages() -> None:
+    """Of two levels; other pages stand below one of these."""
+    assert 25 <= len(contents("index")) <= 36
