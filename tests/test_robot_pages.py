@@ -60,6 +60,13 @@ def test_loop_of_the_page_on_c_compiles(library: GeneratedC, tmp_path: Path) -> 
     output_of("gcc", "-std=c99", *STRICT, "-fsyntax-only", f"-I{library.folder}", tmp_path / "page.c")
 
 
+@pytest.mark.parametrize("page", ["joystick", "stops"])
+def test_ticks_of_how_to_pages_compile(page: str, library: GeneratedC, tmp_path: Path) -> None:
+    (code,) = blocks(f"how-to/{page}.md", "c")
+    (tmp_path / "page.c").write_text(code)
+    output_of("gcc", "-std=c99", *STRICT, "-fsyntax-only", f"-I{library.folder}", tmp_path / "page.c")
+
+
 def test_controller_for_ros2_control_holds_moves_and_resumes(library: GeneratedC, tmp_path: Path) -> None:
     """On stand-ins for ROS, around the library's own model; a missing measurement is 50 ticks long, a target is NaN."""
     folders = [f"-I{folder}" for folder in (STUBS / "ros2", ROS / "include", library.folder)]
