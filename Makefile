@@ -9,7 +9,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 .PHONY: demo paper test check docs fuzz lint types wheel-check bench figures charts clean
 
 demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and picture in out/
-	$(BIN)/python examples/iiwa_demo.py --out out
+	$(BIN)/orthocas demo --out out
 
 paper: $(INSTALLED)  ## the 30 figures of the paper in out/paper/; FIGURE=fig06 draws one
 	$(BIN)/python -m examples.paper $(or $(FIGURE),all) --out out/paper

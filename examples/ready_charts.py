@@ -206,7 +206,7 @@ def is_wide(name: str) -> bool:
 
 
 def table(data: Path = DATA) -> list[str]:
-    """The rows of the tables in docs/charts.md: charts with a proof, then wide ones."""
+    """The rows of the tables in docs/reference/ready_charts.md: charts with a proof, then wide ones."""
     rows = []
     for name in RECIPES:
         card = Card.from_json((data / f"{name}.json").read_text(encoding="utf-8"))

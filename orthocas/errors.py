@@ -1,6 +1,7 @@
 """The errors that orthocas raises on purpose. Each message is one line: what was given, and what was expected."""
 
 import difflib
+import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +59,10 @@ class NotSavableWarning(UserWarning):
     """A chart file cannot store the coordinates that a fit is about to compute."""
 
 
+class LawWarning(UserWarning):
+    """A control law is built with settings that are hardly meant."""
+
+
 class ShapeError(OrthocasError, ValueError):
     """An array has the wrong shape."""
 
@@ -94,6 +99,16 @@ class RobotError(OrthocasError, ValueError):
     """A robot description cannot be read, or contains a joint that orthocas does not support."""
 
 
+_SMALLER_TASKS = {"position+axis:z": 5, "position": 3, "orientation": 3, "position:xy": 2, "axis:z": 2, "position:x": 1}
+_MOST_RADIANS = 7.0  # more than a turn: no bounded joint of an arm turns so far from its middle
+
+
+def degrees_hint(*values: float) -> str:
+    """The end of a message about joint positions that look like degrees; "" for others."""
+    largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
+    return "; are these degrees? Joint positions are in radians" if largest > _MOST_RADIANS else ""
+
+
 class DomainError(OrthocasError, ValueError):
     """A joint-space domain is empty, or leaves the joint limits."""
 
@@ -103,10 +118,12 @@ class MetricError(OrthocasError, ValueError):
 
 
 class NotRedundantError(OrthocasError, ValueError):
-    """The task leaves no freedom: m >= n."""
+    """The task leaves no freedom: m >= n. The message names tasks that leave some."""
 
     def __init__(self, m: int, n: int) -> None:
-        super().__init__(f"the task has m = {m} components and the robot n = {n} joints, expected m < n")
+        smaller = [f"{task} (m = {size})" for task, size in _SMALLER_TASKS.items() if size < min(m, n)][:3]
+        advice = f"; redundant tasks are, for example, {', '.join(smaller)}" if smaller else ""
+        super().__init__(f"the task has m = {m} components and the robot n = {n} joints, expected m < n{advice}")
 
 
 class SingularTaskError(OrthocasError, ValueError):

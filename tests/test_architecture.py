@@ -196,7 +196,7 @@ def test_every_package_is_installed() -> None:
 
 
 def test_references_used_in_docstrings_are_listed() -> None:
-    listed = (ROOT / "docs" / "references.md").read_text()
+    listed = (ROOT / "docs" / "reference" / "references.md").read_text()
     used = {word for path in SOURCES.values() for word in re.findall(r"\[([A-Z][A-Za-z]*\d{4})\]", path.read_text())}
     assert "AS2023" in used
     for key in used:

@@ -231,7 +231,7 @@ def test_laws_without_a_chart_are_refused(way_atlas: oc.Atlas, planar_fit: Any, 
 
 def test_program_of_the_page_on_atlases_in_c_compiles(generated: GeneratedC, tmp_path: Path) -> None:
     """With C99 and every warning an error."""
-    page = (Path(__file__).parent.parent / "docs" / "atlas_in_c.md").read_text()
+    page = (Path(__file__).parent.parent / "docs" / "how-to" / "atlas_in_c.md").read_text()
     (code,) = re.findall(r"```c\n(.*?)```", page, flags=re.DOTALL)
     declared = code[code.index("arm_status tick(") : code.index(") {") + 1] + ";\n"
     (tmp_path / "page.c").write_text(code.replace("/* One tick", f"{declared}\n/* One tick", 1))

@@ -101,7 +101,7 @@ def test_equation_29_can_be_indefinite_where_double_diagonal_is_not() -> None:
     """M with a large off-diagonal part and stiffnesses far apart: B Z S + S Z B of positive factors, yet negative."""
     M, K, Z = np.array([[1.0, 0.99], [0.99, 1.0]]), np.array([1.0, 1e4]), np.full(2, 0.7)
     least, largest = np.linalg.eigvalsh(damping("square_root", M, K, Z))
-    assert least == pytest.approx(-16.5024, abs=1e-3)  # as in docs/derivations.md
+    assert least == pytest.approx(-16.5024, abs=1e-3)  # as in docs/explanation/derivations_control.md
     assert least / largest == pytest.approx(-0.1338, abs=1e-4)
     for ratios in (Z, np.array([0.1, 2.0]), np.array([0.0, 1.0])):
         assert np.linalg.eigvalsh(damping("double_diagonal", M, K, ratios))[0] > -1e-12

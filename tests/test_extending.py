@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from programs import needs_c, python
 
-PAGE = Path(__file__).parent.parent / "docs" / "extending.md"
+PAGE = Path(__file__).parent.parent / "docs" / "how-to" / "extending.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
 BASIS, TERM, LOSS, LAW, TASK, DOMAIN, SOLVER = BLOCKS[1:]
 

@@ -79,6 +79,7 @@ def test_a_number_without_a_record_and_a_stale_one_are_found() -> None:
 def test_longer_numbers_do_not_count_as_the_phrase() -> None:
     assert figures.places("12.5 s, 2.55 s, 1,2.5 s", "2.5 s") == []
     assert len(figures.places("it takes\n  2.5 s", "takes 2.5 s")) == 1
+    assert len(figures.places("it [takes](../a.md#b) 2.5 s, or [lasts](a.md) 2.5 s", "[takes](a.md) 2.5 s")) == 1
 
 
 SCRIPT = """

@@ -156,9 +156,9 @@ def test_command_lists_charts_shows_cards_and_writes_files(run: Run) -> None:
 
 
 def test_page_shows_the_figures_of_the_cards() -> None:
-    page = (ROOT / "docs" / "charts.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "ready_charts.md").read_text(encoding="utf-8")
     for line in ready_charts.table():
         assert line in page
-    pictures = re.findall(r"\]\((figures/charts/[^)]+)\)", page)
+    pictures = re.findall(r"\]\(\.\./(figures/charts/[^)]+)\)", page)
     assert {Path(path).stem for path in pictures} == set(NAMES)
     assert all((ROOT / "docs" / path).exists() for path in pictures)

@@ -1,4 +1,4 @@
-"""Programs of docs/robots.md and docs/c_controller.md compile, and the controller for ros2_control runs.
+"""Programs of docs/how-to/robots.md and docs/how-to/c_code.md compile, and the controller for ros2_control runs.
 
 Nothing here is a robot: headers of libfranka, FRI and ROS are replaced by stand-ins with the same signatures.
 """
@@ -42,14 +42,14 @@ def blocks(page: str, language: str) -> list[str]:
 
 @pytest.mark.parametrize(("number", "stubs"), [(0, "libfranka"), (1, "fri")])
 def test_programs_of_the_page_on_robots_compile(number: int, stubs: str, library: GeneratedC, tmp_path: Path) -> None:
-    code = blocks("robots.md", "cpp")[number]
+    code = blocks("how-to/robots.md", "cpp")[number]
     (tmp_path / "page.cpp").write_text(code)
     output_of(*CPP, "-fsyntax-only", f"-I{STUBS / stubs}", f"-I{library.folder}", tmp_path / "page.cpp")
 
 
 def test_loop_of_the_page_on_c_compiles(library: GeneratedC, tmp_path: Path) -> None:
     """With C99 and every warning an error."""
-    (code,) = blocks("c_controller.md", "c")
+    (code,) = blocks("how-to/c_code.md", "c")
     yours = """
     void read_robot(double *q, double *dq);
     void write_robot(const double *torque);
@@ -57,6 +57,13 @@ def test_loop_of_the_page_on_c_compiles(library: GeneratedC, tmp_path: Path) -> 
     void run(const double target[7], long ticks);
     """
     (tmp_path / "page.c").write_text(yours + code)
+    output_of("gcc", "-std=c99", *STRICT, "-fsyntax-only", f"-I{library.folder}", tmp_path / "page.c")
+
+
+@pytest.mark.parametrize("page", ["joystick", "stops"])
+def test_ticks_of_how_to_pages_compile(page: str, library: GeneratedC, tmp_path: Path) -> None:
+    (code,) = blocks(f"how-to/{page}.md", "c")
+    (tmp_path / "page.c").write_text(code)
     output_of("gcc", "-std=c99", *STRICT, "-fsyntax-only", f"-I{library.folder}", tmp_path / "page.c")
 
 

@@ -3,6 +3,7 @@
 import re
 import sys
 from importlib import import_module
+from os.path import normpath
 from pathlib import Path
 from types import ModuleType
 
@@ -25,7 +26,7 @@ def contents(page: str) -> set[str]:
     folder = Path(page).parent
     trees = re.findall(r"```\{toctree\}\n(.*?)```", PAGES[page], flags=re.DOTALL)
     names = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
-    return {str(folder / name) for name in names}
+    return {normpath(folder / name) for name in names}
 
 
 def test_every_public_name_is_in_the_reference_once() -> None:
@@ -67,5 +68,20 @@ def test_formulas_of_docstrings_become_markup() -> None:
     markup = import_module("plain_formulas").markup
     assert markup("J_x A^-1 J_xi^T = 0") == r"J\ :sub:`x`\  A\ :sup:`-1`\  J\ :sub:`ξ`\ \ :sup:`T`\  = 0"
     assert markup("`xi_1` and lambda1 |dxi_j|, see [AS2023]") == (
-        r"``xi_1`` and λ1 \|dξ\ :sub:`j`\ \|, see :doc:`[AS2023] </references>`"
+        r"``xi_1`` and λ1 \|dξ\ :sub:`j`\ \|, see :doc:`[AS2023] </reference/references>`"
     )
+
+
+HOW_TO = [name for name in PAGES if name.startswith("how-to/")]
+
+
+@pytest.mark.parametrize("name", HOW_TO)
+def test_how_to_pages_are_short(name: str) -> None:
+    """At most 800 words beside their code; explanations and tables of measurements have other pages."""
+    text = re.sub(r"^( *)```.*?^\1```$", "", PAGES[name], flags=re.DOTALL | re.MULTILINE)
+    assert len(text.split()) <= 800
+
+
+def test_the_navigation_has_about_thirty_pages() -> None:
+    """Of two levels; other pages stand below one of these."""
+    assert 25 <= len(contents("index")) <= 36

@@ -90,7 +90,7 @@ def test_examples_are_steps_files(name: str, chart: oc.Chart, iiwa_fit: Any) -> 
 
 
 def test_steps_files_in_the_docs_can_be_read(chart: oc.Chart, tmp_path: Path) -> None:
-    text = (Path(__file__).parent.parent / "docs" / "simulate.md").read_text()
+    text = (Path(__file__).parent.parent / "docs" / "reference" / "simulation.md").read_text()
     blocks = re.findall(r"```json\n(.*?)```", text, flags=re.DOTALL)
     assert [read_steps(written(tmp_path, block), chart).has_steps for block in blocks] == [True, False]
 

@@ -148,7 +148,7 @@ def test_the_command_line_serves_until_ctrl_c(page: Page, tmp_path: Path) -> Non
 
 
 def test_blocks_of_the_page_on_views_run(run: Run, tmp_path: Path) -> None:
-    text = (Path(__file__).parent.parent / "docs" / "view.md").read_text()
+    text = (Path(__file__).parent.parent / "docs" / "how-to" / "view.md").read_text()
     code = "\n".join(re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL))
     printed = python(f"{code}\nfit.chart.save('arm.orthocas')", tmp_path).splitlines()
     assert printed == ["True"]

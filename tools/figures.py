@@ -35,7 +35,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "docs" / "records"
 CHEAP = 120.0  # CPU seconds
-UNREAD = ("docs/references.md", "docs/changelog.md")  # pages and DOIs of papers; no page of its own
+UNREAD = ("docs/reference/references.md", "docs/changelog.md")  # pages and DOIs of papers; no page of its own
 
 NUMBER = re.compile(r"(?<![\w.^_])[-+]?\d(?:[\d,]*\d)?(?:\.\d+)?(?:e[-+]?\d+)?(?![\w^]|\.\d)")
 UNITS = (
@@ -57,6 +57,7 @@ UNPRINTED = re.compile(  # what is no text: front matter, blocks of code, header
     re.DOTALL | re.MULTILINE,
 )
 LINE = re.compile(r"^ *\|.*\|$", re.MULTILINE)  # of a table
+TARGET = re.compile(r"\]\([^)]*\)")  # of a link, which may move
 NUMERIC_CELL = re.compile(r"[\s\d.,e/%→±°x*+-]+")
 TAKEN = re.compile(r"\{([^{}|]+?)(?:\*([\d.e+-]+))?\|([^{}]+)\}")
 
@@ -145,17 +146,19 @@ def _counts(text: str, span: tuple[int, int], numeric: Sequence[tuple[int, int]]
 
 
 def places(page: str, phrase: str) -> list[tuple[int, int]]:
-    """Where a page has the phrase, whatever its line breaks; not within a longer number."""
-    if " ".join(phrase.split()) not in on_one_line(page):  # much faster than the search below
+    """Where a page has the phrase, whatever its line breaks and targets of links; not within a longer number."""
+    if on_one_line(phrase) not in on_one_line(page):  # much faster than the search below
         return []
-    words = r"\s+".join(re.escape(word) for word in phrase.split())
+    words = r"\s+".join(re.escape(word) for word in TARGET.sub("]()", phrase).split()).replace(
+        r"\]\(\)", r"\]\([^)]*\)"
+    )
     return [found.span() for found in re.finditer(rf"(?<![\d.])(?<!\d,){words}(?![\d]|[.,]\d|e[-+]?\d)", page)]
 
 
 @cache
 def on_one_line(page: str) -> str:
-    """A page with single spaces."""
-    return " ".join(page.split())
+    """A page with single spaces, and without the targets of its links."""
+    return " ".join(TARGET.sub("]()", page).split())
 
 
 def numbers(text: str) -> list[str]:

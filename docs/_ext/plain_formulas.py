@@ -1,6 +1,7 @@
 """Docstrings as pages show them: formulas with Greek letters, indices and powers, and links to pages and names.
 
-The docstrings themselves are plain text, for `help` and editors: J_x A^-1 J_xi^T = 0, docs/angles.md, [AS2023].
+The docstrings themselves are plain text, for `help` and editors: J_x A^-1 J_xi^T = 0, docs/explanation/angles.md,
+[AS2023].
 """
 
 import re
@@ -24,7 +25,7 @@ LINKED = re.compile(rf"`(?:orthocas\.|oc\.)?((?:{'|'.join(orthocas.__all__)})(?:
 POWER = re.compile(r"\^(-?\d+|-?T|#A?|\*|\{[^}\s]+\})")
 INDEX = re.compile(rf"(?<!\w)(d?(?:[A-Za-z]|{LETTER})|grad)_({LETTER}|[A-Za-z0-9]{{1,3}}|\{{[^}}\s]+\}})(?!\w)")
 WORD = re.compile(rf"(?<![\w`])(d?)({LETTER})(\d?)(?!\w|=|\.\w)")
-PAGE = re.compile(r"docs/(\w+)\.md(?:#[\w-]+)?")
+PAGE = re.compile(r"docs/([\w/-]+)\.md(?:#[\w-]+)?")
 CITED = re.compile(r"\[([A-Z]{1,5}\d{4})\]")
 TYPES = {stringify_annotation(kind, "smart"): name for kind, name in ((ArrayLike, "ArrayLike"), (Array, "Array"))}
 SECTIONS = Config(napoleon_use_rtype=False, napoleon_custom_sections=["Source"])
@@ -47,7 +48,7 @@ def _prose(text: str) -> str:
     text = INDEX.sub(lambda found: rf"{_plain(found[1])}\ :sub:`{_plain(found[2])}`\ ", text)
     text = WORD.sub(lambda found: f"{found[1]}{GREEK[found[2]]}{found[3]}", text)
     text = PAGE.sub(r":doc:`/\1`", text)
-    text = CITED.sub(r":doc:`[\1] </references>`", text)
+    text = CITED.sub(r":doc:`[\1] </reference/references>`", text)
     return re.sub(r"(?<=\w)_(?!\w)", r"\\_", text)  # name_ would be a link
 
 

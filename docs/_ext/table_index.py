@@ -13,7 +13,7 @@ class TermsInIndex(SphinxTransform):
 
     def apply(self) -> None:
         """Called by Sphinx for each page."""
-        if self.env.docname != "glossary":
+        if self.env.docname != "reference/glossary":
             return
         for count, row in enumerate(self.document.findall(nodes.row)):
             if isinstance(row.parent, nodes.tbody):

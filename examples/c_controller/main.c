@@ -2,7 +2,7 @@
  * A 1 kHz loop around a generated controller under supervision, with histograms of the computing time and the lateness
  * of its ticks.
  *
- * Generate the library with the name `arm` (docs/c_controller.md). A simulation replaces the robot: forward dynamics
+ * Generate the library with the name `arm` (docs/how-to/c_code.md). A simulation replaces the robot: forward dynamics
  * with the library's own mass matrix and bias, one semi-implicit Euler step per tick. For your robot, replace
  * `read_robot` and `write_robot`.
  */
@@ -128,7 +128,7 @@ int main(int argc, char **argv) {
       case ARM_OK: ++good; break;
       case ARM_SATURATED: ++cut; break;
       case ARM_NEAR_BOUNDARY: ++near; break;
-      case ARM_CAUGHT: arm_resume(&state); break; /* your program: when the reason is gone (docs/c_controller.md) */
+      case ARM_CAUGHT: arm_resume(&state); break; /* your program: when the reason is gone (docs/how-to/c_code.md) */
       default: break;                             /* RETURNING: wait; BAD_INPUT: find the fault */
     }
     done = now();

@@ -13,7 +13,7 @@ from orthocas.atlas.evaluation import Blend
 from orthocas.charts.chart import Chart
 from orthocas.control.controller import Controller, ControlStatus
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
-from orthocas.errors import InvalidValueError, PathError
+from orthocas.errors import InvalidValueError, LawWarning, PathError
 from orthocas.tools.cached import building, cached_property
 from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.display import Shown, number_list
@@ -37,7 +37,7 @@ class AskedPosture:
     A chart is left where the position lies in the outer half of the overlap of its box, if another chart's cell holds
     it. A cell ends where that overlap begins, so charts do not alternate.
 
-    Every hand-over begins a new xi_d, so motions that repeat through several charts are not cyclic. A RuntimeWarning
+    Every hand-over begins a new xi_d, so motions that repeat through several charts are not cyclic. A LawWarning
     says so once, when a hand-over comes again with the tool at the same place and other joints.
 
     Args:
@@ -124,8 +124,8 @@ class AskedPosture:
             self._warned = True
             warnings.warn(
                 f"this motion repeats through several charts, and its joints are {drift:.2g} off since it passed here "
-                "first: wide charts and corridors are cyclic, hand-overs are not (docs/atlas.md)",
-                RuntimeWarning,
+                "first: wide charts and corridors are cyclic, hand-overs are not (docs/how-to/atlas.md)",
+                LawWarning,
                 stacklevel=3,
             )
 

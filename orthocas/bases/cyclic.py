@@ -40,7 +40,7 @@ def cyclic_joints(problem: Problem) -> tuple[str, ...]:
         problem: robot, task, metric and domain.
 
     Source:
-        ours, docs/domains.md.
+        ours, docs/explanation/domains.md.
 
     Example:
         >>> import orthocas as oc

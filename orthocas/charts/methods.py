@@ -115,7 +115,7 @@ class InverseMethods(PhiFunctions):
             NoExpressionError: if `inside` is asked of grown coordinates.
 
         Source:
-            ours: docs/inverse.md.
+            ours: docs/how-to/inverse.md.
         """
         require_at_least("tolerance", tolerance, 0)
         targets = self._rows("phi", phi)
@@ -167,7 +167,7 @@ class InverseMethods(PhiFunctions):
 
         A chart without a fold may have several: det J != 0 makes phi one-to-one near each point only. On the box of a
         certificate's proof "one-to-one", there is at most one. The search starts in all cells of the domain that may
-        hold a solution. It is no proof that there are no others; docs/inverse.md has what it misses.
+        hold a solution. It is no proof that there are no others; docs/explanation/inverse.md has what it misses.
 
         Args:
             phi: target values, (n,).

@@ -126,7 +126,7 @@ class LeakStatistics:
     does not depend on the choice of task coordinates.
 
     Source:
-        ours, docs/angles.md.
+        ours, docs/explanation/angles.md.
     """
 
     mean: float

@@ -14,6 +14,7 @@ from orthocas.version import VERSION
 
 _GROUP = "orthocas.commands"
 COMMANDS = {
+    "demo": "Fit coordinates for the 7-DoF arm of the paper, print their quality, save a chart and pictures (10 s).",
     "fit": "Fit extra coordinates to a problem and save the chart.",
     "evaluate": "Measure the quality of a chart on held-out samples of its domain.",
     "certify": "Prove that a chart does not fold anywhere on its domain, and keep the proof in its file.",

@@ -1,5 +1,6 @@
 """Builds a controller from command-line options, and rejects options that belong to another controller."""
 
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
@@ -11,7 +12,7 @@ from orthocas.cli.problem_argument import parse_numbers
 from orthocas.control.controller import Controller
 from orthocas.control.gains import Setting
 from orthocas.control.registry import law_names, law_of
-from orthocas.errors import OptionError
+from orthocas.errors import LawWarning, OptionError
 from orthocas.tools.checks import Array
 
 CONTROLLERS = law_names()
@@ -73,7 +74,9 @@ def build_controller(name: str, chart: Chart, settings: Mapping[str, str], limit
         field: text if law.options[field].is_word else _one_or_all(_option(field), text)
         for field, text in settings.items()
     }
-    return law.on_chart(chart, None if limit is None else _one_or_all("--limit", limit), **values)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LawWarning)  # commands print the remarks of the law
+        return law.on_chart(chart, None if limit is None else _one_or_all("--limit", limit), **values)
 
 
 def _option(name: str) -> str:

@@ -8,6 +8,7 @@ import typer
 from orthocas.charts import quality
 from orthocas.charts.chart import Chart
 from orthocas.cli.output import AsJson, print_json, print_rows, report_rows, whole_number
+from orthocas.cli.reach import reach_data, reach_rows
 
 
 def evaluate(
@@ -21,8 +22,9 @@ def evaluate(
     json: AsJson = False,
 ) -> None:
     """Measure the quality of a chart on held-out samples of its domain."""
-    report = quality.evaluate(Chart.load(chart), samples, seed)
+    judged = Chart.load(chart)
+    report = quality.evaluate(judged, samples, seed)
     if json:
-        print_json(report.as_dict())
+        print_json({**report.as_dict(), **reach_data(judged)})
     else:
-        print_rows(report_rows(report))
+        print_rows({**report_rows(report), **reach_rows(judged)})

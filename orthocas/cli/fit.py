@@ -43,6 +43,7 @@ from orthocas.cli.problem_argument import (
     wide_fit,
     with_options,
 )
+from orthocas.cli.reach import reach_data, reach_rows
 from orthocas.errors import Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
@@ -234,8 +235,7 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     if offer is not None:
         bound, share = offer.least_singular_value, offer.share
         rows["clear part"] = f"--least-singular-value {bound:g} leaves out singular positions and keeps {share:.1%}"
-    rows["chart"] = str(target)
-    return rows
+    return {**rows, **reach_rows(result.chart), "chart": str(target)}
 
 
 def _domain_rows(suggestion: DomainSuggestion) -> dict[str, str]:
@@ -257,6 +257,7 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
     return {
         **({} if suggestion is None else {"suggested_domain": suggestion.as_dict()}),
         "chart": str(target),
+        **reach_data(result.chart),
         "parametrisation": result.chart.coordinates.label,
         "status": result.status.value,
         "seconds": result.seconds,

@@ -26,7 +26,7 @@ _CHOICES = (HOLD, SCHEDULE, OBJECTIVE)
 
 def follow(
     chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
-    path: Annotated[Path, typer.Argument(metavar="PATH.csv", help="Waypoints of the tool, see docs/paths.md.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH.csv", help="Waypoints of the tool, see docs/how-to/paths.md.")],
     out: Annotated[Path, typer.Option("--out", help="CSV file for times, positions, velocities and accelerations.")],
     xi: Annotated[
         str | None,

@@ -8,7 +8,6 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.charts.coordinates import InvertibleMap
 from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.cli.problem_argument import (
     ROBOT,
@@ -19,7 +18,7 @@ from orthocas.cli.problem_argument import (
     is_robot_file,
     with_options,
 )
-from orthocas.errors import InvalidValueError, OptionError, SingularTaskError
+from orthocas.errors import OptionError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches as find_branches
@@ -143,17 +142,9 @@ def _problem(problem: Problem) -> dict[str, Any]:
 
 
 def _reach(chart: "Chart") -> dict[str, Any]:
-    """How far each coordinate reaches alone from the centre of the domain, and what stops it there."""
-    if isinstance(chart.coordinates, InvertibleMap):  # grown coordinates take seconds
-        return {}
-    try:
-        reach = chart.xi_range(chart.problem.domain.centre)
-    except InvalidValueError:  # the task is not finite there
-        return {}
-    return {
-        "xi_range": {part.label: [plain(part.low), plain(part.high)] for part in reach},
-        "xi_stops": {part.label: [str(part.low_stop), str(part.high_stop)] for part in reach},
-    }
+    from orthocas.cli.reach import reach_data  # as _load
+
+    return reach_data(chart)
 
 
 def _involutivity(problem: Problem) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import inspect
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
@@ -11,7 +12,7 @@ import typer
 
 from orthocas.errors import one_line, printable
 from orthocas.tools.json import to_json
-from orthocas.tools.progress import Monitor, Progress, silent
+from orthocas.tools.progress import Monitor, Progress
 
 if TYPE_CHECKING:
     from orthocas.charts.quality import Report
@@ -109,12 +110,25 @@ def report_rows(report: "Report") -> dict[str, str]:
 
 @contextmanager
 def terminal_monitor() -> Iterator[Monitor]:
-    """A monitor that draws one bar per stage. It is silent when standard error is not a terminal."""
+    """A monitor that draws one bar per stage; a line every ten seconds when standard error is not a terminal."""
     if not sys.stderr.isatty():
-        yield silent
+        yield lines_of_progress()
         return
     with _stage_bars() as show:
         yield show
+
+
+def lines_of_progress(pause: float = 10.0) -> Monitor:
+    """A monitor that prints where a long computation is, at most once every `pause` seconds."""
+    last = time.monotonic()
+
+    def show(progress: Progress) -> None:
+        nonlocal last
+        if (now := time.monotonic()) - last >= pause:
+            last = now
+            note(f"{progress.stage}, {progress.fraction:.0%}: {progress.detail}")
+
+    return show
 
 
 @contextmanager

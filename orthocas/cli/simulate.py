@@ -49,7 +49,7 @@ def simulate(
     chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)}.")],
     steps: Annotated[
-        Path, typer.Option("--steps", help="JSON file with the motion of the robot, see docs/simulate.md.")
+        Path, typer.Option("--steps", help="JSON file with the motion of the robot, see docs/reference/simulation.md.")
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder for the run, its pictures and the report.")],
     settings: dict[str, str],

@@ -28,7 +28,7 @@ STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT, SECOND_FORCE = (  #: units of gains, 
     "largest command per joint, > 0; INFINITY for no limit",
     "J per unit of the second quantity",
 )
-SPRING_FREQUENCY = 12 * np.pi  #: [rad/s], 6 Hz: arms whose masses are 20 % off stay in their boxes (docs/control.md)
+SPRING_FREQUENCY = 12 * np.pi  #: [rad/s], 6 Hz; what it holds: docs/measurements/control.md
 FASTEST = 36 * np.pi  #: [rad/s], 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7
 _SAMPLES, _SEED = 512, 0
 _TOO_FAST = 3000.0  # weight of the squared logarithm by which a mode exceeds the fastest frequency
@@ -116,7 +116,7 @@ def matched_stiffness(chart: Chart, frequency: float = SPRING_FREQUENCY, fastest
             the domain modes are faster, see `modes` of a law.
 
     Source:
-        ours, docs/derivations.md#stiffness
+        ours, docs/explanation/derivations_control.md#stiffness
     """
     require_kind("chart", chart, Chart)
     chart.function("xi")  # raises for grown charts

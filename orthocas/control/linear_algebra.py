@@ -143,7 +143,7 @@ def damping_matrix(
 
     Source:
         square_root: [AS2023] eq. (29); double diagonalisation: [AOFH2003]; its form without eigenvectors and for
-        several ratios is ours, docs/derivations.md#damping.
+        several ratios is ours, docs/explanation/derivations_control.md#damping.
     """
     if design == "square_root":
         half = square_root(inertia) * _row(damping_ratio * ca.sqrt(stiffness))

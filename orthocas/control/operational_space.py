@@ -1,5 +1,6 @@
 """Impedance and PD+ control in phi ([AS2023] Sec. 8), and their modes of decoupling."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
@@ -38,7 +39,7 @@ from orthocas.control.memory import MEMORIES, Memory, Remembers
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, LawWarning
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import Batched
@@ -48,6 +49,7 @@ from orthocas.tools.display import Shown, number_list
 
 _MODE_SAMPLES = 256
 _MUCH_DEG = 15.0  # leak from which on decoupled laws are warned of
+_LARGE_RATIO = 5.0  # damping ratio from which on a percentage is suspected
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -212,6 +214,11 @@ class _OperationalSpace(Shown):
         }.items():
             object.__setattr__(self, name, value)
         _ = self.memory  # raises for bounds of another size
+        doubts = _like_a_percentage(self.damping_ratio)
+        if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
+            doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")
+        for doubt in doubts:
+            warnings.warn(doubt, LawWarning, stacklevel=2)
 
     @classmethod
     def on_chart(
@@ -277,8 +284,8 @@ class _OperationalSpace(Shown):
     def remarks(self) -> list[str]:
         """Warnings.
 
-        The metric does not decouple task and extra coordinates, a decoupled law has a chart that leaks much, or D is
-        not positive semi-definite.
+        The metric does not decouple task and extra coordinates, a damping ratio looks like a percentage, a decoupled
+        law has a chart that leaks much, or D is not positive semi-definite.
         """
         found, metric = [], self.problem.metric.name
         if metric != "inertia":
@@ -286,10 +293,11 @@ class _OperationalSpace(Shown):
                 f"the metric of this chart is {metric}, but task and extra coordinates are decoupled only for A = M "
                 "(inertia)"
             )
+        found += _like_a_percentage(self.damping_ratio)
         if self.coupling == "decoupled" and (leak := self._leak_deg()) > _MUCH_DEG:
             found.append(
                 f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull at "
-                "both, which coupled ones do not; see docs/wide.md"
+                "both, which coupled ones do not; see docs/how-to/wide.md"
             )
         if share := self.check_damping().indefinite_share:
             found.append(
@@ -476,6 +484,14 @@ class _OperationalSpace(Shown):
     def median_volume(self) -> float:
         """Of the gradients over the domain, squared; in blocks if the law is decoupled."""
         return median_volume(self.problem, self.chart.rates, "inertia", self._blocks)
+
+
+def _like_a_percentage(damping_ratio: Array) -> list[str]:
+    """A remark on damping ratios that are far above 1."""
+    largest = float(damping_ratio.max())
+    if largest <= _LARGE_RATIO:
+        return []
+    return [f"damping_ratio = {largest:g} is far above critical damping, which is 1; 0.7 is usual"]
 
 
 class Impedance(_OperationalSpace):

@@ -7,7 +7,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import too_far
 from orthocas.charts.solutions import Tracker, TrackerStatus
 from orthocas.control.reference import Reference
-from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError
+from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError, degrees_hint
 from orthocas.tasks.domains import bounds_of, contains
 from orthocas.tools.checks import Array, as_point, require_kind
 
@@ -25,7 +25,8 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
     if reference.labels != chart.labels:
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
     if not contains(chart.problem.domain, q_start):
-        raise UnreachableReferenceError(f"the start lies outside the domain: {_outside(chart, q_start)}")
+        hint = degrees_hint(*q_start[~np.array(chart.problem.robot.tree.prismatic)])
+        raise UnreachableReferenceError(f"the start lies outside the domain: {_outside(chart, q_start)}{hint}")
     times = reference.grid()
     values = reference.sample(times)[0]
     path, q = np.empty((len(times), chart.n)), q_start

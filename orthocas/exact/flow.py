@@ -134,8 +134,9 @@ class TaskFlow:
     """The flow dq/ds = J_x^#A dx, s in [0, 1], which changes task values by exactly dx, A-orthogonally to the leaves.
 
     For m = 1 it is dq/ds = dx grad_A h / (dh(grad_A h)), the curve of [AS2023] eq. (23) with the task value as its
-    parameter. It ends on the desired leaf without a stopping rule (ours, docs/derivations.md#growing). For m >= 2 it
-    follows the straight line in task coordinates; other paths end elsewhere unless the distribution is involutive.
+    parameter. It ends on the desired leaf without a stopping rule (ours,
+    docs/explanation/derivations_exact.md#growing). For m >= 2 it follows the straight line in task coordinates; other
+    paths end elsewhere unless the distribution is involutive.
     """
 
     problem: Problem

@@ -52,7 +52,7 @@ def level_surface(
 
     Source:
         Marching cubes: [AS2023] Sec. 5.2. Exact vertices and the improvement of the triangles are ours:
-        docs/derivations.md#disk-chart.
+        docs/explanation/derivations_exact.md#disk-chart.
     """
     frozen_array("level", level, ())
     corners = np.stack([frozen_array("low", low, (3,)), frozen_array("high", high, (3,))])
@@ -209,7 +209,7 @@ def harmonic_disk(mesh: TriangleMesh) -> Array:
         FoldedMapError: if the map inverts triangles.
 
     Source:
-        [AS2023] eqs. (40)-(43), by libigl. The check is ours: docs/derivations.md#disk-chart.
+        [AS2023] eqs. (40)-(43), by libigl. The check is ours: docs/explanation/derivations_exact.md#disk-chart.
     """
     loop = require_disk(mesh)
     disk = solve_dirichlet(mesh, loop, igl.map_vertices_to_circle(mesh.vertices, loop))

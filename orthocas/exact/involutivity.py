@@ -86,7 +86,7 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
         MetricError: if A is not symmetric positive definite at a sample.
 
     Source:
-        Theorem: [AS2023] Sec. 3. Defect and expected leak: ours, docs/derivations.md#involutivity.
+        Theorem: [AS2023] Sec. 3. Defect and expected leak: ours, docs/explanation/derivations_exact.md#involutivity.
 
     Example:
         >>> import orthocas as oc
@@ -193,7 +193,7 @@ class TaskBrackets:
     """Brackets of an A-orthonormal basis e_1..e_m of span{grad_A h_i}; U is the Cholesky factor of A = U^T U.
 
     Source:
-        ours, docs/derivations.md#involutivity.
+        ours, docs/explanation/derivations_exact.md#involutivity.
     """
 
     q: ca.SX  #: the symbol, (n, 1)

@@ -95,7 +95,7 @@ def require_disk(mesh: TriangleMesh) -> Indices:
         NotADiskError: if the mesh is not a disk; the message says what it is.
 
     Source:
-        Ours: docs/derivations.md#disk-chart.
+        Ours: docs/explanation/derivations_exact.md#disk-chart.
     """
     found = (mesh.components, mesh.boundary_loops, mesh.euler_characteristic)
     if found != (1, 1, 1) or mesh.clashing_edges:
@@ -225,7 +225,7 @@ def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
         New faces (F, 3) with the same vertices, boundary and topology.
 
     Source:
-        Ours, after [BS2007]: docs/derivations.md#disk-chart.
+        Ours, after [BS2007]: docs/explanation/derivations_exact.md#disk-chart.
     """
     faces = faces.copy()
     for _ in range(_MOST_ROUNDS):

@@ -45,7 +45,7 @@ def spectral_start(
         gradients: gradients of the basis, if there are some already. Default: those of the family.
 
     Source:
-        ours, docs/derivations.md#spectral-start.
+        ours, docs/explanation/derivations_fits.md#spectral-start.
     """
     basis = gradients_of(family, samples.points.shape[1]) if gradients is None else gradients
     G = basis.dense(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)

@@ -289,7 +289,7 @@ def suggest_domain(
         KeyboardInterrupt: after Ctrl-C; `Interrupted` with the fit on the box found, if it comes during a fit.
 
     Source:
-        ours, docs/domains.md.
+        ours, docs/explanation/domains.md.
 
     Example:
         >>> import orthocas as oc

@@ -149,7 +149,7 @@ def log_lengths(coordinate_jacobian: ca.SX) -> ca.SX:
     Angles do not fix how fast a coordinate grows along itself: xi^7 is as orthogonal as xi, but flat at 0.
 
     Source:
-        ours, docs/derivations.md#lengths.
+        ours, docs/explanation/derivations_fits.md#lengths.
     """
     return ca.log(ca.sum2(coordinate_jacobian**2)) / 2
 
@@ -183,7 +183,7 @@ def leak_sines(task_basis: ca.SX, coordinate_jacobian: ca.SX, metric_inverse: ca
         Components in [-1, 1]; NaN where a coordinate gradient vanishes.
 
     Source:
-        ours, docs/angles.md.
+        ours, docs/explanation/angles.md.
     """
     J = coordinate_jacobian
     require_shape("coordinate_jacobian", J.shape, (None, task_basis.shape[1]))
@@ -202,7 +202,7 @@ def metric_mutual_cosines(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | No
         metric_inverse: A^-1, (n, n); None for the identity.
 
     Source:
-        ours, docs/angles.md.
+        ours, docs/explanation/angles.md.
     """
     J = coordinate_jacobian
     raised = J if metric_inverse is None else J @ metric_inverse
@@ -263,7 +263,7 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
         InvalidValueError: for too many coordinates.
 
     Source:
-        ours, docs/derivations.md#regularity.
+        ours, docs/explanation/derivations_fits.md#regularity.
     """
     if coordinate_jacobian.shape[0] > MOST_ROWS:
         wanted = (
@@ -400,7 +400,7 @@ class Weights:
         angles: what the task and mutual terms measure: 'paper', the cosines of [AS2023] eq. (24) with Euclidean norms;
             'metric', cosines in the metric with an orthonormal basis of the task gradients, which do not depend on the
             choice of task coordinates. Default: 'metric' for A = M, where closed loops are better with it, and 'paper'
-            otherwise; see docs/angles.md.
+            otherwise; see docs/explanation/angles.md.
 
     Raises:
         InvalidValueError: if a weight is negative or not finite, or all weights are zero.

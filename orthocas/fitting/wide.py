@@ -147,7 +147,7 @@ def fit_wide(
         Interrupted: after Ctrl-C, once there are coordinates; before that, KeyboardInterrupt.
 
     Source:
-        ours, docs/wide.md.
+        ours, docs/how-to/wide.md.
 
     Example:
         >>> import orthocas as oc

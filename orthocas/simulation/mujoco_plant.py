@@ -185,8 +185,8 @@ class MuJoCoPlant(Shown):
     """A robot in MuJoCo that holds a torque for a tick, then shows where it is. Fast enough for runs of many ticks.
 
     M ddq + C dq + g = clip(torque) + loads + pushes - friction, with stops at the joint limits. The physics takes steps
-    of fourth order (RK4), shorter ones where viscous friction is stiff for the inertia of a joint (docs/simulate.md).
-    Not for several threads at once. Needs the extra `orthocas[mujoco]`.
+    of fourth order (RK4), shorter ones where viscous friction is stiff for the inertia of a joint
+    (docs/reference/simulation.md). Not for several threads at once. Needs the extra `orthocas[mujoco]`.
 
     Args:
         robot: the true robot.

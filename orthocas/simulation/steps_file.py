@@ -1,4 +1,4 @@
-"""Steps files: JSON files that describe the motion of a simulated robot. Format: docs/simulate.md."""
+"""Steps files: JSON files that describe the motion of a simulated robot. Format: docs/reference/simulation.md."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

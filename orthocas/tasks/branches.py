@@ -134,7 +134,7 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
         SingularTaskError: if no position is clear.
 
     Source:
-        ours, docs/wide.md.
+        ours, docs/how-to/wide.md.
 
     Example:
         >>> import orthocas as oc

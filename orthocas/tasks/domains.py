@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocas.errors import DomainError, InvalidValueError, ShapeError
+from orthocas.errors import DomainError, InvalidValueError, ShapeError, degrees_hint
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
 from orthocas.tools import json
@@ -440,7 +440,7 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
     converge faster than with independent points. Domains that draw points themselves get independent ones.
 
     Source:
-        M. Roberts, docs/references.md [R2018]. The use for training is ours.
+        M. Roberts, docs/reference/references.md [R2018]. The use for training is ours.
     """
     if domain.draws_itself:
         return sample_uniform(domain, samples, seed)
@@ -600,4 +600,5 @@ def _raise_outside(robot: Robot, i: int, low: Array, high: Array) -> None:
     raise DomainError(
         f"domain of joint '{robot.joint_names[i]}' is [{low[i]:.4g}, {high[i]:.4g}], "
         f"expected an interval inside its limits [{robot.lower[i]:.4g}, {robot.upper[i]:.4g}]"
+        + ("" if robot.tree.prismatic[i] else degrees_hint(low[i], high[i]))
     )

@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.errors import DomainError, InvalidValueError, NotRedundantError
+from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, degrees_hint
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM
 from orthocas.tasks.clear_box import row_scale
@@ -197,7 +197,9 @@ def home_posture(robot: Robot, task: Task, home: ArrayLike | str | None = None) 
     if outside.size:
         k = int(outside[0])
         limits = f"[{robot.lower[k]:.4g}, {robot.upper[k]:.4g}]"
-        raise DomainError(f"home of joint '{robot.joint_names[k]}' is {q[k]:.4g}, expected inside its limits {limits}")
+        hint = "" if robot.tree.prismatic[k] else degrees_hint(q[k])
+        text = f"home of joint '{robot.joint_names[k]}' is {q[k]:.4g}, expected inside its limits {limits}{hint}"
+        raise DomainError(text)
     return Home(q, source)
 
 

@@ -138,6 +138,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     ),
     "info --branches": ((*_PROBLEMS, *_FILES), {}, (*_PROBLEM_OPTIONS, "--task")),
     "certify": (_FILES, {"--seconds": "0.5", "--out": "new.orthocas"}, ("--bound", "--workers")),
+    "demo": (("", *_PROBLEMS), {"--out": "out"}, ()),  # takes no word, so this is refused before it fits
     "evaluate": (_FILES, {"--samples": "50"}, ("--seed",)),
     "info": ((*_PROBLEMS, *_FILES), {}, _PROBLEM_OPTIONS),
     "compare": (

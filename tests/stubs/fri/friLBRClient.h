@@ -1,4 +1,4 @@
-// The part of KUKA's FRI 1.15 that docs/robots.md uses, with the same signatures. Nothing works.
+// The part of KUKA's FRI 1.15 that docs/how-to/robots.md uses, with the same signatures. Nothing works.
 #pragma once
 
 namespace KUKA {

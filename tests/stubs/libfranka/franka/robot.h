@@ -1,4 +1,4 @@
-// The part of libfranka 0.15.0 that docs/robots.md uses, with the same signatures. Nothing works.
+// The part of libfranka 0.15.0 that docs/how-to/robots.md uses, with the same signatures. Nothing works.
 #pragma once
 #include <array>
 #include <functional>
