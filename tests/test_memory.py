@@ -1,5 +1,6 @@
 """Laws that remember: momentum and regressors against Pinocchio, wrong models, C against Python, users' memories."""
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -273,6 +274,13 @@ def test_what_cannot_be_remembered_is_refused(chart: oc.Chart) -> None:
         Memory({"sum": np.zeros(3)}, {}, memory.step)
     with pytest.raises(InvalidValueError, match="adds is other to extra_torque"):
         Memory(memory.start, {"extra_torque": "other"}, memory.step)
+
+
+@pytest.mark.slow
+def test_python_of_the_page_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (Path(__file__).parent.parent / "docs" / "how-to" / "wrong_model.md").read_text()
+    exec(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)[0], {})
+    assert float(capsys.readouterr().out) < 1e-3
 
 
 @needs_c
