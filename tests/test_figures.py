@@ -122,3 +122,13 @@ def test_a_run_gives_values_and_tables_shows_what_moved_and_renews_pages(
     assert page.read_text() == "It is 2.2\ndegrees off.\n\n| A 1 | 3.0 | 2.20 |\n"
     assert json.loads(path.read_text())["values"] == {"arm, angle [deg]": 2.2}
     assert figures.main([], keep=False) == 0
+
+
+def test_rows_belong_together_by_their_labels_whatever_their_order() -> None:
+    old = [("", "| a | 4 | 1 | 2 |"), ("", "| a | 5 | 3 | 4 |"), ("", "| b, c | x | 5 |"), ("", "| gone | 7 |")]
+    new = [("", "| b, c | x | 6 |"), ("", "| new | 9 |"), ("", "| a | 4 | 1 | 3 |"), ("", "| a | 5 | 3 | 5 |")]
+    assert figures.paired(old, new) == [
+        ("| a | 4 | 1 | 2 |", "| a | 4 | 1 | 3 |"),
+        ("| a | 5 | 3 | 4 |", "| a | 5 | 3 | 5 |"),
+        ("| b, c | x | 5 |", "| b, c | x | 6 |"),
+    ]

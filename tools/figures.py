@@ -248,8 +248,10 @@ def moved(old: Record, new: Record) -> list[str]:
     ]
     if len(old.rows) != len(new.rows):
         return [*found, f"{len(old.rows)} -> {len(new.rows)} rows of tables"]
-    pairs = zip(old.rows, new.rows, strict=True)
-    return found + [f"{a}\n      -> {b}" for (header, a), (_, b) in pairs if not _row_close(header, a, b, old)]
+    headers = {row: header for header, row in old.rows}
+    pairs = paired(old.rows, new.rows)
+    lost = [f"{row}\n      -> no such row" for _, row in old.rows if row not in {a for a, _ in pairs}]
+    return found + lost + [f"{a}\n      -> {b}" for a, b in pairs if not _row_close(headers[a], a, b, old)]
 
 
 def _row_close(header: str, a: str, b: str, record: Record) -> bool:
@@ -295,11 +297,25 @@ def renew(old: Record, new: Record) -> None:
         for before, after in changes:
             for start, end in reversed(places(text, before)):
                 text = text[:start] + renumbered(text[start:end], after) + text[end:]
-        pairs = zip(old.rows, new.rows, strict=False)
-        rows = {key(a): b for (_, a), (_, b) in pairs if len(numbers(a)) == len(numbers(b)) > 1}
+        rows = {key(a): b for a, b in paired(old.rows, new.rows) if len(numbers(a)) == len(numbers(b)) > 1}
         text = LINE.sub(lambda line, rows=rows: renumbered(line[0], rows.get(key(line[0]), line[0])), text)
         if text != page:
             (ROOT / name).write_text(text)
+
+
+def paired(old: Sequence[tuple[str, str]], new: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Rows of old and new tables that belong together: by their labels, in order where these are not unique."""
+    waiting: dict[str, list[str]] = {}
+    for _, row in new:
+        waiting.setdefault(label(row), []).append(row)
+    return [(row, waiting[label(row)].pop(0)) for _, row in old if waiting.get(label(row))]
+
+
+def label(row: str) -> str:
+    """The cells before the first one that is a number, or the first cell."""
+    cells = _cells(row)
+    count = next((i for i, cell in enumerate(cells) if NUMERIC_CELL.fullmatch(cell)), len(cells))
+    return " | ".join(cells[: max(1, count)])
 
 
 def renumbered(text: str, after: str) -> str:
