@@ -78,10 +78,11 @@ def test_controller_for_ros2_control_holds_moves_and_resumes(library: GeneratedC
     assert float(printed.pop("moved by")) == pytest.approx(0.1, abs=1e-4)
     assert float(printed.pop("still moved by")) == pytest.approx(0.1, abs=1e-4)
     assert float(printed.pop("now moved by")) == pytest.approx(0.05, abs=1e-4)
+    assert float(printed.pop("present off by")) < 1e-3
     assert printed == {
         "without joints": "1",
         "first command": "A1/effort",
-        "last state": "A7/velocity",
+        "last state": "A7/effort",
         "held": f"{ok}",
         "moved": f"{ok}",
         "spoiled target": f"{ok}",
@@ -89,6 +90,8 @@ def test_controller_for_ros2_control_holds_moves_and_resumes(library: GeneratedC
         "blind": "8",
         "seeing again": f"{caught}",
         "resumed": f"{ok}",
+        "brakes closed": f"{caught}",
+        "brakes open": f"{caught}",
     }
 
 

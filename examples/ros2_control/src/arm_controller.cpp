@@ -26,6 +26,7 @@ CallbackReturn ArmController::on_init() {
   try {
     auto_declare<std::vector<std::string>>("joints", {});
     auto_declare<double>("smoothness", 4.5);
+    auto_declare<bool>("effort_states", false);
   } catch (const std::exception &error) {
     RCLCPP_ERROR(get_node()->get_logger(), "cannot declare parameters: %s", error.what());
     return CallbackReturn::ERROR;
@@ -44,6 +45,7 @@ InterfaceConfiguration ArmController::state_interface_configuration() const {
   for (const auto &joint : joints_) {
     wanted.names.push_back(joint + "/" + hardware_interface::HW_IF_POSITION);
     wanted.names.push_back(joint + "/" + hardware_interface::HW_IF_VELOCITY);
+    if (effort_states_) wanted.names.push_back(joint + "/" + hardware_interface::HW_IF_EFFORT);
   }
   return wanted;
 }
@@ -51,6 +53,7 @@ InterfaceConfiguration ArmController::state_interface_configuration() const {
 CallbackReturn ArmController::on_configure(const rclcpp_lifecycle::State & /*previous*/) {
   joints_ = get_node()->get_parameter("joints").as_string_array();
   smoothness_ = get_node()->get_parameter("smoothness").as_double();
+  effort_states_ = get_node()->get_parameter("effort_states").as_bool();
   if (joints_.size() != ARM_JOINTS || !(smoothness_ > 0.0)) {
     RCLCPP_ERROR(get_node()->get_logger(), "expected %d joints and smoothness > 0, received %zu joints and %g",
                  ARM_JOINTS, joints_.size(), smoothness_);
@@ -78,31 +81,49 @@ CallbackReturn ArmController::on_configure(const rclcpp_lifecycle::State & /*pre
         resume_asked_ = true;
         response->success = true;
       });
+  brakes_service_ = get_node()->create_service<std_srvs::srv::SetBool>(
+      "~/brakes", [this](const std::shared_ptr<std_srvs::srv::SetBool::Request> request,
+                         std::shared_ptr<std_srvs::srv::SetBool::Response> response) {
+        brakes_asked_ = request->data ? 1 : 0;
+        response->success = true;
+      });
+  present_publisher_ = get_node()->create_publisher<std_msgs::msg::Float64MultiArray>("~/present", rclcpp::SystemDefaultsQoS());
   status_publisher_ = get_node()->create_publisher<std_msgs::msg::UInt8>("~/status", rclcpp::SystemDefaultsQoS());
-  status_timer_ = get_node()->create_wall_timer(std::chrono::milliseconds(50), [this]() {
-    std_msgs::msg::UInt8 message;
-    message.data = static_cast<std::uint8_t>(status_.load());
-    status_publisher_->publish(message);
-  });
+  status_timer_ = get_node()->create_wall_timer(std::chrono::milliseconds(50), [this]() { publish(); });
   return CallbackReturn::SUCCESS;
 }
 
+void ArmController::publish() {
+  std_msgs::msg::UInt8 status;
+  std_msgs::msg::Float64MultiArray present;
+  arm_reference here;
+  double q[ARM_JOINTS];
+  std::copy(present_.begin(), present_.end(), q);
+  arm_reference_at(q, &here);
+  present.data.assign(here.value, here.value + ARM_REFERENCE);
+  status.data = static_cast<std::uint8_t>(status_.load());
+  status_publisher_->publish(status);
+  present_publisher_->publish(present);
+  if (const unsigned lost = lost_.exchange(0)) RCLCPP_WARN(get_node()->get_logger(), "%u commands were not written", lost);
+}
+
 CallbackReturn ArmController::on_activate(const rclcpp_lifecycle::State & /*previous*/) {
-  double q[ARM_JOINTS], dq[ARM_JOINTS];
-  if (state_interfaces_.size() != 2 * ARM_JOINTS || command_interfaces_.size() != ARM_JOINTS) {
+  double q[ARM_JOINTS], dq[ARM_JOINTS], effort[ARM_JOINTS];
+  if (state_interfaces_.size() != (effort_states_ ? 3 : 2) * ARM_JOINTS || command_interfaces_.size() != ARM_JOINTS) {
     RCLCPP_ERROR(get_node()->get_logger(), "the hardware lacks interfaces");
     return CallbackReturn::ERROR;
   }
-  read_robot(q, dq);
+  read_robot(q, dq, effort);
   if (!std::all_of(q, q + ARM_JOINTS, [](double value) { return std::isfinite(value); })) {
     RCLCPP_ERROR(get_node()->get_logger(), "the hardware reports no joint positions yet");
     return CallbackReturn::ERROR;
   }
-  arm_start(&state_, q, nullptr);
+  arm_start(&state_, q, ARM_COMMANDS_TORQUE && effort_states_ ? effort : nullptr);  // NaN counts as not given
   arm_reference_at(q, &reference_);
   std::copy_n(reference_.value, ARM_REFERENCE, target_.value.begin());
   target_.number = received_;  // targets from before the activation are void
   resume_asked_ = false;
+  brakes_asked_ = -1;
   status_ = ARM_OK;
   return CallbackReturn::SUCCESS;
 }
@@ -112,11 +133,13 @@ CallbackReturn ArmController::on_deactivate(const rclcpp_lifecycle::State & /*pr
 }
 
 // Missing values become NaN: the supervised law then holds its last command, and says BAD_INPUT.
-void ArmController::read_robot(double *q, double *dq) const {
+void ArmController::read_robot(double *q, double *dq, double *effort) const {
   constexpr double missing = std::numeric_limits<double>::quiet_NaN();
+  const std::size_t each = effort_states_ ? 3 : 2;
   for (std::size_t i = 0; i < ARM_JOINTS; ++i) {
-    q[i] = state_interfaces_[2 * i].get_optional().value_or(missing);
-    dq[i] = state_interfaces_[2 * i + 1].get_optional().value_or(missing);
+    q[i] = state_interfaces_[each * i].get_optional().value_or(missing);
+    dq[i] = state_interfaces_[each * i + 1].get_optional().value_or(missing);
+    effort[i] = effort_states_ ? state_interfaces_[each * i + 2].get_optional().value_or(missing) : missing;
   }
 }
 
@@ -136,14 +159,20 @@ void ArmController::move_reference(const double *q, double period) {
 }
 
 return_type ArmController::update(const rclcpp::Time & /*time*/, const rclcpp::Duration &period) {
-  double q[ARM_JOINTS], dq[ARM_JOINTS], command[ARM_JOINTS];
+  double q[ARM_JOINTS], dq[ARM_JOINTS], effort[ARM_JOINTS], command[ARM_JOINTS];
   bool written = true;
-  read_robot(q, dq);
+  read_robot(q, dq, effort);
+  const int brakes = brakes_asked_.exchange(-1);
+  const double *now = ARM_COMMANDS_TORQUE && effort_states_ ? effort : nullptr;
+  if (brakes == 1) arm_hold(&state_, q, now);
+  if (brakes == 0) arm_release(&state_, q, now);
   move_reference(q, period.seconds());
   if (resume_asked_.exchange(false)) arm_resume(&state_);
   status_ = arm_step(&state_, &arm_default_safety, q, dq, &reference_, &arm_default_gains, period.seconds(), command);
   for (std::size_t i = 0; i < ARM_JOINTS; ++i) written = command_interfaces_[i].set_value(command[i]) && written;
-  return written ? return_type::OK : return_type::ERROR;
+  if (!written) ++lost_;  // an ERROR would deactivate the controller: the arm would lose all its commands for a single one
+  std::copy_n(q, ARM_JOINTS, present_.begin());
+  return return_type::OK;
 }
 
 }  // namespace arm_controller

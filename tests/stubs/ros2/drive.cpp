@@ -20,7 +20,7 @@ void log_with_format(const Logger &, const char *format, ...) {
 namespace {
 constexpr int N = ARM_JOINTS;
 using rclcpp_lifecycle::made;
-std::array<double, N> q, dq, seen, torque;
+std::array<double, N> q, dq, seen, torque, felt;
 
 // One semi-implicit Euler step of M ddq + C dq = torque.
 void move_arm() {
@@ -70,10 +70,12 @@ int main() {
     commands.emplace_back(&torque[i]);
     states.emplace_back(&seen[i]);
     states.emplace_back(&dq[i]);
+    states.emplace_back(&felt[i]);
   }
   seen = q;
   if (controller.on_init() != controller_interface::CallbackReturn::SUCCESS) return 1;
   controller.get_node()->parameters["smoothness"].number = 3.0;
+  controller.get_node()->parameters["effort_states"].number = 1.0;
   controller.get_node()->parameters["joints"] = {};
   std::printf("without joints %d\n", controller.on_configure({}) == controller_interface::CallbackReturn::ERROR);
   controller.get_node()->parameters["joints"].names = {"A1", "A2", "A3", "A4", "A5", "A6", "A7"};
@@ -109,5 +111,16 @@ int main() {
   auto response = std::make_shared<std_srvs::srv::Trigger::Response>();
   made<rclcpp::Service<std_srvs::srv::Trigger>>->callback(std::make_shared<std_srvs::srv::Trigger::Request>(), response);
   std::printf("resumed %d\n", run(controller, 3000));
+  auto closed = std::make_shared<std_srvs::srv::SetBool::Request>();
+  auto answer = std::make_shared<std_srvs::srv::SetBool::Response>();
+  closed->data = true;
+  made<rclcpp::Service<std_srvs::srv::SetBool>>->callback(closed, answer);
+  std::printf("brakes closed %d\n", run(controller, 100));
+  closed->data = false;
+  made<rclcpp::Service<std_srvs::srv::SetBool>>->callback(closed, answer);
+  std::printf("brakes open %d\n", run(controller, 100));
+  arm_reference_at(q.data(), &reference);
+  const auto &present = made<rclcpp::Publisher<std_msgs::msg::Float64MultiArray>>->last.data;
+  std::printf("present off by %.6f\n", std::fabs(present[ARM_TASK] - reference.value[ARM_TASK]));
   return 0;
 }

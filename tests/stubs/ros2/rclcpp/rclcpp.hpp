@@ -21,6 +21,7 @@ struct Parameter {
   double number = 0.0;
   std::vector<std::string> as_string_array() const { return names; }
   double as_double() const { return number; }
+  bool as_bool() const { return number != 0.0; }
 };
 template <typename M>
 struct Subscription {
