@@ -1,5 +1,6 @@
 """Shared problems, charts and real robot descriptions; one thread for linear algebra."""
 
+import math
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: threads of BLAS that spin take other processes' cores
@@ -202,8 +203,9 @@ def drawings(request: pytest.FixtureRequest) -> dict[str, Drawing]:
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command of orthocas in an empty folder, in this process."""
+    """Run a command of orthocas in an empty folder, in this process, without lines of progress on a busy machine."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("orthocas.cli.output.PAUSE", math.inf)
 
     def call(*words: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["orthocas", *words])

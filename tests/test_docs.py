@@ -52,7 +52,7 @@ def test_newcomers_path_from_a_urdf_to_c_runs(run: Run) -> None:
             continue
         assert program == "orthocas"
         code, printed, err = run(*words)
-        assert (code, re.sub(r"note: .*, \d+%: .*\n", "", err)) == (0, ""), line  # but for progress, if it is slow
+        assert (code, err) == (0, ""), line
         if words[0] == "certify":
             assert "no fold everywhere on the domain" in printed
     assert Path("c/panda.c").exists()

@@ -43,7 +43,7 @@ def test_laws_that_are_hardly_meant_warn() -> None:
 
 
 def test_long_computations_print_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
-    show, often = lines_of_progress(), lines_of_progress(pause=0.0)
+    show, often = lines_of_progress(10.0), lines_of_progress(0.0)
     show(Progress("degree 4", 0.5, "loss 1"))
     assert capsys.readouterr() == ("", "")
     often(Progress("degree 4", 0.5, "loss 1"))

@@ -34,6 +34,7 @@ def number(text: str) -> float:
         raise typer.BadParameter(f"received {text!r}, expected a number") from None
 
 
+PAUSE = 10.0  #: [s] between lines of progress where there is no terminal
 _UNEVEN = 30.0  # ratio of gradient lengths above which the same gain means too different things across the domain
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
@@ -112,13 +113,13 @@ def report_rows(report: "Report") -> dict[str, str]:
 def terminal_monitor() -> Iterator[Monitor]:
     """A monitor that draws one bar per stage; a line every ten seconds when standard error is not a terminal."""
     if not sys.stderr.isatty():
-        yield lines_of_progress()
+        yield lines_of_progress(PAUSE)
         return
     with _stage_bars() as show:
         yield show
 
 
-def lines_of_progress(pause: float = 10.0) -> Monitor:
+def lines_of_progress(pause: float) -> Monitor:
     """A monitor that prints where a long computation is, at most once every `pause` seconds."""
     last = time.monotonic()
 
