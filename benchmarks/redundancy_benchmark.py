@@ -8,6 +8,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from redundancy import tuning
 from redundancy.arms import SOURCES
 from redundancy.runner import measured, save, scenarios
 
@@ -36,7 +37,10 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
     parser.add_argument("--method", type=Path, action="append", default=[], help="a file with METHODS of your own")
     parser.add_argument("--quick", action="store_true", help="one arm, short runs; prints, and keeps nothing")
+    parser.add_argument("--tune", action="store_true", help="choose the settings first (8 min)")
     options = parser.parse_args()
+    if options.tune:
+        tuning.main()
     results = main(options.names, options.arms, options.seeds, options.method, options.quick)
     for name, result in results.items():
         print(f"{name}: {result['number']}")

@@ -1,7 +1,7 @@
 """What a method is, what it is given, and what a scenario asks."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -98,4 +98,3 @@ class Scenario:
     mobile: bool = False  #: whether the arm stands on a mobile base
     format: str = ".2g"  #: of the number in the table
     served: str = "the tip was within 2 mm and 0.02 rad of its target at 99 % of the ticks"
-    unsuited: Mapping[str, str] = field(default_factory=dict)  #: methods that the question excludes, and why

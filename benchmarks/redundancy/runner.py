@@ -104,15 +104,13 @@ def followed(arm: Arm, method: Method, stream: Stream, until: float) -> Run:
     return Run(stream, np.array(path), np.array(errors))
 
 
-def case(scenario: Scenario, arm: Arm, build: Any, settings: Mapping[str, Any], seed: int, quick: bool) -> dict[str, Any]:
+def case(scenario: Scenario, arm: Arm, build: Any, seed: int, quick: bool) -> dict[str, Any]:
     """One scenario, arm, method and seed: what is kept of it. `build` is a method of the arm, or why there is none."""
     found: dict[str, Any] = {"arm": arm.name, "seed": seed}
     before = time.process_time()
     try:
         if isinstance(build, Unsuited):
             raise build
-        if build.name in scenario.unsuited:
-            raise Unsuited(scenario.unsuited[build.name])
         rng = np.random.default_rng([seed, *scenario.name.encode(), *arm.name.encode()])
         streams = scenario.streams(arm, rng, quick)
         before = time.process_time()
@@ -153,11 +151,10 @@ def on_arm(
     arm, found = Arm(name, mobile), []
     asked = [scenario for scenario in scenarios().values() if scenario.name in names and scenario.mobile == mobile]
     for method in methods(more) if asked else ():
-        settings = settings_of(method)
-        build = built(method, arm, settings)
+        build = built(method, arm, settings_of(method))
         for scenario in asked:
             for seed in seeds:
-                found.append((scenario.name, method.name, case(scenario, arm, build, settings, seed, quick)))
+                found.append((scenario.name, method.name, case(scenario, arm, build, seed, quick)))
     return found
 
 

@@ -1,24 +1,42 @@
 """Charts of orthocas: tight, wide, along a known path, with the elbow's angle as coordinate, and many in an atlas."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from redundancy.arms import TICK, Arm
 from redundancy.protocol import Target, Unsuited
+from redundancy.search import secant
 
 import orthocas as oc
 from orthocas.charts.solutions import Tracker
-from orthocas.errors import OrthocasError
+from orthocas.errors import DomainError, OrthocasError
 from orthocas.tools.checks import Array
 
 MARGIN = 1e-3  # of joint ranges [rad]
+
+
+def around_home(arm: Arm, half_width: float) -> oc.Box:
+    """A box with home in its middle, within the joint limits."""
+    room = np.minimum(arm.home - arm.lower, arm.upper - arm.home) - MARGIN
+    return oc.Box(arm.home, np.minimum(half_width, room))
+
+
+def widest_clear(arm: Arm, clearance: float) -> oc.ClearBox:
+    """The clear part of the box of the joint limits; where its middle is singular, of a smaller one around home."""
+    inner = around_home(arm, np.pi)
+    ends = [(arm.lower + MARGIN, inner.centre - inner.half_width), (arm.upper - MARGIN, inner.centre + inner.half_width)]
+    for share in np.linspace(0, 1, 21):
+        low, high = ((1 - share) * outer + share * near for outer, near in ends)
+        with suppress(DomainError):
+            return oc.ClearBox(oc.Box((low + high) / 2, (high - low) / 2), arm.task, clearance)
+    raise Unsuited("home is not clear of singular positions")
 
 
 class OnChart:
     """The tracker of a chart. Where a target is out of its domain, it goes as near as the domain lets it."""
 
     packages = ("orthocas", "casadi")
-    named = False  #: whether xi is the angle of the elbow
 
     def __init__(self, arm: Arm, chart: oc.Chart | None) -> None:
         self.arm, self.chart = arm, chart
@@ -38,13 +56,33 @@ class OnChart:
         self.posture: Array | None = None
 
     def step(self, target: Target) -> Array:
-        """Follow x and xi."""
+        """Follow x and xi, or search for the xi of a wished elbow."""
         assert self.chart is not None
-        if target.posture is not self.posture:  # xi of a posture changes seldom
-            self.posture, self.wanted = target.posture, self.chart.xi(target.posture)
-        xi = [target.elbow] if self.named and target.elbow is not None else self.wanted
+        if self.posture is None:
+            self.xi = self.chart.xi(self.follower.q)
+        if target.posture is not self.posture:
+            self.posture, self.wished = target.posture, self.chart.xi(target.posture)
         x = self.chart.problem.task.value(target.placement.translation, target.placement.rotation)
-        return np.array(self.follower.step(np.concatenate([x, xi])))
+        if target.elbow is None or self.chart.r > 1:
+            self.xi = self._ramped()
+            return np.array(self.follower.step(np.concatenate([x, self.xi])))
+        angle = target.elbow
+
+        def rest(xi: float) -> float:
+            return angle - self.arm.elbow(self.follower.step(np.append(x, xi)))
+
+        self.xi = np.array([secant(rest, float(self.xi[0]))])
+        return np.array(self.follower.q)
+
+    def _ramped(self) -> Array:
+        """The next xi on the way to the wished one: as far as the joints' speed permits."""
+        assert self.chart is not None
+        way = self.wished - self.xi
+        if not way.any():
+            return self.wished
+        joints = np.linalg.solve(self.chart.jacobian(self.follower.q), np.concatenate([np.zeros(self.chart.m), way]))
+        needed = float((np.abs(joints) / (0.8 * TICK * self.arm.fastest)).max())
+        return self.xi + way / max(1.0, needed)
 
 
 class Tight(OnChart):
@@ -57,9 +95,8 @@ class Tight(OnChart):
         if arm.mobile:
             box, family = oc.Box(arm.home, half_width), oc.Mobile(oc.Polynomial(2))
         else:
-            room = np.minimum(arm.home - arm.lower, arm.upper - arm.home) - MARGIN
-            box, family = oc.Box(arm.home, np.minimum(half_width, room)), oc.Polynomial(3)
-        clear = oc.ClearBox(box, arm.task, 0.05) if not arm.mobile else box
+            box, family = around_home(arm, half_width), oc.Polynomial(3)
+        clear = box if arm.mobile else oc.ClearBox(box, arm.task, 0.05)
         super().__init__(arm, oc.fit(oc.Problem(arm.robot, arm.task, domain=clear), family).chart)
 
 
@@ -68,7 +105,6 @@ class Wide(OnChart):
 
     name = "chart, wide"
     grid = ({"clearance": 0.1}, {"clearance": 0.05}, {"clearance": 0.2})
-    named = True
 
     def __init__(self, arm: Arm, clearance: float) -> None:
         if arm.mobile:
@@ -78,7 +114,7 @@ class Wide(OnChart):
 
 
 class Corridor(OnChart):
-    """One chart near the postures of a path that is known before: those of least-norm steps with xi free."""
+    """One chart near the postures of a path that is known before: those of least-norm steps."""
 
     name = "chart, corridor"
     grid = ({"radius": 0.2}, {"radius": 0.1}, {"radius": 0.4})
@@ -98,13 +134,17 @@ class Corridor(OnChart):
         for target in path:
             now = now + np.linalg.pinv(self.arm.jacobian(now)) @ self.arm.error(now, target.placement)
             postures.append(now)
-        problem = oc.Problem(self.arm.robot, self.arm.task, domain=oc.Box(self.arm.home, 1.0))
-        try:
+        problem = oc.Problem(self.arm.robot, self.arm.task, domain=around_home(self.arm, 1.0))
+        self.chart = None
+        with suppress(OrthocasError):  # where the path leaves the joint limits, there is no corridor
             near = oc.corridor_problem(problem, np.array(postures[:: self.thinned]), self.radius)
             self.chart = oc.fit(near, oc.Polynomial(3, "auto")).chart
-        except OrthocasError as error:
-            raise Unsuited(f"no corridor: {type(error).__name__}") from None
-        super().start(q, path)
+            super().start(q, path)
+        self.q = q
+
+    def step(self, target: Target) -> Array:
+        """Follow; without a corridor, stay."""
+        return self.q if self.chart is None else super().step(target)
 
     def tracker(self, q: Array) -> Tracker:
         """From q; it holds still outside."""
@@ -117,26 +157,24 @@ class Elbow(OnChart):
 
     name = "SEW angle"
     grid = ({"clearance": 0.05}, {"clearance": 0.02}, {"clearance": 0.1})
-    named = True
 
     def __init__(self, arm: Arm, clearance: float) -> None:
         if arm.mobile:
             raise Unsuited("one number, for one joint more than the task has")
-        box = oc.Box((arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2 - MARGIN)
-        problem = oc.Problem(arm.robot, arm.task, domain=oc.ClearBox(box, arm.task, clearance))
+        problem = oc.Problem(arm.robot, arm.task, domain=widest_clear(arm, clearance))
         given = oc.Given.from_function("elbow", arm.n, arm.elbow_expression)
         super().__init__(arm, oc.fit(problem, given).chart)
 
 
 class Atlas:
-    """Not here: it is built for hours, and hand-overs bring back drift; docs/atlas.md measures one."""
+    """Not run: docs/atlas.md measures one."""
 
     name = "chart, atlas"
     packages = ("orthocas",)
     grid = ({},)
 
     def __init__(self, arm: Arm) -> None:
-        raise Unsuited("takes hours to build for each arm; a corridor is its tool for known paths")
+        raise Unsuited("no atlas of poses is built here: see the page of atlases")
 
 
 METHODS = (Tight, Wide, Corridor, Elbow, Atlas)

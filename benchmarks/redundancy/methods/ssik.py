@@ -8,10 +8,9 @@ import numpy as np
 import ssik
 from redundancy.arms import BASE, TICK, TIP, Arm
 from redundancy.protocol import Target, Unsuited
+from redundancy.search import secant
 
 from orthocas.tools.checks import Array
-
-STEPS, NEAR = 6, 1e-4  # of the search for the redundancy, and the error at which it ends [rad]
 
 
 class SSIK:
@@ -32,39 +31,36 @@ class SSIK:
 
     def start(self, q: Array, path: Sequence[Target] | None) -> None:
         """Begin at q."""
-        self.tracker = self.ik.tracker(q, max_joint_speed=self.arm.fastest, jump_threshold=self.threshold, t0=0.0)
-        self.time, self.posture = 0.0, q
+        self.tracker = self._tracker(q)
+        self.time, self.posture, self.wished = 0.0, self.arm.home, None
 
     def step(self, target: Target) -> Array:
-        """Follow, and slide where posture or elbow ask for it."""
+        """Slide to a wished posture of a tool at rest, or follow, and search for a wished elbow."""
         self.time += TICK
-        q = np.array(self.tracker.update(target.placement.homogeneous, self.time).q)
-        asked = target.elbow is not None or target.posture is not self.arm.home
-        if asked and self.tracker.redundancy is not None:
-            self._slide(target)
-            q = np.array(self.tracker.q)
-        return q
+        if target.elbow is None and target.posture is not self.posture:
+            self.posture = target.posture
+            there = self._tracker(target.posture).redundancy
+            self.wished = there.t if there else None
+        if target.elbow is None and self.wished is not None:
+            self.tracker.set_redundancy(self.wished, self.time)
+        else:
+            self.tracker.update(target.placement.homogeneous, self.time)
+        if target.elbow is not None and self.tracker.redundancy is not None:
+            self._slide(target.elbow)
+        return np.array(self.tracker.q)
 
-    def _slide(self, target: Target) -> None:
-        """A secant on what is left of the wish, in the redundancy's own number."""
-        last, rest = self.tracker.redundancy.t, self._rest(target)
-        ahead = last + 1e-3
-        for _ in range(STEPS):
-            if abs(rest) < NEAR:
-                return
-            low, high = self.tracker.redundancy.arc
-            self.tracker.set_redundancy(float(np.clip(ahead, low, high)))
-            now, left = self.tracker.redundancy.t, self._rest(target)
-            if now == last or left == rest:
-                return
-            ahead, last, rest = now - left * (now - last) / (left - rest), now, left
+    def _tracker(self, q: Array) -> ssik.Tracker:
+        return self.ik.tracker(q, max_joint_speed=self.arm.fastest, jump_threshold=self.threshold, t0=0.0)
 
-    def _rest(self, target: Target) -> float:
-        """What is left of the wished elbow, or of the way to the wished posture along the self-motion."""
-        q = np.array(self.tracker.q)
-        if target.elbow is not None:
-            return target.elbow - self.arm.elbow(q)
-        return float(self.arm.elbow(target.posture) - self.arm.elbow(q))
+    def _slide(self, wished: float) -> None:
+        """Search for the redundancy at which the elbow has the wished angle [rad]."""
+
+        def rest(value: float) -> float:
+            if self.tracker.redundancy is not None:
+                self.tracker.set_redundancy(float(np.clip(value, *self.tracker.redundancy.arc)))
+            return wished - self.arm.elbow(np.array(self.tracker.q))
+
+        secant(rest, self.tracker.redundancy.t)
 
 
 METHODS = (SSIK,)
