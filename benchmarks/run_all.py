@@ -53,7 +53,7 @@ SCRIPTS = (
     "faults",
     "following",
     "operational_space",
-    "redundancy_peers",
+    "redundancy_benchmark",
     "xi_in_qp",
     "random_walk",
     "metric_loss",

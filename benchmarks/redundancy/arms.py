@@ -94,7 +94,9 @@ class Arm:
         across = ca.cross(ca.cross(line / ca.norm_2(line), ca.DM(self._reference)), line)
         cosine, sine = ca.dot(across, side), ca.dot(line / ca.norm_2(line), ca.cross(across, side))
         at_home = ca.Function("home", [q], [ca.atan2(sine, cosine)])(self.home)
-        return ca.atan2(sine * ca.cos(at_home) - cosine * ca.sin(at_home), cosine * ca.cos(at_home) + sine * ca.sin(at_home))
+        return ca.atan2(
+            sine * ca.cos(at_home) - cosine * ca.sin(at_home), cosine * ca.cos(at_home) + sine * ca.sin(at_home)
+        )
 
     @cached_property
     def elbow(self) -> Callable[[Array], float]:
@@ -240,7 +242,8 @@ def _place(placement: pin.SE3) -> str:
 def _inertia(inertia: pin.Inertia) -> str:
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = inertia.inertia
     words = "".join(
-        f' {n}="{v:.17g}"' for n, v in zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), (xx, xy, xz, yy, yz, zz), strict=True)
+        f' {n}="{v:.17g}"'
+        for n, v in zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), (xx, xy, xz, yy, yz, zz), strict=True)
     )
     place = _place(pin.SE3(np.eye(3), inertia.lever))
     return f'<inertial>{place}<mass value="{inertia.mass:.17g}"/><inertia{words}/></inertial>'

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pinocchio as pin
-from redundancy.arms import Arm
-from redundancy.protocol import Target
 
 from orthocas.tools.checks import Array
+from redundancy.arms import Arm
+from redundancy.protocol import Target
 
 
 def smooth(count: int) -> Array:

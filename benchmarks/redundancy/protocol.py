@@ -6,9 +6,9 @@ from typing import Any, Protocol
 
 import numpy as np
 import pinocchio as pin
-from redundancy.arms import Arm
 
 from orthocas.tools.checks import Array
+from redundancy.arms import Arm
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,12 @@ class Method(Protocol):
     """One way to follow targets. A file in `methods` lists the classes of its methods in `METHODS`."""
 
     name: str  #: of the row
-    packages: Sequence[str]  #: distributions whose versions are recorded; one that is missing makes the row "not installed"
-    grid: Sequence[Mapping[str, Any]]  #: up to three settings, as keyword arguments; the first is that of the documentation
+    packages: Sequence[
+        str
+    ]  #: distributions whose versions are recorded; one that is missing makes the row "not installed"
+    grid: Sequence[
+        Mapping[str, Any]
+    ]  #: up to three settings, as keyword arguments; the first is that of the documentation
 
     def __init__(self, arm: Arm, **settings: Any) -> None:
         """Prepare for an arm. Raises Unsuited if it cannot be done."""
@@ -96,5 +100,6 @@ class Scenario:
     judge: Callable[[Arm, list[Run]], Score]
     also: str = ""  #: the name of the second number
     mobile: bool = False  #: whether the arm stands on a mobile base
-    format: str = ".2g"  #: of the number in the table
+    least: float = 0.0  #: numbers below this are the same to the user; they share a rank
+    percent: bool = False  #: whether the number is a share, whose mean over the arms counts, and not the median
     served: str = "the tip was within 2 mm and 0.02 rad of its target at 99 % of the ticks"

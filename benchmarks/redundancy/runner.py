@@ -14,10 +14,10 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from redundancy.arms import SOURCES, Arm
-from redundancy.protocol import Method, Run, Scenario, Stream, Unsuited
 
 import orthocas as oc
+from redundancy.arms import SOURCES, Arm
+from redundancy.protocol import Method, Run, Scenario, Stream, Unsuited
 
 FOLDER = Path(__file__).parent
 RESULTS, SETTINGS = FOLDER / "results", FOLDER / "settings.json"
@@ -122,7 +122,7 @@ def case(scenario: Scenario, arm: Arm, build: Any, seed: int, quick: bool) -> di
         found |= {"us per tick": round(1e6 * (time.process_time() - before) / ticks)}
     except Unsuited as reason:
         found |= {"why": str(reason)}
-    except Exception as error:  # noqa: BLE001 (a method that fails has a row, and the others go on)
+    except Exception as error:
         logging.getLogger(__name__).warning("%s, %s, %s", scenario.name, arm.name, build, exc_info=error)
         found |= {"why": f"failed: {type(error).__name__}"}
     return found
@@ -138,7 +138,7 @@ def built(method: Any, arm: Arm, settings: Mapping[str, Any]) -> Any:
         return method(arm, **settings)
     except Unsuited as reason:
         return reason
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
         logging.getLogger(__name__).warning("%s, %s", method.name, arm.name, exc_info=error)
         return Unsuited(f"failed: {type(error).__name__}")
 

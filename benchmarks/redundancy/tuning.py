@@ -48,7 +48,14 @@ def main() -> None:
         costs = {number: rows for number, rows in costs.items() if rows}
         chosen[method.name] = dict(method.grid[_best(costs)])
         all_costs[method.name] = [{"settings": dict(method.grid[k]), "lost and drift": _plain(costs[k])} for k in costs]
-    content = {"schema": SCHEMA, "seed": SEED, "arms": TUNED_ON, "scenarios": SCENARIOS, "chosen": chosen, "tried": all_costs}
+    content = {
+        "schema": SCHEMA,
+        "seed": SEED,
+        "arms": TUNED_ON,
+        "scenarios": SCENARIOS,
+        "chosen": chosen,
+        "tried": all_costs,
+    }
     SETTINGS.write_text(json.dumps(content, indent=1) + "\n")
 
 

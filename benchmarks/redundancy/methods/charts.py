@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
-from redundancy.arms import TICK, Arm
-from redundancy.protocol import Target, Unsuited
-from redundancy.search import secant
 
 import orthocas as oc
 from orthocas.charts.solutions import Tracker
 from orthocas.errors import DomainError, OrthocasError
 from orthocas.tools.checks import Array
+from redundancy.arms import TICK, Arm
+from redundancy.protocol import Target, Unsuited
+from redundancy.search import secant
 
 MARGIN = 1e-3  # of joint ranges [rad]
 
@@ -25,7 +25,10 @@ def around_home(arm: Arm, half_width: float) -> oc.Box:
 def widest_clear(arm: Arm, clearance: float) -> oc.ClearBox:
     """The clear part of the box of the joint limits; where its middle is singular, of a smaller one around home."""
     inner = around_home(arm, np.pi)
-    ends = [(arm.lower + MARGIN, inner.centre - inner.half_width), (arm.upper - MARGIN, inner.centre + inner.half_width)]
+    ends = [
+        (arm.lower + MARGIN, inner.centre - inner.half_width),
+        (arm.upper - MARGIN, inner.centre + inner.half_width),
+    ]
     for share in np.linspace(0, 1, 21):
         low, high = ((1 - share) * outer + share * near for outer, near in ends)
         with suppress(DomainError):

@@ -5,11 +5,11 @@ from contextlib import suppress
 
 import mink
 import numpy as np
-from redundancy.arms import TICK, Arm
-from redundancy.protocol import Target
 
 from orthocas.simulation import MuJoCoPlant
 from orthocas.tools.checks import Array
+from redundancy.arms import TICK, Arm
+from redundancy.protocol import Target
 
 
 class Mink:

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 from ompl import base, geometric, util
-from redundancy.arms import TICK, Arm
-from redundancy.protocol import Target, Unsuited
 
 from orthocas.tools.checks import Array
+from redundancy.arms import TICK, Arm
+from redundancy.protocol import Target, Unsuited
 
 LIMIT, CLOSE = 1.0, 1e-4  # for a plan [s]; of the constraint [m], [rad]
 

@@ -5,12 +5,12 @@ from contextlib import suppress
 
 import numpy as np
 import pinocchio as pin
-from redundancy.arms import TICK, Arm
-from redundancy.protocol import Target
 
 from orthocas.errors import SimulationError
 from orthocas.simulation import MuJoCoPlant
 from orthocas.tools.checks import Array
+from redundancy.arms import TICK, Arm
+from redundancy.protocol import Target
 
 CALLS = 10  # in a tick
 

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 import pink
-from redundancy.arms import TICK, TIP, Arm
-from redundancy.protocol import Target
 
 from orthocas.tools.checks import Array
+from redundancy.arms import TICK, TIP, Arm
+from redundancy.protocol import Target
 
 
 class Pink:

@@ -7,10 +7,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import placo
-from redundancy.arms import TICK, TIP, Arm
-from redundancy.protocol import Target
 
 from orthocas.tools.checks import Array
+from redundancy.arms import TICK, TIP, Arm
+from redundancy.protocol import Target
 
 
 class Placo:

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from redundancy.arms import Arm
-from redundancy.protocol import Target
 
 from orthocas.tools.checks import Array
+from redundancy.arms import Arm
+from redundancy.protocol import Target
 
 
 class PseudoInverse:

@@ -6,11 +6,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import ssik
+
+from orthocas.tools.checks import Array
 from redundancy.arms import BASE, TICK, TIP, Arm
 from redundancy.protocol import Target, Unsuited
 from redundancy.search import secant
-
-from orthocas.tools.checks import Array
 
 
 class SSIK:

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pinocchio as pin
-from redundancy.arms import Arm
-from redundancy.paths import between, in_ball, targets
-from redundancy.protocol import Run, Scenario, Score, Stream
 from scipy.spatial.distance import cdist
 
 from orthocas.tools.checks import Array
+from redundancy.arms import Arm
+from redundancy.paths import between, in_ball, targets
+from redundancy.protocol import Run, Scenario, Score, Stream
 
 COUNT, WAY, EVERY, LEFT_OUT = 24, 100, 5, 4  # demonstrations; ticks; between samples; one of so many is for the test
 WIDTHS, RIDGE = (0.5, 1.0, 2.0, 4.0), 1e-6  # of the kernel; chosen for the smallest error, so the learner is no excuse
@@ -56,4 +56,5 @@ SCENARIO = Scenario(
     },
     streams,
     judge,
+    least=0.05,
 )

@@ -1,6 +1,7 @@
 """Repeated tool paths: does the arm come back to the posture where it began?"""
 
 import numpy as np
+
 from redundancy.arms import Arm
 from redundancy.paths import direction, moved, targets
 from redundancy.protocol import Run, Scenario, Score, Stream
@@ -39,5 +40,5 @@ SCENARIO = Scenario(
     },
     streams,
     judge,
-    format=".1e",
+    least=1e-4,
 )

@@ -1,6 +1,7 @@
 """A number for the elbow: how far is the elbow from the angle that was asked for, while the tool moves?"""
 
 import numpy as np
+
 from redundancy.arms import Arm
 from redundancy.paths import wandering
 from redundancy.protocol import Run, Scenario, Score, Stream, Target
@@ -38,4 +39,5 @@ SCENARIO = Scenario(
     },
     streams,
     judge,
+    least=0.1,
 )

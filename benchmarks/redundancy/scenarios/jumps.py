@@ -1,6 +1,7 @@
 """Cartesian paths: how many does the arm follow without a jump?"""
 
 import numpy as np
+
 from redundancy.arms import TICK, Arm
 from redundancy.paths import direction, moved, smooth, targets
 from redundancy.protocol import Run, Scenario, Score, Stream
@@ -43,7 +44,8 @@ SCENARIO = Scenario(
     streams,
     judge,
     also="lines on which a joint exceeds its velocity limit [%]",
-    format=".0f",
+    least=1.0,
+    percent=True,
     served="every method; a line is followed if the tip stays within 2 mm and 0.02 rad at 99 % of the ticks, and no joint "
     "leaves its limits of position and velocity",
 )

@@ -1,6 +1,7 @@
 """Near targets: are the answers near each other, whatever the way?"""
 
 import numpy as np
+
 from redundancy.arms import Arm
 from redundancy.paths import between, direction, in_ball, moved, targets
 from redundancy.protocol import Run, Scenario, Score, Stream
@@ -46,4 +47,5 @@ SCENARIO = Scenario(
     },
     streams,
     judge,
+    least=1e-3,
 )

@@ -1,6 +1,7 @@
 """A posture spring in the null space: does the arm get to its targets, or do joints end at their limits?"""
 
 import numpy as np
+
 from redundancy.arms import Arm
 from redundancy.paths import between, targets
 from redundancy.protocol import Run, Scenario, Score, Stream
@@ -38,6 +39,7 @@ SCENARIO = Scenario(
     streams,
     judge,
     also="runs that end with a joint at its limit [%]",
-    format=".0f",
+    least=1.0,
+    percent=True,
     served="every method; a target is missed where the tip ends 2 mm or 0.02 rad off, or a joint beyond its limit",
 )

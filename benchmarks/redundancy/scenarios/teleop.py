@@ -1,6 +1,7 @@
 """Long teleoperation: does the elbow stay where the operator had it?"""
 
 import numpy as np
+
 from redundancy.arms import Arm
 from redundancy.paths import targets, wandering
 from redundancy.protocol import Run, Scenario, Score, Stream
@@ -30,4 +31,5 @@ SCENARIO = Scenario(
     },
     streams,
     judge,
+    least=0.1,
 )
