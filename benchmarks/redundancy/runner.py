@@ -22,7 +22,7 @@ from redundancy.protocol import Method, Run, Scenario, Stream, Unsuited
 FOLDER = Path(__file__).parent
 RESULTS, SETTINGS = FOLDER / "results", FOLDER / "settings.json"
 SCHEMA = 1  #: of the files in results
-BUDGET = 25.0  #: CPU seconds of a case; slower methods are stopped, and their row says so
+BUDGET = 8.0  #: CPU seconds of a case; slower methods are stopped, and their row says so
 ORDER = ("pseudo_inverse", "pink", "mink", "placo", "ssik", "operational_space", "ompl", "charts")  #: of the rows
 
 

@@ -6,7 +6,7 @@ from redundancy.arms import TICK, Arm
 from redundancy.paths import direction, moved, smooth, targets
 from redundancy.protocol import Run, Scenario, Score, Stream
 
-COUNT, LENGTH, TICKS, FASTER = 16, 0.5, 300, 1.05  # of the arm's size; of the velocity limit
+COUNT, LENGTH, TICKS, FASTER = 12, 0.5, 200, 1.05  # of the arm's size; of the velocity limit
 
 
 def streams(arm: Arm, rng: np.random.Generator, quick: bool) -> list[Stream]:

@@ -6,7 +6,7 @@ from redundancy.arms import Arm
 from redundancy.paths import between, targets
 from redundancy.protocol import Run, Scenario, Score, Stream
 
-COUNT, WAY, HOLD = 12, 200, 100  # targets; ticks
+COUNT, WAY, HOLD = 8, 150, 50  # targets; ticks
 FAR, MARGIN = 1.0, 0.1  # of targets from home and from limits [rad]
 
 

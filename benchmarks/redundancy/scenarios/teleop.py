@@ -6,12 +6,12 @@ from redundancy.arms import Arm
 from redundancy.paths import targets, wandering
 from redundancy.protocol import Run, Scenario, Score, Stream
 
-TICKS = 2000
+TICKS = 1200
 
 
 def streams(arm: Arm, rng: np.random.Generator, quick: bool) -> list[Stream]:
     """A smooth random motion of the hand that never repeats itself."""
-    path = wandering(arm, rng, TICKS // 5 if quick else TICKS, 0.15, 0.4)
+    path = wandering(arm, rng, TICKS // 3 if quick else TICKS, 0.15, 0.4)
     return [Stream(arm.home, targets(arm, path), known=False)]
 
 
