@@ -10,7 +10,7 @@ from pathlib import Path
 
 from redundancy import tuning
 from redundancy.arms import SOURCES
-from redundancy.runner import measured, save, scenarios
+from redundancy.runner import measured, scenarios
 
 QUICK = ("drift", "elbow", "base")
 
@@ -24,10 +24,7 @@ def main(
 ) -> dict[str, dict[str, object]]:
     """Run, and keep the results unless it is quick."""
     chosen = names or (QUICK if quick else tuple(scenarios()))
-    found = measured(chosen, arms[:1] if quick else arms, seeds[:1] if quick else seeds, more, quick)
-    if not quick:
-        save(found)
-    return found
+    return measured(chosen, arms[:1] if quick else arms, seeds[:1] if quick else seeds, more, quick)
 
 
 if __name__ == "__main__":

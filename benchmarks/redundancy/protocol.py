@@ -20,7 +20,7 @@ class Target:
     elbow: float | None = None  #: angle of the elbow, if that is wanted [rad]
 
 
-class Unsuited(Exception):
+class Unsuited(Exception):  # noqa: N818 (it is an answer, not an error)
     """Why a method does not do this arm or this scenario; the table prints it."""
 
 

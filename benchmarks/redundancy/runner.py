@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 import orthocas as oc
-from redundancy.arms import SOURCES, Arm
+from redundancy.arms import SOURCES, TICK, Arm
 from redundancy.protocol import Method, Run, Scenario, Stream, Unsuited
 
 FOLDER = Path(__file__).parent
 RESULTS, SETTINGS = FOLDER / "results", FOLDER / "settings.json"
 SCHEMA = 1  #: of the files in results
-BUDGET = 8.0  #: CPU seconds of a case; slower methods are stopped, and their row says so
+PATIENCE = 50  #: ticks after which a method that takes longer than a tick for each is stopped; its row says so
 ORDER = ("pseudo_inverse", "pink", "mink", "placo", "ssik", "operational_space", "ompl", "charts")  #: of the rows
 
 
@@ -90,17 +90,17 @@ def versions(method: Any) -> dict[str, str]:
     return found
 
 
-def followed(arm: Arm, method: Method, stream: Stream, until: float) -> Run:
-    """Stream targets to a method, until it has used its time."""
+def followed(arm: Arm, method: Method, stream: Stream) -> Run:
+    """Stream targets to a method."""
     method.start(stream.start, stream.targets if stream.known else None)
-    path, errors = [], []
+    path, errors, begin = [], [], time.process_time()
     for k, target in enumerate(stream.targets):
         q = np.array(method.step(target), dtype=float)
         rest = arm.error(q, target.placement) if np.isfinite(q).all() else np.full(6, np.inf)
         path.append(q)
         errors.append((np.linalg.norm(rest[:3]), np.linalg.norm(rest[3:])))
-        if k % 20 == 0 and time.process_time() > until:
-            raise Unsuited("too slow: stopped after its time")
+        if k > PATIENCE and time.process_time() - begin > k * TICK:
+            raise Unsuited("slower than the ticks of 10 ms")
     return Run(stream, np.array(path), np.array(errors))
 
 
@@ -114,7 +114,7 @@ def case(scenario: Scenario, arm: Arm, build: Any, seed: int, quick: bool) -> di
         rng = np.random.default_rng([seed, *scenario.name.encode(), *arm.name.encode()])
         streams = scenario.streams(arm, rng, quick)
         before = time.process_time()
-        runs = [followed(arm, build, stream, before + BUDGET) for stream in streams]
+        runs = [followed(arm, build, stream) for stream in streams]
         ticks = sum(len(run.q) for run in runs)
         score = scenario.judge(arm, runs)
         found |= {"value": _number(score.value), "served": bool(score.served)}
@@ -168,9 +168,13 @@ def measured(
 ) -> dict[str, dict[str, Any]]:
     """The content of the results' files, by scenario."""
     tasks = [(name, mobile, names, seeds, more, quick) for mobile in (False, True) for name in arms]
-    cases = [one for found in _in_processes(tasks, processes) for one in found]
-    known = scenarios()
-    return {name: _file(known[name], [one for one in cases if one[0] == name], arms, seeds, more) for name in names}
+    known, cases, content = scenarios(), [], {}
+    for found in _in_processes(tasks, processes):
+        cases += found
+        content = {name: _file(known[name], [one for one in cases if one[0] == name], arms, seeds, more) for name in names}
+        if not quick:
+            save(content)  # what is there so far
+    return content
 
 
 def _in_processes(tasks: Sequence[Any], processes: int) -> Iterator[list[Any]]:

@@ -1,4 +1,4 @@
-"""Settings by the same budget for all: three settings each, tried on two arms and two scenarios, with a seed of its own."""
+"""Settings by one budget for all: three each, tried on two arms and two scenarios, with a seed of its own."""
 
 import json
 import warnings

@@ -43,8 +43,8 @@ SCENARIO = Scenario(
     "The base turns instead of the arm",
     "heading of the base after all picks [deg]",
     {
-        "https://github.com/PickNikRobotics/moveit_pro_example_ws/pull/736": "the UR5e-on-Ridgeback spins its base a full "
-        '~360° "pirouette" before a grasp',
+        "https://github.com/PickNikRobotics/moveit_pro_example_ws/pull/736": "the UR5e-on-Ridgeback spins its base a "
+        'full ~360° "pirouette" before a grasp',
     },
     streams,
     judge,

@@ -51,8 +51,8 @@ SCENARIO = Scenario(
     "Multi-modal demonstrations",
     "joint error of a policy learned from the demonstrations, rms [deg]",
     {
-        "https://arxiv.org/abs/2606.29940": "Existing retargeting methods yield imprecise or inconsistent solutions, causing "
-        "action multi-modality that prevents supervised policies from reliably converging.",
+        "https://arxiv.org/abs/2606.29940": "Existing retargeting methods yield imprecise or inconsistent solutions, "
+        "causing action multi-modality that prevents supervised policies from reliably converging.",
     },
     streams,
     judge,

@@ -35,17 +35,17 @@ SCENARIO = Scenario(
     "Jitter and jumps along Cartesian paths",
     "lines not followed [%]",
     {
-        "https://github.com/mani-skill/ManiSkill/issues/1207": "the arm on the right-hand side of the screen rotates the "
-        "wrist and forearm roll joints 180 degrees opposite to one another, even though the same position could be achieved "
-        "by rotating neither joint.",
-        "https://github.com/moveit/moveit/issues/797": "I have stumbled on this IK jumps issue for a very long time before "
-        "actually understanding what was happening.",
+        "https://github.com/mani-skill/ManiSkill/issues/1207": "the arm on the right-hand side of the screen rotates "
+        "the wrist and forearm roll joints 180 degrees opposite to one another, even though the same position could be "
+        "achieved by rotating neither joint.",
+        "https://github.com/moveit/moveit/issues/797": "I have stumbled on this IK jumps issue for a very long time "
+        "before actually understanding what was happening.",
     },
     streams,
     judge,
     also="lines on which a joint exceeds its velocity limit [%]",
     least=1.0,
     percent=True,
-    served="every method; a line is followed if the tip stays within 2 mm and 0.02 rad at 99 % of the ticks, and no joint "
-    "leaves its limits of position and velocity",
+    served="every method; a line is followed if the tip stays within 2 mm and 0.02 rad at 99 % of the ticks, and no "
+    "joint leaves its limits of position and velocity",
 )

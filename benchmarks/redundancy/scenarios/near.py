@@ -41,9 +41,9 @@ SCENARIO = Scenario(
     "Consistent answers for near targets",
     "largest joint difference between answers for targets 2 mm apart [rad]",
     {
-        "https://github.com/flexivrobotics/flexiv_rdk/issues/163": "for target points that are in very close proximity to "
-        "one another in Cartesian space, the trajectory taken from the starting pose is neither consistent nor repeatable "
-        "across multiple runs.",
+        "https://github.com/flexivrobotics/flexiv_rdk/issues/163": "for target points that are in very close proximity "
+        "to one another in Cartesian space, the trajectory taken from the starting pose is neither consistent nor "
+        "repeatable across multiple runs.",
     },
     streams,
     judge,

@@ -17,7 +17,7 @@ def streams(arm: Arm, rng: np.random.Generator, quick: bool) -> list[Stream]:
 
 
 def judge(arm: Arm, runs: list[Run]) -> Score:
-    """Largest error of the tool [mm]. Served: the slider's posture was reached, but for a fifth of the jump, in the mean."""
+    """Largest error of the tool [mm]; served: the posture was reached, but for a fifth of the jump, in the mean."""
     run, shares = runs[0], []
     before = run.stream.start
     for k in range(TICKS - 1, len(run.q), TICKS):
@@ -32,8 +32,8 @@ SCENARIO = Scenario(
     "Sliders that leave the null space",
     "largest error of the tool [mm]",
     {
-        "https://github.com/moveit/moveit/issues/2970": "dragging the null-space slider can leave the null-space and start "
-        "moving the end effector away from the picked pose.",
+        "https://github.com/moveit/moveit/issues/2970": "dragging the null-space slider can leave the null-space and "
+        "start moving the end effector away from the picked pose.",
     },
     streams,
     judge,

@@ -33,8 +33,8 @@ SCENARIO = Scenario(
     "A posture spring, and joints at their limits",
     "targets missed [%]",
     {
-        "https://github.com/isaac-sim/IsaacLab/pull/7862": "the null-space term cannot recentre the redundant joints once "
-        "the task term drives them onto their limits.",
+        "https://github.com/isaac-sim/IsaacLab/pull/7862": "the null-space term cannot recentre the redundant joints "
+        "once the task term drives them onto their limits.",
     },
     streams,
     judge,
