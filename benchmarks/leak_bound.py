@@ -36,7 +36,7 @@ def ball(n: int, count: int, seed: int) -> Array:
 
 def projectors(problem: oc.Problem, q: Array) -> Array:
     """P(q) of points (N, n), the projectors onto ker J_x (N, n, n)."""
-    J = problem.task.batched_jacobian(q).reshape(len(q), -1, q.shape[1])
+    J = problem.task.batched_jacobian(q)[0].reshape(len(q), -1, q.shape[1])
     basis = np.linalg.qr(J.transpose(0, 2, 1))[0]
     return np.asarray(np.eye(q.shape[1]) - basis @ basis.transpose(0, 2, 1))
 

@@ -171,7 +171,9 @@ def measured(
     known, cases, content = scenarios(), [], {}
     for found in _in_processes(tasks, processes):
         cases += found
-        content = {name: _file(known[name], [one for one in cases if one[0] == name], arms, seeds, more) for name in names}
+        content = {
+            name: _file(known[name], [one for one in cases if one[0] == name], arms, seeds, more) for name in names
+        }
         if not quick:
             save(content)  # what is there so far
     return content
