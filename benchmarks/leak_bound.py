@@ -7,8 +7,8 @@ grad xi = e + S x + d(x), |S| <= curvature, |d| <= change |x|^2 / 2 this gives, 
     rms sin(leak) >= (e . mean P T - curvature |mean sym(x (P T)^T)| - change / 2 mean |x|^2 |P T|)
                      / sqrt(mean (1 + curvature |x| + change |x|^2 / 2)^2 |T - P T|^2).
 
-W is the antisymmetric part of x -> -dP[x] e on the space orthogonal to N, so that the bound is |W| R / sqrt(n + 2) to first
-order in the radius R. Quadratic coordinates reach that order: there it is the least leak. Means are Monte Carlo.
+W is the antisymmetric part of x -> -dP[x] e on the space orthogonal to N, so that the bound is |W| R / sqrt(n + 2) to
+first order in the radius R. Quadratic coordinates reach that order: there it is the least leak. Means are Monte Carlo.
 """
 
 import numpy as np

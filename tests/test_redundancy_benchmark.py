@@ -67,9 +67,9 @@ def test_a_tip_that_is_off_at_two_per_cent_of_the_ticks_did_not_follow() -> None
     stream = Stream(arm.home, [Target(arm.placement(arm.home), arm.home)] * 100)
     errors = np.zeros((100, 2))
     errors[:2, 0] = 3e-3
-    assert not Run(stream, np.tile(arm.home, (100, 1)), errors).followed
+    assert not Run(stream, np.tile(arm.home, (100, 1)), errors, True, True).followed
     errors[0, 0] = 0
-    assert Run(stream, np.tile(arm.home, (100, 1)), errors).followed
+    assert Run(stream, np.tile(arm.home, (100, 1)), errors, True, True).followed
 
 
 def test_ranks_put_arms_that_are_not_served_last_and_share_what_does_not_matter() -> None:

@@ -64,11 +64,13 @@ class Run:
     stream: Stream
     q: Array  #: (N, n)
     errors: Array  #: of the tip, position [m] and rotation [rad] (N, 2)
+    placed: bool  #: whether all joints stayed within their limits of position
+    slow: bool  #: whether they stayed within 1.05 times their limits of velocity
 
     @property
     def followed(self) -> bool:
-        """Whether the tip was where it was wanted at 99 % of the ticks."""
-        return bool((np.mean(self.on_target) >= FOLLOWED) and np.isfinite(self.q).all())
+        """Whether the tip was where it was wanted at 99 % of the ticks, and joints within their limits."""
+        return bool(np.mean(self.on_target) >= FOLLOWED and self.placed and self.slow)
 
     @property
     def on_target(self) -> Array:
@@ -102,4 +104,7 @@ class Scenario:
     mobile: bool = False  #: whether the arm stands on a mobile base
     least: float = 0.0  #: numbers below this are the same to the user; they share a rank
     percent: bool = False  #: whether the number is a share, whose mean over the arms counts, and not the median
-    served: str = "the tip was within 2 mm and 0.02 rad of its target at 99 % of the ticks"
+    served: str = (
+        "the tip was within 2 mm and 0.02 rad of its target at 99 % of the ticks, and all joints within their limits of "
+        "position and velocity"
+    )

@@ -22,6 +22,7 @@ from redundancy.protocol import Method, Run, Scenario, Stream, Unsuited
 FOLDER = Path(__file__).parent
 RESULTS, SETTINGS = FOLDER / "results", FOLDER / "settings.json"
 SCHEMA = 1  #: of the files in results
+FASTER = 1.05  #: than its velocity limit, which a joint may be
 PATIENCE = 50  #: ticks after which a method that takes longer than a tick for each is stopped; its row says so
 ORDER = ("pseudo_inverse", "pink", "mink", "placo", "ssik", "operational_space", "ompl", "charts")  #: of the rows
 
@@ -101,7 +102,9 @@ def followed(arm: Arm, method: Method, stream: Stream) -> Run:
         errors.append((np.linalg.norm(rest[:3]), np.linalg.norm(rest[3:])))
         if k > PATIENCE and time.process_time() - begin > k * TICK:
             raise Unsuited("slower than the ticks of 10 ms")
-    return Run(stream, np.array(path), np.array(errors))
+    q = np.array(path)
+    steps = np.abs(np.diff(np.vstack([stream.start, q]), axis=0))
+    return Run(stream, q, np.array(errors), arm.inside(q), bool((steps <= FASTER * TICK * arm.fastest).all()))
 
 
 def case(scenario: Scenario, arm: Arm, build: Any, seed: int, quick: bool) -> dict[str, Any]:

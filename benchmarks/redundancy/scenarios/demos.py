@@ -9,7 +9,7 @@ from redundancy.arms import Arm
 from redundancy.paths import between, in_ball, targets
 from redundancy.protocol import Run, Scenario, Score, Stream
 
-COUNT, WAY, EVERY, LEFT_OUT = 20, 80, 4, 4  # demonstrations; ticks; between samples; one of so many is for the test
+COUNT, WAY, EVERY, LEFT_OUT = 14, 110, 5, 4  # demonstrations; ticks; between samples; one of so many is for the test
 WIDTHS, RIDGE = (0.5, 1.0, 2.0, 4.0), 1e-6  # of the kernel; chosen for the smallest error, so the learner is no excuse
 
 

@@ -34,8 +34,8 @@ SCENARIO = Scenario(
     {
         "https://github.com/xArm-Developer/xArm-Python-SDK/issues/45": "Is there any way I can bias the IK solution "
         "to a desired elbow configuration?",
-        "https://github.com/lbr-stack/lbr_fri_ros2_stack/issues/179": "due to the multiple degrees of freedom, there is "
-        "a problem in that the pose changes each time it is executed",
+        "https://github.com/lbr-stack/lbr_fri_ros2_stack/issues/179": "due to the multiple degrees of freedom, there "
+        "is a problem in that the pose changes each time it is executed",
     },
     streams,
     judge,

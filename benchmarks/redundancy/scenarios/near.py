@@ -6,7 +6,7 @@ from redundancy.arms import Arm
 from redundancy.paths import between, direction, in_ball, moved, targets
 from redundancy.protocol import Run, Scenario, Score, Stream
 
-PAIRS, WAY, HOLD = 10, 60, 20  # of targets; ticks
+PAIRS, WAY, HOLD = 6, 110, 20  # of targets; ticks
 APART, TURNED = 2e-3, np.radians(0.5)  # [m], [rad]
 
 

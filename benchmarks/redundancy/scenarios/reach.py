@@ -30,7 +30,7 @@ def judge(arm: Arm, runs: list[Run]) -> Score:
     run = runs[0]
     still = slice(OUT + WAIT // 4, OUT + WAIT)
     speed = np.abs(np.diff(run.q[still], axis=0)).max(axis=1).mean() / TICK
-    back = bool(run.on_target[-1] and arm.inside(run.q))
+    back = bool(run.on_target[-1] and run.placed)
     return Score(float(speed), back, 1e3 * float(run.errors[still, 0].mean()))
 
 

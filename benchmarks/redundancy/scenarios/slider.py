@@ -5,7 +5,7 @@ import numpy as np
 from redundancy.arms import Arm
 from redundancy.protocol import Run, Scenario, Score, Stream, Target
 
-MOVES, TICKS, FAR, REACHED = 12, 100, 0.35, 0.2  # jumps of the slider; ticks after each; [rad]; of a jump left at most
+MOVES, TICKS, FAR, REACHED = 8, 100, 0.35, 0.2  # jumps of the slider; ticks after each; [rad]; of a jump left at most
 
 
 def streams(arm: Arm, rng: np.random.Generator, quick: bool) -> list[Stream]:

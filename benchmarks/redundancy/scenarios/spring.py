@@ -23,7 +23,7 @@ def streams(arm: Arm, rng: np.random.Generator, quick: bool) -> list[Stream]:
 
 def judge(arm: Arm, runs: list[Run]) -> Score:
     """Share of targets where the arm does not end, and share of runs that end with a joint at its limit."""
-    missed = [not (run.on_target[-1] and arm.inside(run.q[-1])) for run in runs]
+    missed = [not (run.on_target[-1] and run.placed and run.slow) for run in runs]
     stuck = [bool((np.minimum(run.q[-1] - arm.lower, arm.upper - run.q[-1]) < 1e-2).any()) for run in runs]
     return Score(100 * float(np.mean(missed)), True, 100 * float(np.mean(stuck)))
 
@@ -41,5 +41,5 @@ SCENARIO = Scenario(
     also="runs that end with a joint at its limit [%]",
     least=1.0,
     percent=True,
-    served="every method; a target is missed where the tip ends 2 mm or 0.02 rad off, or a joint beyond its limit",
+    served="every method; a target is missed where the tip ends 2 mm or 0.02 rad off, or a joint exceeds a limit",
 )

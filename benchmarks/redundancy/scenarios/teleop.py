@@ -6,7 +6,7 @@ from redundancy.arms import Arm
 from redundancy.paths import targets, wandering
 from redundancy.protocol import Run, Scenario, Score, Stream
 
-TICKS = 1200
+TICKS = 1000
 
 
 def streams(arm: Arm, rng: np.random.Generator, quick: bool) -> list[Stream]:
