@@ -6,7 +6,7 @@ Writes docs/records/redundancy.json and docs/figures/redundancy_SCENARIO.png, an
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,11 +45,11 @@ class Row:
         return float(f"{value:.1e}"), self.arms - len(self.values)
 
 
-def rows_of(result: Mapping[str, Any], seed: int) -> list[Row]:
-    """Of a scenario's file."""
+def rows_of(result: Mapping[str, Any], seed: int, arms: Collection[str] | None = None) -> list[Row]:
+    """Of a scenario's file, for all arms or some."""
     found = []
     for method, row in result["methods"].items():
-        cases = [case for case in row["cases"] if case["seed"] == seed]
+        cases = [case for case in row["cases"] if case["seed"] == seed and (arms is None or case["arm"] in arms)]
         ran = [case for case in cases if "value" in case or case["why"].startswith(("slower", "failed", "the start"))]
         good = [case for case in ran if case.get("served") and case["value"] is not None]
         also = [case["also"] for case in good if case.get("also") is not None]
@@ -73,17 +73,17 @@ def number(value: float) -> str:
 
 def table(scenario: Scenario, result: Mapping[str, Any]) -> list[str]:
     """Header and rows in Markdown, best first; below, what did not run."""
-    first, *others = result["seeds"]
-    rows = rows_of(result, first)
+    rows, arms = rows_of(result, result["seeds"][0]), common_arms(result)
     own = ranks(rows, scenario)
-    other = [ranks(rows_of(result, seed), scenario) for seed in others]
+    repeated = [ranks(rows_of(result, seed, arms), scenario) for seed in result["seeds"]]
     what = "mean of the arms" if scenario.percent else "median of the arms served"
-    columns = ["method", f"{scenario.number}, {what}", "worst", "arms served", "rank", "rank, other seed"]
+    seeds = f"ranks with seeds {', '.join(map(str, result['seeds']))} on {len(arms)} arms"
+    columns = ["method", f"{scenario.number}, {what}", "worst", "arms served", "rank", seeds]
     lines = ["| " + " | ".join([*columns, *([scenario.also] if scenario.also else [])]) + " |"]
     for row in sorted((row for row in rows if row.values), key=lambda row: own[row.method]):
         middle = (np.mean if scenario.percent else np.median)(row.values)
         cells = [row.method, number(float(middle)), number(max(row.values)), f"{len(row.values)} of {row.arms}"]
-        cells += [str(own[row.method]), ", ".join(str(found.get(row.method, "-")) for found in other) or "-"]
+        cells += [str(own[row.method]), ", ".join(str(found.get(row.method, "-")) for found in repeated)]
         cells += [number(float(np.median(row.also))) if row.also else "-"] if scenario.also else []
         lines.append(f"| {' | '.join(cells)} |")
     for row in rows:
@@ -97,6 +97,13 @@ def table(scenario: Scenario, result: Mapping[str, Any]) -> list[str]:
             ]
             lines.append(f"| {' | '.join(cells)} |")
     return lines
+
+
+def common_arms(result: Mapping[str, Any]) -> set[str]:
+    """The arms that ran with every seed."""
+    cases = [case for row in result["methods"].values() for case in row["cases"]]
+    ran = [{case["arm"] for case in cases if case["seed"] == seed} for seed in result["seeds"]]
+    return set.intersection(*ran)
 
 
 def not_run(result: Mapping[str, Any]) -> str:
@@ -146,8 +153,8 @@ def changes(found: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, str]
     """Pairs of methods that change places between the seeds, by scenario."""
     pairs = []
     for name, result in found.items():
-        scenario, seeds = scenarios()[name], result["seeds"]
-        one, other = (ranks(rows_of(result, seed), scenario) for seed in (seeds[0], seeds[-1]))
+        scenario, seeds, arms = scenarios()[name], result["seeds"], common_arms(result)
+        one, other = (ranks(rows_of(result, seed, arms), scenario) for seed in (seeds[0], seeds[-1]))
         both = sorted(set(one) & set(other))
         pairs += [(name, a, b) for a in both for b in both if one[a] < one[b] and other[a] > other[b]]
     return pairs

@@ -103,8 +103,8 @@ class Scenario:
     also: str = ""  #: the name of the second number
     mobile: bool = False  #: whether the arm stands on a mobile base
     least: float = 0.0  #: numbers below this are the same to the user; they share a rank
-    percent: bool = False  #: whether the number is a share, whose mean over the arms counts, and not the median
+    percent: bool = False  #: whether the number is a share; then the mean over the arms counts
     served: str = (
-        "the tip was within 2 mm and 0.02 rad of its target at 99 % of the ticks, and all joints within their limits of "
-        "position and velocity"
+        "the tip was within 2 mm and 0.02 rad of its target at 99 % of the ticks, and all joints within their limits "
+        "of position and velocity"
     )
