@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/.installed
 export PYTHONDONTWRITEBYTECODE = # or every test that starts Python compiles orthocas again
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
-.PHONY: demo paper test check docs fuzz lint types wheel-check bench figures charts clean
+.PHONY: demo paper test check docs fuzz lint types wheel-check bench redundancy figures charts clean
 
 demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and picture in out/
 	$(BIN)/orthocas demo --out out
@@ -42,6 +42,15 @@ bench: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet -e '.[bench]'
 	$(BIN)/python benchmarks/run_all.py
 
+redundancy: .venv-redundancy/.installed  ## methods of redundancy resolution side by side (30 minutes), for docs/peers.md
+	OMP_NUM_THREADS=1 PYTHONPATH=. .venv-redundancy/bin/python benchmarks/redundancy_benchmark.py
+	PYTHONPATH=. .venv-redundancy/bin/python benchmarks/redundancy_page.py
+
+.venv-redundancy/.installed: benchmarks/redundancy/requirements.txt
+	$(PYTHON) -m venv .venv-redundancy
+	.venv-redundancy/bin/python -m pip install --quiet -r $<
+	touch $@
+
 figures: $(INSTALLED)  ## measure the cheap figures of the documentation again, and show what moved beyond its tolerance
 	OMP_NUM_THREADS=1 $(BIN)/python tools/figures.py $(ONLY)
 
@@ -59,4 +68,4 @@ build/site: $(INSTALLED) $(shell find orthocas problems solvers -type f -not -pa
 	$(BIN)/python -m pip install --quiet --no-deps --upgrade --target build/site build/wheel/*.whl
 
 clean:
-	rm -rf $(VENV) build dist out *.egg-info
+	rm -rf $(VENV) .venv-redundancy build dist out *.egg-info

@@ -1,0 +1,1 @@
+"""A benchmark of redundancy resolution, made of what users report; see README.md."""

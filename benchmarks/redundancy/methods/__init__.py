@@ -1,0 +1,1 @@
+"""The methods: every file here has a tuple METHODS."""

@@ -1,0 +1,1 @@
+"""The scenarios: every file here has one SCENARIO."""

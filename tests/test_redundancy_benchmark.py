@@ -1,0 +1,105 @@
+"""The benchmark of redundancy resolution: its arms, its judges, and a method from a file outside."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import redundancy_page
+from redundancy import runner
+from redundancy.arms import Arm
+from redundancy.protocol import Run, Stream, Target
+
+DUMMY = """
+class HoldStill:
+    name, packages, grid = "hold still", ("numpy",), ({},)
+
+    def __init__(self, arm):
+        pass
+
+    def start(self, q, path):
+        self.q = q
+
+    def step(self, target):
+        return self.q
+
+
+METHODS = (HoldStill,)
+"""
+
+
+def test_the_urdf_of_an_arm_says_the_same_to_pinocchio_and_orthocas() -> None:
+    arm = Arm("panda")
+    q = arm.home + 0.1 * np.sin(np.arange(7))
+    assert np.abs(arm.error(q, arm.placement(q))).max() < 1e-12
+    np.testing.assert_allclose(arm.placement(q).translation, arm.robot.tip_position(q), atol=1e-12)
+    np.testing.assert_allclose(arm.jacobian(q)[:3], arm.robot.tip_jacobian(q)[:3], atol=1e-12)
+
+
+def test_postures_of_the_self_motion_have_the_elbow_that_was_asked_for() -> None:
+    arm = Arm("panda")
+    q = arm.with_elbow(0.2)
+    assert abs(arm.elbow(q) - 0.2) < 1e-4
+    assert np.abs(arm.error(q, arm.placement(arm.home))).max() < 1e-4
+
+
+def test_all_scenarios_have_a_thread_and_streams_that_begin_at_home() -> None:
+    known = runner.scenarios()
+    assert len(known) == 10
+    for name, scenario in known.items():
+        assert scenario.threads, name
+        assert all(address.startswith("https://") for address in scenario.threads)
+        arm = Arm("iiwa", scenario.mobile)
+        for stream in scenario.streams(arm, np.random.default_rng(0), True):
+            first = arm.error(stream.start, stream.targets[0].placement)
+            assert np.abs(first).max() < 2e-2, name
+
+
+def test_a_package_that_is_missing_has_a_row_that_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "absent.py"
+    path.write_text("import no_such_package_here\n")
+    (method,) = [method for method in runner.methods([path]) if method.name == "absent"]
+    found = runner.case(runner.scenarios()["drift"], Arm("iiwa"), runner.built(method, Arm("iiwa"), {}), 0, True)
+    assert found["why"] == "not installed (no_such_package_here)"
+
+
+def test_a_tip_that_is_off_at_two_per_cent_of_the_ticks_did_not_follow() -> None:
+    arm = Arm("iiwa")
+    stream = Stream(arm.home, [Target(arm.placement(arm.home), arm.home)] * 100)
+    errors = np.zeros((100, 2))
+    errors[:2, 0] = 3e-3
+    assert not Run(stream, np.tile(arm.home, (100, 1)), errors, True, True).followed
+    errors[0, 0] = 0
+    assert Run(stream, np.tile(arm.home, (100, 1)), errors, True, True).followed
+
+
+def test_ranks_put_arms_that_are_not_served_last_and_share_what_does_not_matter() -> None:
+    scenario = runner.scenarios()["drift"]
+    rows = [
+        redundancy_page.Row("exact", [1e-15, 1e-14], [], 2, ""),
+        redundancy_page.Row("exact too", [1e-9, 1e-8], [], 2, ""),
+        redundancy_page.Row("drifts", [0.1, 0.2], [], 2, ""),
+        redundancy_page.Row("half", [1e-15], [], 2, ""),
+        redundancy_page.Row("none", [], [], 2, "failed"),
+    ]
+    assert redundancy_page.ranks(rows, scenario) == {"exact": 1, "exact too": 1, "drifts": 3, "half": 4}
+
+
+@pytest.mark.slow
+def test_a_quick_run_with_a_method_from_a_file_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A chart closes circles and holds the elbow; the pseudo-inverse drifts; who holds still serves nobody."""
+    path = tmp_path / "hold_still.py"
+    path.write_text(DUMMY)
+    wanted = {"pseudo-inverse", "chart, tight", "hold still"}
+    every = runner.methods
+    monkeypatch.setattr(runner, "methods", lambda more=(): [one for one in every(more) if one.name in wanted])
+    found = runner.measured(["drift", "elbow"], ["panda"], [0], [path], quick=True, processes=1)
+    value = {
+        name: {method: row["cases"][0] for method, row in result["methods"].items()} for name, result in found.items()
+    }
+    assert value["drift"]["chart, tight"]["value"] < 1e-9
+    assert value["drift"]["pseudo-inverse"]["value"] > 1e-3
+    assert value["elbow"]["chart, tight"]["value"] < 0.1
+    assert not any(cases["hold still"]["served"] for cases in value.values())
+    lines = redundancy_page.table(runner.scenarios()["drift"], found["drift"])
+    assert [line.split("|")[1].strip() for line in lines[1:]] == ["chart, tight", "pseudo-inverse", "hold still"]
+    redundancy_page.picture(runner.scenarios()["drift"], found["drift"]).savefig(tmp_path / "drift.png")
