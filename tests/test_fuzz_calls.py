@@ -1,8 +1,7 @@
-"""A quick part of the campaigns of calls, threads and ticks; `make fuzz` runs the rest."""
+"""A quick part of the campaigns of calls and ticks; `make fuzz` runs the rest."""
 
 import pytest
 from fuzz.calls import calls
-from fuzz.threads import threads
 from fuzz.ticks import ticks
 from programs import needs_c
 
@@ -10,11 +9,6 @@ from programs import needs_c
 @pytest.mark.slow
 def test_calls_give_results_or_one_error() -> None:
     assert calls(150) == []
-
-
-@pytest.mark.slow
-def test_sixteen_threads_get_what_one_gets() -> None:
-    assert threads(200) == []
 
 
 @needs_c
