@@ -175,10 +175,11 @@ def atlas() -> oc.Atlas:
     _folders.append(TemporaryDirectory())
     path = Path(_folders[-1].name) / "arm.orthocas-atlas"
     with ThreadPoolExecutor(1) as executor:
-        return oc.build_atlas(problem, path, asked, region=[[0.0, 0.9, 0.9]], radius=0.3, executor=executor)
+        return oc.build_atlas(problem, path, asked, executor=executor, **AROUND)
 
 
 _folders: list[TemporaryDirectory[str]] = []
+AROUND: dict[str, Any] = {"region": [[0.0, 0.9, 0.9]], "radius": 0.3}  #: what the atlas covers
 IN_ATLAS = np.array([0.0, 0.9, 0.9])  #: a covered posture
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from fuzz.calls import Like
 from fuzz.good_calls import good_calls
 from public_objects import CHARTS, circle, fitted, impedance, planar, points_of, steps, trajectory
 
@@ -99,6 +100,14 @@ NO_NUMBERS = {
 def test_only_real_numbers_are_numbers(value: Any) -> None:
     with pytest.raises(InvalidValueError, match="^q is .*, expected an array of numbers$"):
         as_float_array("q", value)
+
+
+@pytest.mark.parametrize("value", [[1.0], (1.0,), np.ones(1), Like(1.0), [np.array(1.0)]], ids=repr)
+def test_one_number_is_no_list_and_no_tensor(value: Any) -> None:
+    """What is checked as a number is computed with as it is."""
+    for call in (lambda: oc.Weights(task=value), lambda: fitted().chart.inverse(np.zeros(3), tolerance=value)):
+        with pytest.raises(InvalidValueError, match="expected a number"):
+            call()
 
 
 def test_numbers_of_any_class_are_taken() -> None:

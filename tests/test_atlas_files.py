@@ -18,7 +18,7 @@ from planar_atlas import ASKED, built, cells_of, planar
 
 import orthocas as oc
 from orthocas.atlas.atlas_file import ATLAS, Stock, add_results, chart_type, header_of, plan_terms, read_stock
-from orthocas.atlas.build import Job, Processes, opened, packed, run_job
+from orthocas.atlas.build import Job, opened, packed, run_job
 from orthocas.atlas.lattice import Cell, Outcome, Result
 from orthocas.atlas.plan import make_plan
 from orthocas.atlas.regions import joint_range_of
@@ -26,6 +26,7 @@ from orthocas.errors import AtlasFileError
 from orthocas.tools.archive import from_npy, to_npy
 from orthocas.tools.block_file import create, owned, sealed
 from orthocas.tools.checks import Array
+from orthocas.tools.processes import Processes
 
 
 @pytest.mark.slow

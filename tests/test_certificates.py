@@ -1,7 +1,7 @@
 """Certificates are kept, checked, resumed and void when anything changes; the command."""
 
 import json
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -160,6 +160,43 @@ def test_an_executor_finds_the_same_parts() -> None:
         shared = oc.certify(chart(), executor=executor)
         assert oc.check_certificate(chart(), shared, executor=executor)
     assert shared.regular.codes.tolist() == certified().regular.codes.tolist()
+
+
+class Dying(ThreadPoolExecutor):
+    """An executor whose first calls end as if their processes had died."""
+
+    def __init__(self, deaths: int) -> None:
+        super().__init__(1)
+        self.deaths = deaths
+
+    def submit(self, *arguments: Any, **named: Any) -> Future[Any]:
+        if not self.deaths:
+            return super().submit(*arguments, **named)
+        self.deaths -= 1
+        future: Future[Any] = Future()
+        future.set_exception(BrokenExecutor("a process died"))
+        return future
+
+
+def test_boxes_of_processes_that_died_are_judged_again() -> None:
+    with Dying(2) as executor:
+        shared = oc.certify(chart(), executor=executor)
+        assert executor.deaths == 0
+        executor.deaths = 2
+        assert oc.check_certificate(chart(), shared, executor=executor)
+        assert executor.deaths == 0
+    assert shared.regular.codes.tolist() == certified().regular.codes.tolist()
+
+
+def test_boxes_that_processes_die_over_stay_unproved(caplog: pytest.LogCaptureFixture) -> None:
+    with Dying(100) as executor:
+        found = oc.certify(chart(), executor=executor)
+        with pytest.raises(CertifyError, match="one of its processes died"):
+            oc.check_certificate(chart(), certified(), executor=executor)
+    assert (found.proved, found.dead) == (False, 0)
+    assert len(caplog.messages) == 1
+    assert "worker processes died over them" in caplog.text
+    assert oc.certify(chart(), resume=found).proved
 
 
 def command(*words: Any) -> Any:

@@ -5,13 +5,12 @@ import os
 import pickle
 import random
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from orthocas.tasks.domains import Box
 from orthocas.tools.batch import THREADS
 from orthocas.tools.block_file import begins, create, owned, set_rest_aside, text_of
 from orthocas.tools.checks import Array
-from orthocas.tools.processes import begin_worker, starting_workers, worker_pool
+from orthocas.tools.processes import ATTEMPTS, Processes, begin_worker, worker_died
 from orthocas.tools.progress import Monitor, Progress
 
 _LEAST_CLEAR = 0.3  # share of the samples of a box that have to be clear of singular positions for a chart
@@ -36,7 +35,6 @@ _BATCH = 4  # cells in a job
 _AHEAD = 3  # jobs in flight for each worker
 _IN_FLIGHT = 64  # jobs in flight of an executor that somebody gives
 _FLUSH = 2.0  # seconds between blocks of the file
-_ATTEMPTS = 3  # of a cell whose worker dies
 _SEED = 0
 
 
@@ -136,48 +134,6 @@ def _dividing(plan: Plan, u: Array, clear: Mask) -> int:
     return int(np.argmax(np.maximum(gaps, middle)))
 
 
-class Processes(Executor):
-    """An executor of single processes with one thread each. One that died is replaced when work is submitted to it.
-
-    Args:
-        size: number of processes.
-        plan: what `keep_plan` keeps in each.
-    """
-
-    def __init__(self, size: int, plan: bytes) -> None:
-        self._plan = plan
-        self._pools = [self._pool() for _ in range(size)]
-        self._pending: list[set[Future[Any]]] = [set() for _ in range(size)]
-
-    def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Run `work` in the process with the least to do."""
-        for pending in self._pending:
-            pending -= {future for future in pending if future.done()}
-        slot = min(range(len(self._pools)), key=lambda k: len(self._pending[k]))
-        try:
-            future = self._started(slot, work, *arguments, **named)
-        except BrokenExecutor:
-            self._pools[slot].shutdown(wait=False)
-            self._pools[slot] = self._pool()
-            future = self._started(slot, work, *arguments, **named)
-        self._pending[slot].add(future)
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes at once: what they have not handed over runs again the next time."""
-        for pool in self._pools:
-            for process in list((pool._processes or {}).values()):  # a pool would wait for running work
-                process.kill()
-            pool.shutdown(wait=wait, cancel_futures=True)
-
-    def _started(self, slot: int, work: Callable[..., Any], *arguments: Any, **named: Any) -> Future[Any]:
-        with starting_workers():
-            return self._pools[slot].submit(work, *arguments, **named)
-
-    def _pool(self) -> ProcessPoolExecutor:
-        return worker_pool(1, _begin, os.getpid(), self._plan)
-
-
 def _begin(parent: int, plan: bytes) -> None:
     begin_worker(parent)
     keep_plan(plan)
@@ -264,9 +220,9 @@ class Building:
                 self._keep(wanted, result)
             return
         for wanted in batch:
-            if wanted.attempts + 1 < _ATTEMPTS:
+            if wanted.attempts + 1 < ATTEMPTS:
                 self.waiting.append(Wanted(wanted.cell, wanted.parent, wanted.upper, wanted.attempts + 1))
-            elif isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":
+            elif worker_died(future):
                 self._keep(wanted, Result(wanted.cell, Outcome.FAILED))
             else:
                 raise error
@@ -339,7 +295,7 @@ def workers(executor: Executor | None, jobs: int | None, plan: Plan) -> Iterator
         yield executor, _IN_FLIGHT, content
         return
     size = THREADS if jobs is None else jobs
-    own = Processes(size, content)
+    own = Processes(size, _begin, os.getpid(), content)
     try:
         yield own, _AHEAD * size, None
     finally:

@@ -2,8 +2,9 @@
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import BrokenExecutor, Executor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from orthocas.charts.chart_file import fingerprint
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.tasks.domains import Box, Domain, contains, reach, sample_heavily, slack
 from orthocas.tools.checks import Array, as_number, require_at_least, require_executor, require_kind
+from orthocas.tools.processes import in_order
 from orthocas.tools.progress import Monitor, Progress, silent
 
 _SAMPLES = 20_000  # points where folds are looked for before the proof
@@ -417,7 +419,7 @@ def check_certificate(
     require_same(chart, certificate)
     bound, rows = checked_bound(chart, certificate.bound), chart_rows(chart)
     judge = judge_of(chart, rows, bound, certificate.method)
-    mapped: Mapped = map if executor is None else executor.map
+    mapped: Mapped = map if executor is None else partial(in_order, executor)
     if certificate.fold and not _folds(chart, judge, np.array(certificate.fold)):
         return False
     if not _regular(certificate, _judged(judge, certificate.regular, mapped, monitor)):
@@ -458,9 +460,12 @@ def _around_the_centre(certificate: Certificate, box: Subdivision) -> bool:
 def _judged(judge: Judge, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[Verdicts]:
     low, high = parts.leaves(PROVED)
     found = []
-    for verdicts in mapped(judge, _cut(low), _cut(high)):
-        found.append(verdicts)
-        monitor(Progress("check", min(len(found) * _AT_ONCE / len(low), 1.0), f"{len(low)} boxes"))
+    try:
+        for verdicts in mapped(judge, _cut(low), _cut(high)):
+            found.append(verdicts)
+            monitor(Progress("check", min(len(found) * _AT_ONCE / len(low), 1.0), f"{len(low)} boxes"))
+    except BrokenExecutor:
+        raise CertifyError("the executor cannot be used any more: one of its processes died") from None
     return found
 
 

@@ -1,21 +1,26 @@
 """Branch and bound: judge boxes, and halve those on which nothing is proved, the largest first."""
 
 import heapq
+import logging
 import time
+from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from orthocas.certificates.judges import NEVER, UNKNOWN, Judge, Verdicts
 from orthocas.charts.certificate import MOST_BOXES, OPEN, PROVED, Subdivision, halfway
+from orthocas.errors import CertifyError
 from orthocas.tools.checks import Array
+from orthocas.tools.processes import ATTEMPTS, worker_died
 
 BATCH = 512  #: most boxes of one task
 _SMALL = 128  # boxes; smaller tasks take longer for each
 _TASKS = 8  # that the waiting boxes are cut into if they are few
 _IN_FLIGHT = 64  # most tasks of an executor at a time
+_log = logging.getLogger(__name__)
 Priority = Callable[[Array, Array], Array]  #: corners (boxes, n) -> numbers, smallest first
 Look = Callable[["Search"], None]  #: called after each batch
 
@@ -51,6 +56,7 @@ class Search:
     _codes: list[int] = field(default_factory=list)
     _children: list[int] = field(default_factory=list)  #: place of the lower half; the upper half follows
     _waiting: list[tuple[float, int, Array, Array]] = field(default_factory=list)  #: a heap
+    _deaths: Counter[int] = field(default_factory=Counter)  #: of processes, by the places of their boxes
 
     def __post_init__(self) -> None:
         low, high = self.base.leaves(OPEN)
@@ -127,11 +133,26 @@ class Search:
             return
         while self._waiting and len(pending) < _IN_FLIGHT:
             batch = self._take()
-            pending[self.executor.submit(self.judge, *_corners(batch))] = batch
+            try:
+                pending[self.executor.submit(self.judge, *_corners(batch))] = batch
+            except BrokenExecutor:
+                raise CertifyError("the executor cannot be used any more: one of its processes died") from None
         done = wait(pending, return_when=FIRST_COMPLETED).done
         for future in done:
-            verdicts = future.result()
-            self._apply(pending.pop(future), verdicts)
+            batch = pending.pop(future)
+            if worker_died(future):
+                self._again(batch)
+            else:
+                self._apply(batch, future.result())
+
+    def _again(self, batch: list[tuple[float, int, Array, Array]]) -> None:
+        """Return boxes whose process died; those for which that was the last attempt stay open."""
+        self._deaths.update(place for _, place, _, _ in batch)
+        given_up = [box for box in batch if self._deaths[box[1]] >= ATTEMPTS]
+        self._return([box for box in batch if self._deaths[box[1]] < ATTEMPTS])
+        if given_up:
+            self.failed = min(self.failed, *(rank for rank, _, _, _ in given_up))
+            _log.warning("%d boxes are left unproved: worker processes died over them", len(given_up))
 
     def _take(self) -> list[tuple[float, int, Array, Array]]:
         return [heapq.heappop(self._waiting) for _ in range(self._batch_size())]

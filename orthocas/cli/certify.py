@@ -19,13 +19,7 @@ from orthocas.cli.output import AsJson, Force, note, number, print_json, print_r
 from orthocas.errors import Interrupted
 from orthocas.tools.archive import require_free
 from orthocas.tools.checks import require_count
-from orthocas.tools.processes import (
-    begin_worker,
-    scheduler_executor,
-    starting_workers,
-    worker_pool,
-    workers_killed_on_error,
-)
+from orthocas.tools.processes import Processes, begin_worker, scheduler_executor
 
 _NOT_PROVED = 1  # exit code
 
@@ -94,10 +88,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor | None]:
         with scheduler_executor(scheduler) as executor:
             yield executor
     elif workers > 1:
-        with worker_pool(workers, begin_worker, os.getpid()) as executor, workers_killed_on_error():
-            with starting_workers():
-                for _ in range(workers):  # each call starts a process
-                    executor.submit(os.getpid)
+        with Processes(workers, begin_worker, os.getpid()) as executor:
             yield executor
     else:
         yield None

@@ -3,10 +3,12 @@
 import os
 from collections.abc import Collection
 from importlib import import_module
+from numbers import Real
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -117,11 +119,14 @@ def as_float_array(name: str, value: Any) -> Array:
 
 
 def as_number(name: str, value: Any) -> float:
-    """Convert one number, or an array that holds just one, to a float.
+    """Convert one number of Python, NumPy or CasADi to a float.
 
     Raises:
-        InvalidValueError: for anything else.
+        InvalidValueError: for anything else, lists and tensors of one number included: many callers only check that a
+            value is a number, and go on with the value itself.
     """
+    if not isinstance(value, Real | np.ndarray | ca.DM) or (isinstance(value, np.ndarray) and value.ndim):
+        raise InvalidValueError(name, repr(value)[:80], "a number")
     array = as_float_array(name, value)
     if array.size != 1:
         raise InvalidValueError(name, repr(value)[:80], "a number")

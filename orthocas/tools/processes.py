@@ -1,23 +1,29 @@
 """Processes that share work: workers of this machine, and schedulers of many machines."""
 
 import ctypes
+import logging
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from concurrent.futures import wait as wait_for
 from contextlib import contextmanager
 from importlib import import_module
-from multiprocessing import active_children, current_process, get_context, parent_process, resource_tracker
+from multiprocessing import current_process, get_context, parent_process, resource_tracker
 from multiprocessing.connection import wait
 from multiprocessing.synchronize import Event
+from typing import Any
 
 from orthocas.errors import ArchiveError, SchedulerError
+from orthocas.tools.interrupts import deferred
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
 _PARENT = "ORTHOCAS_PARENT"  # environment variable with the process id of a worker's parent, until the worker reads it
 _SPAWNED = "--multiprocessing-fork"  # on the command line of processes that multiprocessing starts
+ATTEMPTS = 3  #: at work whose process dies each time
+_log = logging.getLogger(__name__)
 _SPAWN = get_context("spawn")  # new interpreters: forked ones inherit the locks of threads that no longer run
 
 
@@ -58,13 +64,14 @@ def starting_workers() -> Iterator[None]:
     """For the block in which an executor starts processes, that is, around its first calls of `submit`.
 
     The processes use one thread each, so that they do not compete for cores. They end with this one from the moment
-    when they import orthocas. Ctrl-C waits here until the end of the block; there it never comes, imports included.
+    when they import orthocas. Ctrl-C never comes there, imports included. Here all signals wait until the end of the
+    block: half a start leaves a process that nobody knows, or one that complains that its input ends.
     """
     given = {"OMP_NUM_THREADS": "1", _PARENT: str(os.getpid())}
     before = {name: os.environ.get(name) for name in given}
     os.environ.update(given)
     try:
-        with _blocked(signal.SIGINT):
+        with deferred(), _blocked(signal.SIGINT):
             yield
     finally:
         for name, value in before.items():
@@ -74,16 +81,71 @@ def starting_workers() -> Iterator[None]:
                 os.environ[name] = value
 
 
-@contextmanager
-def workers_killed_on_error() -> Iterator[None]:
-    """Kill the processes that a block started if it raises: a pool waits for all of them, also while they import."""
-    others = set(active_children())
+class Processes(Executor):
+    """An executor of single processes with one thread each. One that died is replaced when work is submitted to it.
+
+    Args:
+        size: number of processes.
+        begin: called first in each, with the arguments; calls `begin_worker`.
+        arguments: of `begin`.
+    """
+
+    def __init__(self, size: int, begin: Callable[..., object], *arguments: object) -> None:
+        self._begin = begin, arguments
+        self._pools = [self._pool() for _ in range(size)]
+        self._pending: list[set[Future[Any]]] = [set() for _ in range(size)]
+
+    def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        """Run `work` in the process with the least to do."""
+        for pending in self._pending:
+            pending -= {future for future in pending if future.done()}
+        slot = min(range(len(self._pools)), key=lambda k: len(self._pending[k]))
+        try:
+            future = self._started(slot, work, *arguments, **named)
+        except (BrokenExecutor, BrokenPipeError):  # a pipe: it died before it had its arguments
+            _log.warning("a worker process died, killed or out of memory: another one takes its place")
+            self._pools[slot].shutdown(wait=False)
+            self._pools[slot] = self._pool()
+            future = self._started(slot, work, *arguments, **named)
+        self._pending[slot].add(future)
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes at once: what they have not handed over is lost."""
+        for pool in self._pools:
+            for process in list((pool._processes or {}).values()):  # a pool would wait for running work
+                process.kill()
+            pool.shutdown(wait=wait, cancel_futures=True)
+
+    def _started(self, slot: int, work: Callable[..., Any], *arguments: Any, **named: Any) -> Future[Any]:
+        with starting_workers():
+            return self._pools[slot].submit(work, *arguments, **named)
+
+    def _pool(self) -> ProcessPoolExecutor:
+        begin, arguments = self._begin
+        return worker_pool(1, begin, *arguments)
+
+
+def worker_died(future: Future[Any]) -> bool:
+    """Whether the process that ran a finished future has died, here or at a Dask scheduler."""
+    error = None if future.cancelled() else future.exception()
+    return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
+
+
+def in_order(executor: Executor, work: Callable[..., Any], *columns: Sequence[Any]) -> Iterator[Any]:
+    """As `executor.map`, but work whose process died runs again, up to `ATTEMPTS` times."""
+    rows = list(zip(*columns, strict=True))
+    futures = [executor.submit(work, *row) for row in rows]
     try:
-        yield
-    except BaseException:
-        for process in set(active_children()) - others:
-            process.kill()
-        raise
+        for k, row in enumerate(rows):
+            for _ in range(ATTEMPTS - 1):
+                wait_for([futures[k]])
+                if worker_died(futures[k]):
+                    futures[k] = executor.submit(work, *row)
+            yield futures[k].result()
+    finally:
+        for future in futures:
+            future.cancel()
 
 
 def knows_parent() -> bool:

@@ -5,13 +5,14 @@ import json
 import struct
 import zlib
 from base64 import b64decode, b64encode
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from public_objects import atlas
+from public_objects import AROUND, atlas
 
 import orthocas as oc
 from fuzz.child import Finding, run
@@ -19,6 +20,7 @@ from fuzz.mutants import Rng, changed_array, changed_data, flipped, pick
 from fuzz.sealed_files import judged
 from orthocas.atlas.atlas_file import ATLAS, chart_type
 from orthocas.atlas.coverage import evaluate_atlas
+from orthocas.errors import AtlasFileError
 from orthocas.tools.block_file import scan, sealed
 
 _PREFIX, _BLOCK, _CHECK = struct.Struct("<16sQ32s"), struct.Struct("<4sIQQ"), struct.Struct("<I")
@@ -41,6 +43,7 @@ def judge(original: Path, seed: int) -> str | None:
 def use(path: Path) -> None:
     """Open an atlas, evaluate it, go back to joint positions and into other charts, and go on building it."""
     before = path.read_bytes()
+    _go_on(path)
     found = oc.Atlas.load(path)
     n = found.problem.n
     q = found.problem.domain.centre + np.random.default_rng(0).uniform(-1, 1, (30, n)) * found.problem.domain.half_width
@@ -54,6 +57,23 @@ def use(path: Path) -> None:
         found.chart(number)
     evaluate_atlas(found, 200, 0)
     assert path.read_bytes() == before
+
+
+def _go_on(path: Path) -> None:
+    """Go on building a copy: it is refused and stays as it is, or nothing of it is lost."""
+    before, copy, plan = path.read_bytes(), path.with_name("mutant.copy"), atlas().plan
+    copy.write_bytes(before)
+    try:
+        with ThreadPoolExecutor(1) as executor:
+            again = oc.build_atlas(plan.problem, copy, plan.settings, time_limit=0, executor=executor, **AROUND)
+    except AtlasFileError:
+        assert copy.read_bytes() == before, "a refused file is changed"
+        return
+    rest = b"".join(other.read_bytes() for other in path.parent.glob("mutant.copy.rest*"))
+    whole = before[: len(before) - len(rest)]
+    assert copy.read_bytes()[: len(whole)] == whole, "bytes of the file are gone"
+    assert rest == before[len(whole) :], "what was cut is not kept"
+    assert len(rest) > 0 or len(again) == len(atlas()), "charts are gone"
 
 
 def mutant(original: Path, rng: Rng) -> bytes:

@@ -83,10 +83,30 @@ def _bent(rng: Rng, good: np.ndarray) -> Any:
     return pick(rng, (*shapes, good.tolist() * 2 if good.ndim else [], dict(enumerate(flat))))
 
 
+class Like:
+    """What NumPy turns into an array, as it does tensors of PyTorch, but neither an array nor a number itself."""
+
+    def __init__(self, content: Any) -> None:
+        self.content = content
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.content, dtype=dtype)
+
+
 @cache
 def _values() -> tuple[Any, ...]:
     numbers = (0, 1, 2, -1, 10**5, 10**9, 10**18, 10**400, 1.5, -0.0, 1e-320, 1e9, 1e300, np.nan, np.inf, -np.inf, 1j)
-    numpies = (np.float32(1), np.int8(3), np.array(2.0), np.zeros(0), np.zeros(3), np.ones((3, 3)), np.zeros((2, 0)))
+    numpies = (
+        np.float32(1),
+        np.int8(3),
+        np.array(2.0),
+        np.ones(1),
+        np.ones((1, 1)),
+        np.zeros(0),
+        np.zeros(3),
+        np.ones((3, 3)),
+        np.zeros((2, 0)),
+    )
     more = (
         np.full(3, np.nan),
         np.array(["1", "2", "3"]),
@@ -95,6 +115,7 @@ def _values() -> tuple[Any, ...]:
         np.ones((4, 3), dtype=complex),
         np.eye(3) > 0,
     )
+    ones = ([0.5], (1.0,), [np.array(1.0)], np.ones(1), np.ones((1, 1)), ca.DM(0.5), Like(0.5), Like([0.1, 0.2, 0.3]))
     plain = (None, True, False, b"bytes", [], (), {}, set(), object(), type, len, print, range(3), Fraction(1, 3), ...)
     nested = (
         [[1], [1, 2]],
@@ -118,7 +139,7 @@ def _values() -> tuple[Any, ...]:
         lambda q: ca.if_else(q[0] > 0, 1, 2),
     )
     paths = (Path("nowhere/x"), Path("/dev/full"), Path("/proc/x"), Path("/dev/null/x"), Path(), Path(".."))
-    return (*numbers, *numpies, *more, *plain, *nested, *symbols, *functions, *paths)
+    return (*numbers, *numpies, *more, *ones, *plain, *nested, *symbols, *functions, *paths)
 
 
 @cache

@@ -18,6 +18,8 @@ from fuzz.paths import logs, paths, postures
 from fuzz.robots import robots
 from fuzz.runs import runs
 from fuzz.steps import steps
+from fuzz.threads import threads
+from fuzz.ticks import ticks
 from fuzz.views import views
 
 CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
@@ -37,6 +39,8 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "runs": runs,
     "signals": signals.campaign,
     "steps": steps,
+    "threads": threads,
+    "ticks": ticks,
     "views": views,
 }
 

@@ -64,10 +64,12 @@ def judge(originals: Path, seed: int) -> str | None:
 
 
 def use(name: str, path: Path) -> None:
-    """Resume the fit."""
+    """Resume the fit; a file that is refused stays as it is."""
+    before = path.read_bytes()
     try:
         found = oc.fit(problem(), **FITS[name], checkpoint=path)
     except CheckpointError:
+        assert path.read_bytes() == before, "a refused checkpoint is changed"
         raise
     except OrthocasError as error:  # where the numbers in the file lead to
         raise OrthocasError(f"mutant: {error}") from None

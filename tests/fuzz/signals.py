@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ _SECONDS = 300.0  # for one round, on a busy machine
 _PATIENCE = 20.0  # seconds from a signal to the end of the process
 _LATE = 1.0  # seconds that a run may go on after a signal and end well
 _AFTERWARDS = 5.0  # seconds until the last process of a command has gone
+WHOM = ("it", "all its processes", "a worker")  #: who gets a signal; a command without workers gets it itself
 _SIGNALS = (signal.SIGINT, signal.SIGINT, signal.SIGINT, signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 _LOOP = """
 import orthocas as oc
@@ -87,10 +88,10 @@ def judge(seed: int) -> str | None:
     with place() as folder:
         for _ in range(KILLS):
             number = _SIGNALS[rng.integers(len(_SIGNALS))]
-            moment, alone = rng.uniform(0.02, 1.1) * whole, bool(rng.integers(2))
-            what = _stopped(folder, name, number, moment, alone, wanted)
+            moment, whom = rng.uniform(0.02, 1.1) * whole, WHOM[rng.integers(len(WHOM))]
+            what = _stopped(folder, name, number, moment, whom, wanted)
             if what is not None:
-                return f"{name}, {signal.Signals(number).name} after {moment:.2f} of {whole:.2f} s: {what}"
+                return f"{name}, {signal.Signals(number).name} to {whom} after {moment:.2f} of {whole:.2f} s: {what}"
         process = _start(folder, name)
         out, err = process.communicate()
         if process.returncode != 0:
@@ -99,17 +100,20 @@ def judge(seed: int) -> str | None:
         return f"{name}: leftovers {left}" if left else _difference(found, wanted)
 
 
-def _stopped(folder: Path, name: str, number: int, moment: float, alone: bool, wanted: dict[str, Any]) -> str | None:
-    """Run a command, stop it, and look at what it leaves; Ctrl-C and SIGHUP may come to all its processes at once."""
-    process = _start(folder, name)
+def _stopped(folder: Path, name: str, number: int, moment: float, whom: str, wanted: dict[str, Any]) -> str | None:
+    """Run a command, stop it or one of its workers, and look at what it leaves."""
+    process, worker = _start(folder, name), None
     try:
         process.wait(moment)
     except subprocess.TimeoutExpired:
-        together = number in (signal.SIGINT, signal.SIGHUP) and not alone
-        (os.killpg if together else os.kill)(process.pid, number)
+        workers = _workers(process.pid) if whom == "a worker" else []
+        worker = workers[0] if workers else None
+        together = number in (signal.SIGINT, signal.SIGHUP) and whom == "all its processes"
+        with suppress(ProcessLookupError):  # it ended meanwhile
+            (os.killpg if together else os.kill)(worker or process.pid, number)
     start = time.monotonic()
     try:
-        out, err = process.communicate(timeout=_PATIENCE)
+        out, err = process.communicate(timeout=_PATIENCE if worker is None else _SECONDS)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         return f"still running {_PATIENCE:g} s later"
@@ -121,6 +125,8 @@ def _stopped(folder: Path, name: str, number: int, moment: float, alone: bool, w
         return f"processes {left} still run"
     if process.returncode == 0 and (what := _difference(numbers(folder, out), wanted)):
         return f"exit code 0 with {what}"
+    if worker is not None:
+        return _complaint_of_worker(process.returncode, err) or torn(folder)
     said = None if name == "loop" else _complaint(process.returncode, number, late, err)
     drafts = [] if number == signal.SIGKILL else [name for name in _drafts(folder) if f"-{process.pid}-" in name]
     return said or (f"drafts {drafts} are left" if drafts else torn(folder))
@@ -137,6 +143,12 @@ def _complaint(code: int, number: int, late: float, err: str) -> str | None:
     if "Traceback" in err or "Exception ignored" in err or "Error" in err:
         return f"a traceback: {err[-600:]}"
     return f"the signal was lost: the run went on for {late:.1f} s" if code == 0 and late > _LATE else None
+
+
+def _complaint_of_worker(code: int, err: str) -> str | None:
+    """What is wrong with a command of which one worker was stopped: it goes on, and says so in one line at most."""
+    lines = [line for line in err.splitlines() if not line.startswith("note: ")]
+    return f"exit code {code} with {lines[:5]}" if code != 0 or len(lines) > 1 else None
 
 
 def _difference(found: dict[str, Any], wanted: dict[str, Any]) -> str | None:
@@ -209,6 +221,19 @@ def _attend_signals() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+
+
+def _workers(session: int) -> list[int]:
+    """The processes of a session that multiprocessing started to work."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            of_session = (path / "stat").read_text().rpartition(")")[2].split()[3]
+            if int(of_session) == session and b"spawn_main" in (path / "cmdline").read_bytes():
+                found.append(int(path.name))
+        except (OSError, ValueError):
+            continue  # it ended meanwhile
+    return found
 
 
 def _processes(session: int) -> list[str]:
