@@ -67,7 +67,8 @@ def test_evaluate_json_has_the_promised_keys(run: Run, saved: str) -> None:
     assert set(data["task_angle_deg"]) == {"mean", "std", "max"}
     assert set(data["conditioning"]) == {"min", "p01", "mean"}
     want = oc.evaluate(oc.load(saved), 500, 3).as_dict()
-    assert data == json.loads(json.dumps(want))
+    assert {name: value for name, value in data.items() if name in want} == json.loads(json.dumps(want))
+    assert set(data) - set(want) == {"xi_range", "xi_stops"}
 
 
 @pytest.mark.slow
