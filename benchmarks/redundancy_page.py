@@ -1,4 +1,4 @@
-"""Tables and pictures of the redundancy benchmark, from `benchmarks/redundancy/results`, for docs/peers.md.
+"""Tables and pictures of the redundancy benchmark, from `benchmarks/redundancy/results`, for docs/measurements/redundancy.md.
 
 Writes docs/records/redundancy.json and docs/figures/redundancy_SCENARIO.png, and puts every table between the comments
 `<!-- NAME -->` and `<!-- end -->` of the page.
@@ -18,7 +18,7 @@ from redundancy.protocol import Scenario
 from redundancy.runner import RESULTS, scenarios
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE, RECORD = ROOT / "docs" / "peers.md", ROOT / "docs" / "records" / "redundancy.json"
+PAGE, RECORD = ROOT / "docs" / "measurements" / "redundancy.md", ROOT / "docs" / "records" / "redundancy.json"
 FIGURES = ROOT / "docs" / "figures"
 GREY, BLUE, RED = "#808080", "#1f77b4", "#d62728"
 WIDTH, HEIGHT, BESIDE = 7.2, 0.24, 0.1  # of a picture, of a row in it [in]; of the space for failures
