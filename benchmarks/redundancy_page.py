@@ -1,4 +1,4 @@
-"""Tables and pictures of the redundancy benchmark, from `benchmarks/redundancy/results`, for docs/measurements/redundancy.md.
+"""Tables and pictures of the redundancy benchmark, from `benchmarks/redundancy/results`, for the page.
 
 Writes docs/records/redundancy.json and docs/figures/redundancy_SCENARIO.png, and puts every table between the comments
 `<!-- NAME -->` and `<!-- end -->` of the page.

@@ -18,10 +18,10 @@ from orthocas.viewer.looks import Look, Solid, capsule, stick_arm, urdf_look
 from orthocas.viewer.rendering import Camera, Layer, render
 
 RADIUS, LOOPS, STEPS = 0.1, 4, 400  #: of the circle [m]; circles; steps of each
-SWING, LOOP, PAUSE = 44, 20, 8  #: pictures of the swing, of each circle, and at rest after it
-SIZE, BARE, COLOURS = (400, 430), 46, 96  #: of a panel [pixels]; rows for the caption; of the film
-SECONDS, LARGEST = 0.08, 2_000_000  #: between pictures; bytes
-CAMERA = Camera((2.9, -1.9, 1.35), (0.22, 0.0, 0.42), 24.0)
+SWING, LOOP, PAUSE = 36, 16, 8  #: pictures of the swing, of each circle, and at rest after it
+SIZE, BARE, COLOURS = (380, 400), 40, 48  #: of a panel [pixels]; rows for the caption; of the film
+SECONDS = 0.1  #: between pictures
+CAMERA = Camera((2.9, -1.9, 1.35), (0.2, 0.0, 0.41), 15.5)
 TRACE = (217, 95, 2)
 
 
@@ -105,9 +105,10 @@ def draw(
     at = [min(round(k * STEPS / LOOP), len(held) - 1) for k in range(1, LOOPS * LOOP + 1)]
     rows = [(a, swung[0], "xi swings the elbow, the hand stays", "") for a in swung]
     for k in at:
-        off = f"{np.abs(drifted[k] - drifted[0]).max():.2f} rad off" if k % STEPS == 0 else ""
-        back = "joints are back" if k % STEPS == 0 else ""
-        row = (held[k], drifted[k], f"xi held: {back}", f"least norm: {off}")
+        back, off = "", ""
+        if k % STEPS == 0:
+            back, off = ": the joints are back", f": {np.abs(drifted[k] - drifted[0]).max():.2f} rad off"
+        row = (held[k], drifted[k], f"xi held{back}", f"least norm{off}")
         rows += [row] * (1 + PAUSE * (k % STEPS == 0))
     hand = robot.tip_position(held[: STEPS + 1])
     memory: dict[bytes, np.ndarray] = {}

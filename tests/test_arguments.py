@@ -102,7 +102,10 @@ def test_only_real_numbers_are_numbers(value: Any) -> None:
         as_float_array("q", value)
 
 
-@pytest.mark.parametrize("value", [[1.0], (1.0,), np.ones(1), Like(1.0), [np.array(1.0)]], ids=repr)
+NOT_ONE = {"list": [1.0], "tuple": (1.0,), "array": np.ones(1), "tensor": Like(1.0), "nested": [np.array(1.0)]}
+
+
+@pytest.mark.parametrize("value", NOT_ONE.values(), ids=NOT_ONE)
 def test_one_number_is_no_list_and_no_tensor(value: Any) -> None:
     """What is checked as a number is computed with as it is."""
     for call in (lambda: oc.Weights(task=value), lambda: fitted().chart.inverse(np.zeros(3), tolerance=value)):
