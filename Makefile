@@ -42,7 +42,7 @@ bench: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet -e '.[bench]'
 	$(BIN)/python benchmarks/run_all.py
 
-redundancy: .venv-redundancy/.installed  ## methods of redundancy resolution side by side (30 minutes), for docs/peers.md
+redundancy: .venv-redundancy/.installed  ## methods of redundancy resolution side by side (30 minutes), for docs/measurements/redundancy.md
 	OMP_NUM_THREADS=1 PYTHONPATH=. .venv-redundancy/bin/python benchmarks/redundancy_benchmark.py
 	PYTHONPATH=. .venv-redundancy/bin/python benchmarks/redundancy_page.py
 

@@ -213,7 +213,8 @@ class _OperationalSpace(Shown):
             "remembers": remembers,
         }.items():
             object.__setattr__(self, name, value)
-        _ = self.memory  # raises for bounds of another size
+        if remembers is not None:
+            _ = self.memory  # raises for bounds of another size
         doubts = _like_a_percentage(self.damping_ratio)
         if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
             doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")

@@ -95,10 +95,7 @@ class Tight(OnChart):
     grid = ({"half_width": 0.6}, {"half_width": 0.3}, {"half_width": 0.9})
 
     def __init__(self, arm: Arm, half_width: float) -> None:
-        if arm.mobile:
-            box, family = oc.Box(arm.home, half_width), oc.Mobile(oc.Polynomial(2))
-        else:
-            box, family = around_home(arm, half_width), oc.Polynomial(3)
+        box, family = around_home(arm, half_width), oc.Mobile(oc.Polynomial(2)) if arm.mobile else oc.Polynomial(3)
         clear = box if arm.mobile else oc.ClearBox(box, arm.task, 0.05)
         super().__init__(arm, oc.fit(oc.Problem(arm.robot, arm.task, domain=clear), family).chart)
 
