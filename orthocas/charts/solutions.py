@@ -12,8 +12,10 @@ from orthocas.charts.newton import GOAL, REFRESHES, Bound, PointFunctions, Point
 from orthocas.errors import InvalidValueError, InverseError
 from orthocas.tasks.domains import Domain, contains, reach
 from orthocas.tools.batch import dense_function
+from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, Indices, as_float_array, as_point, require_shape
 from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.interrupts import deferred
 
 _FEW = 5  # rows that a message names
 _ROUNDED = 1e-9  # error up to which only rounding may have stopped the decrease
@@ -161,7 +163,8 @@ class Tracker(Shown):
         self._limit = np.broadcast_to(limit, n)
         self._solver = PointSolver(functions)
         self._before, self._guarded = np.empty(n), np.empty(2)
-        function = _guard(domain, self._limit)
+        with deferred(), building:  # CasADi's expressions are not for several threads at a time
+            function = _guard(domain, self._limit)
         self._guard = Bound(function, [self._before, self._solver.reached], [self._guarded])
         self.reset(q0)
 

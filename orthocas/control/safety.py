@@ -12,7 +12,9 @@ from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_float_array, as_number, require_count, require_shape
+from orthocas.tools.interrupts import deferred
 
 _SAMPLES, _SEED = 256, 0
 _RATE = {"torque": 1000.0, "velocity": 20.0}  # [N m/s] as on many arms, 1 N m in a millisecond; [rad/s^2]
@@ -158,11 +160,12 @@ class Safety:
 
 def _joint_motion(controller: Controller, points: Array, slow: Array) -> Array:
     """Time that joints take at slow speeds (n,) per unit of each controlled quantity, at 90 % of the points (k,)."""
-    q = ca.MX.sym("q", controller.problem.n)
-    m, relative = controller.problem.m, Relative(controller.problem.task)
-    moving = ca.vertcat(relative.rates(q), ca.jacobian(controller.measured(q)[m:], q))
-    rows = Batched(dense_function("J", [q], [moving]))(points)[0]
-    J = rows.reshape(len(points), -1, q.shape[0])
+    n, m, relative = controller.problem.n, controller.problem.m, Relative(controller.problem.task)
+    with deferred(), building:  # threads share the law
+        q = ca.MX.sym("q", n)
+        moving = ca.vertcat(relative.rates(q), ca.jacobian(controller.measured(q)[m:], q))
+        function = dense_function("J", [q], [moving])
+    J = Batched(function)(points)[0].reshape(len(points), -1, n)
     largest = (np.abs(np.linalg.pinv(J[np.isfinite(J).all(axis=(1, 2))])) / slow[:, None]).max(axis=1)
     return np.asarray(np.quantile(largest, 0.9, axis=0))
 

@@ -14,7 +14,9 @@ from orthocas.charts.newton import Newton
 from orthocas.charts.phi import largest
 from orthocas.errors import PathError, SolveError
 from orthocas.tools.batch import Batched
+from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, Indices
+from orthocas.tools.interrupts import deferred
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
@@ -37,12 +39,13 @@ class Solver:
     def __init__(self, chart: "Chart") -> None:
         self.chart = chart
         self._newton = Newton(chart.phi_map)
-        q, v, w = (ca.MX.sym(name, chart.n) for name in ("q", "v", "w"))
-        bends = (
-            chart.problem.task.rates_derivative_function(q, v, w),
-            chart.coordinates.functions["second_derivative"](q, v, w),
-        )
-        turning = ca.Function("turning", [q, v, w], [ca.densify(ca.vertcat(*bends))])
+        with deferred(), building:  # threads share the chart
+            q, v, w = (ca.MX.sym(name, chart.n) for name in ("q", "v", "w"))
+            bends = (
+                chart.problem.task.rates_derivative_function(q, v, w),
+                chart.coordinates.functions["second_derivative"](q, v, w),
+            )
+            turning = ca.Function("turning", [q, v, w], [ca.densify(ca.vertcat(*bends))])
         self._turning = Batched(chart.runnable(turning))
 
     def jacobian(self, q: Array) -> Array:

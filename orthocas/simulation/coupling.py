@@ -11,8 +11,10 @@ from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError
 from orthocas.simulation.trajectory import Trajectory
 from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.display import Shown
+from orthocas.tools.interrupts import deferred
 
 _NO_STEP = 1e-9  # smaller differences of targets are rounding
 
@@ -106,7 +108,9 @@ def task_acceleration_breakdown(chart: Chart, trajectory: Trajectory) -> Breakdo
     require_kind("trajectory", trajectory, Trajectory)
     if trajectory.kind != "torque":
         raise InvalidValueError("trajectory", f"a run of '{trajectory.controller}'", "a run of a torque controller")
-    parts = Batched(_parts(chart))(trajectory.q, trajectory.dq, trajectory.command)
+    with deferred(), building:  # threads share the chart
+        function = _parts(chart)
+    parts = Batched(function)(trajectory.q, trajectory.dq, trajectory.command)
     return Breakdown(chart.problem.task.labels, *parts)
 
 

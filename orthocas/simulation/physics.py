@@ -169,7 +169,8 @@ def run_physics(
     times = np.arange(ticks) / rate
     wanted, errors = np.hstack(reference.sample(times)), noise.sample(ticks, loop.n)
     shares = loop.loads.shares(times, 1 / rate)
-    law = _law(loop, len(reference.labels)) if supervised is None else supervised.tick
+    with deferred(), building:
+        law = _law(loop, len(reference.labels)) if supervised is None else supervised.tick
     if supervised is not None:
         supervised.start(start[: loop.n] + errors[0, : loop.n])
 
