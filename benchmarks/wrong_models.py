@@ -1,9 +1,9 @@
 """Arms that are not what the law believes, in MuJoCo: masses 40 % off, 3 kg in the hand, torques 2 N m off (5 min).
 
 PD+ coupled of ready charts with default gains and settings, in C at 1 kHz, without a memory, with a momentum observer
-and with adaptation. Each case runs five times, from rest at random postures in the inner half of the domain, with the
-torque that held the arm before as the command of the start. The hand takes the 3 kg, and torques go off, half a second
-after it. Sag: how far the flange is from where it should be 2 s later, at most. Left: runs in which the catcher took
+and with adaptation. Each case runs five times, from rest at random postures in the inner half of the domain; nothing is
+known of the torque that held the arm before. The hand takes the 3 kg, and torques go off, half a second after the
+start. Sag: how far the flange is from where it should be 2 s later, at most. Left: runs in which the catcher took
 over. Torques are off at the joints that feel at least 0.02 kg m^2: 2 N m turn a bare flange without a rotor at 13 rad/s
 after one tick, before anything is measured. Postures at which the motors could not hold the arm are not drawn (nan:
 there are no others).
@@ -67,7 +67,7 @@ def sag(law: PDPlus, library: CompiledLibrary, case: str, seed: int) -> tuple[fl
         push = 2.0 * rng.choice([-1.0, 1.0], robot.n) * (np.diag(robot.mass_matrix(q)) > LEAST_INERTIA)
     supervisor, plant = Supervisor(library, law), MuJoCoPlant(first)
     plant.reset(q)
-    supervisor.start(q, first.gravity(q))
+    supervisor.start(q)
     reference, left = np.concatenate([chart.phi(q), np.zeros(2 * chart.n)]), False
     for k in range(CHANGE + LENGTH):
         if k == CHANGE and then is not first:

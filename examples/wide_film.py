@@ -19,7 +19,7 @@ from orthocas.viewer.rendering import Camera, Layer, render
 
 RADIUS, LOOPS, STEPS = 0.1, 4, 400  #: of the circle [m]; circles; steps of each
 SWING, LOOP, PAUSE = 36, 16, 8  #: pictures of the swing, of each circle, and at rest after it
-SIZE, BARE, COLOURS = (380, 400), 40, 48  #: of a panel [pixels]; rows for the caption; of the film
+SIZE, BARE, COLOURS = (340, 360), 40, 40  #: of a panel [pixels]; rows for the caption; of the film
 SECONDS = 0.1  #: between pictures
 CAMERA = Camera((2.9, -1.9, 1.35), (0.2, 0.0, 0.41), 15.5)
 TRACE = (217, 95, 2)

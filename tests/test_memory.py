@@ -166,14 +166,17 @@ def test_c_remembers_what_python_remembers(chart: oc.Chart, tmp_path: Path, reme
         there, _ = ticks.tick(x, dq, wanted, TICK)
         assert status in (ControlStatus.OK, ControlStatus.SATURATED)
         np.testing.assert_allclose(command, there, atol=2e-2 if single else 1e-9)
-        np.testing.assert_allclose(supervisor.correction, ticks.fields["correction"], atol=2e-2 if single else 1e-9)
+        np.testing.assert_allclose(
+            supervisor.memory["correction"], ticks.fields["correction"], atol=2e-2 if single else 1e-9
+        )
         dq = dq + TICK * np.linalg.solve(robot.mass_matrix(x), command - robot.bias(x, dq))
         x = x + TICK * dq
+    assert np.abs(supervisor.memory["correction"]).max() > 1.0
     supervisor.hold(x)
-    assert np.abs(supervisor.correction).max() > 1.0  # what is known of the arm stays known while brakes hold it
+    assert not supervisor.memory["correction"].any()  # a load may have gone when brakes open again
     supervisor.start(x, robot.gravity(x))
     lacks = robot.gravity(x) - chart.problem.robot.gravity(x)
-    np.testing.assert_allclose(supervisor.correction, lacks, atol=1e-4)
+    np.testing.assert_allclose(supervisor.memory["correction"], lacks, atol=1e-4)
 
 
 @needs_c
@@ -189,15 +192,14 @@ def test_the_catcher_holds_a_heavier_arm_with_what_is_known_of_it(chart: oc.Char
         x, dq, wanted = q.copy(), np.zeros(3), at_rest(chart, q).ravel()
         supervisor.start(q, heavy.gravity(q))
         supervisor.step(q, dq, wanted, TICK)
-        supervisor.hold(q)
-        supervisor.release(q)
+        supervisor.step(q, np.full(3, 20.0), wanted, 1.0)  # late: caught
         for _ in range(1000):
             command, status = supervisor.step(x, dq, wanted, TICK)
             assert status == ControlStatus.CAUGHT
             dq = dq + TICK * np.linalg.solve(heavy.mass_matrix(x), command - heavy.bias(x, dq))
             x = x + TICK * dq
         found[name] = float(np.abs(x - q).max())
-    assert found["momentum"] < 1e-3 < found["none"]
+    assert found["momentum"] < 5e-3 < found["none"] / 5, found
 
 
 @pytest.mark.slow
@@ -244,7 +246,48 @@ def test_a_memory_of_a_users_own_runs_in_python_and_c(chart: oc.Chart, tmp_path:
         supervisor.step(x, np.full(3, 1e-3 * (k % 2)), at_rest(chart, q).ravel(), TICK)
         ticks.tick(x, np.full(3, 1e-3 * (k % 2)), at_rest(chart, q), TICK)
     assert np.abs(ticks.fields["sum"]).max() > 1e-3
-    np.testing.assert_allclose(supervisor.sum, ticks.fields["sum"], atol=1e-12)
+    np.testing.assert_allclose(supervisor.memory["sum"], ticks.fields["sum"], atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stiffness", "ratio"), [(20.0, 0.7), (8.0, 0.7), (50.0, 0.3)])
+def test_adaptation_does_not_make_soft_laws_swing(chart: oc.Chart, stiffness: float, ratio: float) -> None:
+    """With an exact model; a weight of the error of 5 1/s did, for such springs."""
+    law = PDPlus(chart, stiffness, ratio, limit=400.0, remembers=Adaptation())
+    ticks, robot, q = Remembering(law), chart.problem.robot, chart.problem.domain.centre
+    wanted, x, dq, period = at_rest(chart, q), q + 0.05, np.zeros(3), 2e-3
+    away = []
+    for _ in range(5000):
+        command, _ = ticks.tick(x, dq, wanted, period)
+        dq = dq + period * np.linalg.solve(robot.mass_matrix(x), command - robot.bias(x, dq))
+        x = x + period * dq
+        away.append(np.abs(x - q).max())
+    assert max(away[4000:]) < 0.5 * max(away[:1000])
+
+
+def test_memories_that_do_not_fit_are_refused(chart: oc.Chart) -> None:
+    @dataclass(frozen=True)
+    class Odd(Leaky):
+        gain: str = "stiffness"
+        size: int = 1
+        field: str = "sum"
+
+        def of(self, law: Any) -> Memory:
+            sizes = {"q": 3, "dq": 3, "reference": 3, "reference_velocity": 3, "reference_acceleration": 3}
+            sizes |= {name: len(value) for name, value in law.gains.items()} | {"command": 3, "active": 1, "period": 1}
+            inputs = {name: ca.MX.sym(name, size) for name, size in sizes.items()}
+            inputs[self.field] = ca.MX.sym(self.field, self.size)
+            step = ca.Function("step", [*inputs.values()], [inputs[self.field]], [*inputs], [f"next_{self.field}"])
+            return Memory({self.field: np.zeros(self.size)}, {self.gain: self.field}, step)
+
+    law_of(chart, Odd(size=3))
+    for odd, words in ((Odd(), "size of its gain"), (Odd("limit", 3), "not the limit"), (Odd(field="Sum"), "for C")):
+        with pytest.raises(InvalidValueError, match=words):
+            law_of(chart, odd)
+    step = law_of(chart, MomentumObserver()).memory.step  # type: ignore[union-attr]
+    start = {name: np.full(3, np.nan) for name in ("expected", "drive", "correction")}
+    with pytest.raises(InvalidValueError, match="finite"):
+        Memory(start, {}, step)
 
 
 def test_what_cannot_be_remembered_is_refused(chart: oc.Chart) -> None:

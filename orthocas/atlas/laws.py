@@ -13,6 +13,7 @@ from orthocas.atlas.evaluation import Blend
 from orthocas.charts.chart import Chart
 from orthocas.control.controller import Controller, ControlStatus
 from orthocas.control.gains import command_limit, non_negative_gains, positive_gains
+from orthocas.control.memory import memory_of
 from orthocas.errors import InvalidValueError, LawWarning, PathError
 from orthocas.tools.cached import building, cached_property
 from orthocas.tools.checks import Array, require_kind
@@ -116,11 +117,15 @@ class AskedPosture:
         """Warn if the same hand-over comes again with other joints."""
         charts, x = (self.number, number), self._x[0]
         sizes = self.chart.phi_sizes[: len(x)]
-        alike = (q for known, there, q in self._passed if known == charts and (abs(x - there) < _ALIKE * sizes).all())
+        alike = (
+            (q, there)
+            for known, there, q in self._passed
+            if known == charts and (abs(x - there) < _ALIKE * sizes).all()
+        )
         before = next(alike, None)
         if before is None:
             self._passed.append((charts, x.copy(), self.q.copy()))
-        elif not self._warned and (drift := float(np.abs(self.q - before).max())) > _DRIFT:
+        elif not self._warned and (drift := self._drift_since(*before, x)) > _DRIFT:
             self._warned = True
             warnings.warn(
                 f"this motion repeats through several charts, and its joints are {drift:.2g} off since it passed here "
@@ -128,6 +133,11 @@ class AskedPosture:
                 LawWarning,
                 stacklevel=3,
             )
+
+    def _drift_since(self, q: Array, there: Array, x: Array) -> float:
+        """How far joints are from q, beyond what the small difference of the tool's places asks of them."""
+        J = self.chart.jacobian(self.q)[: len(x)]
+        return float(np.abs(self.q - q - np.linalg.pinv(J) @ (x - there)).max())
 
     def _held(self, t: float) -> Array:
         """xi_d with two derivatives, (3, r), t after the last hand-over."""
@@ -223,6 +233,8 @@ class HandedOver(Shown):
                 law = self.law(asked.chart)
                 if law.command != "torque":
                     raise InvalidValueError("law", f"one that commands {law.command}", "a torque law")
+                if memory_of(law) is not None:
+                    raise InvalidValueError("law", "one with a memory", "one without, because a memory is of one chart")
                 while len(self._laws) >= _LAWS:
                     self._laws.pop(next(iter(self._laws)))
                 self._laws[asked.number] = law

@@ -32,7 +32,7 @@ _OF_MEMORY = {  # code of laws that remember, by its place in the templates of t
     "known_memory": "  known = !state->fresh && state->bad_ticks == 0;\n",
     "use_memory": "",
     "remember": "  remember(state, &shifted, given, cut ? 0.0 : state->weight,\n"
-    "           known && state->mode == ${NAME}_LAW ? since : 0.0);\n",
+    "           known && state->mode != ${NAME}_HOLD ? since : 0.0);\n",
 }
 _OF_CORRECTION = {  # and of those whose memory is a torque
     "correct_command": "    correct(state, command);\n",
@@ -163,6 +163,9 @@ def _memory_values(controller: Controller, known: Mapping[str, str]) -> dict[str
         f"  arg[{first + 3 + i}] = last.{field};\n  res[{i}] = state->memory.{field};"
         for i, field in enumerate(memory.start)
     ]
+    kept = [
+        f"  keep_numbers(state->memory.{field}, last.{field}, {len(value)});" for field, value in memory.start.items()
+    ]
     values = {
         **known,
         **control_values(controller),
@@ -170,6 +173,7 @@ def _memory_values(controller: Controller, known: Mapping[str, str]) -> dict[str
         "start": ",\n".join(f"  {{{numbers(value)}}}" for value in memory.start.values()),
         "after_gains": str(first),
         "pointers": "\n".join(pointers),
+        "kept": "\n".join(kept),
         "corrections": "",
         "start_meaning": "",
     }

@@ -114,10 +114,12 @@ class Supervisor:
         return pace
 
     def __getattr__(self, name: str) -> Any:
-        """The fields of the state in C: mode, cause, weight, anchor, ..., and those of its memory."""
+        """The fields of the state in C: mode, cause, weight, anchor, ...; `memory` is a dictionary of arrays."""
         if name.startswith("_"):
             raise AttributeError(name)
         value = getattr(self._state, name)
+        if name == "memory":
+            return {field[0]: np.array(getattr(value, field[0])) for field in value._fields_}
         return np.array(value) if isinstance(value, ctypes.Array) else value
 
     def _asked(self, reference: Array | ChartReference) -> tuple[Array, Any]:
@@ -169,13 +171,19 @@ def _state_type(
         *((name, quantities) for name in ("offset", "integral")),
         *(("inertia", precision.c_type * n**2) for _ in range(has_spring)),
         *((name, joints) for name in ("carry",) if of_atlas),
-        *((name, precision.c_type * size) for name, size in remembered.items()),  # the struct `memory`
+        *(("memory", _memory_type(remembered, precision)) for _ in range(bool(remembered))),
         *((name, quantities) for name in ("value", "velocity", "acceleration")),
         *((name, ctypes.c_int) for name in ("reference_chart",) if of_atlas),
         ("safety", settings),
         ("limit", joints),
     ]
     return type("State", (ctypes.Structure,), {"_fields_": layout})
+
+
+def _memory_type(remembered: dict[str, int], precision: Precision) -> type[ctypes.Structure]:
+    """The struct of what a law remembers."""
+    layout = [(name, precision.c_type * size) for name, size in remembered.items()]
+    return type("Memory", (ctypes.Structure,), {"_fields_": layout})
 
 
 def _settings_type(values: dict[str, Any], precision: Precision) -> type[ctypes.Structure]:

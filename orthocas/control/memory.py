@@ -1,5 +1,6 @@
 """Laws with a state: what a law remembers from tick to tick, and the two memories that come with orthocas."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
@@ -14,7 +15,15 @@ from orthocas.control.linear_algebra import block_inertia
 from orthocas.errors import InvalidValueError
 from orthocas.robots import dynamics
 from orthocas.robots.tree import KinematicTree
-from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
+from orthocas.tools.checks import (
+    Array,
+    as_float_array,
+    as_number,
+    as_point,
+    require_finite,
+    require_kind,
+    require_shape,
+)
 from orthocas.tools.display import Shown, number_list
 
 if TYPE_CHECKING:
@@ -22,7 +31,7 @@ if TYPE_CHECKING:
 
 _SHARE = 0.5  # of the law's limit that a correction may use, by default
 _GRAVITY = 9.81  # [m/s^2]
-_CROSSED = 5.0  # weight [1/s] of the error in the filtered error J^-1 (de + weight e)
+_CROSSED = 0.5  # weight of the error in J^-1 (de + weight e), in the decay rate of the slowest mode
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +62,10 @@ class Memory:
     def __post_init__(self) -> None:
         require_kind("step", self.step, ca.Function)
         start = {name: as_float_array(name, value) for name, value in self.start.items()}
+        for name, value in start.items():
+            require_finite(name, value)
+            if not re.fullmatch(r"[a-z]\w*", name, flags=re.ASCII):
+                raise InvalidValueError("name of a field", repr(name), "small letters, digits and underscores, for C")
         object.__setattr__(self, "start", start)
         wanted = {name: len(value) for name, value in start.items()}
         known = self.step.name_in()
@@ -63,6 +76,18 @@ class Memory:
         for gain, name in self.adds.items():
             if name not in start or gain not in known:
                 raise InvalidValueError("adds", f"{name} to {gain}", "a field, and a gain that is an input of step")
+
+    def require_fitting(self, controller: Controller) -> None:
+        """Raise InvalidValueError unless the step takes what the law has, and fields have the sizes of their gains."""
+        n, gains = controller.problem.n, controller.gains
+        wanted = {name: symbol.shape[0] for name, symbol in named_inputs(n, gains, len(controller.labels)).items()}
+        wanted |= {"command": n, "active": 1, "period": 1} | {name: len(value) for name, value in self.start.items()}
+        found = {name: self.step.size1_in(name) for name in self.step.name_in()}
+        if list(found.items()) != list(wanted.items()):
+            raise InvalidValueError("inputs of step", found, str(wanted))
+        for gain, name in self.adds.items():
+            if len(self.start[name]) != len(gains[gain]) or gain == "limit":
+                raise InvalidValueError("adds", f"{name} to {gain}", "a field of the size of its gain, not the limit")
 
     @property
     def torque(self) -> str | None:
@@ -206,11 +231,13 @@ class Adaptation:
 
     Inverse dynamics are linear in the errors p of the first moments (mass times centre) of the links. The law gets
     the `extra_torque` Y p with Y = Y(q, dq, w, a) at the desired velocity w and acceleration a of the joints, and
-    dp/dt = -rate gain Y^T J^-1 (de / 5 s^-1 + e) in phi, with a gain for each moment by the law's own stiffness.
-    Moments stay within bounds. Torque that no moment explains (offsets, friction) is known from the start only.
+    dp/dt = -rate gain Y^T J^-1 (de / c + e) in phi, with a gain for each moment by the law's own stiffness, and c half
+    of the decay rate of the law's slowest mode. Moments stay within bounds. Torque that no moment explains (offsets,
+    friction) is known from the start only, when all that is missing counts as such; what is wrong about that in other
+    postures is learned there.
 
     Args:
-        rate: about how fast moments are learned, > 0 [1/s].
+        rate: about how fast moments are learned, > 0 [1/s]; at most c.
         bound: largest correction of each joint, > 0, (n,) or one number [N m] or [N]; default half of the law's limit.
 
     Source:
@@ -248,13 +275,23 @@ class Adaptation:
         a = -B @ (Lambda @ bend(chart, q, dq, w, wanted))
         Y = regressor(q, dq, w, a)
         springs = self._springs(law)[list(joints)] / _GRAVITY**2
-        slope = -self.rate * springs * (Y.T @ (B @ (Lambda @ (de / _CROSSED + e))))
+        slowest = self._crossed(law)
+        slope = -min(self.rate, slowest) * springs * (Y.T @ (B @ (Lambda @ (de / slowest + e))))
         change = ca.if_else(inputs["active"] > 0, inputs["active"] * inputs["period"] * slope, 0)
         largest = np.full(len(joints), float(bound.max()) / _GRAVITY)
         moments = _cut(inputs["moments"] + _known(change), largest)
         offset = ca.if_else(inputs["period"] > 0, inputs["offset"], inputs["correction"] - Y @ moments)
         found = {"moments": moments, "offset": _known(offset), "correction": _cut(Y @ moments + offset, bound)}
         return _of_torque(fields, inputs, found)
+
+    def _crossed(self, law: "_OperationalSpace") -> float:
+        """c [1/s]; larger weights, and faster learning, make soft laws swing."""
+        modes = law.modes(law.problem.domain.centre)
+        sprung = modes.frequencies > 0
+        decays = 2 * np.pi * modes.frequencies[sprung] * np.minimum(modes.damping_ratios[sprung], 1.0)
+        if not (decays > 0).any():
+            raise InvalidValueError("law with a memory", "without springs and damping", "both, to learn from errors")
+        return _CROSSED * float(decays[decays > 0].min())
 
     def _springs(self, law: "_OperationalSpace") -> Array:
         """Stiffness of the law at the joints, the diagonal of J^T K J in the middle of the domain, (n,)."""

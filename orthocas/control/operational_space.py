@@ -261,7 +261,12 @@ class _OperationalSpace(Shown):
     @cached_property
     def memory(self) -> Memory | None:
         """What the law remembers from tick to tick."""
-        return None if self.remembers is None else self.remembers.of(self)
+        if self.remembers is None:
+            return None
+        memory = self.remembers.of(self)
+        require_kind("memory", memory, Memory)
+        memory.require_fitting(self)
+        return memory
 
     @property
     def settings(self) -> Mapping[str, str]:

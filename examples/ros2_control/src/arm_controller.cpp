@@ -54,6 +54,7 @@ CallbackReturn ArmController::on_configure(const rclcpp_lifecycle::State & /*pre
   joints_ = get_node()->get_parameter("joints").as_string_array();
   smoothness_ = get_node()->get_parameter("smoothness").as_double();
   effort_states_ = get_node()->get_parameter("effort_states").as_bool();
+  for (auto &position : present_) position = std::numeric_limits<double>::quiet_NaN();
   if (joints_.size() != ARM_JOINTS || !(smoothness_ > 0.0)) {
     RCLCPP_ERROR(get_node()->get_logger(), "expected %d joints and smoothness > 0, received %zu joints and %g",
                  ARM_JOINTS, joints_.size(), smoothness_);
@@ -84,6 +85,7 @@ CallbackReturn ArmController::on_configure(const rclcpp_lifecycle::State & /*pre
   brakes_service_ = get_node()->create_service<std_srvs::srv::SetBool>(
       "~/brakes", [this](const std::shared_ptr<std_srvs::srv::SetBool::Request> request,
                          std::shared_ptr<std_srvs::srv::SetBool::Response> response) {
+        brakes_closed_ = request->data;
         brakes_asked_ = request->data ? 1 : 0;
         response->success = true;
       });
@@ -100,7 +102,7 @@ void ArmController::publish() {
   double q[ARM_JOINTS];
   std::copy(present_.begin(), present_.end(), q);
   arm_reference_at(q, &here);
-  present.data.assign(here.value, here.value + ARM_REFERENCE);
+  if (std::isfinite(q[0])) present.data.assign(here.value, here.value + ARM_REFERENCE);  // else before the first tick
   status.data = static_cast<std::uint8_t>(status_.load());
   status_publisher_->publish(status);
   present_publisher_->publish(present);
@@ -118,7 +120,9 @@ CallbackReturn ArmController::on_activate(const rclcpp_lifecycle::State & /*prev
     RCLCPP_ERROR(get_node()->get_logger(), "the hardware reports no joint positions yet");
     return CallbackReturn::ERROR;
   }
-  arm_start(&state_, q, ARM_COMMANDS_TORQUE && effort_states_ ? effort : nullptr);  // NaN counts as not given
+  const bool held = brakes_closed_;  // then no effort says what the arm needs
+  arm_start(&state_, q, ARM_COMMANDS_TORQUE && effort_states_ && !held ? effort : nullptr);  // NaN counts as not given
+  if (held) arm_hold(&state_, q, nullptr);
   arm_reference_at(q, &reference_);
   std::copy_n(reference_.value, ARM_REFERENCE, target_.value.begin());
   target_.number = received_;  // targets from before the activation are void

@@ -50,6 +50,7 @@ class ArmController : public controller_interface::ControllerInterface {
   realtime_tools::RealtimeThreadSafeBox<Target> box_;
   std::atomic<bool> resume_asked_{false};
   std::atomic<int> brakes_asked_{-1};  // 1: they have closed; 0: they open; -1: nothing new
+  std::atomic<bool> brakes_closed_{false};
   std::atomic<int> status_{ARM_OK};
   std::atomic<unsigned> lost_{0};  // ticks in which a command could not be written
   std::array<std::atomic<double>, ARM_JOINTS> present_{};
