@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import self_motion_picture
+import wide_film
 from PIL import Image
 
 from orthocas.viewer.looks import Solid, ball
@@ -61,3 +62,18 @@ def test_the_hand_of_the_readme_stays_while_the_elbow_moves(tmp_path: Path) -> N
     assert found["elbow_moves_m"] > 0.5
     with Image.open(tmp_path / "self_motion.png") as picture:
         assert min(np.asarray(picture)[0].min(), np.asarray(picture)[:, 0].min()) == 255  # nothing touches the edge
+
+
+@pytest.mark.slow
+def test_the_film_of_the_readme_shows_a_hand_that_stays_and_joints_that_come_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wide_film, "LOOPS", 1)
+    monkeypatch.setattr(wide_film, "STEPS", 100)
+    found = wide_film.main(tmp_path, quick=True)
+    assert found["hand_moves"] < 1e-12
+    assert found["elbow_moves_m"] > 0.3
+    assert found["left_by_chart_rad"] < 1e-9
+    assert found["left_by_pseudo_inverse_rad"] > 0.1
+    with Image.open(tmp_path / "wide_chart.gif") as film:
+        assert film.n_frames > 5  # type: ignore[attr-defined]
