@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/.installed
 export PYTHONDONTWRITEBYTECODE = # or every test that starts Python compiles orthocas again
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
-.PHONY: demo paper test check docs fuzz lint types wheel-check bench redundancy figures charts clean
+.PHONY: demo paper test check docs joss fuzz lint types wheel-check bench redundancy figures charts clean
 
 demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and picture in out/
 	$(BIN)/orthocas demo --out out
@@ -23,6 +23,10 @@ check: lint  ## while working: lint and the fast tests, with the slowest of them
 docs: $(INSTALLED)  ## the documentation site in build/docs, its pages run; a warning is an error
 	$(BIN)/python -m pip install --quiet -e '.[docs]'
 	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -q -W --keep-going -E -j 2 -b html docs build/docs
+
+joss: $(INSTALLED)  ## the paper in docs/joss as build/joss/paper.pdf, to read
+	$(BIN)/python -m pip install --quiet -e '.[joss]'
+	$(BIN)/python tools/joss.py
 
 COUNT ?= 1000
 fuzz: $(INSTALLED)  ## the campaign of faults; COUNT mutants of each kind, CAMPAIGN="charts ..." for some kinds

@@ -1,7 +1,7 @@
 """Tables and pictures of the redundancy benchmark, from `benchmarks/redundancy/results`, for the page.
 
 Writes docs/records/redundancy.json and docs/figures/redundancy_SCENARIO.png, and puts every table between the comments
-`<!-- NAME -->` and `<!-- end -->` of the page.
+`<!-- NAME -->` and `<!-- end -->` of the page, and an overview of them all into the paper in docs/joss.
 """
 
 import json
@@ -19,9 +19,19 @@ from redundancy.runner import RESULTS, scenarios
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, RECORD = ROOT / "docs" / "measurements" / "redundancy.md", ROOT / "docs" / "records" / "redundancy.json"
-FIGURES = ROOT / "docs" / "figures"
+PAPER, FIGURES = ROOT / "docs" / "joss" / "paper.md", ROOT / "docs" / "figures"
 GREY, BLUE, RED = "#808080", "#1f77b4", "#d62728"
 WIDTH, HEIGHT, BESIDE = 7.2, 0.24, 0.1  # of a picture, of a row in it [in]; of the space for failures
+
+OVERVIEW = {  # methods in the paper's table, and their names there
+    "chart, tight": "tight chart",
+    "chart, wide": "wide chart",
+    "pink, posture 1e-3": "pink, small posture cost",
+    "pink, posture 0": "pink, no posture",
+    "operational space": "projector",
+    "SEW angle": "SEW angle",
+    "ssik": "ssik",
+}
 
 
 @dataclass(frozen=True)
@@ -99,6 +109,23 @@ def table(scenario: Scenario, result: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+def overview(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """A row for each scenario in Markdown: numbers as in its table, and how many arms were served if not all."""
+    lines = ["| " + " | ".join(["number", *OVERVIEW.values()]) + " |"]
+    for name, result in found.items():
+        scenario = scenarios()[name]
+        rows = {row.method: row for row in rows_of(result, result["seeds"][0])}
+        numbers = [short(rows[method], scenario) if rows[method].arms else "-" for method in OVERVIEW]
+        lines.append(f"| {' | '.join([scenario.number, *numbers])} |")
+    return lines
+
+
+def short(row: Row, scenario: Scenario) -> str:
+    """A cell of the overview."""
+    value = number(float((np.mean if scenario.percent else np.median)(row.values))) if row.values else "none"
+    return value if len(row.values) == row.arms else f"{value} ({len(row.values)}/{row.arms})"
+
+
 def common_arms(result: Mapping[str, Any]) -> set[str]:
     """The arms that ran with every seed."""
     cases = [case for row in result["methods"].values() for case in row["cases"]]
@@ -161,7 +188,7 @@ def changes(found: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, str]
 
 
 def main() -> None:
-    """Renew tables, pictures and the record."""
+    """Renew tables, pictures, the record, and the table of the paper."""
     page, known = PAGE.read_text(), scenarios()
     found = {
         name: json.loads((RESULTS / f"{name}.json").read_text())
@@ -178,6 +205,14 @@ def main() -> None:
             rf"(<!-- {name} -->\n).*?(<!-- end -->)", lambda m, text=text: f"{m[1]}\n{text}\n\n{m[2]}", page, flags=re.S
         )
         picture(known[name], result).savefig(FIGURES / f"redundancy_{name}.png", dpi=110, transparent=True)
+    lines = overview(found)
+    record["tables"].append(lines)
+    rule = "| :" + "- | :".join(["-" * 34, *["-" * 10] * len(OVERVIEW)]) + "- |"  # pandoc takes widths from it
+    text = "\n".join([lines[0], rule, *lines[1:]])
+    paper = re.sub(
+        r"(<!-- overview -->\n).*?(<!-- end -->)", lambda m: f"{m[1]}\n{text}\n\n{m[2]}", PAPER.read_text(), flags=re.S
+    )
+    PAPER.write_text(paper)
     PAGE.write_text(page)
     RECORD.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
     swapped = changes(found)

@@ -21,7 +21,7 @@ extensions = [
     "command_line",
     "table_index",
 ]
-exclude_patterns = ["_ext"]
+exclude_patterns = ["_ext", "joss"]  # the paper is no page
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 

@@ -1,5 +1,6 @@
 """What a release needs agrees: version, dependencies, and contents of the archives."""
 
+import re
 from importlib.util import find_spec
 
 import pytest
@@ -32,3 +33,14 @@ def test_contents_of_archives_are_judged() -> None:
         "w.whl lacks py.typed",
         "w.whl holds tests/",
     ]
+
+
+def test_the_paper_has_the_title_and_authors_of_the_citation_and_its_references() -> None:
+    folder = release.ROOT / "docs" / "joss"
+    paper, citation = (folder / "paper.md").read_text(), (release.ROOT / "CITATION.cff").read_text()
+    own = citation.partition("preferred-citation")[0]
+    assert re.findall("^title: .*", paper, re.MULTILINE) == re.findall("^title: .*", own, re.MULTILINE)
+    authors = re.findall(r"- name: (.*)\n    affiliation", paper)
+    assert authors == re.findall("- name: (.*)", own) != []
+    listed = re.findall(r"^@\w+\{(\w+),", (folder / "paper.bib").read_text(), re.MULTILINE)
+    assert set(re.findall(r"@(\w+)\]", paper)) == set(listed)

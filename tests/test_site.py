@@ -14,7 +14,8 @@ import orthocas
 DOCS = Path(__file__).parent.parent / "docs"
 sys.path.insert(0, str(DOCS / "_ext"))
 DIRECTIVE = re.compile(r"^\.\. auto(?:class|function|module):: (orthocas(?:\.\w+)+)$", flags=re.MULTILINE)
-PAGES = {str(path.relative_to(DOCS).with_suffix("")): path.read_text() for path in DOCS.rglob("*.md")}
+FILES = {str(path.relative_to(DOCS).with_suffix("")): path for path in DOCS.rglob("*.md")}
+PAGES = {name: path.read_text() for name, path in FILES.items() if not name.startswith("joss/")}  # the paper is no page
 
 
 def described() -> list[str]:
