@@ -176,7 +176,21 @@ class Remembering(Shown):
 
 
 @dataclass(frozen=True)
-class MomentumObserver:
+class _Correcting:
+    """A rate, and a bound on the correction."""
+
+    rate: float = 5.0
+    bound: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < as_number("rate", self.rate) < np.inf:
+            raise InvalidValueError("rate", self.rate, "a finite number > 0")
+        if self.bound is not None:
+            as_float_array("bound", self.bound)
+
+
+@dataclass(frozen=True)
+class MomentumObserver(_Correcting):
     """Finds the torque that the model does not explain from the momentum p = M dq, and takes it off the command.
 
     With M ddq + C dq + g = tau + tau_ext, the momentum obeys dp/dt = tau + C^T dq - g + tau_ext. The observer
@@ -194,14 +208,7 @@ class MomentumObserver:
         lightweight manipulator arm", IROS 2006.
     """
 
-    rate: float = 5.0
-    bound: ArrayLike | None = None
     name: ClassVar[str] = "momentum"
-
-    def __post_init__(self) -> None:
-        _require_positive("rate", self.rate)
-        if self.bound is not None:
-            as_float_array("bound", self.bound)
 
     def of(self, law: "_OperationalSpace") -> Memory:
         """The memory of a law: expected momentum, its rate, and the correction.
@@ -226,7 +233,7 @@ class MomentumObserver:
 
 
 @dataclass(frozen=True)
-class Adaptation:
+class Adaptation(_Correcting):
     """Adaptive PD+: first moments of the links and of what the arm carries are learned from the tracking error.
 
     Inverse dynamics are linear in the errors p of the first moments (mass times centre) of the links. The law gets
@@ -246,14 +253,7 @@ class Adaptation:
         IEEE T-RA 7(4), 1991.
     """
 
-    rate: float = 5.0
-    bound: ArrayLike | None = None
     name: ClassVar[str] = "adaptive"
-
-    def __post_init__(self) -> None:
-        _require_positive("rate", self.rate)
-        if self.bound is not None:
-            as_float_array("bound", self.bound)
 
     def of(self, law: "_OperationalSpace") -> Memory:
         """The memory of a law: errors of first moments [kg m] (masses [kg] for sliding joints), offset, correction.
@@ -302,11 +302,6 @@ class Adaptation:
 MEMORIES: Mapping[str, type[MomentumObserver] | type[Adaptation]] = {
     kind.name: kind for kind in (MomentumObserver, Adaptation)
 }
-
-
-def _require_positive(name: str, value: float) -> None:
-    if not 0 < as_number(name, value) < np.inf:
-        raise InvalidValueError(name, value, "a finite number > 0")
 
 
 def _bound(bound: ArrayLike | None, law: "_OperationalSpace") -> Array:
