@@ -10,7 +10,7 @@ from benchmark import run
 
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.fitting.comparison import Comparison
+from orthocas.fitting.compare import Comparison
 from orthocas.solvers.protocol import Solver
 
 HEADER = (

@@ -12,7 +12,7 @@ from typing import Any
 import orthocas as oc
 from orthocas import problems, solvers
 from orthocas.cli.output import terminal_monitor
-from orthocas.fitting.comparison import Comparison
+from orthocas.fitting.compare import Comparison
 from orthocas.fitting.comparison_figures import convergence_figure, front_figure
 from orthocas.solvers.protocol import Solver
 from orthocas.tools.progress import Monitor, silent

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 from self_motion_picture import POSTURE, robot_file
 
 import orthocas as oc
-from orthocas.viewer.arm import BodyPoses
-from orthocas.viewer.looks import Look, Solid, capsule, stick_arm, urdf_look
+from orthocas.viewer.looks import BodyPoses, Look, Solid, capsule, stick_arm, urdf_look
 from orthocas.viewer.rendering import Camera, Layer, render
 
 RADIUS, LOOPS, STEPS = 0.1, 4, 400  #: of the circle [m]; circles; steps of each

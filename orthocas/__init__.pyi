@@ -20,6 +20,7 @@ from orthocas.atlas.coverage import evaluate_atlas as evaluate_atlas
 from orthocas.atlas.plan import AtlasSettings as AtlasSettings
 from orthocas.bases.circle import Circle as Circle
 from orthocas.bases.cyclic import cyclic_joints as cyclic_joints
+from orthocas.bases.given import SEW as SEW
 from orthocas.bases.given import Given as Given
 from orthocas.bases.mlp import MLP as MLP
 from orthocas.bases.mobile import Mobile as Mobile
@@ -27,7 +28,6 @@ from orthocas.bases.products import Fourier as Fourier
 from orthocas.bases.products import Linear as Linear
 from orthocas.bases.products import Polynomial as Polynomial
 from orthocas.bases.registry import register_parametrisation as register_parametrisation
-from orthocas.bases.sew import SEW as SEW
 from orthocas.certificates.certify import certified_box as certified_box
 from orthocas.certificates.certify import certify as certify
 from orthocas.certificates.certify import check_certificate as check_certificate
@@ -51,8 +51,8 @@ from orthocas.codegen.generate import generate_c as generate_c
 from orthocas.exact.involutivity import Involutivity as Involutivity
 from orthocas.exact.involutivity import involutivity as involutivity
 from orthocas.exact.involutivity import lie_bracket as lie_bracket
+from orthocas.fitting.compare import Comparison as Comparison
 from orthocas.fitting.compare import compare as compare
-from orthocas.fitting.comparison import Comparison as Comparison
 from orthocas.fitting.corridor_problem import corridor_problem as corridor_problem
 from orthocas.fitting.distil import distil as distil
 from orthocas.fitting.fit import Fit as Fit

@@ -4,9 +4,8 @@ from orthocas.solvers.adam import Adam
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.gradient_flow import GradientFlow
 from orthocas.solvers.ipopt import Ipopt
-from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.lbfgs import LBFGS, QuasiNewton
 from orthocas.solvers.protocol import Solver
-from orthocas.solvers.quasi_newton import QuasiNewton
 from orthocas.tools.checks import require_known
 
 __all__ = ["LBFGS", "SOLVERS", "Adam", "GaussNewton", "GradientFlow", "Ipopt", "QuasiNewton", "get"]

@@ -19,7 +19,7 @@ from orthocas import control, problems, solvers
 from orthocas.atlas.laws import AskedPosture, BlendedImpedance, HandedOver
 from orthocas.atlas.simulate import AtlasControl
 from orthocas.control import Controller, Reference
-from orthocas.fitting.comparison import Comparison
+from orthocas.fitting.compare import Comparison
 from orthocas.fitting.fit import ClearPart, Fit
 from orthocas.robots.tree import on_moving_base
 from orthocas.simulation import (

@@ -11,7 +11,7 @@ from public_objects import fitted, given, network, planar
 import orthocas as oc
 from orthocas import problems
 from orthocas.charts.certificate import PROVED
-from orthocas.charts.worst_points import worst_points
+from orthocas.charts.point_quality import worst_points
 from orthocas.errors import CertifyError, InvalidValueError
 
 

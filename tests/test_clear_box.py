@@ -17,7 +17,7 @@ import orthocas as oc
 from orthocas import control
 from orthocas.bases.cyclic import over_cyclic_joints
 from orthocas.certificates.certify import check_certificate
-from orthocas.charts.worst_points import worst_points
+from orthocas.charts.point_quality import worst_points
 from orthocas.codegen import CompiledLibrary, check_c, compile_shared
 from orthocas.control import ControlStatus
 from orthocas.errors import ChartFileError, DomainError, InvalidValueError, UnreachableReferenceError

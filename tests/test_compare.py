@@ -25,7 +25,7 @@ from orthocas import solvers
 from orthocas.bases import register_parametrisation
 from orthocas.errors import ArchiveError, ChartFileError, Interrupted, InvalidValueError
 from orthocas.fitting import grid as cells
-from orthocas.fitting.comparison import Comparison
+from orthocas.fitting.compare import Comparison
 from orthocas.fitting.comparison_figures import convergence_figure, front_figure
 from orthocas.fitting.grid import Cell, CellResult, run_cell, run_cells
 from orthocas.fitting.terms import Weights

@@ -11,8 +11,7 @@ from public_objects import planar
 import orthocas as oc
 from orthocas.bases.family import JointSpace
 from orthocas.certificates.chart_rows import chart_rows
-from orthocas.certificates.cofactor_judge import CofactorJudge, least_value
-from orthocas.certificates.determinant import DEGREE, Determinant, multi_indices_up_to
+from orthocas.certificates.determinant import DEGREE, CofactorJudge, Determinant, least_value, multi_indices_up_to
 from orthocas.certificates.judges import NEVER
 from orthocas.certificates.outside import OutsideJudge, inside_judge, judge_of
 from orthocas.certificates.waves import Waves, cofactors, waves_of

@@ -7,8 +7,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.bases import JointSpace
-from orthocas.charts.point_quality import Judged
-from orthocas.charts.worst_points import least_in_domain, worst_points
+from orthocas.charts.point_quality import Judged, least_in_domain, worst_points
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.residuals import Loss, sample_loss

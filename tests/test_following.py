@@ -16,8 +16,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, NoExpressionError, PathError, PathFileError, ShapeError
 from orthocas.paths import JointMotion
-from orthocas.paths.checks import Limits
-from orthocas.paths.choose_xi import Costs, XiChoice, walk
+from orthocas.paths.follow import Costs, Limits, XiChoice, walk
 from orthocas.paths.joint_curve import JointCurve, Solver
 from orthocas.paths.plan import Plan
 from orthocas.robots.obstacles import LinkDistances, Sphere

@@ -24,8 +24,7 @@ from orthocas.errors import (
     ShapeError,
     UnknownNameError,
 )
-from orthocas.exact.flow import Arrival, TaskFlow
-from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.flow import Arrival, GrownCoordinates, TaskFlow
 from orthocas.exact.leaves import leaf_from_arrays
 from orthocas.tasks.metric import metric_matrices
 from orthocas.tools.archive import read_archive, write_archive

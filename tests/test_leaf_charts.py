@@ -9,9 +9,8 @@ from scipy.optimize import brentq
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.exact.disk_leaf import disk_leaf
 from orthocas.exact.flow import TaskFlow
-from orthocas.exact.leaves import circle_leaf, linear_leaf
+from orthocas.exact.leaves import circle_leaf, disk_leaf, linear_leaf
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
 START = np.array([np.pi / 3, 0.0])

@@ -13,7 +13,7 @@ from conftest import ROBOTS, arm, one_joint, robot_data
 import orthocas as oc
 from orthocas.errors import InvalidValueError, OrthocasError, RobotError, ShapeError, UnknownNameError
 from orthocas.robots import urdf
-from orthocas.robots.planar import planar_model
+from orthocas.robots.pinocchio_model import planar_model
 
 XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
 

@@ -11,7 +11,7 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas.bases.sew import SEW_KINDS, sew_angle
+from orthocas.bases.given import SEW_KINDS, sew_angle
 from orthocas.errors import RobotError, UnknownNameError
 from orthocas.problems.iiwa import CENTRE, urdf_path
 from orthocas.problems.iiwa import robot as iiwa_robot

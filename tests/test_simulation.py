@@ -14,7 +14,7 @@ import orthocas as oc
 from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Projector, Reference
 from orthocas.errors import InvalidValueError
 from orthocas.problems.iiwa import urdf_path
-from orthocas.robots.planar import planar_model
+from orthocas.robots.pinocchio_model import planar_model
 from orthocas.simulation import (
     Outcome,
     coupling_index,

@@ -10,7 +10,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.errors import StepsFileError
-from orthocas.simulation.steps_file import read_steps
+from orthocas.simulation.disturbances import read_steps
 
 STEPS: dict[str, Any] = {
     "duration": 4,

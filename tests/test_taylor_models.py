@@ -10,12 +10,19 @@ from certified_charts import chart, fourier
 from public_objects import given, network
 
 import orthocas as oc
-from orthocas.certificates import functions
+from orthocas.certificates import taylor
 from orthocas.certificates.chart_rows import chart_rows, joint_models
-from orthocas.certificates.functions import exponential, hyperbolic_tangent, sine_and_cosine
 from orthocas.certificates.graph import TaylorGraph
 from orthocas.certificates.judges import conditioning_bound, in_singular_basis, lower_bound, pivots
-from orthocas.certificates.taylor import TaylorModel, above, monomials, sum_error
+from orthocas.certificates.taylor import (
+    TaylorModel,
+    above,
+    exponential,
+    hyperbolic_tangent,
+    monomials,
+    sine_and_cosine,
+    sum_error,
+)
 from orthocas.tasks.samples import samples_at
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
@@ -75,14 +82,14 @@ def test_nothing_is_known_outside_the_range_of_the_proof(x: float) -> None:
     assert np.isinf(exponential(np.array([x]))[1]).all()
 
 
-@pytest.mark.parametrize("name", [*functions.UNARY])
+@pytest.mark.parametrize("name", [*taylor.UNARY])
 def test_functions_of_models_contain_sampled_values(name: str) -> None:
     rng = np.random.default_rng(5)
     low = rng.uniform(0.3, 0.6, (200, 2))
     (x, y), _ = joint_models(low, low + rng.uniform(0, 0.2, (200, 2)), (0, 1))
     t = rng.uniform(-1, 1, (200, 2))
     inner = x * y + x
-    model = functions.UNARY[name](inner)
+    model = taylor.UNARY[name](inner)
     q = [x.centre + x.coefficients[1] * t[:, 0], y.centre + y.coefficients[1] * t[:, 1]]
     v = ca.SX.sym("v")
     made = {"assign": v, "neg": -v, "twice": 2 * v, "sq": v * v, "inv": 1 / v}
@@ -95,7 +102,7 @@ def test_functions_of_models_contain_sampled_values(name: str) -> None:
 
 def test_reciprocals_and_roots_give_up_where_they_may_be_undefined() -> None:
     (x,), _ = joint_models(np.array([[-0.1]]), np.array([[0.2]]), (0,))
-    for function in (functions.reciprocal, functions.square_root, functions.reciprocal_square_root):
+    for function in (taylor.reciprocal, taylor.square_root, taylor.reciprocal_square_root):
         assert not np.isfinite(function(x).remainder).any()
         assert not (lower_bound(function(x)) > -np.inf).any()
 

@@ -15,8 +15,7 @@ from orthocas.errors import (
     RobotError,
 )
 from orthocas.robots.urdf import lock_off_chain, read_urdf
-from orthocas.viewer.arm import BodyPoses
-from orthocas.viewer.looks import ball, block, by_colour, capsule, drum, stick_arm, urdf_look
+from orthocas.viewer.looks import BodyPoses, ball, block, by_colour, capsule, drum, stick_arm, urdf_look
 from orthocas.viewer.view import shape_of
 
 

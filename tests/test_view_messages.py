@@ -18,8 +18,8 @@ from test_view_guard import connected
 from test_view_pages import wait
 
 import orthocas as oc
-from orthocas.viewer.messages import _CAMERA_NUMBERS
 from orthocas.viewer.player import RobotPage
+from orthocas.viewer.window import _CAMERA_NUMBERS
 
 pytestmark = pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'")
 CAMERA = {name: [0] * size if size else 1 for name, size in _CAMERA_NUMBERS.items()} | {"type": "ViewerCameraMessage"}

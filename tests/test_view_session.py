@@ -14,7 +14,7 @@ from orthocas.errors import (
     UnknownNameError,
 )
 from orthocas.fitting.fit import Fit
-from orthocas.viewer.session import Session
+from orthocas.viewer.panel import Session
 
 
 def test_a_coordinate_moves_the_joints_and_holds_the_task(iiwa_fit: Fit) -> None:

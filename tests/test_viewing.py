@@ -23,8 +23,7 @@ from orthocas.errors import (
 )
 from orthocas.tools import checks
 from orthocas.viewer import Motion, export_page, window
-from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel
-from orthocas.viewer.session import Session
+from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel, Session
 from orthocas.viewer.window import Loop, is_local
 
 

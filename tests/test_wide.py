@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 import orthocas as oc
 from orthocas import control
-from orthocas.bases.sew import sew_angle
+from orthocas.bases.given import sew_angle
 from orthocas.charts.self_motion import StopKind
 from orthocas.codegen import check_c
 from orthocas.errors import ChartFileError, DomainError, Interrupted, InvalidValueError, ShapeError, UnknownNameError

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import orthocas as oc
 from orthocas.simulation import Outcome, Trajectory
-from orthocas.simulation.animation import save_animation
+from orthocas.simulation.figure import save_animation
 
 SIZE = (480, 400)  # [pixel]
 _COLOURS, _SAMPLED = 64, 4  # of every fourth frame

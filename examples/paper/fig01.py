@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.colors import to_rgba
 from matplotlib.patheffects import withStroke
 
-from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.flow import GrownCoordinates
 from orthocas.tasks.problem import task_jacobians
 from orthocas.tools.checks import Array
 

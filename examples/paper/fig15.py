@@ -14,10 +14,9 @@ from matplotlib.colors import to_rgb, to_rgba
 
 from orthocas import problems
 from orthocas.charts.grow import grow
-from orthocas.exact.disk_leaf import DiskLeaf, disk_leaf
-from orthocas.exact.flow import TaskFlow
-from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.flow import GrownCoordinates, TaskFlow
 from orthocas.exact.harmonic import level_surface, signed_areas
+from orthocas.exact.leaves import DiskLeaf, disk_leaf
 from orthocas.tasks.domains import Box, sample_uniform
 from orthocas.tasks.problem import Problem, task_jacobians
 from orthocas.tasks.task import Task

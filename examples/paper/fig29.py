@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.patches import Arc, Polygon
 
-from orthocas.exact.disk_leaf import DiskLeaf, disk_leaf
+from orthocas.exact.leaves import DiskLeaf, disk_leaf
 from orthocas.tools.checks import Array, Indices
 
 from .charted_surface import add_with_edges

@@ -9,7 +9,7 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.errors import PathFileError
 from orthocas.tools.checks import Array
-from orthocas.tools.csv_table import LONGEST, column_places, read_table
+from orthocas.tools.files import LONGEST, column_places, read_table
 
 _TIME, _WANTED = "time_s", "desired_"
 _MOST = 1_000_000

@@ -13,8 +13,7 @@ from orthocas import problems
 from orthocas.charts.chart import Chart
 from orthocas.charts.grow import grow
 from orthocas.charts.singularities import SingularPoint
-from orthocas.exact.flow import TaskFlow
-from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.flow import GrownCoordinates, TaskFlow
 from orthocas.exact.leaves import CircleLeaf
 from orthocas.tasks.domains import Torus
 from orthocas.tasks.problem import Problem

@@ -19,7 +19,7 @@ from orthocas.atlas.plan import AtlasSettings, Plan, lattice_of
 from orthocas.atlas.regions import Region, Surroundings, joint_range_of
 from orthocas.errors import AtlasFileError, InvalidValueError, OrthocasError
 from orthocas.tasks.domains import NARROWEST
-from orthocas.tasks.problem_file import FOREIGN, problem_from_data, problem_to_data
+from orthocas.tasks.problem import FOREIGN, problem_from_data, problem_to_data
 from orthocas.tools.archive import Stored, from_npy, to_npy
 from orthocas.tools.block_file import BlockKind, Contents, append, scan
 from orthocas.tools.checks import Array, Indices, frozen_array, frozen_indices, require_count

@@ -14,8 +14,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import DomainError
 from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import Box, Domain
-from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_file import problem_from_data, problem_to_data
+from orthocas.tasks.problem import Problem, problem_from_data, problem_to_data
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array
 from orthocas.tools.json import plain

@@ -18,7 +18,7 @@ from orthocas.bases.family import (
     SelfDerivativeFamily,
     component_gradients,
 )
-from orthocas.bases.given import Given
+from orthocas.bases.given import SEW, Given
 from orthocas.bases.mlp import MLP
 from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import Fourier, Linear, Polynomial, ProductFamily, Term
@@ -31,7 +31,6 @@ from orthocas.bases.registry import (
     require_savable,
     warn_unless_savable,
 )
-from orthocas.bases.sew import SEW
 
 __all__ = [
     "MLP",

@@ -1,22 +1,34 @@
-"""Coordinates given in closed form. Their chart is evaluated, saved and used like any other, without a fit."""
+"""Coordinates given in closed form, also the shoulder-elbow-wrist angle. Their charts need no fit."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Literal
 
 import casadi as ca
 import numpy as np
 
 from orthocas.bases.family import ClosedForm, Expression, JointSpace, component_gradients
+from orthocas.errors import InvalidValueError, RobotError
+from orthocas.robots.kinematics import Pose, body_poses
+from orthocas.robots.robot import Robot
+from orthocas.robots.tree import KinematicTree
+from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, require_count, require_shape, require_text
+from orthocas.tools.checks import Array, require_count, require_known, require_shape, require_text
 from orthocas.tools.expressions import Tape, expression_of, replay, require_tape, to_tape
 
-if TYPE_CHECKING:
-    from orthocas.tasks.problem import Problem
-
 _MOST_JOINTS = 1000
+SEWKind = Literal["conventional", "stereographic"]
+SEW_KINDS: tuple[SEWKind, ...] = ("conventional", "stereographic")
+# (e_t, e_r) in the world. The singular half-line e_t points down into the base. With e_r = -x, an arm that reaches
+# along +x with its elbow up has psi = 0, far from the jump at +-pi.
+_DIRECTIONS = {
+    "conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)),
+}
+_MEETING = 1e-5  # axes closer than this meet [m]
+_PARALLEL = 1e-6  # axes at a smaller angle are parallel [rad]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,3 +118,159 @@ class GivenFamily:
     def initial(self, seed: int) -> Array:
         """An empty array: there are no parameters."""
         return np.zeros(0)
+
+
+def sew_angle(robot: Robot, kind: str) -> ca.Function:
+    """The SEW angle psi(q): the rotation of the elbow about the line from shoulder to wrist.
+
+    S is the point where axes 1, 2 and 3 meet, W the point where axes 5 and 6 meet, E the point of axis 4 nearest to
+    axis 3. With p_SE = E - S, p_SW = W - S and e_SW = p_SW / |p_SW|,
+
+        k_r = (e_SW - e_t) x e_r,  k_x = k_r x p_SW,  psi = atan2(e_SW . (k_x x p_SE), k_x . p_SE).
+
+    This is the right-handed angle about e_SW from the half-plane of k_x to the half-plane of E. If axis 7 also meets W,
+    a motion that keeps the tip's pose rotates E about a fixed line, and psi by the same angle. Otherwise W moves with
+    the elbow.
+
+    - conventional: e_t = 0, e_r = z, so that k_x is e_r across e_SW: psi = 0 in the vertical plane of S and W with
+      the elbow up. Singular where W is straight above or straight below S: a line, which upright arms reach.
+    - stereographic: e_t = -z, e_r = -x, so that k_x is e_r rotated with e_SW from +z by the shortest way.
+      Singular only where W is straight below S: a half-line, inside the base of an upright arm.
+
+    Both are undefined where S, E and W lie on one line, as in a stretched arm. Near a singularity the gradient grows
+    like 1 / distance. At a singularity psi is arbitrary, and its gradient is huge or NaN. psi jumps between -pi and pi,
+    its gradient does not.
+
+    Args:
+        robot: a chain of seven revolute joints. Its z axis is the up direction above.
+        kind: one of `SEW_KINDS`.
+
+    Returns:
+        q (7, 1) [rad] -> psi (1, 1) [rad] in [-pi, pi], SX, dense.
+
+    Raises:
+        UnknownNameError: if there is no such kind.
+        RobotError: if the robot is not a chain of seven revolute joints, or its axes are parallel or do not meet in S
+            and W.
+
+    Source:
+        Both angles and their singularities: [EW2024]. The choice of E (the foot of the common normal of axes 3 and 4)
+        and of e_r = -x is ours, and so is the conventional angle as the case e_t = 0.
+    """
+    require_known("SEW angle", kind, SEW_KINDS)
+    _require_seven_revolute(robot.tree)
+    shoulder, elbow, wrist = _heights(robot.tree)
+    q = ca.SX.sym("q", robot.n)
+    poses = body_poses(robot.tree, q)
+    S, E, W = _on_axis(poses[0], shoulder), _on_axis(poses[3], elbow), _on_axis(poses[4], wrist)
+    e_t, e_r = (ca.SX(ca.DM(direction)) for direction in _DIRECTIONS[kind])
+    return dense_function("sew_angle", [q], [_angle(E - S, W - S, e_t, e_r)])
+
+
+def _angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.SX:
+    """psi of columns (3, 1). atan2 needs no unit k_x."""
+    e_SW = p_SW / ca.norm_2(p_SW)
+    k_r = ca.cross(e_SW - e_t, e_r)
+    k_x = ca.cross(k_r, p_SW)
+    return ca.atan2(ca.dot(e_SW, ca.cross(k_x, p_SE)), ca.dot(k_x, p_SE))
+
+
+def _on_axis(pose: Pose, height: float) -> ca.SX:
+    """The point of a joint's axis (z of its body) at a height above the body's origin, (3, 1) in the world."""
+    R, p = pose
+    return p + R[:, 2] * height
+
+
+def _heights(tree: KinematicTree) -> tuple[float, float, float]:
+    """Heights [m] of S on axis 1, of E on axis 4 and of W on axis 5, above the origins of bodies 1, 4 and 5.
+
+    The heights do not depend on q, because neighbouring axes are fixed to each other: S is fixed in the base and in
+    bodies 1 to 3, E in bodies 3 and 4, and W in bodies 4 to 6.
+    """
+    names = tree.joint_names
+    shoulder, on_2, gap_12 = _common_normal(tree, 0)
+    also_on_2, _, gap_23 = _common_normal(tree, 1)
+    _, elbow, _ = _common_normal(tree, 2)
+    wrist, _, gap_56 = _common_normal(tree, 4)
+    for first, gap in ((0, gap_12), (1, gap_23), (4, gap_56)):
+        if gap > _MEETING:
+            raise RobotError(
+                f"the axes of joints '{names[first]}' and '{names[first + 1]}' are {gap:.3g} m apart, "
+                f"expected axes that meet within {_MEETING:g} m"
+            )
+    if abs(on_2 - also_on_2) > _MEETING:
+        raise RobotError(
+            f"the axes of joints '{names[0]}' and '{names[2]}' meet that of '{names[1]}' at points "
+            f"{abs(on_2 - also_on_2):.3g} m apart, expected one point within {_MEETING:g} m"
+        )
+    return shoulder, elbow, wrist
+
+
+def _common_normal(tree: KinematicTree, i: int) -> tuple[float, float, float]:
+    """Ends of the common normal of axes i and i + 1, as heights on the two axes, and its length [m]."""
+    origin, axis = tree.translations[i + 1], tree.rotations[i + 1][:, 2]  # of joint i + 1 in body i, whose axis is z
+    across = axis[:2]
+    if np.linalg.norm(across) < _PARALLEL:
+        names = tree.joint_names
+        raise RobotError(
+            f"the axes of joints '{names[i]}' and '{names[i + 1]}' are parallel, expected axes at an angle"
+        )
+    height = -float(origin[:2] @ across) / float(across @ across)
+    end = origin + height * axis
+    return float(end[2]), height, float(np.linalg.norm(end[:2]))
+
+
+def _require_seven_revolute(tree: KinematicTree) -> None:
+    """Raise RobotError unless the tree is a chain of seven revolute joints."""
+    if tree.n != 7:
+        raise RobotError(f"the robot has {tree.n} joints, expected 7 for a shoulder-elbow-wrist angle")
+    for i, name in enumerate(tree.joint_names):
+        if tree.joint_kinds[i] != "revolute":
+            raise RobotError(f"joint '{name}' is {tree.joint_kinds[i]}, expected 7 revolute joints")
+        if tree.parents[i] != i - 1:
+            raise RobotError(f"joint '{name}' does not follow joint '{tree.joint_names[i - 1]}', expected a chain")
+
+
+@dataclass(frozen=True)
+class SEW:
+    """xi(q) = psi(q), the rotation of the elbow about the line from shoulder to wrist [EW2024].
+
+    It is a baseline: it describes the self-motion well, but its gradient is not orthogonal to that of the task.
+
+    Args:
+        kind: "conventional" or "stereographic"; see `orthocas.bases.given.sew_angle`.
+    """
+
+    kind: SEWKind = "stereographic"
+    linear = True
+
+    def __post_init__(self) -> None:
+        require_known("SEW angle", self.kind, SEW_KINDS)
+
+    @property
+    def label(self) -> str:
+        """'sew:KIND'."""
+        return f"sew:{self.kind}"
+
+    def for_problem(self, problem: Problem) -> Given:
+        """The angle of the problem's arm.
+
+        Raises:
+            InvalidValueError: if the degree of redundancy is not 1.
+            RobotError: if the arm has no shoulder, elbow and wrist.
+        """
+        if problem.r != 1:
+            raise InvalidValueError("r", problem.r, "1 for one SEW angle: use a pose task and a 7-joint arm")
+        return Given.from_function(self.label, problem.n, sew_angle(problem.robot, self.kind))
+
+    def closed_form(self, problem: Problem) -> ClosedForm:
+        """There are no parameters."""
+        return self.for_problem(problem).closed_form(problem)
+
+    def family(self, space: JointSpace, outputs: int) -> GivenFamily:
+        """Not available: call `for_problem` first.
+
+        Raises:
+            InvalidValueError: always, because the angle depends on the robot.
+        """
+        raise InvalidValueError("parametrisation", self.label, "the angle of a robot: for_problem(problem)")

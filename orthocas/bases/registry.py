@@ -9,11 +9,10 @@ from typing import Any, cast
 from orthocas.bases.circle import Circle
 from orthocas.bases.cyclic import Cyclic, parse_suffix
 from orthocas.bases.family import Parametrisation
-from orthocas.bases.given import Given
+from orthocas.bases.given import SEW, Given, SEWKind
 from orthocas.bases.mlp import MLP
 from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import Fourier, Linear, Polynomial
-from orthocas.bases.sew import SEW, SEWKind
 from orthocas.errors import InvalidValueError, NotSavableWarning
 from orthocas.tools.checks import require_kind, require_known
 

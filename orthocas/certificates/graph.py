@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from orthocas.certificates.functions import (
+from orthocas.certificates.taylor import (
     BINARY,
     POWERS,
     UNARY,
+    TaylorModel,
     cosine,
     power,
     reciprocal,
@@ -18,7 +19,6 @@ from orthocas.certificates.functions import (
     sine,
     square,
 )
-from orthocas.certificates.taylor import TaylorModel
 from orthocas.errors import CertifyError
 from orthocas.tools.expressions import to_tape
 

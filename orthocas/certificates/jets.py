@@ -8,9 +8,19 @@ from math import comb, factorial, prod
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.certificates.functions import sine_and_cosine
 from orthocas.certificates.task_rows import TipRows, longest_reach, rotation_deviation
-from orthocas.certificates.taylor import DEGREE, TINY, UP, Monomial, TaylorModel, Variables, above, monomials, sum_error
+from orthocas.certificates.taylor import (
+    DEGREE,
+    TINY,
+    UP,
+    Monomial,
+    TaylorModel,
+    Variables,
+    above,
+    monomials,
+    sine_and_cosine,
+    sum_error,
+)
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.domains import Domain
 from orthocas.tools.checks import Array

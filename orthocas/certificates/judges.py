@@ -9,8 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.certificates.chart_rows import ChartRows
-from orthocas.certificates.functions import reciprocal, reciprocal_square_root
-from orthocas.certificates.taylor import TINY, UP, TaylorModel, Variables, monomials, stacked, sum_error
+from orthocas.certificates.taylor import (
+    TINY,
+    UP,
+    TaylorModel,
+    Variables,
+    monomials,
+    reciprocal,
+    reciprocal_square_root,
+    stacked,
+    sum_error,
+)
 from orthocas.charts.certificate import ELIMINATION
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array

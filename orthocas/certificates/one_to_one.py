@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.products import ProductFamily
-from orthocas.certificates.chart_rows import ChartRows, CoordinateRows, GraphRows, true_gradients
+from orthocas.certificates.chart_rows import ChartRows, CoordinateRows, GraphRows, ProductRows, true_gradients
 from orthocas.certificates.jets import ORDERS, Around, Jets, TipJets
 from orthocas.certificates.judges import (
     Verdicts,
@@ -30,7 +30,6 @@ from orthocas.certificates.judges import (
     pivots,
     singular_vectors,
 )
-from orthocas.certificates.product_rows import ProductRows
 from orthocas.certificates.task_rows import TipRows
 from orthocas.certificates.taylor import TINY, UNIT, UP, TaylorModel, above, sum_error
 from orthocas.charts.certificate import Subdivision

@@ -18,8 +18,7 @@ from orthocas.certificates.chart_rows import (
     task_gradients,
     true_gradients,
 )
-from orthocas.certificates.cofactor_judge import CofactorJudge
-from orthocas.certificates.determinant import Determinant
+from orthocas.certificates.determinant import CofactorJudge, Determinant
 from orthocas.certificates.judges import (
     NEVER,
     RegularityJudge,

@@ -15,7 +15,7 @@ from orthocas.charts.methods import InverseMethods
 from orthocas.charts.point_quality import PointQuality, point_quality
 from orthocas.charts.self_motion import SelfMotion, XiRange, self_motion, xi_range
 from orthocas.errors import InvalidValueError
-from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.flow import GrownCoordinates
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import as_path, as_point_set, require_kind
 from orthocas.tools.display import Shown, listed

@@ -5,12 +5,19 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import GrownChart
 from orthocas.errors import GrowError, InvalidValueError, NotInvolutiveError
-from orthocas.exact.disk_leaf import CELLS, disk_leaf
-from orthocas.exact.flow import TaskFlow
-from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.flow import GrownCoordinates, TaskFlow
 from orthocas.exact.involutivity import involutivity
-from orthocas.exact.leaf import LeafChart, turning_joints
-from orthocas.exact.leaves import LEAVES, CircleLeaf, Leaf, circle_leaf, linear_leaf
+from orthocas.exact.leaves import (
+    CELLS,
+    LEAVES,
+    CircleLeaf,
+    Leaf,
+    LeafChart,
+    circle_leaf,
+    disk_leaf,
+    linear_leaf,
+    turning_joints,
+)
 from orthocas.tasks.domains import Box, sample_evenly
 from orthocas.tasks.problem import Problem, check
 from orthocas.tools.checks import (

@@ -12,8 +12,7 @@ from orthocas.charts.inside import Inside, Nearest
 from orthocas.charts.inverse import Inverse
 from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, PointFunctions, Starts, inverse_function
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
-from orthocas.charts.reaching import ReachingTracker, parts_of
-from orthocas.charts.solutions import Solutions, Tracker
+from orthocas.charts.solutions import ReachingTracker, Solutions, Tracker, parts_of
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.problem import task_sizes

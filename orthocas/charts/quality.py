@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.charts.angles import pairs
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.point_quality import Judged
-from orthocas.charts.worst_points import WorstPoints, worst_points
+from orthocas.charts.point_quality import Judged, WorstPoints, worst_points
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.samples import idle_joints, samples_at

@@ -8,8 +8,8 @@ import scipy
 
 from orthocas.charts.chart import Chart
 from orthocas.errors import GrowError
-from orthocas.exact.grown import GrownCoordinates
-from orthocas.exact.leaf import turning_joints
+from orthocas.exact.flow import GrownCoordinates
+from orthocas.exact.leaves import turning_joints
 from orthocas.tasks.domains import contains, sample_evenly
 from orthocas.tasks.metric import metric_matrices
 from orthocas.tasks.problem import Problem, task_jacobians

@@ -22,8 +22,8 @@ from orthocas.cli.problem_argument import (
     with_options,
 )
 from orthocas.errors import Interrupted, printable
+from orthocas.fitting.compare import Comparison
 from orthocas.fitting.compare import compare as compare_fits
-from orthocas.fitting.comparison import Comparison
 from orthocas.fitting.comparison_figures import convergence_figure, front_figure
 from orthocas.fitting.settings import PRECISIONS, Precision
 from orthocas.solvers import get as get_solver

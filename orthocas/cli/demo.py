@@ -9,8 +9,8 @@ from orthocas import problems
 from orthocas.bases.products import Polynomial
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.quality import evaluate
+from orthocas.cli.evaluate import reach_rows
 from orthocas.cli.output import Force, terminal_monitor
-from orthocas.cli.reach import reach_rows
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
 from orthocas.tools.files import output_folder, published

@@ -10,6 +10,7 @@ from orthocas.bases.family import Parametrisation
 from orthocas.bases.registry import parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import Report, evaluate
+from orthocas.cli.evaluate import reach_data, reach_rows
 from orthocas.cli.output import (
     AsJson,
     Force,
@@ -43,7 +44,6 @@ from orthocas.cli.problem_argument import (
     wide_fit,
     with_options,
 )
-from orthocas.cli.reach import reach_data, reach_rows
 from orthocas.errors import Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart

@@ -142,7 +142,7 @@ def _problem(problem: Problem) -> dict[str, Any]:
 
 
 def _reach(chart: "Chart") -> dict[str, Any]:
-    from orthocas.cli.reach import reach_data  # as _load
+    from orthocas.cli.evaluate import reach_data  # as _load
 
     return reach_data(chart)
 

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.reaching import DESCENTS, INERTIA, ZONE
+from orthocas.charts.solutions import DESCENTS, INERTIA, ZONE
 from orthocas.codegen.boundary import boundary_units
 from orthocas.codegen.description import chart_values, filled, flags, numbers, words
 from orthocas.codegen.precision import Precision, bounds_inside

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.point_quality import Judged
-from orthocas.charts.worst_points import least_in_domain
+from orthocas.charts.point_quality import Judged, least_in_domain
 from orthocas.control.controller import (
     Command,
     fallback_function,

@@ -2,11 +2,11 @@
 
 - `fit` is the entry point. `settings` checks the arguments, `stages` runs the minimisations, `starts` begins them.
 - `terms` has the terms and weights of the loss, `residuals` the loss of one sample.
-- `basis_objective` (with `basis_gradients`) evaluates the loss for families linear in theta, `array_objective` for
-  networks, `graph_objective` for all others. `symbolic_loss` gives the loss as one CasADi expression.
+- `basis_objective` (with `basis_gradients`) evaluates the loss for families linear in theta, `dense_objectives` for
+  networks and all others. `symbolic_loss` gives the loss as one CasADi expression.
 - `fold_search` finds folds, `checkpoint` keeps the state of a long fit in a file.
 - `suggest_domain` (with `probe`) and `corridor_problem` choose domains. `distil` fits grown coordinates.
-- `compare` fits a `grid`; `comparison` is its result.
+- `compare` fits a `grid`, and has the result.
 """
 
 __all__: list[str] = []

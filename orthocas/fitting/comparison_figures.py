@@ -14,7 +14,7 @@ from orthocas.fitting.grid import CellResult
 from orthocas.tools.picture import Picture
 
 if TYPE_CHECKING:
-    from orthocas.fitting.comparison import Comparison, Summary
+    from orthocas.fitting.compare import Comparison, Summary
 
 Colour = tuple[float, float, float, float]
 _HUES = {"linear": "Greys", "polynomial": "Blues", "fourier": "Greens", "mlp": "Oranges", "sew": "Purples"}

@@ -15,7 +15,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.phi import shortest
 from orthocas.charts.quality import Report, evaluate
 from orthocas.errors import GrowError, InvalidValueError
-from orthocas.exact.grown import GrownCoordinates
+from orthocas.exact.flow import GrownCoordinates
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import Solver
 from orthocas.tasks.domains import sample_evenly, sample_uniform

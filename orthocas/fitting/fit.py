@@ -24,7 +24,7 @@ from orthocas.bases.mobile import Mobile, anywhere
 from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.worst_points import WorstPoints
+from orthocas.charts.point_quality import WorstPoints
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.like import Likeness

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.bases.family import LinearFamily
-from orthocas.bases.sew import sew_angle
+from orthocas.bases.given import sew_angle
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.basis_gradients import BasisGradients

@@ -13,9 +13,8 @@ from orthocas.fitting.like import WEIGHT, Like, Likeness, LikeTerm
 from orthocas.fitting.terms import WeightNumbers, Weights, register_loss_term
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.ipopt import Ipopt
-from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.lbfgs import LBFGS, QuasiNewton
 from orthocas.solvers.protocol import Solver
-from orthocas.solvers.quasi_newton import QuasiNewton
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_problem
 from orthocas.tools.checks import as_number, require_count, require_kind, require_known

@@ -12,13 +12,12 @@ from orthocas.bases.family import ArrayFamily, Family, GradedParametrisation, Jo
 from orthocas.bases.products import Fourier, Polynomial
 from orthocas.charts.angles import pairs
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.worst_points import WorstPoints, worst_points
+from orthocas.charts.point_quality import WorstPoints, worst_points
 from orthocas.errors import CheckpointError, InfeasibleError, InvalidValueError, SolveError
-from orthocas.fitting.array_objective import ArrayObjective
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.basis_objective import STRIDE, BasisObjective, BoundedMutual, expanded
 from orthocas.fitting.checkpoint import Checkpoint, Stage
-from orthocas.fitting.graph_objective import GraphObjective
+from orthocas.fitting.dense_objectives import ArrayObjective, GraphObjective
 from orthocas.fitting.like import LikeTerm
 from orthocas.fitting.settings import FitSettings
 from orthocas.fitting.starts import Mirror, find_mirror, spectral_start

@@ -22,8 +22,8 @@ from orthocas.bases.family import (
 from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.point_quality import worst_points
 from orthocas.charts.regular_part import RegularPart
-from orthocas.charts.worst_points import worst_points
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, RobotError
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.checkpoint import Stage

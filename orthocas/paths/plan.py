@@ -16,7 +16,7 @@ from orthocas.robots.spatial import rotations_of
 from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array, as_float_array, frozen_array
-from orthocas.tools.csv_table import LONGEST, column_places, read_table
+from orthocas.tools.files import LONGEST, column_places, read_table
 
 _SAMPLES = 501  # of a path that is given as a function
 _SAME = 1e-9  # relative distance of the ends of closed paths

@@ -10,7 +10,7 @@ import pinocchio as pin
 from orthocas.robots.tree import BASE_JOINTS
 from orthocas.robots.xml import read_xml
 from orthocas.tools.checks import Array
-from orthocas.tools.csv_table import column_places, read_table
+from orthocas.tools.files import column_places, read_table
 
 if TYPE_CHECKING:
     from orthocas.robots.robot import Robot

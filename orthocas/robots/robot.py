@@ -11,12 +11,12 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.robots import dynamics, kinematics, planar, urdf
+from orthocas.robots import dynamics, kinematics, urdf
 from orthocas.robots.dynamics import PAYLOAD, with_payload
 from orthocas.robots.homes import model_states, postures, srdf_states
 from orthocas.robots.kinematics import with_tool
 from orthocas.robots.mjcf import model_from_mjcf
-from orthocas.robots.pinocchio_model import frame_index, tree_from_model
+from orthocas.robots.pinocchio_model import TIP, frame_index, planar_model, tree_from_model
 from orthocas.robots.tree import KinematicTree
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import BuiltOnUse, cached_property
@@ -167,7 +167,7 @@ class Robot(Shown):
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
         """A planar arm with uniform links of given lengths [m] and masses [kg]. Gravity points along -y."""
-        return cls(tree_from_model(planar.planar_model(lengths, masses), planar.TIP))
+        return cls(tree_from_model(planar_model(lengths, masses), TIP))
 
     def with_scaled_masses(self, factor: ArrayLike) -> Self:
         """The same robot with scaled masses: mass and inertia of each body times a factor, (n,) or one number > 0.

@@ -1,11 +1,16 @@
 """Simulation of controllers in closed loop with the full dynamics, and evaluation of the runs."""
 
-from orthocas.simulation.coupling import Breakdown, Coupling, coupling_index, task_acceleration_breakdown
 from orthocas.simulation.disturbances import Friction, Noise, Push, Stops
-from orthocas.simulation.mujoco_plant import MuJoCoPlant
-from orthocas.simulation.mujoco_scene import Elasticity, MuJoCo, Payload, Wall
+from orthocas.simulation.mujoco_plant import Elasticity, MuJoCo, MuJoCoPlant, Payload, Wall
 from orthocas.simulation.run import simulate, simulate_many
-from orthocas.simulation.trajectory import Outcome, Trajectory
+from orthocas.simulation.trajectory import (
+    Breakdown,
+    Coupling,
+    Outcome,
+    Trajectory,
+    coupling_index,
+    task_acceleration_breakdown,
+)
 
 __all__ = [
     "Breakdown",

@@ -1,24 +1,45 @@
-"""Figure of a run: controlled quantities with their references, joints, commands and storage over time."""
+"""Pictures of runs: the figure and the animation."""
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
 
 from orthocas.control.controller import FROM_THE_LAW, ControlStatus
+from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.simulation.trajectory import Trajectory
 from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, require_known
+from orthocas.tools.files import published, require_replaceable_files, require_writable
 from orthocas.tools.picture import Picture
-
-if TYPE_CHECKING:
-    from orthocas.simulation.trajectory import Trajectory
+from orthocas.tools.progress import Monitor, Progress, silent
 
 ACTUAL, FALLBACK = "#3d85c6", "#d62728"
 _WANTED, _STORAGE = "#222222", "#1b9e77"
 _SMALL = 8.0  # font size [pt]
 _NARROWEST = 1e-2  # smallest range of a panel, relative to the widest, so that a quantity at rest looks at rest
+_ARM, _TRAIL, _TARGET, _SHADOW = "#444c56", ACTUAL, FALLBACK, "#cfcfcf"
+_LEGEND: dict[str, Any] = {"fontsize": 8, "ncols": 2, "frameon": False}
+_WIDTH, _DPI = 8.6, 100  # [inch], [dots/inch]
+_PANEL = 0.66  # height of a quantity's panel [inch]
+_MARGIN = 0.08  # around the arm, as a share of the widest range
+_FLAT = 1e-9  # range of a coordinate of a planar arm [m]
+FORMATS = ("gif", "mp4")
+_RATE = 20  # frames per second
+_MOST = 400  # frames; longer runs play faster than real time
+_COLOURS = 128
+Frame = NDArray[np.uint8]  #: (height, width, 3)
 
 
 def units_of(problem: Problem) -> dict[str, str]:
@@ -134,3 +155,221 @@ def _in_mathematics(label: str) -> str:
     """A label such as xi1 as a mathematical symbol; other labels unchanged."""
     number = label.removeprefix("xi")
     return rf"$\xi_{{{number}}}$" if label.startswith("xi") and number.isdigit() else label
+
+
+class MovingPicture:
+    """Draws the moving parts over a background that is drawn once, so that a frame takes milliseconds.
+
+    Args:
+        trajectory: the run.
+        problem: robot and task.
+        speed: playback speed relative to real time, for the title.
+    """
+
+    def __init__(self, trajectory: Trajectory, problem: Problem, speed: float = 1.0) -> None:
+        k = len(trajectory.labels)
+        height = max(4.2, _PANEL * k + 0.8)
+        figure = Figure(figsize=(_WIDTH, round(height * _DPI / 2) * 2 / _DPI), dpi=_DPI)  # even height: MP4 needs it
+        self._canvas = cast(Any, FigureCanvasAgg(figure))
+        self._times, self._values = trajectory.times, trajectory.value
+        self._arm = _Arm(figure, trajectory, problem)
+        grid = figure.add_gridspec(k, 1, left=0.61, right=0.98, bottom=0.5 / height, top=1 - 0.35 / height, hspace=0.18)
+        panels = np.array([figure.add_subplot(grid[i]) for i in range(k)])
+        draw_quantities(panels, trajectory, units_of(problem), drawn=False)
+        self._lines: list[Any] = []
+        for axes in panels:
+            axes.tick_params(labelbottom=axes is panels[-1])
+            shade_fallback(axes, trajectory)
+            self._lines += axes.plot([], [], color=ACTUAL, linewidth=2, label="actual", animated=True)
+            self._lines += axes.plot([], [], color=FALLBACK, linewidth=1, animated=True)
+        panels[-1].set_xlabel("time [s]", fontsize=9)
+        figure.align_ylabels(panels)
+        handles = [self._lines[0], *panels[0].lines[:1]]
+        figure.legend(handles=handles, loc=(0.605, 1 - 0.34 / height), **_LEGEND)
+        self.title = trajectory.controller + ("" if speed == 1 else f", {speed:.3g} x real time")
+        self.axes = tuple(figure.axes)  #: the axes of the arm, then those of each quantity
+        figure.text(0.02, 1 - 0.25 / height, self.title, fontsize=10)
+        self._clock = figure.text(0.42, 1 - 0.25 / height, "", fontsize=10, animated=True)
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(figure.bbox)
+
+    def pictures(self, instants: NDArray[np.int_]) -> Iterator[Frame]:
+        """Frames of the run at the given instants, by index."""
+        for index in instants:
+            self._canvas.restore_region(self._background)
+            for artist in self._moved(int(index)):
+                self._canvas.figure.draw_artist(artist)
+            yield np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def _moved(self, index: int) -> list[Artist]:
+        """All moving artists, placed as they are at an instant."""
+        now = self._times[index]
+        for i in range(self._values.shape[1]):
+            done, cursor = self._lines[2 * i : 2 * i + 2]
+            done.set_data(self._times[: index + 1], self._values[: index + 1, i])
+            cursor.set_data([now, now], cursor.axes.get_ylim())
+        self._clock.set_text(f"t = {now:.2f} s")
+        return [*self._arm.moved(index), *self._lines, self._clock]
+
+
+class _Arm:
+    """The arm, the path of its tip and the target of the tip, in 2-D axes for planar arms, otherwise in 3-D."""
+
+    def __init__(self, figure: Figure, trajectory: Trajectory, problem: Problem) -> None:
+        points = problem.robot.joint_points(trajectory.q)  # (N, points, 3)
+        low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+        flat = np.flatnonzero(high - low < _FLAT)
+        shown = np.delete(np.arange(3), flat[-1]) if flat.size else np.arange(3)
+        axes = _axes_around(figure, low[shown], high[shown], ["xyz"[i] for i in shown])
+        self._points, self._targets = points[..., shown], _tip_targets(trajectory, problem)[:, shown]
+        zero = np.zeros((len(shown), 0))
+        axes.plot(*self._points[0, :1].T, "s", color=_ARM, markersize=9)
+        self._lines: list[Any] = [
+            *axes.plot(*zero, color=_TRAIL, linewidth=1.5, animated=True, label="tip path"),
+            *axes.plot(*zero, "-o", color=_ARM, linewidth=3.5, markersize=5.5, animated=True),
+            *axes.plot(
+                *zero,
+                "+",
+                color=_TARGET,
+                markersize=13,
+                markeredgewidth=1.6,
+                animated=True,
+                label="target",
+            ),
+        ]
+        self._shadow: list[Any] = [] if flat.size else axes.plot(*zero, color=_SHADOW, linewidth=3, animated=True)
+        known = self._lines[0], self._lines[2]
+        figure.legend(handles=known[: 1 + np.isfinite(self._targets).all()], loc=(0.02, 0.01), **_LEGEND)
+
+    def moved(self, index: int) -> list[Artist]:
+        """The lines, placed as they are at an instant."""
+        now = self._points[index]
+        shapes = [self._points[: index + 1, -1], now, self._targets[index : index + 1]]
+        for line, shape in zip(self._lines, shapes, strict=True):
+            (line.set_data if shape.shape[1] == 2 else line.set_data_3d)(*shape.T)
+        for line in self._shadow:
+            line.set_data_3d(now[:, 0], now[:, 1], np.full(len(now), line.axes.get_zlim()[0]))
+        return [*self._shadow, *self._lines]
+
+
+def _tip_targets(trajectory: Trajectory, problem: Problem) -> Array:
+    """Target of the tip, (N, 3). Axes that the task leaves free follow the tip; NaN if the task is not a position."""
+    if not problem.task.name.startswith("position:"):
+        return np.full((len(trajectory.times), 3), np.nan)
+    target = problem.robot.joint_points(trajectory.q)[:, -1].copy()
+    for i, label in enumerate(problem.task.labels):
+        target[:, "xyz".index(label)] = trajectory.reference[:, i]
+    return target
+
+
+def _axes_around(figure: Figure, low: Array, high: Array, names: list[str]) -> Any:
+    """Axes for the arm, with the same scale in all directions."""
+    longest = (high - low).max()
+    middle, extent = (low + high) / 2, high - low + 2 * _MARGIN * longest
+    if len(names) == 2:
+        axes: Any = figure.add_axes((0.075, 0.17, 0.445, 0.74))
+        shape = figure.get_size_inches() * axes.get_position().size
+        extent = (extent / shape).max() * shape
+        axes.grid(alpha=0.3)
+    else:
+        axes = figure.add_axes((-0.02, 0.05, 0.52, 0.88), projection="3d")
+        extent = np.maximum(extent, longest / 2)
+        axes.set_box_aspect(extent, zoom=0.95)
+        axes.view_init(elev=22, azim=-60)
+        axes.locator_params(nbins=4)
+    for letter, name, centre, length in zip("xyz", names, middle, extent, strict=False):
+        getattr(axes, f"set_{letter}lim")(centre - length / 2, centre + length / 2)
+        getattr(axes, f"set_{letter}label")(f"{name} [m]", fontsize=9)
+    axes.tick_params(labelsize=8)
+    return axes
+
+
+def require_format(name: str) -> None:
+    """Check early that an animation of this format can be made on this machine.
+
+    Raises:
+        UnknownNameError: if the format is neither gif nor mp4.
+        InvalidValueError: for mp4 without ffmpeg on the PATH.
+    """
+    require_known("animation format", name, FORMATS)
+    if name == "mp4" and shutil.which("ffmpeg") is None:
+        raise InvalidValueError("animation", "mp4", "gif, because mp4 needs ffmpeg, which is not on the PATH")
+
+
+def save_animation(
+    path: str | Path, trajectory: Trajectory, problem: Problem, monitor: Monitor = silent, force: bool = False
+) -> None:
+    """Write an animation of the arm and its controlled quantities. The file appears whole or not at all.
+
+    The arm is drawn in 3-D, or in its plane if it is planar. The animation has 20 frames per second and runs in real
+    time for runs of up to 20 s.
+
+    Args:
+        path: of the file, ending in .gif or .mp4.
+        trajectory: the run.
+        problem: robot and task.
+        monitor: called with progress.
+        force: replace any file of that name; default only those that the list `.orthocas.json` of the folder has, which
+            is kept there.
+
+    Raises:
+        UnknownNameError, InvalidValueError: if the format is unknown, or ffmpeg is missing.
+        ArchiveError: if the file cannot be written, or there is one that orthocas did not write, or a symbolic link.
+    """
+    target = Path(path)
+    require_format(target.suffix.removeprefix("."))
+    require_writable(target, ArchiveError)
+    require_replaceable_files(target.parent, [target.name], force)
+    instants, speed = _chosen(trajectory.times)
+    film = MovingPicture(trajectory, problem, speed)
+    samples = np.vstack(list(film.pictures(instants[[0, -1]])))
+    pictures = _watched(film.pictures(instants), len(instants), monitor)
+    with published(target.parent, listed=True, force=force) as folder:
+        draft = folder / target.name
+        if target.suffix == ".gif":
+            _write_gif(draft, pictures, samples)
+        else:
+            _write_mp4(draft, pictures, (len(samples) // 2, samples.shape[1]))
+
+
+def _chosen(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], float]:
+    """Indices of the instants to show, and the factor by which they play faster than real time."""
+    length = float(times[-1] - times[0])
+    speed = max(1.0, length * _RATE / _MOST)
+    wanted = np.arange(times[0], times[-1] + 1e-9, speed / _RATE)
+    return np.clip(np.searchsorted(times, wanted - 1e-9), 0, len(times) - 1), speed
+
+
+def _watched(pictures: Iterator[Frame], count: int, monitor: Monitor) -> Iterator[Frame]:
+    for k, picture in enumerate(pictures, start=1):
+        yield picture
+        monitor(Progress("draw animation", k / count, f"frame {k} of {count}"))
+
+
+def _write_gif(path: Path, pictures: Iterator[Frame], samples: Frame) -> None:
+    """Write frames in the palette of the samples; each frame stores only what changes."""
+    palette = Image.fromarray(samples).quantize(_COLOURS)
+    frames = (Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
+    first = next(frames)
+    with path.open("wb") as file:  # unlike a file that Pillow opens, this one is closed even after Ctrl-C
+        first.save(file, "GIF", save_all=True, append_images=frames, duration=1000 // _RATE, loop=0, optimize=True)
+
+
+def _write_mp4(path: Path, pictures: Iterator[Frame], size: tuple[int, int]) -> None:
+    """Send raw frames of size (height, width) to ffmpeg through a pipe."""
+    come = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[1]}x{size[0]}", "-r", str(_RATE), "-i", "-"]
+    command = ["ffmpeg", "-loglevel", "error", "-y", *come, "-pix_fmt", "yuv420p", str(path)]
+    with tempfile.TemporaryFile() as said:
+        ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said, stderr=said)
+        try:
+            with suppress(BrokenPipeError), ffmpeg:  # if ffmpeg gives up, its messages say why
+                assert ffmpeg.stdin is not None
+                for picture in pictures:
+                    ffmpeg.stdin.write(picture.tobytes())
+        except BaseException:
+            ffmpeg.kill()
+            raise
+        said.seek(0)
+        if ffmpeg.returncode != 0:
+            text = said.read().decode(errors="replace").strip()[-200:]
+            raise ArchiveError(f"ffmpeg could not write {path.name}: {text or f'exit code {ffmpeg.returncode}'}")

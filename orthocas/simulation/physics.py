@@ -11,11 +11,9 @@ from orthocas.control.memory import Remembering, memory_of
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
-from orthocas.simulation.closed_loop import ClosedLoop, Piece, run_compiled
 from orthocas.simulation.disturbances import Loads, Noise
-from orthocas.simulation.loops import held_plant, pieces
-from orthocas.simulation.mujoco_plant import MuJoCoPlant
-from orthocas.simulation.mujoco_scene import MuJoCo
+from orthocas.simulation.loops import ClosedLoop, Piece, held_plant, pieces, run_compiled
+from orthocas.simulation.mujoco_plant import MuJoCo, MuJoCoPlant
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_number, require_kind
 from orthocas.tools.files import draft_folder

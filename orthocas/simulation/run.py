@@ -17,10 +17,9 @@ from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
 from orthocas.robots.robot import Robot
-from orthocas.simulation.closed_loop import ClosedLoop, Piece
 from orthocas.simulation.disturbances import Friction, Loads, Noise, Push, Stops
-from orthocas.simulation.loops import CompiledLoop, integrate, run_ticks
-from orthocas.simulation.mujoco_scene import MUJOCO, MuJoCo
+from orthocas.simulation.loops import ClosedLoop, CompiledLoop, Piece, integrate, run_ticks
+from orthocas.simulation.mujoco_plant import MUJOCO, MuJoCo
 from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, law_in_ticks, run_physics, run_supervised
 from orthocas.simulation.trajectory import Outcome, Trajectory
 from orthocas.tools.batch import THREADS, Batched

@@ -7,10 +7,8 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
-from orthocas.viewer.arm import GHOSTS, Arm, Ghosts
-from orthocas.viewer.looks import Look, chain_length
-from orthocas.viewer.panel import ChartPanel
-from orthocas.viewer.session import Session
+from orthocas.viewer.looks import GHOSTS, Arm, Ghosts, Look, chain_length
+from orthocas.viewer.panel import ChartPanel, Session
 from orthocas.viewer.window import Loop, place_camera, place_floor, place_lights, show_error
 
 _STEP = 1e-3  # of the sliders

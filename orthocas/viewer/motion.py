@@ -14,7 +14,7 @@ from orthocas.paths.joint_motion import JointMotion
 from orthocas.robots.robot import Robot
 from orthocas.simulation.trajectory import Trajectory
 from orthocas.tools.checks import Array, as_float_array, as_point_set, frozen_array, require_count, require_kind
-from orthocas.tools.csv_table import column_places, read_table
+from orthocas.tools.files import column_places, read_table
 
 _MOST_INSTANTS = 1_000_000
 _TIME = "time_s"

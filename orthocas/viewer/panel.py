@@ -1,16 +1,20 @@
 """Readings of a joint position as a small page of HTML: numbers and bars."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import takewhile
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
+from orthocas.charts.self_motion import Walls
+from orthocas.charts.solutions import TrackerStatus
+from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import bounds_of
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, as_number, as_point, require_kind, require_known
 from orthocas.viewer.motion import Motion
 
 GOOD, FAIR, POOR = "#2f9e62", "#e0a100", "#d64545"
@@ -29,6 +33,10 @@ padding:8px 10px;margin-top:10px}
 .oc .held b{font-size:17px;font-weight:650;color:#1f5fa8;font-variant-numeric:tabular-nums}
 .oc .stop{margin-top:10px;padding:7px 10px;border-radius:8px;background:#fff3e6;color:#8a4b08;font-size:12px}
 </style>"""
+MOST_STEPS = 200  # of the tracker towards one wish
+_SHORTEST = 1e-4  # share of the way to a wish below which there is no way on
+_REACHED = 1e-10  # of the sizes of the components
+_MOST_UNDONE = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,3 +270,133 @@ class PlayerPanel:
             f'<div class="held"><span>joints from their start</span>{shown}</div>'
             f"{''.join(ends)}{self._joints.html(motion.at(seconds))}"
         )
+
+
+class Session:
+    """A joint position of a chart that follows what is wished for components of phi.
+
+    A wish names components of phi, such as {"xi1": 0.2}; the others keep their values. `follow` moves q along the
+    straight line in phi with a tracker, so within the domain and without jumps. Where the line leaves the domain or
+    meets a fold, q stays before it, and the wish is given up. A session belongs to one thread.
+
+    Args:
+        chart: a fitted chart.
+        q: where to begin, (n,); default: the centre of the domain.
+
+    Raises:
+        NoExpressionError: if the coordinates are grown.
+        InvalidValueError: if q lies outside the domain, or J is singular there.
+    """
+
+    beyond = 0.0  #: how far a wish for a coordinate may lie beyond its ends in the chart, as a share of their distance
+    _wished: Array  #: phi, (n,)
+
+    def __init__(self, chart: Chart, q: Array | None = None) -> None:
+        require_kind("chart", chart, Chart)
+        self.home: Array = chart.problem.domain.centre if q is None else as_point("q", q, chart.n)
+        self._past: list[Array] = []
+        self._use(chart, self.home)
+
+    @property
+    def place(self) -> str:
+        """Where the chart belongs, if there are several."""
+        return ""
+
+    @property
+    def q(self) -> Array:
+        """The joint position, (n,)."""
+        return self._tracker.q
+
+    @property
+    def readings(self) -> Readings:
+        """What the page shows about q; the task should have the value that was last wished for."""
+        return self._readers.at(self.q, self._wished[: self.chart.m], self.stop)
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is an earlier joint position to return to."""
+        return bool(self._past)
+
+    def wish(self, values: Mapping[str, float]) -> None:
+        """Wish for values of some components of phi, by their labels.
+
+        Raises:
+            UnknownNameError, InvalidValueError: if there is no such component, or a value is not finite.
+        """
+        require_kind("values", values, Mapping)
+        wished = self._wished.copy()
+        for label, value in values.items():
+            require_known("component of phi", str(label), self.chart.labels)
+            number = as_number(f"wish for {label}", value)
+            if not np.isfinite(number):
+                raise InvalidValueError(f"wish for {label}", value, "a finite number")
+            wished[self.chart.labels.index(label)] = number
+        self._wished = wished
+
+    def follow(self, most_steps: int = MOST_STEPS) -> bool:
+        """Move towards the wish. Returns whether q has moved; afterwards the wish is met, given up, or still ahead."""
+        moved = False
+        for _ in range(most_steps):
+            here = self.chart.phi(self.q)
+            if not self._far(here).any():
+                break
+            if not self._step(here):
+                self._give_up(here)
+                break
+            moved, self.stop = True, ""
+        return moved
+
+    def remember(self) -> None:
+        """Keep the joint position, for `undo`."""
+        if not self._past or (self._past[-1] != self.q).any():
+            self._past = [*self._past[-_MOST_UNDONE:], self.q]
+
+    def undo(self) -> None:
+        """Return to the last joint position that was remembered and is another one."""
+        while self._past:
+            before = self._past.pop()
+            if (before != self.q).any():
+                self._place(before)
+                return
+
+    def go_home(self) -> None:
+        """Return to where the session began."""
+        self.remember()
+        self._place(self.home)
+
+    def _step(self, here: Array) -> bool:
+        """Step as far along the line as the tracker allows. Returns whether it allows any step."""
+        share = 1.0
+        while share >= _SHORTEST:
+            self._tracker.step(here + share * (self._wished - here))
+            if self._tracker.status is TrackerStatus.OK:
+                return True
+            share /= 2
+        return False
+
+    def _give_up(self, here: Array) -> None:
+        """Wish for what there is in place of what cannot be, and say what is in the way."""
+        self.stop = self._reason()
+        self._wished = np.where(self._far(here), here, self._wished)
+
+    def _far(self, here: Array) -> NDArray[np.bool_]:
+        """Which components of phi are not yet what is wished for, (n,)."""
+        return np.asarray(np.abs((self._wished - here) / self.chart.phi_sizes) > _REACHED)
+
+    def _reason(self) -> str:
+        if self._tracker.status is TrackerStatus.OUTSIDE_DOMAIN:
+            return str(self._walls.worst(self.q))
+        return "a fold of the chart or a singular position"
+
+    def _use(self, chart: Chart, q: Array) -> None:
+        """Go on in a chart, at rest at a joint position."""
+        self.chart = chart
+        self._tracker = chart.tracker(q)
+        self._readers, self._walls = Readers(chart), Walls(chart.problem)
+        self._wished = chart.phi(q)
+        self.stop = ""  #: what stopped the last motion, or ""
+
+    def _place(self, q: Array) -> None:
+        self._tracker.reset(q)
+        self._wished = self.chart.phi(q)
+        self.stop = ""

@@ -11,8 +11,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import fan_along
 from orthocas.robots.robot import Robot
 from orthocas.tools.checks import Array, Indices
-from orthocas.viewer.arm import BodyPoses, shades
-from orthocas.viewer.looks import SHELL, Colour, Look, Solid, capsule, chain_length, stick_arm
+from orthocas.viewer.looks import SHELL, BodyPoses, Colour, Look, Solid, capsule, chain_length, shades, stick_arm
 
 _SAMPLES = 2  # per pixel and axis
 _MOST = 2_000_000  # candidates of pixels that are looked at together

@@ -16,9 +16,8 @@ from orthocas.tools.files import published, require_replaceable, require_writabl
 from orthocas.viewer.chart_page import ChartPage
 from orthocas.viewer.looks import Look, stick_arm, urdf_look
 from orthocas.viewer.motion import Motion, require_joints
-from orthocas.viewer.player import PlayerPage, RobotPage
-from orthocas.viewer.recording import Scene, chart_scene, motion_scene, recorded, robot_scene
-from orthocas.viewer.session import Session
+from orthocas.viewer.panel import Session
+from orthocas.viewer.player import PlayerPage, RobotPage, Scene, chart_scene, motion_scene, recorded, robot_scene
 from orthocas.viewer.window import LOCAL, close_window, open_window
 
 PORT = 8080

@@ -31,7 +31,7 @@ from orthocas.atlas.laws import BlendedImpedance, HandedOver
 from orthocas.atlas.simulate import AtlasControl
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
-from orthocas.viewer.session import Session
+from orthocas.viewer.panel import Session
 
 Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments that it takes
 

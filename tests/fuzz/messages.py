@@ -9,8 +9,7 @@ import numpy as np
 
 from fuzz.child import Finding, run, verdict
 from fuzz.mutants import NUMBERS, OTHERS, TEXTS, Rng, changed_data, pick
-from orthocas.viewer.messages import Inbox
-from orthocas.viewer.window import LOCAL, open_window
+from orthocas.viewer.window import LOCAL, Inbox, open_window
 
 _KINDS = (
     *("GuiUpdateMessage", "ViewerCameraMessage", "TransformControlsUpdateMessage", "FileTransferStartUpload"),

@@ -10,8 +10,7 @@ import public_objects
 from fuzz.child import Finding, run
 from fuzz.mutants import NUMBERS, OTHERS, TEXTS, Rng, changed_data, flipped, pick
 from fuzz.sealed_files import judged
-from orthocas.simulation.disturbances import Loads
-from orthocas.simulation.steps_file import read_steps
+from orthocas.simulation.disturbances import Loads, read_steps
 
 ONE_STEP = {"time": 0.5, "move": {"x": 0.1}}
 ORIGINALS: tuple[dict[str, Any], ...] = (
