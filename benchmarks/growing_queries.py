@@ -12,10 +12,11 @@ from statistics import median
 import numpy as np
 from benchmark import run
 from scipy.integrate import RK45
+from sundials_flow import SundialsFlow
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.exact.flow import SundialsFlow, TaskFlow
+from orthocas.exact.flow import TaskFlow
 from orthocas.tools.checks import Array
 
 LEVEL = np.zeros(1)

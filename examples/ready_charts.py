@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from rendering import fan_picture, widest_coordinate
 from self_motion_picture import robot_file, save_trimmed
 
 import orthocas as oc
@@ -20,7 +21,6 @@ from orthocas.charts import Card, Model
 from orthocas.charts.chart_file import fingerprint
 from orthocas.charts.self_motion import fan_along
 from orthocas.viewer.looks import urdf_look
-from orthocas.viewer.rendering import fan_picture, widest_coordinate
 
 ROOT = Path(__file__).parent.parent
 DATA = ROOT / "orthocas" / "charts" / "data"

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageChops
+from rendering import Picture, fan_picture
 
 import orthocas as oc
 from orthocas.viewer.looks import urdf_look
-from orthocas.viewer.rendering import Picture, fan_picture
 
 POSTURE = (0.0, -0.5, 0.0, -2.2, 0.0, 1.7, np.pi / 4)  #: of the solid arm [rad]
 WIDTH, HEIGHT, MARGIN = 1000, 780, 16  #: [pixels]

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from rendering import Camera, Layer, render
 from scipy.spatial.transform import Rotation
 from self_motion_picture import POSTURE, robot_file
 
 import orthocas as oc
 from orthocas.viewer.looks import BodyPoses, Look, Solid, capsule, stick_arm, urdf_look
-from orthocas.viewer.rendering import Camera, Layer, render
 
 RADIUS, LOOPS, STEPS = 0.1, 4, 400  #: of the circle [m]; circles; steps of each
 SWING, LOOP, PAUSE = 36, 16, 8  #: pictures of the swing, of each circle, and at rest after it

@@ -4,11 +4,12 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from sundials_flow import SundialsFlow
 
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import GrowError
-from orthocas.exact.flow import Arrival, BatchedFlow, SundialsFlow, TaskFlow
+from orthocas.exact.flow import Arrival, BatchedFlow, TaskFlow
 from orthocas.tasks.metric import metric_matrices
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])

@@ -7,9 +7,9 @@ import pytest
 import self_motion_picture
 import wide_film
 from PIL import Image
+from rendering import Camera, Layer, render
 
 from orthocas.viewer.looks import Solid, ball
-from orthocas.viewer.rendering import Camera, Layer, render
 
 CAMERA = Camera((5.0, 0.0, 0.0), (0.0, 0.0, 0.0), 60.0)
 RED, BLUE = (200, 20, 20), (20, 20, 200)

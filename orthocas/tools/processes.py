@@ -148,11 +148,6 @@ def in_order(executor: Executor, work: Callable[..., Any], *columns: Sequence[An
             future.cancel()
 
 
-def knows_parent() -> bool:
-    """Whether this process may be one of `starting_workers`."""
-    return _PARENT in os.environ
-
-
 def end_early_with_parent() -> None:
     """End with the parent already while Python imports what a worker needs; `orthocas` calls it first of all.
 
