@@ -48,6 +48,8 @@ def main(quick: bool = False, file: Path | None = None) -> dict[str, float]:
             atlas = oc.build_atlas(known, path, case.asked, region=start[None], radius=case.reach, jobs=1)
         else:
             atlas = oc.Atlas.load(file)
+        print("| circle | hand-overs | pseudo-inverse [rad] | atlas with hand-overs [rad] | one chart [rad] |")
+        print("| --- | --- | --- | --- | --- |")
         rows = [row for size in case.sizes for row in of_size(atlas, start, size, case.circles)]
     hand_overs, least, across, one = np.array(rows).T
     return {
@@ -63,16 +65,15 @@ def of_size(atlas: oc.Atlas, start: Array, size: float, circles: int) -> list[tu
     """Hand-overs and what is left over, for circles of one size in random planes, and print them."""
     rng, rows = np.random.default_rng(5), []
     task = atlas.problem.task
-    for _ in range(circles):
+    for number in range(1, circles + 1):
         q = start + rng.uniform(-0.2, 0.2, len(start))
         x = circle(task.batched(q[None])[0][0], size, rng)
         motion = follow_in_atlas(atlas, x, q)
         chart = oc.chart_along(atlas, x, q)
         ends = (pseudo_inverse(atlas.problem, q, x), motion.q[-1], held(chart, q, x))
         left = [float(np.abs(end - q).max()) for end in ends]
-        print(
-            f"{size:g} m: {motion.hand_overs} hand-overs; {left[0]:.2g}, {left[1]:.2g}, {left[2]:.1g} rad", flush=True
-        )
+        cells = f"{motion.hand_overs} | {left[0]:.2g} | {left[1]:.2g} | {left[2]:.1g}"
+        print(f"| {size:g} m, plane {number} | {cells} |", flush=True)
         rows.append((motion.hand_overs, *left))
     return rows
 

@@ -122,7 +122,7 @@ def main(out: Path, quick: bool = False) -> dict[str, dict[str, float]]:
 def table(found: dict[str, dict[str, float]], chart: Chart, what: str) -> list[str]:
     """One kind of number for each component of phi, the task in mm, a line for each kind of joints."""
     m, last = chart.m, [] if what == "coupling" else ["joint_difference_of_end_and_start_rad"]
-    units = [f"{label} [mm]" for label in chart.labels[:m]] + chart.labels[m:]
+    units = [f"{label} [mm]" for label in chart.labels[:m]] + list(chart.labels[m:])
     lines = [f"| joints | {' | '.join(units)} |" + " at the end [rad] |" * len(last)]
     lines.append("| --- |" + " --- |" * (len(units) + len(last)))
     for name, numbers in found.items():
