@@ -10,6 +10,7 @@ held.
 """
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -45,7 +46,11 @@ def main(quick: bool = False) -> dict[str, float]:
     """Build an atlas around circles, and run them."""
     case = QUICK if quick else CASE
     problem = problems.get(case.name)
-    loops = {f"{size:g} m, plane {k + 1}": loop(problem, size, k) for size in case.sizes for k in range(case.circles)}
+    loops = {
+        f"{size:g} m, plane {k}": loop
+        for size in case.sizes
+        for k, loop in enumerate(circles(problem, size, case.circles), 1)
+    }
     around = np.vstack([pseudo_inverse(problem, q, x) for q, x in loops.values()])
     print(HEADER)
     with TemporaryDirectory() as folder:
@@ -62,11 +67,12 @@ def main(quick: bool = False) -> dict[str, float]:
     }
 
 
-def loop(problem: oc.Problem, size: float, number: int) -> tuple[Array, Array]:
-    """A start near the centre of the domain, and a circle of the tool from there in a random plane."""
-    rng = np.random.default_rng([5, number])
-    q = problem.domain.centre + rng.uniform(-0.2, 0.2, problem.n)
-    return q, circle(problem.task.batched(q[None])[0][0], size, rng)
+def circles(problem: oc.Problem, size: float, count: int) -> Iterator[tuple[Array, Array]]:
+    """Starts near the centre of the domain, and circles of the tool from there in random planes."""
+    rng = np.random.default_rng(5)
+    for _ in range(count):
+        q = problem.domain.centre + rng.uniform(-0.2, 0.2, problem.n)
+        yield q, circle(problem.task.batched(q[None])[0][0], size, rng)
 
 
 def row(atlas: oc.Atlas, name: str, q: Array, x: Array) -> tuple[float, ...]:

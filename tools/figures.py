@@ -296,7 +296,7 @@ def _row_close(header: str, a: str, b: str, record: Record) -> bool:
 
 
 def _cells(row: str) -> list[str]:
-    return [cell.strip() for cell in row.strip("| ").split("|")]
+    return [cell.strip() for cell in row.strip()[1:-1].split("|")]
 
 
 def _number(word: str) -> float:
