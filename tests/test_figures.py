@@ -25,6 +25,14 @@ def test_what_a_record_prints_is_on_a_page(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RECORDS)
+def test_tables_of_a_record_are_on_a_page(name: str) -> None:
+    """No record is kept for nobody."""
+    rows = {figures.key(line[0]) for page in PAGES.values() for line in figures.LINE.finditer(page)}
+    unused = [t[0] for t in RECORDS[name].tables if not any(figures.key(row) in rows for row in t[1:])]
+    assert unused == []
+
+
+@pytest.mark.parametrize("name", RECORDS)
 def test_phrases_say_what_their_numbers_are(name: str) -> None:
     """A bare number would explain every other one like it."""
     assert [phrase for phrase in RECORDS[name].printed if figures.says_nothing(phrase)] == []
