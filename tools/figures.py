@@ -72,6 +72,7 @@ class Record:
     source: str  #: "measured", "transcribed" or "constants"
     command: str = ""  #: what measures the numbers, from the repository root
     script: str = ""  #: file whose `main` this tool calls; "" for a command that prints its values as JSON (`--json`)
+    results: str = ""  #: folder of the repository where a run of hours leaves what the tables are made of
     arguments: Mapping[str, Any] = field(default_factory=dict)  #: of `main`
     cpu_seconds: float | None = None  #: of the run; None if it was not timed
     tolerance: Mapping[str, float] = field(default_factory=dict)
