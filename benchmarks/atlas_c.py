@@ -123,7 +123,7 @@ _ROWS = (
 
 
 def main(quick: bool = False, file: Path | None = None) -> dict[str, float]:
-    """Print sizes and times; return the times of the search and of a hand-over tick [us]."""
+    """Print times; return sizes, and the times of the search and of a hand-over tick [us]."""
     with TemporaryDirectory() as place:
         folder = Path(place)
         atlas, path = _atlas(folder, quick, file)
@@ -135,15 +135,12 @@ def main(quick: bool = False, file: Path | None = None) -> dict[str, float]:
         q = path[rng.integers(len(path), size=_POSITIONS)] + rng.uniform(-0.1, 0.1, (_POSITIONS, path.shape[1]))
         q.tofile(folder / "positions")
         times, sizes = _run(folder)
-        print(
-            f"{len(atlas)} charts in the atlas, {len(part)} in the part ({len(tables.fits)} fitted): tables "
-            f"{tables.bytes / 1024:.0f} KiB, library {library.stat().st_size / 1024:.0f} KiB, stack "
-            f"{generated.stack_bytes} bytes, state {sizes[1]} bytes; {sizes[0]} positions\n"
-        )
+        found = {"charts": len(atlas), "along the path": len(part), "positions": sizes[0]}
+        found |= {"tables KiB": tables.bytes / 1024, "library KiB": library.stat().st_size / 1024}
     print("| call | median us | best us | slowest position us |\n| --- | --- | --- | --- |")
     for name, row in zip(_ROWS, times, strict=True):
         print(f"| {name} | " + " | ".join(f"{time:.3f}" for time in row) + " |")
-    return {"search_us": times[0][0], "hand_over_us": times[-1][0]}
+    return found | {"search_us": times[0][0], "hand_over_us": times[-1][0]}
 
 
 def _atlas(folder: Path, quick: bool, file: Path | None) -> tuple[oc.Atlas, Array]:

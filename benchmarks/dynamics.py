@@ -15,6 +15,13 @@ from c_timing import nanoseconds_per_call
 import orthocas as oc
 from orthocas.problems import iiwa
 
+WORDS = {
+    "orthocas": "orthocas",
+    "adam_robotics": "adam-robotics 0.5, compiled the same way",
+    "generated_library": "the library that `orthocas codegen` writes, with gravity and a status beside them",
+    "pinocchio_from_python": "Pinocchio 4.1, C++ called from Python (call overhead included)",
+}
+
 
 def main(quick: bool = False) -> dict[str, float]:
     """Print nanoseconds per call, medians of 9 alternating rounds in one process; `quick`: few calls of Pinocchio."""
@@ -41,8 +48,9 @@ def main(quick: bool = False) -> dict[str, float]:
         times = nanoseconds_per_call(functions, sources={"generated_library": _generated(Path(folder))})
     times["pinocchio_from_python"] = _pinocchio_nanoseconds(model, 100 if quick else 20_000)
     times["ratio"] = times["orthocas"] / times["adam_robotics"]
-    for name, value in times.items():
-        print(f"{name:>22}: {value:8.2f}{'' if name == 'ratio' else ' ns'}")
+    print("| library | ns per call |\n| --- | --- |")
+    for name, words in WORDS.items():
+        print(f"| {words} | {times[name]:.0f} |")
     return times
 
 

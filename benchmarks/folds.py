@@ -1,7 +1,5 @@
 """Default fits look for folds: time and quality, and the least conditioning at millions of other samples."""
 
-import time
-
 import numpy as np
 from benchmark import run, table
 from suggested_domains import robot_of
@@ -11,8 +9,8 @@ from orthocas.charts.point_quality import Judged
 from orthocas.tasks.domains import sample_heavily, sample_uniform
 
 HEADER = (
-    "| problem | degree | fit [s] | task std [deg] | mutual std [deg] | least conditioning: the fit's search | uniform "
-    "| near faces and corners | folds |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+    "| problem | degree | task std [deg] | mutual std [deg] | least conditioning: the fit's search | uniform "
+    "| near faces and corners | folds |\n| --- | --- | --- | --- | --- | --- | --- | --- |"
 )
 DEGREES = (4, 5, 6)  # of the 7-DoF arm, with 10 million samples each
 ROBOTS = (  # with the default box around the default home, and 400,000 samples each
@@ -39,14 +37,12 @@ def least(chart: oc.Chart, samples: int, heavy: bool) -> tuple[float, int]:
 
 def row(problem: oc.Problem, name: str, degree: int, samples: int) -> str:
     """Fit with the default weights, and judge at half of the samples each."""
-    start = time.perf_counter()
     fit = oc.fit(problem, oc.Polynomial(degree))
-    seconds = time.perf_counter() - start
     report = oc.evaluate(fit.chart, samples=min(samples, 100_000))
     (uniform, some), (heavy, others) = (least(fit.chart, samples // 2, near_faces) for near_faces in (False, True))
     worst = np.nan if fit.worst is None else fit.worst.least
     return (
-        f"| {name} | {degree} | {seconds:.1f} | {report.task_angle.std:.2f} | {report.mutual_angle.std:.2f} "
+        f"| {name} | {degree} | {report.task_angle.std:.2f} | {report.mutual_angle.std:.2f} "
         f"| {worst:.3f} | {uniform:.3f} | {heavy:.3f} | {some + others} |"
     )
 

@@ -21,8 +21,8 @@ from orthocas.errors import Interrupted
 from orthocas.tools.progress import Monitor, Progress
 
 HEADER = (
-    "| inputs | parameters | weights | epochs | training [s] | task std [deg] | mutual std [deg] "
-    "| conditioning mean / 1 % / min |\n| --- | --- | --- | --- | --- | --- | --- | --- |"
+    "| inputs | parameters | weights | epochs | task std [deg] | mutual std [deg] "
+    "| conditioning mean / 1 % / min |\n| --- | --- | --- | --- | --- | --- | --- |"
 )
 CASES = (((1000.0, 1.0), True), ((1000.0, 30.0), True), ((1000.0, 30.0), False))  # weights, whether inputs are raw
 
@@ -53,7 +53,7 @@ def row(weights: tuple[float, float], raw: bool, quick: bool) -> str:
     quality, inputs = report.conditioning, "q" if raw else "sin q, cos q"
     return (
         f"| {inputs} | {fit.chart.coordinates.size} | {', '.join(f'{w:g}' for w in weights)} "
-        f"| {fit.stages[-1].result.iterations} | {fit.seconds:.0f} "
+        f"| {fit.stages[-1].result.iterations} "
         f"| {report.task_angle.std:.3f} | {report.mutual_angle.std:.3f} "
         f"| {quality.mean:.3f} / {quality.p01:.3f} / {quality.min:.3f} |"
     )

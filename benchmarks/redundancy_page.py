@@ -195,8 +195,9 @@ def main() -> None:
         for name in known
         if (RESULTS / f"{name}.json").exists()
     }
-    record = json.loads(RECORD.read_text()) if RECORD.exists() else {"source": "transcribed", "printed": []}
-    record |= {"command": "python benchmarks/redundancy_benchmark.py", "tables": []}
+    record = json.loads(RECORD.read_text()) if RECORD.exists() else {"printed": []}
+    record |= {"source": "measured", "command": "python benchmarks/redundancy_benchmark.py", "tables": []}
+    record["results"] = str(RESULTS.relative_to(ROOT))
     for name, result in found.items():
         lines = table(known[name], result)
         record["tables"].append(lines)

@@ -43,6 +43,7 @@ SCRIPTS = (
     "mesh_chart",
     "growing_queries",
     "lengths",
+    "angles",
     "leak_bound",
     "closed_loop",
     "control_tick",

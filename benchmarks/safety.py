@@ -3,12 +3,9 @@
 Forces at elbow, wrist and tip in 26 directions, as strong as the motors could hold at rest (times 0.3 to 1, at most
 400 N), for 0.05 to 0.5 s, from random postures in the inner 60 % of the domain. Two seconds after the push, the program
 asks the catcher for the law again, and the arm goes back at 0.3 rad/s of its fastest joint, which takes long for wrists
-that the push turned around. PD+ coupled with default gains and default settings, cubic coordinates.
-
-`--cases "iiwa pose:z euclidean, panda pose:z euclidean"` pushes others than position tasks with A = M.
+that the push turned around. PD+ coupled with default gains and default settings, cubic coordinates (15 min).
 """
 
-import argparse
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -16,6 +13,7 @@ from tempfile import TemporaryDirectory
 
 import mujoco
 import numpy as np
+from benchmark import run, table
 from default_gains import chart_of
 
 import orthocas as oc
@@ -23,11 +21,22 @@ from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import ControlStatus, PDPlus
 from orthocas.simulation import MuJoCoPlant
 
-CASES = ("iiwa position inertia", "panda position inertia", "xarm7 position inertia")  # robot, task, metric
+CASES = (  # robot, task, metric
+    "iiwa position inertia",
+    "panda position inertia",
+    "xarm7 position inertia",
+    "iiwa pose:z euclidean",
+    "panda pose:z euclidean",
+)
 PLACES = {"elbow": 3, "wrist": 5, "tip": None}
 DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 TICK, QUIET, AFTER, LONGEST = 1e-3, 0.3, 2.0, 60.0  # [s] without push, until the law is asked for, until the end
 STRONGEST = 400.0  # [N]
+RUNS = 60  # of each case
+HEADER = (
+    "| arm | left the domain | caught | joints below 2 rad/s after | at rest after | fastest joint | torque a tick "
+    "| back under the law, after |\n| --- | --- | --- | --- | --- | --- | --- | --- |"
+)
 REST = 0.05  # [rad/s]
 
 
@@ -44,28 +53,21 @@ class Push:
     back_after: float  #: time from asking for the law until it commands inside the domain; infinite if it never did [s]
 
 
-def main() -> None:
-    """Print a table in Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", default=", ".join(CASES), help="robot, task and metric of each row")
-    parser.add_argument("--runs", type=int, default=200, help="pushes of each arm")
-    parser.add_argument("--quick", action="store_true", help="six pushes of one arm")
-    options = parser.parse_args()
-    cases, runs = (CASES[:1], 6) if options.quick else (options.cases.split(","), options.runs)
-    print(
-        "| case | left | caught | below 2 rad/s after | at rest after | fastest joint | torque a tick | back, after |"
+def main(quick: bool = False) -> list[str]:
+    """Print a table; `quick` takes six pushes of one arm."""
+    return table(HEADER, (row(case, 6 if quick else RUNS) for case in (CASES[:1] if quick else CASES)))
+
+
+def row(case: str, runs: int) -> str:
+    """The pushes of one arm."""
+    name, task, metric = case.split()
+    found = pushes(chart_of(name, task, metric), runs)
+    return (
+        f"| {name}, {task}, {metric} | {sum(p.left for p in found)} of {runs} | {sum(p.caught for p in found)} "
+        f"| {max(p.slow_after for p in found):.2f} s | {max(p.rest_after for p in found):.2f} s "
+        f"| {max(p.fastest for p in found):.0f} rad/s | {max(p.change for p in found):.2f} N m "
+        f"| {sum(p.back_after < np.inf for p in found)}, {max(p.back_after for p in found):.1f} s |"
     )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for case in cases:
-        name, task, metric = case.split()
-        found = pushes(chart_of(name, task, metric), runs)
-        print(
-            f"| {name}, {task}, {metric} | {sum(p.left for p in found)} of {runs} | {sum(p.caught for p in found)} "
-            f"| {max(p.slow_after for p in found):.2f} s | {max(p.rest_after for p in found):.2f} s "
-            f"| {max(p.fastest for p in found):.0f} rad/s | {max(p.change for p in found):.2f} N m "
-            f"| {sum(p.back_after < np.inf for p in found)}, {max(p.back_after for p in found):.1f} s |",
-            flush=True,
-        )
 
 
 def pushes(chart: oc.Chart, runs: int, seed: int = 0) -> list[Push]:
@@ -145,4 +147,4 @@ def strongest(plant: MuJoCoPlant, link: int | None, unit: np.ndarray) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run(main, __doc__)

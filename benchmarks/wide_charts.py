@@ -27,7 +27,7 @@ HEADER = (
     "| targets found |\n|" + " --- |" * 7
 )
 LOOPS = (
-    "| arm | radius [m] | closed, xi held | left over [rad] | closed, pseudo-inverse | left over [rad] |\n|"
+    "| arm | radius [m] | closed, xi held | left over [rad] | closed, pseudo-inverse | it leaves over [rad] |\n|"
     + " --- |" * 6
 )
 STEPS = 300  #: of a circle

@@ -10,6 +10,7 @@ held.
 """
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,25 +31,32 @@ class Case:
     sizes: tuple[float, ...]
     circles: int
     asked: oc.AtlasSettings
-    reach: float  #: of the atlas around the start [rad]
+    reach: float  #: of the atlas around the postures of the pseudo-inverse [rad]
 
 
-CASE = Case("iiwa", (0.05, 0.1, 0.2), 2, oc.AtlasSettings(half_width=0.4), 0.5)
-QUICK = Case("planar_3r_xy", (0.15,), 1, oc.AtlasSettings(2, 14.0, half_width=0.25, splits=2), 0.6)
+CASE = Case("iiwa", (0.05, 0.1, 0.2), 2, oc.AtlasSettings(half_width=0.4), 0.3)
+QUICK = Case("planar_3r_xy", (0.15,), 1, oc.AtlasSettings(2, 14.0, half_width=0.25, splits=2), 0.3)
+HEADER = (
+    "| circle | hand-overs | pseudo-inverse [rad] | atlas with hand-overs [rad] | one chart [rad] |\n"
+    "| --- | --- | --- | --- | --- |"
+)
 
 
-def main(quick: bool = False, file: Path | None = None) -> dict[str, float]:
-    """Build an atlas, or open one, and run the circles."""
+def main(quick: bool = False) -> dict[str, float]:
+    """Build an atlas around circles, and run them."""
     case = QUICK if quick else CASE
-    known = problems.get(case.name)
-    start = known.domain.centre
+    problem = problems.get(case.name)
+    loops = {
+        f"{size:g} m, plane {k}": loop
+        for size in case.sizes
+        for k, loop in enumerate(circles(problem, size, case.circles), 1)
+    }
+    around = np.vstack([pseudo_inverse(problem, q, x) for q, x in loops.values()])
+    print(HEADER)
     with TemporaryDirectory() as folder:
-        if file is None:
-            path = Path(folder) / "loops.orthocas-atlas"
-            atlas = oc.build_atlas(known, path, case.asked, region=start[None], radius=case.reach, jobs=1)
-        else:
-            atlas = oc.Atlas.load(file)
-        rows = [row for size in case.sizes for row in of_size(atlas, start, size, case.circles)]
+        path = Path(folder) / "loops.orthocas-atlas"
+        atlas = oc.build_atlas(problem, path, case.asked, region=around, radius=case.reach, jobs=1)
+        rows = [row(atlas, name, q, x) for name, (q, x) in loops.items()]
     hand_overs, least, across, one = np.array(rows).T
     return {
         "hand_overs": float(hand_overs.sum()),
@@ -59,22 +67,22 @@ def main(quick: bool = False, file: Path | None = None) -> dict[str, float]:
     }
 
 
-def of_size(atlas: oc.Atlas, start: Array, size: float, circles: int) -> list[tuple[float, ...]]:
-    """Hand-overs and what is left over, for circles of one size in random planes, and print them."""
-    rng, rows = np.random.default_rng(5), []
-    task = atlas.problem.task
-    for _ in range(circles):
-        q = start + rng.uniform(-0.2, 0.2, len(start))
-        x = circle(task.batched(q[None])[0][0], size, rng)
-        motion = follow_in_atlas(atlas, x, q)
-        chart = oc.chart_along(atlas, x, q)
-        ends = (pseudo_inverse(atlas.problem, q, x), motion.q[-1], held(chart, q, x))
-        left = [float(np.abs(end - q).max()) for end in ends]
-        print(
-            f"{size:g} m: {motion.hand_overs} hand-overs; {left[0]:.2g}, {left[1]:.2g}, {left[2]:.1g} rad", flush=True
-        )
-        rows.append((motion.hand_overs, *left))
-    return rows
+def circles(problem: oc.Problem, size: float, count: int) -> Iterator[tuple[Array, Array]]:
+    """Starts near the centre of the domain, and circles of the tool from there in random planes."""
+    rng = np.random.default_rng(5)
+    for _ in range(count):
+        q = problem.domain.centre + rng.uniform(-0.2, 0.2, problem.n)
+        yield q, circle(problem.task.batched(q[None])[0][0], size, rng)
+
+
+def row(atlas: oc.Atlas, name: str, q: Array, x: Array) -> tuple[float, ...]:
+    """Hand-overs and what is left over, printed too."""
+    motion = follow_in_atlas(atlas, x, q)
+    chart = oc.chart_along(atlas, x, q)
+    ends = (pseudo_inverse(atlas.problem, q, x)[-1], motion.q[-1], held(chart, q, x))
+    left = [float(np.abs(end - q).max()) for end in ends]
+    print(f"| {name} | {motion.hand_overs} | {left[0]:.2g} | {left[1]:.2g} | {left[2]:.1g} |", flush=True)
+    return motion.hand_overs, *left
 
 
 def circle(x: Array, size: float, rng: np.random.Generator) -> Array:
@@ -86,12 +94,14 @@ def circle(x: Array, size: float, rng: np.random.Generator) -> Array:
 
 
 def pseudo_inverse(problem: oc.Problem, q: Array, x: Array) -> Array:
-    """The last posture along task values, by steps of least norm."""
+    """Postures along task values, by steps of least norm."""
+    postures = []
     for wanted in x:
         for _ in range(3):
             J = problem.task.batched_jacobian(q[None])[0].reshape(problem.m, problem.n)
             q = q + np.linalg.pinv(J) @ (wanted - problem.task.batched(q[None])[0][0])
-    return q
+        postures.append(q)
+    return np.array(postures)
 
 
 def held(chart: oc.Chart, q: Array, x: Array) -> Array:
@@ -105,7 +115,5 @@ def held(chart: oc.Chart, q: Array, x: Array) -> Array:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--file", type=Path, help="an atlas of the 7-DoF arm, instead of building one")
-    words = parser.parse_args()
-    for key, number in main(words.quick, words.file).items():
+    for key, number in main(parser.parse_args().quick).items():
         print(f"{key:>20}: {number:.4g}")

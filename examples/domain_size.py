@@ -107,12 +107,21 @@ def numbers(rows: list[Row]) -> dict[str, float]:
 
 
 def table(rows: list[Row]) -> list[str]:
-    """The numbers, one line per cube and degree."""
-    lines = ["half-width  degree  expected  angle in A  ratio  task std  mutual std  least conditioning"]
-    for row in rows:
+    """The angles, a line for each cube, and what else the highest degree has."""
+    by_place = {(row.half_width_deg, row.degree): row for row in rows}
+    widths, degrees = (list(dict.fromkeys(part)) for part in zip(*by_place, strict=True))
+    last = f"degree {degrees[-1]}"
+    named = " | ".join(f"degree {degree}" for degree in degrees)
+    lines = [
+        f"| half-width [deg] | expected [deg] | {named} | task / mutual std, {last} | least conditioning, {last} |",
+        "| --- |" + " --- |" * (3 + len(degrees)),
+    ]
+    for width in widths:
+        row = by_place[width, degrees[-1]]
+        angles = " | ".join(f"{by_place[width, degree].angle:.3g}" for degree in degrees)
+        least = f"{row.conditioning:.2f}" if row.conditioning > 0 else "folds"
         lines.append(
-            f"{row.half_width_deg:7g} deg {row.degree:6d} {row.expected:10.3f} {row.angle:10.3f} "
-            f"{row.angle / row.expected:7.2f} {row.task_std:9.3f} {row.mutual_std:11.3f} {row.conditioning:11.3f}"
+            f"| {width} | {row.expected:.3g} | {angles} | {row.task_std:.2f} / {row.mutual_std:.2f} | {least} |"
         )
     return lines
 

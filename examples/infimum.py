@@ -217,11 +217,11 @@ def row(problem: oc.Problem, quick: bool) -> dict[str, float]:
     losses = refined(problem, charts["polynomial:4"], grids)
     infimum, error = extrapolated(losses)
     numbers = {"infimum": infimum, "error": error, "other_start": refined(problem, charts["linear"], grids[-2:-1])[0]}
-    numbers |= {f"grid {cells}": loss for cells, loss in zip(grids, losses, strict=True)}
+    numbers |= {f"splines, {cells} cells": loss for cells, loss in zip(grids, losses, strict=True)}
     splines = Splines(problem.domain, grids[-1])
     if problem.r == 1:
         for steps in STEPS[:1] if quick else STEPS:
-            numbers[f"{steps} steps"] = sampled(problem, staircase(problem, steps))
+            numbers[f"staircase, {steps} steps"] = sampled(problem, staircase(problem, steps))
     return numbers | {label: judged(problem, chart, splines) for label, chart in charts.items()}
 
 
@@ -264,6 +264,32 @@ def limit_over_degree(degrees: Array, losses: Array) -> tuple[float, float]:
     return infimum, max(abs(limit([j for j in everything if j != k]) - infimum) for k in everything)
 
 
+def table(rows: dict[str, dict[str, float]]) -> list[str]:
+    """Losses, and their angles in brackets: a line for each spline grid, family and staircase, a column a problem."""
+    every = dict.fromkeys(label for numbers in rows.values() for label in numbers)
+    kinds = [label.split(",")[0] for label in every]
+    labels = [label for label, kind in zip(every, kinds, strict=True) if kind == "splines"] + ["limit of splines"]
+    labels += [label for label in every if ":" in label or label == "linear"]
+    labels += [label for label, kind in zip(every, kinds, strict=True) if kind == "staircase"]
+    lines = [f"| | {' | '.join(rows)} |", f"| --- |{' --- |' * len(rows)}"]
+    return lines + [
+        f"| {label} | {' | '.join(cell(numbers, label) for numbers in rows.values())} |" for label in labels
+    ]
+
+
+def cell(numbers: dict[str, float], label: str) -> str:
+    """A loss with four digits and its angle; the limit of splines with its error, where refinement shows one."""
+    if label != "limit of splines":
+        return f"{numbers[label]:.4g} ({as_angle(numbers[label]):.3g}°)" if label in numbers else ""
+    infimum, error = max(numbers["infimum"], 0.0), numbers["error"]
+    grids = [value for name, value in numbers.items() if name.startswith("splines")]
+    if infimum == grids[-1]:
+        return f"below {infimum:.4g} ({as_angle(infimum):.3g}°), no limit found"
+    if error > infimum:
+        return f"below {infimum + error:.2g} ({as_angle(infimum + error):.2g}°)"
+    return f"{infimum:.4g} ± {error:.1g} ({as_angle(infimum):.3g}°)"
+
+
 def draw(rows: dict[str, dict[str, float]]) -> Figure:
     """The families beside the infimum, as angles."""
     figure = Figure(figsize=(10.5, 3.6), layout="constrained")
@@ -272,7 +298,7 @@ def draw(rows: dict[str, dict[str, float]]) -> Figure:
         labels = [label for label in numbers if ":" in label or label == "linear"]
         angles = [as_angle(numbers[label]) for label in labels]
         axes.plot(angles, labels, "o", color="C0", label="fitted")
-        finest = [value for label, value in numbers.items() if label.startswith("grid")][-1]
+        finest = [value for label, value in numbers.items() if label.startswith("splines")][-1]
         axes.axvline(as_angle(finest), color="C3", label="splines on the finest grid")
         axes.set(title=name, xlabel="angle, root mean square [deg]", xscale="log")
         subs = (1,) if max(angles) > 50 * min(angles) else (1, 2, 3, 5)  # of labelled ticks
@@ -297,6 +323,7 @@ def main(out: Path, quick: bool = False) -> dict[str, dict[str, float]]:
         rows[name] = row(problem, quick)
         draw(rows).savefig(out / "infimum.png", dpi=150)
         (out / "infimum.json").write_text(json.dumps(rows, indent=1))
+    print("\n".join(table(rows)), flush=True)
     rows["iiwa"] = seven_joints(quick)
     (out / "infimum.json").write_text(json.dumps(rows, indent=1))
     return rows
@@ -307,7 +334,5 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out"))
     parser.add_argument("--quick", action="store_true")
     arguments = parser.parse_args()
-    for name, numbers in main(arguments.out, arguments.quick).items():
-        print(name)
-        for key, value in numbers.items():
-            print(f"  {key:14} {value:10.5g}" + ("" if key == "error" else f" {as_angle(max(value, 0.0)):8.3f} deg"))
+    for key, value in main(arguments.out, arguments.quick)["iiwa"].items():
+        print(f"iiwa  {key:14} {value:10.5g}" + ("" if key == "error" else f" {as_angle(max(value, 0.0)):8.3f} deg"))

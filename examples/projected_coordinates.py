@@ -15,7 +15,7 @@ start at random postures in the inner 30 % or 80 % of the domain:
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,7 +94,8 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     """
     out.mkdir(parents=True, exist_ok=True)
     found: dict[str, float] = {}
-    for case in CASES[1:2] if quick else CASES:
+    cases = CASES[1:2] if quick else CASES
+    for case in cases:
         arm = build(case, 3 if quick else case.degree)
         found |= removed_shares(arm, 300 if quick else 2000)
         for size, radius in zip(SIZES, case.radii, strict=True):
@@ -102,7 +103,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
             for damping in DAMPING_RATIOS:
                 found |= energies(arm, size, damping, 3 if quick else case.runs)
             found |= drifts(arm, size, radius, 3 if quick else CYCLES)
-        print_table(case, found)
+    print_table(cases, found)
     found |= hidden(quick)
     draw(found).savefig(out / "projected_coordinates.png", dpi=130)
     return found
@@ -283,39 +284,32 @@ def hidden(quick: bool) -> dict[str, float]:
     return found
 
 
-def print_table(case: Case, found: dict[str, float]) -> None:
-    """Print the numbers of one arm: x <- xi without and with feed-forward, xi <- x with it."""
-    print(f"\n{case.name}, circles of {case.radii} m\n")
-    titles = (
-        "part, second task",
-        "removed",
-        "x <- xi",
-        "PD+",
-        "xi <- x, PD+",
-        "metric",
-        "V rises",
-        "... 0.1",
-        "V left",
-        "drift",
-    )
-    print(f"| {' | '.join(titles)} |")
-    print("| --- " * len(titles) + "|")
-    for size in SIZES:
-        for name in ("linear direct", "linear projected", "fitted direct", "fitted projected", "joints projected"):
-            row = {
-                key.partition(name)[2].strip(" :,"): value for key, value in found.items() if f" {size} {name}" in key
-            }
-            share = found[f"{case.name} {size} {name.split()[0]}: removed"] if "projected" in name else 0.0
-            cells = [f"{share:.1%}", *(f"{1e3 * row[f'{way}: x <- xi']:.2g} mm" for way in ("impedance", "PD+"))]
-            cells += [f"{1e3 * row[f'PD+: xi <- x{more}']:.2g}" for more in ("", " in the metric")]
-            for way in (f"damping {damping:g}" for damping in DAMPING_RATIOS):
-                counts = f"{row[f'{way}: runs with a rise']:.0f} of {row[f'{way}: runs']:.0f}"
-                cells += [f"{counts}, {row[f'{way}: largest rise']:.1g}"]
-            cells += [
-                f"{row['damping 0.7: V left']:.1%}",
-                f"{row['drift, feedback 0']:.2g}, {row['drift, feedback 1']:.2g} rad",
-            ]
-            print(f"| {size} {name} | {' | '.join(cells)} |", flush=True)
+ROWS = (  # of the table: title, name of the number, unit of print, format
+    ("removed: linear ξ", "linear: removed", 100, ".2g", "%"),
+    ("removed: fitted ξ", "fitted: removed", 100, ".2g", "%"),
+    ("removed: joint springs", "joints: removed", 100, ".2g", "%"),
+    ("x <- ξ, PD+ decoupled, linear", "linear direct PD+: x <- xi", 1e3, ".2g", "mm"),
+    ("x <- ξ, PD+ decoupled, fitted", "fitted direct PD+: x <- xi", 1e3, ".1g", "mm"),
+    ("x <- ξ, projector with feed-forward, linear ξ", "linear projected PD+: x <- xi", 1e3, ".0e", "mm"),
+    ("ξ <- x, projector with feed-forward, linear", "linear projected PD+: xi <- x in the metric", 1e3, ".2g", ""),
+    ("ξ <- x, projector with feed-forward, fitted", "fitted projected PD+: xi <- x in the metric", 1e3, ".2g", ""),
+    ("drift, fitted ξ direct", "fitted direct: drift, feedback 1", 1, ".0e", "rad"),
+    ("drift, linear ξ projected", "linear projected: drift, feedback 1", 1, ".1g", "rad"),
+    ("drift, fitted ξ projected", "fitted projected: drift, feedback 1", 1, ".1g", "rad"),
+    ("drift, joint springs", "joints projected: drift, feedback 1", 1, ".1g", "rad"),
+    ("drift without feedback, joint springs", "joints projected: drift, feedback 0", 1, ".1g", "rad"),
+)
+
+
+def print_table(cases: Sequence[Case], found: dict[str, float]) -> None:
+    """Print what the page shows: a row for each kind of number, a cell for each arm, with both sizes."""
+    sizes = " / ".join(f"{size:.0%}" for size in SIZES)
+    print(f"| {sizes} of the domain | {' | '.join(case.name for case in cases)} |")
+    print("| --- " * (1 + len(cases)) + "|")
+    for title, name, factor, form, unit in ROWS:
+        pairs = [[f"{found[f'{case.name} {size} {name}'] * factor:{form}}" for size in SIZES] for case in cases]
+        cells = [" / ".join(dict.fromkeys(pair)) + f" {unit}".rstrip() for pair in pairs]
+        print(f"| {title} | {' | '.join(cells)} |")
 
 
 def draw(found: dict[str, float]) -> Figure:

@@ -103,18 +103,33 @@ def main(out: Path, quick: bool = False) -> dict[str, dict[str, float]]:
     rows = {
         "ideal": wanted[logged],
         "servos": servo_run(chart, times, wanted, rates, None),
-        "servos with friction": servo_run(chart, times, wanted, rates, friction),
+        "with friction": servo_run(chart, times, wanted, rates, friction),
         "elastic gears": servo_run(chart, times, wanted, rates, None, GEARS),
-        "elastic gears with friction": servo_run(chart, times, wanted, rates, friction, GEARS),
+        "elastic, with friction": servo_run(chart, times, wanted, rates, friction, GEARS),
     }
     found = {}
     for name, q in rows.items():
-        path = out / f"fig28_{name.replace(' ', '_')}.csv"
+        path = out / f"fig28_{name.replace(',', '').replace(' ', '_')}.csv"
         write_log(path, chart, times[logged], q, desired[logged])
         drawing = draw_log(path, chart)
         drawing.figures[""].savefig(path.with_suffix(".png"), dpi=110)
         found[name] = dict(drawing.numbers) | coupling(chart, q, desired[logged])
+    print("\n".join(table(found, chart, "largest_error")))
+    print("\n".join(table(found, chart, "coupling")))
     return found
+
+
+def table(found: dict[str, dict[str, float]], chart: Chart, what: str) -> list[str]:
+    """One kind of number for each component of phi, the task in mm, a line for each kind of joints."""
+    m, last = chart.m, [] if what == "coupling" else ["joint_difference_of_end_and_start_rad"]
+    units = [f"{label} [mm]" for label in chart.labels[:m]] + list(chart.labels[m:])
+    lines = [f"| joints | {' | '.join(units)} |" + " at the end [rad] |" * len(last)]
+    lines.append("| --- |" + " --- |" * (len(units) + len(last)))
+    for name, numbers in found.items():
+        cells = [numbers[f"{what}_{label}"] * (1e3 if k < m else 1) for k, label in enumerate(chart.labels)]
+        cells += [numbers[key] for key in last]
+        lines.append(f"| {name} | {' | '.join(f'{value:.2g}' for value in cells)} |")
+    return lines
 
 
 if __name__ == "__main__":
@@ -122,7 +137,4 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("out"))
     parser.add_argument("--quick", action="store_true")
     arguments = parser.parse_args()
-    for name, numbers in main(arguments.out, arguments.quick).items():
-        print(name)
-        for key, value in numbers.items():
-            print(f"  {key:42} {value:.4g}")
+    main(arguments.out, arguments.quick)

@@ -166,17 +166,17 @@ def test_a_clear_box_takes_for_clear_what_pinocchio_does() -> None:
 @pytest.mark.slow
 def test_suggested_domain_of_an_arm_from_its_urdf_has_no_folds() -> None:
     (line,) = suggested_domains.main(quick=True)
-    *_, widths, _, leak, least = line.strip("| ").split("|")
+    *_, widths, leak, least = line.strip("| ").split("|")
     assert widths.count("cyclic") == widths.count("idle") == 1
     assert float(leak) <= 8.2  # 8 on the samples of the confirmation
-    assert "none" in least
-    assert float(least.split(",")[1]) >= 0.2
+    assert float(least) >= 0.2
 
 
 @pytest.mark.slow
 def test_comparison_example_draws_and_returns_the_best(tmp_path: Path) -> None:
     best = compare_parametrisations.main(tmp_path, quick=True)
-    assert 5 < best["planar_3r_xy"] < 8
+    least = min(value for name, value in best["planar_3r_xy"].items() if name.endswith("task_std_deg"))
+    assert 5 < least < 8
     for name in ("front.png", "convergence.png", "comparison.csv", "table.txt"):
         assert (tmp_path / "planar_3r_xy" / name).stat().st_size > 100
 

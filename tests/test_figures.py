@@ -25,6 +25,14 @@ def test_what_a_record_prints_is_on_a_page(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RECORDS)
+def test_tables_of_a_record_are_on_a_page(name: str) -> None:
+    """No record is kept for nobody."""
+    rows = {figures.key(line[0]) for page in PAGES.values() for line in figures.LINE.finditer(page)}
+    unused = [t[0] for t in RECORDS[name].tables if not any(figures.key(row) in rows for row in t[1:])]
+    assert unused == []
+
+
+@pytest.mark.parametrize("name", RECORDS)
 def test_phrases_say_what_their_numbers_are(name: str) -> None:
     """A bare number would explain every other one like it."""
     assert [phrase for phrase in RECORDS[name].printed if figures.says_nothing(phrase)] == []
@@ -33,9 +41,8 @@ def test_phrases_say_what_their_numbers_are(name: str) -> None:
 @pytest.mark.parametrize("name", RECORDS)
 def test_records_say_how_they_were_measured(name: str) -> None:
     record = RECORDS[name]
-    if name in {"constants", "by_hand"}:
-        assert record.source == {"constants": "constants", "by_hand": "transcribed"}[name]
-        assert (record.command, record.values) == ("", {})
+    if name == "constants":
+        assert (record.source, record.command, record.values) == ("constants", "", {})
         return
     assert record.source in {"measured", "transcribed"}
     words = record.command.split()
@@ -43,7 +50,11 @@ def test_records_say_how_they_were_measured(name: str) -> None:
     place = words[2].replace(".", "/") if words[1] == "-m" else words[1]
     assert words[0] != "python" or (figures.ROOT / place).exists()
     assert not record.script or "\ndef main(" in (figures.ROOT / record.script).read_text()
-    assert record.source == "transcribed" or (record.script and record.cpu_seconds and record.tolerance)
+    if record.results:
+        assert record.source == "measured" and list((figures.ROOT / record.results).iterdir())
+        return
+    called = record.script or "--json" in words  # how the tool measures it
+    assert record.source == "transcribed" or (called and record.cpu_seconds and record.tolerance)
     assert set(record.values) == record.used
 
 
@@ -80,6 +91,17 @@ def test_longer_numbers_do_not_count_as_the_phrase() -> None:
     assert figures.places("12.5 s, 2.55 s, 1,2.5 s", "2.5 s") == []
     assert len(figures.places("it takes\n  2.5 s", "takes 2.5 s")) == 1
     assert len(figures.places("it [takes](../a.md#b) 2.5 s, or [lasts](a.md) 2.5 s", "[takes](a.md) 2.5 s")) == 1
+
+
+def test_phrases_take_cells_of_tables_by_row_and_column() -> None:
+    table = ["| arm | task | time [s] |", "| iiwa | pose | 3.0 (1 of 2) |", "| iiwa | axis | 4.0 |"]
+    assert dict(figures.cells([table])) == {
+        "iiwa / pose ; time [s]": 3.0,
+        "iiwa / pose ; time [s] ; 2": 1.0,
+        "iiwa / pose ; time [s] ; 3": 2.0,
+        "iiwa / axis ; time [s]": 4.0,
+    }
+    assert dict(figures.cells([["| arm | time |", "| a 1 | 3 |"]])) == {"a 1 ; arm": 1.0, "a 1 ; time": 3.0}
 
 
 SCRIPT = """

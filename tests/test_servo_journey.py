@@ -15,9 +15,7 @@ def test_servos_couple_slightly_and_friction_keeps_joints_from_arriving(
     pytest.importorskip("mujoco")
     monkeypatch.setattr(servo_journey, "SECONDS", 2.5)
     found = servo_journey.main(tmp_path, quick=True)
-    ideal, servos, friction, elastic = (
-        found[name] for name in ("ideal", "servos", "servos with friction", "elastic gears")
-    )
+    ideal, servos, friction, elastic = (found[name] for name in ("ideal", "servos", "with friction", "elastic gears"))
     for label in ("y", "z", "xi3"):
         assert ideal[f"largest_error_{label}"] < 1e-6
         assert 1e-5 < servos[f"largest_error_{label}"] < 5e-3

@@ -7,11 +7,11 @@
 A record is a JSON file. It says how its numbers were measured (`script`, `arguments` of its `main`, or a `command`),
 what they are (`values` of `main` by name, and the `tables` that it prints: headers and rows), how far they may move
 (`tolerance`, relative, by a part of the name, which for cells is that of column and row; "" is the rest), and
-what pages print of them (`printed`). A phrase of `printed` takes values as {name|format} or {name*factor|format}; other
-numbers in it are settings. Rows are known by their numbers, so pages may name them in other words. `source` is
-"measured" if the numbers come from a run by this tool, and "transcribed" if some were copied from a page: --write gives
-such a record new tables, and "measured" once its phrases take values. Numbers that nobody measured (settings, limits,
-versions) are the phrases of `constants.json`.
+what pages print of them (`printed`). A phrase of `printed` takes values as {name|format} or {name*factor|format}, and
+cells of the tables as {row ; column|format}; other numbers in it are settings. Rows are known by their numbers, so
+pages may name them in other words. `source` is "measured" if the numbers come from a run by this tool, and
+"transcribed" if some were copied from a page: --write gives such a record new tables, and "measured" once its phrases
+take values. Numbers that nobody measured (settings, limits, versions) are the phrases of `constants.json`.
 """
 
 import argparse
@@ -22,6 +22,8 @@ import io
 import json
 import re
 import resource
+import shlex
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -69,7 +71,8 @@ class Record:
     name: str
     source: str  #: "measured", "transcribed" or "constants"
     command: str = ""  #: what measures the numbers, from the repository root
-    script: str = ""  #: file whose `main` this tool calls; "" if the command cannot be called so
+    script: str = ""  #: file whose `main` this tool calls; "" for a command that prints its values as JSON (`--json`)
+    results: str = ""  #: folder of the repository where a run of hours leaves what the tables are made of
     arguments: Mapping[str, Any] = field(default_factory=dict)  #: of `main`
     cpu_seconds: float | None = None  #: of the run; None if it was not timed
     tolerance: Mapping[str, float] = field(default_factory=dict)
@@ -194,17 +197,29 @@ def unrecorded(page: str, known: Sequence[Record]) -> list[str]:
 
 def measured(record: Record) -> Record:
     """The record with the numbers of a new run: what `main` returns, and the tables that it prints."""
-    module = imported(record.script)
-    output, before = io.StringIO(), _cpu_seconds()
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(output):
-        out = {"out": Path(folder)} if "out" in inspect.signature(module.main).parameters else {}
-        found = module.main(**out, **record.arguments)
+    before = _cpu_seconds()
+    found, output = called(record) if record.script else (json.loads(ran(record)), "")
     spent = float(f"{_cpu_seconds() - before:.2g}")
-    every = dict(flat(found)) if isinstance(found, Mapping) else {}
+    printed = tables(output)
+    every = dict(cells(printed)) | (dict(flat(found)) if isinstance(found, Mapping) else {})
     values = {name: every[name] for name in sorted(record.used)}
     copied = record.source == "transcribed" and not all(TAKEN.search(phrase) for phrase in record.printed)
     source = "transcribed" if copied else "measured"  # phrases with copied numbers need values first
-    return replace(record, source=source, values=values, tables=tables(output.getvalue()), cpu_seconds=spent)
+    return replace(record, source=source, values=values, tables=printed, cpu_seconds=spent)
+
+
+def called(record: Record) -> tuple[Any, str]:
+    """What `main` of the script returns and prints; files go to a folder that is removed."""
+    module, output = imported(record.script), io.StringIO()
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(output):
+        out = {"out": Path(folder)} if "out" in inspect.signature(module.main).parameters else {}
+        return module.main(**out, **record.arguments), output.getvalue()
+
+
+def ran(record: Record) -> str:
+    """What a command with `--json` prints."""
+    words = shlex.split(record.command)
+    return subprocess.run([sys.executable, *words[1:]], cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
 def imported(script: str) -> Any:
@@ -221,6 +236,21 @@ def flat(found: Mapping[Any, Any], above: str = "") -> Iterator[tuple[str, float
             yield from flat(value, f"{above}{key}, ")
         elif isinstance(value, int | float):
             yield f"{above}{key}", float(f"{value:.6g}")
+
+
+def cells(found: Sequence[Sequence[str]]) -> Iterator[tuple[str, float]]:
+    """Numbers in cells of tables as "row ; column"; of several in a cell, the others as "row ; column ; 2".
+
+    A row is named by its first cell, and by the next ones too where several rows of its table share it.
+    """
+    for header, *lines in found:
+        columns, rows = _cells(header), [_cells(line) for line in lines]
+        width = next((w for w in range(1, len(columns)) if len({tuple(row[:w]) for row in rows}) == len(rows)), 1)
+        for row in rows:
+            for column, cell in zip(columns, row, strict=False):
+                for k, number in enumerate(numbers(cell), 1):
+                    name = f"{' / '.join(row[:width])} ; {column}"
+                    yield name if k == 1 else f"{name} ; {k}", _number(number)
 
 
 def tables(output: str) -> list[list[str]]:
@@ -267,7 +297,7 @@ def _row_close(header: str, a: str, b: str, record: Record) -> bool:
 
 
 def _cells(row: str) -> list[str]:
-    return [cell.strip() for cell in row.strip("| ").split("|")]
+    return [cell.strip() for cell in row.strip()[1:-1].split("|")]
 
 
 def _number(word: str) -> float:

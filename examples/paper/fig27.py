@@ -23,4 +23,7 @@ def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
         for name, angles in (("task", report.task_angle), ("mutual", report.mutual_angle))
         for key in ("mean", "std", "max")
     }
+    if report.without_idle is not None:
+        numbers["task_std_without_idle_deg"] = report.without_idle.task_angle.std
+        numbers["mutual_std_without_idle_deg"] = report.without_idle.mutual_angle.std
     return Drawing({"": figure}, numbers | {"least_conditioning": report.conditioning.min})
