@@ -151,7 +151,7 @@ def test_domains_answer_for_themselves() -> None:
         if package(name) != "tasks" and any(isinstance(n, ast.Name) and n.id in kinds for n in ast.walk(tree(path)))
     }
     assert known - {"orthocas.charts.regular_part"} == {  # a kind that is defined above the coordinates that it needs
-        "orthocas.atlas.chart_of_box",
+        "orthocas.atlas.box_fit",
         "orthocas.fitting.corridor_problem",
         "orthocas.fitting.fit",
         "orthocas.problems.planar",

@@ -10,9 +10,8 @@ from planar_atlas import ASKED, built, planar
 from programs import Run
 
 import orthocas as oc
-from orthocas.atlas.box_fit import CubeBasis
+from orthocas.atlas.box_fit import CubeBasis, moved
 from orthocas.atlas.building import align
-from orthocas.atlas.chart_of_box import moved
 from orthocas.atlas.lattice import Outcome
 from orthocas.atlas.plan import make_plan
 from orthocas.errors import InvalidValueError, PathFileError

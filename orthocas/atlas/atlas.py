@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.atlas.atlas_file import Stock, read_stock, require_whole
-from orthocas.atlas.c_proof import check_c_of_atlas
-from orthocas.atlas.c_source import AtlasSource
-from orthocas.atlas.chart_of_box import chart_of, clipped, moved, part_near, steps_to
+from orthocas.atlas.box_fit import chart_of, clipped, moved, part_near, steps_to
+from orthocas.atlas.c_source import AtlasSource, check_c_of_atlas
 from orthocas.atlas.evaluation import Evaluation
 from orthocas.atlas.index import Index
 from orthocas.atlas.lattice import Outcome

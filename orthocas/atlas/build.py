@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from orthocas.atlas.atlas_file import ATLAS, Stock, add_results, header_of, read_stock
-from orthocas.atlas.box_fit import BoxChart, BoxFitter, Mask
-from orthocas.atlas.chart_of_box import box_of, chart_of
+from orthocas.atlas.box_fit import BoxChart, BoxFitter, Mask, box_of, chart_of
 from orthocas.atlas.index import Index
 from orthocas.atlas.lattice import Cell, Outcome, Result, cell_boundaries
 from orthocas.atlas.plan import Plan

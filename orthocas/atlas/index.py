@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from orthocas.atlas.atlas_file import Stock
-from orthocas.atlas.chart_of_box import widened
+from orthocas.atlas.box_fit import widened
 from orthocas.atlas.lattice import Orbits, Outcome, cell_boundaries, orbits
 from orthocas.atlas.plan import Plan
 from orthocas.tools.cached import cached_property

@@ -1,0 +1,155 @@
+"""Gymnasium environments with actions in (x, xi), and recorded episodes in (x, xi) and back."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.charts.chart import Chart
+from orthocas.charts.solutions import Tracker, TrackerStatus
+from orthocas.errors import DomainError, InvalidValueError, InverseError, MissingExtraError
+from orthocas.tasks.domains import bounds_of
+from orthocas.tools.checks import Array, as_float_array, as_point, as_point_set, require_kind
+
+try:
+    import gymnasium
+except ImportError:
+    raise MissingExtraError("orthocas.learn", "gymnasium", "learn") from None
+
+
+def _positions(env: Any) -> Array:
+    """Joint positions of a MuJoCo environment."""
+    return np.array(env.unwrapped.data.qpos)
+
+
+class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
+    """An environment whose actions are joint positions (n,), with actions in (x, xi) instead.
+
+    An action a in [-1, 1]^n moves the wanted phi by a * step, orientations in the tip's axes; a tracker turns it into
+    joint positions, which never leave the domain, and so the joint limits. A target out of reach is dropped: the arm
+    stays, and the next action counts from there. Observations get xi (r,) and the distance to the nearest face of the
+    domain at their end, [rad] or [m].
+
+    Args:
+        env: the environment; its actions and observations are boxes (gymnasium.spaces.Box).
+        chart: a chart of its arm.
+        step: change of each component of phi by an action of 1, one number or (n,), > 0.
+        joints: places of the chart's joints in the environment's positions; default: the first n.
+        positions: joint positions of the environment; default: `env.unwrapped.data.qpos`, as MuJoCo's have.
+
+    Raises:
+        MissingExtraError: without gymnasium, when `orthocas.learn` is imported: extra `learn`.
+        InvalidValueError: if actions are not n numbers; at `reset`, if the arm starts outside the domain.
+    """
+
+    def __init__(
+        self,
+        env: "gymnasium.Env[Array, Array]",
+        chart: Chart,
+        step: ArrayLike,
+        joints: ArrayLike | None = None,
+        positions: Callable[[Any], Array] = _positions,
+    ) -> None:
+        super().__init__(env)
+        require_kind("chart", chart, Chart)
+        inner, outer = env.action_space, env.observation_space
+        if getattr(inner, "shape", None) != (chart.n,):
+            raise InvalidValueError("actions of env", str(inner)[:80], f"{chart.n} joint positions")
+        if len(getattr(outer, "shape", None) or ()) != 1:
+            raise InvalidValueError("observations of env", str(outer)[:80], "a row of numbers")
+        self.chart, self._positions = chart, positions
+        self._joints = np.arange(chart.n) if joints is None else np.asarray(joints, dtype=int)
+        sizes = as_float_array("step", step)
+        if sizes.shape not in ((), (chart.n,)) or not (sizes > 0).all():
+            raise InvalidValueError("step", sizes.tolist(), f"one number or {chart.n}, > 0")
+        self._step = np.broadcast_to(sizes, chart.n)
+        self._tracker: Tracker | None = None
+        more, (low, high) = np.full(chart.r + 1, np.inf), _ends(outer)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (chart.n,), np.float64)
+        self.observation_space = gymnasium.spaces.Box(np.append(low, -more), np.append(high, more), dtype=np.float64)
+
+    def reset(self, **options: Any) -> tuple[Array, dict[str, Any]]:
+        """Start again; the wanted phi is where the arm starts."""
+        observation, info = self.env.reset(**options)
+        self._tracker = self.chart.tracker(self._here())
+        return self._observed(observation), info
+
+    def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
+        """Move the wanted phi; `info["tracker"]` has the tracker's status."""
+        if self._tracker is None:
+            raise gymnasium.error.ResetNeeded("step before reset, expected reset first")
+        before = self._tracker.q
+        self._tracker.step(self._wanted(before, self._step * np.clip(action, -1.0, 1.0)))
+        status = self._tracker.status
+        observation, reward, terminated, truncated, info = self.env.step(self._tracker.q)
+        return self._observed(observation), reward, terminated, truncated, info | {"tracker": status}
+
+    def _wanted(self, q: Array, change: Array) -> Array:
+        """phi at a change from q."""
+        phi, m = self.chart.phi(q), self.chart.m
+        wanted = np.array(phi + change)
+        if self.chart.relative.turned:
+            none = np.zeros(m)
+            wanted[:m] = np.array(self.chart.relative.moved(phi[:m], change[:m], phi[:m], none, none)[0]).ravel()
+        return wanted
+
+    def _here(self) -> Array:
+        positions: Array = np.asarray(self._positions(self.env), dtype=float)[self._joints]
+        return positions
+
+    def _observed(self, observation: Array) -> Array:
+        """An observation with xi and the distance to the boundary."""
+        q = self._here()
+        low, high = bounds_of(self.chart.problem.domain)
+        distance = np.minimum(q - low, high - q).min()
+        return np.asarray(np.concatenate([observation, self.chart.xi(q), [distance]]))
+
+
+def _ends(space: Any) -> tuple[Array, Array]:
+    return np.asarray(space.low, dtype=float), np.asarray(space.high, dtype=float)
+
+
+def coordinates_of(chart: Chart, q: ArrayLike) -> Array:
+    """phi = (x, xi) of a trajectory q (T, n), such as the states or the actions of an episode; (T, n).
+
+    It is `chart.phi` where `joints_of` finds the way back.
+
+    Raises:
+        DomainError: if a row lies outside the domain; the message names the first.
+
+    Example:
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> from orthocas import learn, problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> q = np.linspace([0.6, 0.8, 0.8], [0.8, 0.7, 0.9], 50)
+        >>> again = learn.joints_of(chart, learn.coordinates_of(chart, q), q[0])
+        >>> bool(abs(again - q).max() < 1e-9)
+        True
+    """
+    require_kind("chart", chart, Chart)
+    points, _ = as_point_set("q", q, chart.n)
+    outside = np.flatnonzero(~chart.problem.domain.contains(points))
+    if outside.size:
+        raise DomainError(f"row {outside[0]} of {len(points)} lies outside the domain, where phi may have no way back")
+    return chart.phi(points)
+
+
+def joints_of(chart: Chart, phi: ArrayLike, q_start: ArrayLike) -> Array:
+    """The trajectory q (T, n) with phi(q) = phi (T, n) that begins next to q_start (n,), each row next to the last.
+
+    phi alone does not tell which of several solutions was meant, so keep the first row of q with an episode.
+
+    Raises:
+        InverseError: if a row has no solution near the last one, inside the domain; the message names it.
+        InvalidValueError: if q_start lies outside the domain.
+    """
+    require_kind("chart", chart, Chart)
+    targets, _ = as_point_set("phi", phi, chart.n)
+    tracker, q = chart.tracker(as_point("q_start", q_start, chart.n), largest_step=np.inf), np.empty(targets.shape)
+    for k, target in enumerate(targets):
+        q[k] = tracker.step(target)
+        if tracker.status != TrackerStatus.OK:
+            raise InverseError(f"row {k} of {len(targets)} has no q near the last one: {tracker.status.name}")
+    return q
