@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from orthocas.errors import CertifyError, InvalidValueError
 from orthocas.tools.checks import Array, frozen_array, require_kind, require_shape, require_text
 from orthocas.tools.display import Shown, number_list
+from orthocas.tools.json import attributes
 
 OPEN, PROVED = 255, 254  #: codes of boxes that are not halved; others are the joint that is
 MOST_BOXES = 20_000_000
@@ -236,20 +237,13 @@ class Certificate(Shown):
         """Plain data for JSON."""
         one = self.injective
         return {
-            "proved": self.proved,
-            "share": self.share,
-            "bound": self.bound,
-            "conditioning": self.conditioning,
-            "boxes": self.boxes,
+            **attributes(self, "proved", "share", "bound", "conditioning", "boxes"),
             "parts": self.regular.proved_count,
             "unproved": self.regular.open_count,
-            "dead": self.dead,
-            "seconds": self.seconds,
+            **attributes(self, "dead", "seconds"),
             "one_to_one_half_width": None if one is None else ((one.high - one.low) / 2).tolist(),
-            "fold": [list(point) for point in self.fold],
-            **({"least_volume": self.least_volume, "clear_share": self.clear_share} if self.least_volume else {}),
-            "method": self.method,
-            "fingerprint": self.fingerprint,
+            **attributes(self, "fold", *(("least_volume", "clear_share") if self.least_volume else ())),
+            **attributes(self, "method", "fingerprint"),
         }
 
     def _verdict(self) -> str:

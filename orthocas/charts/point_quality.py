@@ -16,6 +16,7 @@ from orthocas.tools.batch import in_threads
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import MANY
 from orthocas.tools.display import Shown, number_list
+from orthocas.tools.json import attributes
 
 _CHUNK = 40_000  # joint positions evaluated at once
 _NEAR_THE_END = 0.1  # cos(angle / 2) of turns beyond which rounding of J_x shows
@@ -125,11 +126,7 @@ class PointQuality(Shown):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return {
-            "leak_deg": self.leak_deg.tolist(),
-            "conditioning": self.conditioning.tolist(),
-            "boundary_distance": self.boundary_distance.tolist(),
-        }
+        return attributes(self, "leak_deg", "conditioning", "boundary_distance")
 
 
 def point_quality(problem: Problem, coordinates: CoordinateMap, points: Array) -> PointQuality:

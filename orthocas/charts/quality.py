@@ -1,7 +1,7 @@
 """The quality of a chart on its domain: angles and conditioning ([AS2023] Figs. 20 and 27), leaks and folds."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -17,7 +17,7 @@ from orthocas.tasks.samples import idle_joints, samples_at
 from orthocas.tools.batch import in_threads
 from orthocas.tools.checks import Array, Indices, as_point_set, require_count, require_kind, require_memory
 from orthocas.tools.display import Shown, listed
-from orthocas.tools.json import plain
+from orthocas.tools.json import attributes, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -113,7 +113,7 @@ class AngleStatistics:
 
     def as_dict(self) -> dict[str, float]:
         """Mean, standard deviation and largest deviation [deg]."""
-        return {"mean": self.mean, "std": self.std, "max": self.max}
+        return attributes(self, "mean", "std", "max")
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ class LeakStatistics:
 
     def as_dict(self) -> dict[str, object]:
         """Mean, root mean square and largest leak, and the root mean square of each coordinate [deg]."""
-        return {"mean": self.mean, "rms": self.rms, "max": self.max, "rms_of_each": list(self.rms_of_each)}
+        return attributes(self, "mean", "rms", "max", "rms_of_each")
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,12 +181,8 @@ class Angles:
 
     def as_dict(self) -> dict[str, dict[str, object]]:
         """Plain data: the four angles in degrees."""
-        return {
-            "task_angle_deg": dict(self.task_angle.as_dict()),
-            "mutual_angle_deg": dict(self.mutual_angle.as_dict()),
-            "leak_deg": self.leak.as_dict(),
-            "metric_mutual_angle_deg": dict(self.metric_mutual_angle.as_dict()),
-        }
+        names = ("task_angle", "mutual_angle", "leak", "metric_mutual_angle")
+        return {f"{name}_deg": angles for name, angles in attributes(self, *names).items()}
 
 
 @dataclass(frozen=True)
@@ -298,22 +294,11 @@ class Report(Shown):
         """Plain data for JSON. NaN becomes None."""
         angles = Angles(self.task_angle, self.mutual_angle, self.leak, self.metric_mutual_angle)
         data = {
-            "n": self.n,
-            "m": self.m,
-            "r": self.r,
-            "samples": self.samples,
-            "seed": self.seed,
-            "metric": self.metric,
+            **attributes(self, "n", "m", "r", "samples", "seed", "metric"),
             **angles.as_dict(),
-            "idle_joints": list(self.idle_joints),
-            "without_idle": None if self.without_idle is None else self.without_idle.as_dict(),
-            "conditioning": asdict(self.conditioning),
-            "worst_point": list(self.worst_point),
+            **attributes(self, "idle_joints", "without_idle", "conditioning", "worst_point"),
             "least_conditioning_searched": None if self.worst is None else self.worst.least,
-            "singular_samples": self.singular_samples,
-            "folded_samples": self.folded_samples,
-            "length_ratio": self.length_ratio,
-            "degenerate": self.degenerate,
+            **attributes(self, "singular_samples", "folded_samples", "length_ratio", "degenerate"),
         }
         return dict(plain(data))
 

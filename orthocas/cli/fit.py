@@ -272,12 +272,10 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
         "stages": [
             {
                 "parametrisation": stage.label,
-                "parameters": stage.parameters,
-                "samples": stage.samples,
+                **attributes(stage, "parameters", "samples"),
                 "loss": stage.result.value,
                 "status": stage.result.status.value,
-                "iterations": stage.result.iterations,
-                "seconds": stage.result.seconds,
+                **attributes(stage.result, "iterations", "seconds"),
             }
             for stage in result.stages
         ],

@@ -12,6 +12,7 @@ from orthocas.tasks.problem import Problem, check, is_regular
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, require_count, require_kind, require_memory, require_shape
 from orthocas.tools.display import Shown, number_list
+from orthocas.tools.json import attributes
 
 _ROUNDING = 1e-7  # a defect below this share of the terms that cancel in it counts as zero
 _STRAIGHT = 1e-12  # [rad]; task gradients that turn by less over the domain count as constant
@@ -59,8 +60,7 @@ class Involutivity(Shown):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, without the function."""
-        data = {part.name: getattr(self, part.name) for part in fields(self) if part.name != "function"}
-        return {**data, "worst_point": list(self.worst_point), "verdict": self.verdict}
+        return attributes(self, *(part.name for part in fields(self) if part.name != "function"), "verdict")
 
 
 def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involutivity:

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import product
 from pathlib import Path
 from statistics import median
@@ -93,8 +93,8 @@ class Comparison(Shown):
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON. NaN becomes None."""
         return {
-            "summaries": [plain(asdict(summary)) for summary in self.summaries()],
-            "fits": [plain(asdict(result)) for result in self.results],
+            "summaries": plain(self.summaries()),
+            "fits": plain(self.results),
         }
 
     def facts(self) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +24,7 @@ from orthocas.tasks.samples import idle_joints, sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_number, require_count, require_kind
 from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.json import attributes
 from orthocas.tools.progress import Monitor, Progress, silent
 
 JUDGES = 30_000  #: samples that judge the fit
@@ -119,16 +120,8 @@ class DomainSuggestion(Shown):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return {
-            "home": self.home.tolist(),
-            "home_source": self.home_source,
-            "joints": [asdict(joint) for joint in self.joints],
-            "leak_deg": self.leak_deg,
-            "conditioning": self.conditioning,
-            "worst_point": list(self.worst_point),
-            "asked": asdict(self.asked),
-            "seconds": self.seconds,
-        }
+        quality = ("leak_deg", "conditioning", "worst_point", "asked", "seconds")
+        return attributes(self, "home", "home_source", "joints", *quality)
 
 
 @dataclass(eq=False)

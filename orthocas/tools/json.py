@@ -4,7 +4,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,16 +22,31 @@ _LONGEST = 80  # most characters of the input that an error repeats
 
 
 def plain(value: Any) -> Any:
-    """Convert arrays and tuples to lists, and numbers that are not finite to None, at all levels."""
+    """Convert records and arrays as `as_data` does, and numbers that are not finite to None, at all levels."""
+    data = as_data(value)
+    if isinstance(data, dict):
+        return {key: plain(item) for key, item in data.items()}
+    if isinstance(data, list):
+        return [plain(item) for item in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
+
+
+def as_data(value: Any) -> Any:
+    """Convert arrays and tuples to lists, and records to objects: by their own `as_dict`, or with all their fields."""
+    if hasattr(value, "as_dict"):
+        return value.as_dict()
+    if is_dataclass(value):
+        return attributes(value, *(field.name for field in fields(value)))
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): as_data(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+        return [as_data(item) for item in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def attributes(record: Any, *names: str) -> dict[str, Any]:
+    """The chosen fields and properties of a record by name, for its `as_dict`; see `as_data`."""
+    return {name: as_data(getattr(record, name)) for name in names}
 
 
 def to_json(data: Mapping[str, Any], indent: int | None = None) -> str:
