@@ -146,7 +146,7 @@ def _physics() -> dict[str, Call]:
         "Payload": (simulation.Payload, {"mass": 1.0, "centre": q, "inertia": np.eye(3)}),
         "Wall": (simulation.Wall, {"point": q, "normal": q, "tip_radius": 0.1, "size": 1.0, "time_constant": 0.01}),
         "MuJoCo": (simulation.MuJoCo, {"robot": robot, **options}),
-        "elastic MuJoCoPlant": (
+        "Elasticity": (
             lambda **given: simulation.MuJoCoPlant(robot, elasticity=simulation.Elasticity(**given)),
             {"stiffness": [8000.0, 5000.0, 5000.0], "inertia": 0.4, "damping": 5.0},
         ),
