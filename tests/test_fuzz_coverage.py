@@ -11,6 +11,7 @@ from types import FrameType
 
 import pytest
 import typer
+from fuzz import signals
 from fuzz.campaigns import CAMPAIGNS, READERS, RESULTS, meaning
 from fuzz.child import Finding, Judge
 from fuzz.commands import _COMMANDS
@@ -42,6 +43,12 @@ def test_every_command_belongs_to_the_campaign_of_commands() -> None:
     missing = {name for words in ([], ["atlas"]) for name in commands_of(app_for(words)) if name != "atlas"}
     missing -= {name for name in missing if any(line == name or line.startswith(f"{name} ") for line in tested)}
     assert missing == set()
+
+
+def test_every_command_is_stopped_by_signals() -> None:
+    wanted = {name for words in ([], ["atlas"]) for name in commands_of(app_for(words)) if name != "atlas"}
+    stopped = {words[0] if words[0] != "atlas" else " ".join(words[:2]) for words in signals.COMMANDS.values()}
+    assert {name for name in wanted if name not in stopped} == set()
 
 
 def test_every_reader_belongs_to_a_campaign() -> None:
