@@ -121,9 +121,9 @@ class LBFGSRun:
     def iterate(self) -> Status:
         """Iterate to the end."""
         best, limit = self.best, self.settings.max_iterations
-        if best.iterations == 0:
+        if best.iterations == 0 or not np.isfinite(self.gradient).all():  # a damaged checkpoint may lack it
             self.value, self.gradient = best.value_and_gradient(self.theta)
-            if not np.isfinite(self.value):
+            if not (np.isfinite(self.value) and np.isfinite(self.gradient).all()):
                 return Status.FAILED
         while best.iterations < limit and not self.converged:
             if not np.any(self.gradient):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, SolveError
 from orthocas.solvers.lbfgs import LBFGS, LBFGSRun
 from orthocas.solvers.protocol import EstimatedObjective, Objective, SolveResult
 from orthocas.tools.checks import Array
@@ -48,6 +48,7 @@ class QuasiNewton(LBFGS):
         Raises:
             InvalidValueError: if the objective has no Gauss-Newton matrix because the parametrisation is not linear in
                 theta.
+            SolveError: if the matrix is not finite.
         """
         if not isinstance(objective, EstimatedObjective):
             raise InvalidValueError(
@@ -112,6 +113,10 @@ def _factored(H: Array) -> tuple[Array, bool]:
     while True:
         damped = H.copy()
         damped[np.diag_indices_from(H)] += damping * scale
+        if not np.isfinite(damped).all():
+            raise SolveError(
+                "the curvature of the loss is not finite: parameters are huge, or the checkpoint is damaged"
+            )
         try:
             factor, lower = scipy.linalg.cho_factor(damped, overwrite_a=True)
         except np.linalg.LinAlgError:
