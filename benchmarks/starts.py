@@ -15,7 +15,8 @@ from orthocas.solvers.protocol import Solver
 
 HEADER = (
     "| parametrisation | solver | task std [deg], smallest to largest | task spread "
-    "| mutual std [deg], smallest to largest | mutual spread | seconds, median |\n| --- | --- | --- | --- | --- | --- | --- |"
+    "| mutual std [deg], smallest to largest | mutual spread | seconds, median |\n"
+    "| --- | --- | --- | --- | --- | --- | --- |"
 )
 ADAM = solvers.Adam(epochs=40, learning_rate=5e-3)
 CASES: tuple[tuple[oc.Polynomial | oc.MLP, Sequence[Solver]], ...] = (
