@@ -14,8 +14,9 @@ from orthocas.fitting.compare import Comparison
 from orthocas.solvers.protocol import Solver
 
 HEADER = (
-    "| parametrisation | solver | task std [deg], smallest to largest | spread | mutual std [deg], smallest to largest "
-    "| spread | seconds, median |\n| --- | --- | --- | --- | --- | --- | --- |"
+    "| parametrisation | solver | task std [deg], smallest to largest | task spread "
+    "| mutual std [deg], smallest to largest | mutual spread | seconds, median |\n"
+    "| --- | --- | --- | --- | --- | --- | --- |"
 )
 ADAM = solvers.Adam(epochs=40, learning_rate=5e-3)
 CASES: tuple[tuple[oc.Polynomial | oc.MLP, Sequence[Solver]], ...] = (

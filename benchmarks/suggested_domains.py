@@ -62,8 +62,9 @@ def row(name: str, task: str, metric: str, degree: int, samples: int) -> str:
     widths = ", ".join(f"{joint.half_width:.2f} {MARKS.get(joint.reason, joint.reason)}" for joint in found.joints)
     verdicts = [judged_chart(found.fit.chart, 50_000, seed=100 + k) for k in range(samples // 50_000)]
     least = min(verdict.conditioning for verdict in verdicts)
+    home = "bent" if found.home_source.startswith("bent") else found.home_source
     shown = f"{least:.3f}" if least > 0 else "folds"
-    return f"| {name}, {task}, {metric} | {found.home_source} | {widths} | {verdicts[0].leak_deg:.2f} | {shown} |"
+    return f"| {name}, {task}, {metric} | {home} | {widths} | {verdicts[0].leak_deg:.2f} | {shown} |"
 
 
 def main(quick: bool = False) -> list[str]:

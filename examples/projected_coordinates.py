@@ -297,7 +297,7 @@ ROWS = (  # of the table: title, name of the number, unit of print, format
     ("drift, linear ξ projected", "linear projected: drift, feedback 1", 1, ".1g", "rad"),
     ("drift, fitted ξ projected", "fitted projected: drift, feedback 1", 1, ".1g", "rad"),
     ("drift, joint springs", "joints projected: drift, feedback 1", 1, ".1g", "rad"),
-    ("drift without feedback, joint springs", "joints projected: drift, feedback 0", 1, ".1g", "rad"),
+    ("drift without feedback, joint springs", "joints projected: drift, feedback 0", 1, ".2g", "rad"),
 )
 
 

@@ -68,7 +68,7 @@ class _Run:
             before, gradient, H = self.objective.normal_equations(best.theta)
             best.evaluations += 1
             best.offer(best.theta, before)
-            if not np.isfinite(before):
+            if not (np.isfinite(before) and np.isfinite(gradient).all() and np.isfinite(H).all()):
                 return Status.FAILED
             damping = self.damping
             if not self._step(gradient, H):

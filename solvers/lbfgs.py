@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from orthocas.errors import CheckpointError, InvalidValueError
+from orthocas.errors import CheckpointError, InvalidValueError, SolveError
 from orthocas.solvers.protocol import BestPoint, EstimatedObjective, Objective, SolveResult, Status
 from orthocas.tools.checks import Array, require_at_least, require_count
 from orthocas.tools.progress import UNWATCHED, State, Watch
@@ -124,9 +124,9 @@ class LBFGSRun:
     def iterate(self) -> Status:
         """Iterate to the end."""
         best, limit = self.best, self.settings.max_iterations
-        if best.iterations == 0:
+        if best.iterations == 0 or not np.isfinite(self.gradient).all():  # a damaged checkpoint may lack it
             self.value, self.gradient = best.value_and_gradient(self.theta)
-            if not np.isfinite(self.value):
+            if not (np.isfinite(self.value) and np.isfinite(self.gradient).all()):
                 return Status.FAILED
         while best.iterations < limit and not self.converged:
             if not np.any(self.gradient):
@@ -249,6 +249,7 @@ class QuasiNewton(LBFGS):
         Raises:
             InvalidValueError: if the objective has no Gauss-Newton matrix because the parametrisation is not linear in
                 theta.
+            SolveError: if the matrix is not finite.
         """
         if not isinstance(objective, EstimatedObjective):
             raise InvalidValueError(
@@ -313,6 +314,10 @@ def _factored(H: Array) -> tuple[Array, bool]:
     while True:
         damped = H.copy()
         damped[np.diag_indices_from(H)] += damping * scale
+        if not np.isfinite(damped).all():
+            raise SolveError(
+                "the curvature of the loss is not finite: parameters are huge, or the checkpoint is damaged"
+            )
         try:
             factor, lower = scipy.linalg.cho_factor(damped, overwrite_a=True)
         except np.linalg.LinAlgError:

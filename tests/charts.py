@@ -37,3 +37,12 @@ def beyond_domain(chart: oc.Chart, count: int, share: float) -> np.ndarray:
     domain = chart.problem.domain
     points: np.ndarray = domain.centre + share * (sample_uniform(domain, count, 3) - domain.centre)
     return points
+
+
+def in_a_corridor() -> oc.Chart:
+    """A chart of the surroundings of a bent path; the distance of the first joint does not count."""
+    known = problems.get("planar_3r_x")
+    centre, width = known.domain.centre, known.domain.half_width
+    path = centre + width * np.array([[0.0, -0.6, -0.6], [0.0, 0.0, -0.4], [0.0, 0.5, 0.5]])
+    domain = oc.Corridor(known.domain, path, [np.inf, *(0.4 * width[1:])])
+    return oc.fit(oc.Problem(known.robot, known.task, "inertia", domain), oc.Polynomial(3), samples=500).chart

@@ -8,8 +8,10 @@ from collections.abc import Callable
 from contextlib import chdir, redirect_stdout
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import orthocas as oc
 from orthocas.codegen import GeneratedC
 from orthocas.codegen.library import compilers
 
@@ -39,6 +41,12 @@ def printed_here(code: str, folder: Path) -> str:
     with chdir(folder), redirect_stdout(out):
         exec(compile(code, "page", "exec"), {"__name__": "page"})
     return out.getvalue()
+
+
+def path_flags(corridor: oc.Corridor) -> tuple[str, str]:
+    """What random_ticks.c is told about a corridor."""
+    radius = ("INFINITY" if np.isinf(size) else repr(float(size)) for size in corridor.radius)
+    return f"-DPATH={','.join(map(repr, corridor.postures.ravel().tolist()))}", f"-DRADIUS={','.join(radius)}"
 
 
 def built(generated: GeneratedC, program: str, out: Path, *flags: str, compiler: str | None = None) -> Path:

@@ -15,16 +15,26 @@ from typing import Any
 import numpy as np
 import pytest
 from planar_atlas import ASKED, built, cells_of, planar
+from public_objects import atlas as around_a_posture
 
 import orthocas as oc
-from orthocas.atlas.atlas_file import ATLAS, Stock, add_results, chart_type, header_of, plan_terms, read_stock
+from orthocas.atlas.atlas_file import (
+    ATLAS,
+    Stock,
+    add_results,
+    chart_type,
+    header_of,
+    plan_terms,
+    read_stock,
+    record_type,
+)
 from orthocas.atlas.build import Job, opened, packed, run_job
 from orthocas.atlas.lattice import Cell, Outcome, Result
 from orthocas.atlas.plan import make_plan
 from orthocas.atlas.regions import joint_range_of
 from orthocas.errors import AtlasFileError
 from orthocas.tools.archive import from_npy, to_npy
-from orthocas.tools.block_file import create, owned, sealed
+from orthocas.tools.block_file import append, create, owned, sealed
 from orthocas.tools.checks import Array
 from orthocas.tools.processes import Processes
 
@@ -178,6 +188,22 @@ def test_numbers_of_charts_are_checked(grown: Stock, tmp_path: Path, value: floa
         read_stock(path).numbers(np.array([0]))
 
 
+@pytest.mark.parametrize("forged", ["a tile that is not fitted", "a tile twice"])
+def test_cells_without_use_are_refused(tmp_path: Path, forged: str) -> None:
+    """Their charts would be in the file, but no position would ever be in them."""
+    stock = around_a_posture().stock
+    block, kind = stock.contents.blocks[0], record_type(stock.plan)
+    records = np.frombuffer(block.head, kind).copy()
+    other = np.setdiff1d(np.arange(stock.plan.lattice.size), stock.orbits.fitted)[0]
+    records["tile"][0] = records["tile"][1] if forged == "a tile twice" else other
+    path = tmp_path / "forged.orthocas-atlas"
+    create(path, stock.contents.header, ATLAS)
+    body = stock.path.read_bytes()[block.body : block.body + block.length]
+    append(path, block.tag, records.tobytes(), body, ATLAS)
+    with pytest.raises(AtlasFileError, match=r"forged.*twice, or of tiles outside"):
+        oc.Atlas.load(path)
+
+
 def test_file_of_other_settings_is_not_gone_on_with(planar_atlas: oc.Atlas) -> None:
     with pytest.raises(AtlasFileError, match="another problem, region or settings"):
         oc.build_atlas(planar(), planar_atlas.path, oc.AtlasSettings())
@@ -261,6 +287,33 @@ def test_work_of_killed_processes_runs_again(
     found = oc.build_atlas(planar(), tmp_path / "arm.orthocas-atlas", ASKED, jobs=1)
     assert Deadly.kills == 3
     assert cells_of(found.stock) == cells_of(planar_atlas.stock)
+
+
+class DeadlyOver(Processes):
+    """Processes that are killed while they work at one tile."""
+
+    tile = -1
+
+    def submit(self, *arguments: Any, **named: Any) -> Future[Any]:
+        future = super().submit(*arguments, **named)
+        if any(cell.tile == self.tile for cell in arguments[1].cells):
+            (process,) = self._pools[0]._processes.values()
+            os.kill(process.pid, signal.SIGKILL)
+        return future
+
+
+@pytest.mark.slow
+def test_boxes_over_which_workers_die_are_left_to_the_next_build(
+    planar_atlas: oc.Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    wanted, path = cells_of(planar_atlas.stock), tmp_path / "arm.orthocas-atlas"
+    DeadlyOver.tile = int(planar_atlas.stock.records["tile"][3])
+    with monkeypatch.context() as patch:
+        patch.setattr("orthocas.atlas.build.Processes", DeadlyOver)
+        found = oc.build_atlas(planar(), path, ASKED, jobs=1)
+    assert cells_of(found.stock) == [cell for cell in wanted if cell[0] != [DeadlyOver.tile]]
+    assert "left for the next build" in caplog.text
+    assert cells_of(built(path).stock) == wanted
 
 
 @pytest.mark.slow

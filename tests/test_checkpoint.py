@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from programs import python
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.errors import CheckpointError, Interrupted
+from orthocas.errors import CheckpointError, Interrupted, OrthocasError
 from orthocas.fitting import checkpoint
 from orthocas.fitting.checkpoint import Checkpoint
 from orthocas.solvers.protocol import Solver, Status
@@ -153,6 +154,9 @@ def test_bad_files_are_refused(planar_x: oc.Problem, planar_fit: object, tmp_pat
         ("best_theta", np.full(18, np.inf), "best_theta has shape .*, expected .* with finite entries"),
         ("iterations", np.array(-1.0), r"iterations is \[-1.0\], expected one number >= 0"),
         ("seconds", np.zeros(2), r"seconds is \[0.0, 0.0\], expected one number"),
+        ("gained_little", np.zeros(0), r"gained_little is \[\], expected one number"),
+        ("place", np.zeros(2), "place has shape .*, expected .* with finite entries"),
+        ("height", np.zeros(2), r"height has shape .*, expected one number"),
         ("best_value", np.array(np.nan), "state_best_value is NaN"),
         ("best_theta", np.array(["a"]), "state_best_theta is .*, expected an array of numbers"),
     ],
@@ -260,3 +264,33 @@ def test_process_killed_at_any_time_loses_nothing(planar_x: oc.Problem, tmp_path
     np.testing.assert_allclose(resumed.chart.coordinates.theta, theta, rtol=0, atol=1e-10 * np.abs(theta).max())
     assert [s.result.iterations for s in resumed.stages] == [s.result.iterations for s in whole.stages]
     assert [s.result.evaluations for s in resumed.stages] == [s.result.evaluations for s in whole.stages]
+
+
+@pytest.mark.parametrize("solver", [solvers.GaussNewton(20), solvers.QuasiNewton(20)], ids=lambda solver: solver.name)
+def test_parameters_that_lead_to_infinite_matrices_are_errors_of_ours(
+    planar_x: oc.Problem, tmp_path: Path, solver: solvers.Solver
+) -> None:
+    file, settings = tmp_path / "run", {"solver": solver, "samples": 60}
+    oc.fit(planar_x, oc.Polynomial(3), **settings, checkpoint=file)
+    header, arrays = checkpoint.read_archive(file, checkpoint.CHECKPOINT)
+    for name in ("stage_0", "stage_1"):
+        for size in (1e31, 1e200, 1e300):
+            huge = {**arrays, name: np.full_like(arrays[name], size)}
+            checkpoint.write_archive(file, checkpoint.CHECKPOINT, header, huge)
+            with np.errstate(all="ignore"), suppress(OrthocasError):  # other errors are wrong
+                assert np.isfinite(
+                    oc.fit(planar_x, oc.Polynomial(3), **settings, checkpoint=file).chart.xi([0.6] * 3)
+                ).all()
+
+
+def test_a_state_without_a_gradient_gets_a_new_one(planar_x: oc.Problem, tmp_path: Path) -> None:
+    file, settings = tmp_path / "run", {"solver": solvers.QuasiNewton(20), "samples": 60}
+    with pytest.raises(Killed):
+        oc.fit(planar_x, oc.Polynomial(2), **settings, checkpoint=file, monitor=kill_in("polynomial:2", 0.2))
+    header, arrays = checkpoint.read_archive(file, checkpoint.CHECKPOINT)
+    kept = {name: array for name, array in arrays.items() if name != "state_gradient"}
+    assert len(kept) == len(arrays) - 1
+    found = oc.fit(planar_x, oc.Polynomial(2), **settings, checkpoint=file)
+    checkpoint.write_archive(file, checkpoint.CHECKPOINT, header, kept)
+    again = oc.fit(planar_x, oc.Polynomial(2), **settings, checkpoint=file)
+    np.testing.assert_allclose(again.chart.coordinates.theta, found.chart.coordinates.theta, rtol=1e-6)

@@ -171,6 +171,8 @@ def test_wrong_corridors_are_refused() -> None:
         ([[0.0, 0.0]], np.inf, InvalidValueError),
         ([[3.0, 3.0]], 0.1, InvalidValueError),
         ([[np.nan, 3.0]], 0.1, InvalidValueError),
+        *(([[0.0, 0.0]], size, InvalidValueError) for size in (np.nan, 0.0, 1e-300, 1e300, [1e300, 0.1])),
+        *(([[0.0, 0.0], [0.0, far]], 0.1, InvalidValueError) for far in (1e7, 1e160, -1e300)),
     ):
         with pytest.raises(error):
             oc.Corridor(box, postures, radius)

@@ -51,7 +51,8 @@ def test_records_say_how_they_were_measured(name: str) -> None:
     assert words[0] != "python" or (figures.ROOT / place).exists()
     assert not record.script or "\ndef main(" in (figures.ROOT / record.script).read_text()
     if record.results:
-        assert record.source == "measured" and list((figures.ROOT / record.results).iterdir())
+        assert record.source == "measured"
+        assert list((figures.ROOT / record.results).iterdir())
         return
     called = record.script or "--json" in words  # how the tool measures it
     assert record.source == "transcribed" or (called and record.cpu_seconds and record.tolerance)

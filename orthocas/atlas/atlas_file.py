@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.atlas.lattice import Lattice, Outcome, Result, Symmetries
+from orthocas.atlas.lattice import Lattice, Orbits, Outcome, Result, Symmetries, orbits
 from orthocas.atlas.plan import AtlasSettings, Plan, lattice_of
 from orthocas.atlas.regions import Region, Surroundings, joint_range_of
 from orthocas.errors import AtlasFileError, InvalidValueError, OrthocasError
@@ -22,6 +22,7 @@ from orthocas.tasks.domains import NARROWEST
 from orthocas.tasks.problem import FOREIGN, problem_from_data, problem_to_data
 from orthocas.tools.archive import Stored, from_npy, to_npy
 from orthocas.tools.block_file import BlockKind, Contents, append, scan
+from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices, frozen_array, frozen_indices, require_count
 from orthocas.tools.json import part
 
@@ -48,6 +49,13 @@ class Stock:
     def charts(self) -> Indices:
         """Rows of the records that have a chart."""
         return np.flatnonzero(self.records["outcome"] == Outcome.CHART)
+
+    @cached_property
+    def orbits(self) -> Orbits:
+        """The tiles of the region, and which is fitted for each."""
+        plan, joints = self.plan, list(self.plan.joints)
+        tiles = self.region.tiles(plan.lattice)
+        return orbits(plan.lattice, tiles, plan.maps.of(plan.joints), plan.problem.domain.centre[joints])
 
     def numbers(self, rows: Indices) -> Array:
         """Constants and coefficients of some of the fitted charts, (rows, fitted, 1 + K).
@@ -153,8 +161,9 @@ def read_stock(path: Path) -> Stock:
     try:
         plan, region = _plan(contents.header)
         records, places = _records(path, plan, contents)
-        turns = _turns(plan, contents)
-        return Stock(path, plan, region, contents, records, places, turns)
+        stock = Stock(path, plan, region, contents, records, places, _turns(plan, contents))
+        _require_use(stock)
+        return stock
     except AtlasFileError:
         raise
     except OrthocasError as error:
@@ -294,6 +303,16 @@ def _require_tree(path: Path, plan: Plan, records: Records) -> None:
     sound &= _numbers_make_sense(records)
     if not sound.all():
         raise AtlasFileError(f"{path} is damaged: record {int(np.argmin(sound))} of its cells makes no sense")
+
+
+def _require_use(stock: Stock) -> None:
+    """Raise AtlasFileError unless all cells are of tiles that are fitted for the region, and none comes twice."""
+    records = stock.records
+    outer = records["parent"] < 0
+    halves = 2 * records["parent"][~outer].astype(np.int64) + records["upper"][~outer]
+    again = len(records) - len(np.unique(records["tile"][outer])) - len(np.unique(halves))
+    if again or not np.isin(records["tile"], stock.orbits.fitted).all():
+        raise AtlasFileError(f"{stock.path} is damaged: cells that come twice, or of tiles outside its region")
 
 
 def _numbers_make_sense(records: Records) -> NDArray[np.bool_]:

@@ -1,6 +1,7 @@
 """Builds an atlas: jobs for any executor, boxes that are split, results appended to the file."""
 
 import hashlib
+import logging
 import os
 import pickle
 import random
@@ -35,6 +36,7 @@ _AHEAD = 3  # jobs in flight for each worker
 _IN_FLIGHT = 64  # jobs in flight of an executor that somebody gives
 _FLUSH = 2.0  # seconds between blocks of the file
 _SEED = 0
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,8 +190,8 @@ class Building:
         running: dict[Future[list[Result]], list[Wanted]] = {}
         try:
             while (self.waiting and time.monotonic() < until) or running:
-                while self.waiting and len(running) < in_flight and time.monotonic() < until:
-                    batch = [self.waiting.pop() for _ in range(min(_BATCH, len(self.waiting)))]
+                while self.waiting and len(running) < self._most(in_flight) and time.monotonic() < until:
+                    batch = self._batch()
                     running[executor.submit(run_job, Job(plan, tuple(wanted.cell for wanted in batch)))] = batch
                 done = wait(running, timeout=_FLUSH, return_when=FIRST_COMPLETED).done
                 for future in done:
@@ -211,8 +213,19 @@ class Building:
             self._results = []
         self._report()
 
+    def _most(self, in_flight: int) -> int:
+        """Jobs in flight: one if workers died over the next cell, which could take others with it."""
+        return 1 if self.waiting[-1].attempts else in_flight
+
+    def _batch(self) -> list[Wanted]:
+        """The next cells for one job."""
+        batch = [self.waiting.pop()]
+        while self.waiting and len(batch) < _BATCH and not batch[0].attempts and not self.waiting[-1].attempts:
+            batch.append(self.waiting.pop())
+        return batch
+
     def _take(self, future: "Future[list[Result]]", batch: list[Wanted]) -> None:
-        """Keep the results of a job; cells of a worker that died run again."""
+        """Keep the results of a job; cells of a worker that died run again, after all others."""
         error = future.exception()
         if error is None:
             for wanted, result in zip(batch, future.result(), strict=True):
@@ -220,9 +233,9 @@ class Building:
             return
         for wanted in batch:
             if wanted.attempts + 1 < ATTEMPTS:
-                self.waiting.append(Wanted(wanted.cell, wanted.parent, wanted.upper, wanted.attempts + 1))
+                self.waiting.insert(0, replace(wanted, attempts=wanted.attempts + 1))
             elif worker_died(future):
-                self._keep(wanted, Result(wanted.cell, Outcome.FAILED))
+                _log.warning("worker processes died %d times over a box, which is left for the next build", ATTEMPTS)
             else:
                 raise error
 

@@ -195,7 +195,8 @@ def build_atlas(
     images of each other in a symmetry of the arm, one is fitted.
 
     If the file exists and belongs to the same problem, region and settings, the build goes on from it, also after the
-    process was killed. If a worker dies, the boxes it had run again.
+    process was killed. If a worker dies, the boxes it had run again; one over which workers die three times is left to
+    the next build.
 
     In scripts, call it under `if __name__ == "__main__"`: it starts processes.
 

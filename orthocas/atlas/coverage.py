@@ -22,7 +22,7 @@ _BINS = 24  # of the coverage by joint
 REASONS = {
     Outcome.SINGULAR: "most of the box is too near to singular positions",
     Outcome.POOR: "leak or conditioning is worse than asked, and no split is left",
-    Outcome.FAILED: "the fit failed or its workers died",
+    Outcome.FAILED: "the fit failed",
     5: "not built yet",
 }
 _SLICES = 4  # of the workspace, from inside out

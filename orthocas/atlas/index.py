@@ -7,7 +7,7 @@ import numpy as np
 
 from orthocas.atlas.atlas_file import Stock
 from orthocas.atlas.box_fit import widened
-from orthocas.atlas.lattice import Orbits, Outcome, cell_boundaries, orbits
+from orthocas.atlas.lattice import Orbits, Outcome, cell_boundaries
 from orthocas.atlas.plan import Plan
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
@@ -35,12 +35,10 @@ class Index:
         """The plan of the atlas."""
         return self.stock.plan
 
-    @cached_property
+    @property
     def orbits(self) -> Orbits:
         """The tiles of the region, and which is fitted for each."""
-        plan = self.plan
-        tiles = self.stock.region.tiles(plan.lattice)
-        return orbits(plan.lattice, tiles, plan.maps.of(plan.joints), plan.problem.domain.centre[list(plan.joints)])
+        return self.stock.orbits
 
     @property
     def count(self) -> int:

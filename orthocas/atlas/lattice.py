@@ -247,7 +247,7 @@ class Outcome(IntEnum):
     SPLIT = 1  #: its halves are cells of their own
     SINGULAR = 2  #: all or most of it is too near to singular positions
     POOR = 3  #: no chart of the quality asked for, and no split is left
-    FAILED = 4  #: its workers died, or the fit raised an error
+    FAILED = 4  #: the fit raised an error
 
 
 @dataclass(frozen=True, eq=False)

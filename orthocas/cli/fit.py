@@ -57,6 +57,7 @@ from orthocas.solvers.protocol import Status
 from orthocas.tasks.problem import Problem
 from orthocas.tools.archive import require_free
 from orthocas.tools.display import number_list
+from orthocas.tools.json import attributes
 
 _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 

@@ -17,9 +17,9 @@ from orthocas.tools.files import require_writable
 from orthocas.tools.progress import State
 
 CHECKPOINT = Kind("checkpoint", 1, CheckpointError)
-_NUMBERS = ("iterations", "evaluations", "seconds", "damping", "stretch", "scale", "converged")
-_VECTORS = ("best_theta", "theta", "gradient", "mean", "square")
-_LOSSES = ("best_value", "value")
+_NUMBERS = ("iterations", "evaluations", "seconds", "damping", "stretch", "scale", "converged", "gained_little")
+_VECTORS = ("best_theta", "theta", "gradient", "mean", "square", "place")
+_LOSSES = ("best_value", "value", "height")
 _MOST = 1e15  # of these numbers
 _SECONDS = 30.0  # least time between two writes of a running stage
 

@@ -10,12 +10,23 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.solutions import Tracker, TrackerStatus
 from orthocas.errors import DomainError, InvalidValueError, InverseError, MissingExtraError
 from orthocas.tasks.domains import bounds_of
-from orthocas.tools.checks import Array, as_float_array, as_point, as_point_set, require_kind
+from orthocas.tools.checks import (
+    Array,
+    as_float_array,
+    as_point,
+    as_point_set,
+    frozen_indices,
+    require_kind,
+    require_shape,
+)
 
 try:
     import gymnasium
 except ImportError:
     raise MissingExtraError("orthocas.learn", "gymnasium", "learn") from None
+
+
+_MOST_POSITIONS = 2**31  # of an environment
 
 
 def _positions(env: Any) -> Array:
@@ -40,7 +51,8 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
 
     Raises:
         MissingExtraError: without gymnasium, when `orthocas.learn` is imported: extra `learn`.
-        InvalidValueError: if actions are not n numbers; at `reset`, if the arm starts outside the domain.
+        InvalidValueError: if an argument is invalid, or actions are not n numbers; at `reset`, if the arm starts
+            outside the domain.
     """
 
     def __init__(
@@ -51,6 +63,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         joints: ArrayLike | None = None,
         positions: Callable[[Any], Array] = _positions,
     ) -> None:
+        require_kind("env", env, gymnasium.Env)
         super().__init__(env)
         require_kind("chart", chart, Chart)
         inner, outer = env.action_space, env.observation_space
@@ -58,11 +71,14 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
             raise InvalidValueError("actions of env", str(inner)[:80], f"{chart.n} joint positions")
         if len(getattr(outer, "shape", None) or ()) != 1:
             raise InvalidValueError("observations of env", str(outer)[:80], "a row of numbers")
+        if not callable(positions):
+            raise InvalidValueError("positions", repr(positions)[:80], "a function of an environment")
         self.chart, self._positions = chart, positions
-        self._joints = np.arange(chart.n) if joints is None else np.asarray(joints, dtype=int)
+        places = range(chart.n) if joints is None else joints
+        self._joints = frozen_indices("joints", places, (chart.n,), _MOST_POSITIONS)
         sizes = as_float_array("step", step)
-        if sizes.shape not in ((), (chart.n,)) or not (sizes > 0).all():
-            raise InvalidValueError("step", sizes.tolist(), f"one number or {chart.n}, > 0")
+        if sizes.shape not in ((), (chart.n,)) or not ((sizes > 0) & np.isfinite(sizes)).all():
+            raise InvalidValueError("step", sizes.tolist(), f"one finite number or {chart.n}, > 0")
         self._step = np.broadcast_to(sizes, chart.n)
         self._tracker: Tracker | None = None
         more, (low, high) = np.full(chart.r + 1, np.inf), _ends(outer)
@@ -79,8 +95,9 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         """Move the wanted phi; `info["tracker"]` has the tracker's status."""
         if self._tracker is None:
             raise gymnasium.error.ResetNeeded("step before reset, expected reset first")
-        before = self._tracker.q
-        self._tracker.step(self._wanted(before, self._step * np.clip(action, -1.0, 1.0)))
+        change = as_float_array("action", action)
+        require_shape("action", change.shape, (self.chart.n,))
+        self._tracker.step(self._wanted(self._tracker.q, self._step * np.clip(change, -1.0, 1.0)))
         status = self._tracker.status
         observation, reward, terminated, truncated, info = self.env.step(self._tracker.q)
         return self._observed(observation), reward, terminated, truncated, info | {"tracker": status}
@@ -95,8 +112,10 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         return wanted
 
     def _here(self) -> Array:
-        positions: Array = np.asarray(self._positions(self.env), dtype=float)[self._joints]
-        return positions
+        found = as_float_array("positions", self._positions(self.env))
+        if found.ndim != 1 or len(found) <= self._joints.max():
+            raise InvalidValueError("positions", f"of shape {found.shape}", f"a row with place {self._joints.max()}")
+        return np.asarray(found[self._joints])
 
     def _observed(self, observation: Array) -> Array:
         """An observation with xi and the distance to the boundary."""

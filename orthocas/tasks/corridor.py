@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.tasks.domains import NARROWEST, Box, Domain, register_domain
+from orthocas.tasks.domains import NARROWEST, WIDEST, Box, Domain, register_domain
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_point_set, frozen_array, require_kind
@@ -33,8 +33,8 @@ class Corridor(Box):
 
     Args:
         box: a box; the corridor is that part of it.
-        postures: the path, (N, n) [rad] or [m].
-        radius: one number, or one for each joint (n,), > 1e-9 [rad] or [m].
+        postures: the path, (N, n) [rad] or [m], numbers up to 1e6.
+        radius: one number, or one for each joint (n,), from 1e-9 to 1e6 or infinite [rad] or [m].
 
     Raises:
         ShapeError, InvalidValueError: for arguments of the wrong shape or value.
@@ -57,15 +57,17 @@ class Corridor(Box):
         super().__init__(box.centre, box.half_width, box.unbounded)
         n = len(box.centre)
         path = frozen_array("postures", postures, (None, n))
+        if (widest := np.abs(path).max(initial=0.0)) > WIDEST:
+            raise InvalidValueError("postures", f"up to {widest:.3g}", f"numbers up to {WIDEST:g}")
         if not 1 <= len(path) <= _MOST_POSTURES:
             raise InvalidValueError("number of postures", len(path), f"from 1 to {_MOST_POSTURES}")
         sizes = as_float_array("radius", radius)
         if sizes.shape not in ((), (n,)):
             raise ShapeError("radius", sizes.shape, (n,))
-        if not (sizes > NARROWEST).all() or np.isinf(sizes).all():
-            raise InvalidValueError(
-                "radius", sizes.tolist(), f"numbers above {NARROWEST:g}, at least one of them finite"
-            )
+        finite = np.isfinite(sizes)
+        if not ((sizes > NARROWEST) & (~finite | (sizes <= WIDEST))).all() or not finite.any():
+            wanted = f"numbers above {NARROWEST:g} up to {WIDEST:g}, or infinite ones for some of the joints"
+            raise InvalidValueError("radius", sizes.tolist(), wanted)
         sizes = np.array(np.broadcast_to(sizes, (n,)))
         sizes.setflags(write=False)
         for field, value in (("postures", path), ("radius", sizes)):

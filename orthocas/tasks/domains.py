@@ -34,7 +34,7 @@ _POWERS = (1.0, 0.5, 0.25)  # of the distance from the middle: uniform, near fac
 _LEAST_SHARE, _TRIED = 1e-3, 10_000  # of the points of a box, at least so many, that have to lie in the domain
 _BLOCK = 1000  # fewest points to draw at once, after the first ones
 NARROWEST = 1e-9  #: [rad] or [m]; boxes of this half-width and less drown in rounding
-_WIDEST = 1e6  # [rad] or [m]; wider boxes are mistakes, and overflow later
+WIDEST = 1e6  #: [rad] or [m]; wider boxes are mistakes, and overflow later
 
 
 class Domain(ABC):
@@ -324,9 +324,9 @@ class Box(Domain):
         widths = frozen_array("half_width", np.broadcast_to(widths, middle.shape), middle.shape)
         if widths.size == 0:
             raise InvalidValueError("centre", "empty", "at least one joint")
-        if widths.min() <= NARROWEST or widths.max() > _WIDEST:
+        if widths.min() <= NARROWEST or widths.max() > WIDEST:
             bad = widths.min() if widths.min() <= NARROWEST else widths.max()
-            raise InvalidValueError("half_width", f"{bad:g}", f"numbers above {NARROWEST:g}, up to {_WIDEST:g}")
+            raise InvalidValueError("half_width", f"{bad:g}", f"numbers above {NARROWEST:g}, up to {WIDEST:g}")
         object.__setattr__(self, "centre", middle)
         object.__setattr__(self, "half_width", widths)
         object.__setattr__(self, "unbounded", _joint_indices("unbounded", unbounded, len(middle)))
@@ -576,7 +576,8 @@ def _inside(domain: Domain, samples: int, draw: Callable[[int], Array]) -> Array
     while kept < samples:
         if drawn >= _TRIED and kept < _LEAST_SHARE * drawn:
             share = f"{kept} of {drawn} points of its box lie in the domain"
-            raise DomainError(f"{share}, expected at least {_LEAST_SHARE:.1%}: lower least_singular_value")
+            wanted = "lower least_singular_value, or raise the radius of the corridor"
+            raise DomainError(f"{share}, expected at least {_LEAST_SHARE:.1%}: {wanted}")
         points = draw(size)
         found.append(points[domain.contains(points)])
         drawn, kept = drawn + size, kept + len(found[-1])

@@ -1,7 +1,8 @@
 /* Random ticks inside and outside the domain and close to a singularity, with NaN, infinity and huge numbers among them.
  *
  * Compile with -DTICKS=, -DLIMIT=, -DSINGULAR= (joint positions, separated by commas) and, for a library in single
- * precision, -DNUMBER=float. Prints how often each status of the controller came. Exits with 1 at a wrong status of the
+ * precision, -DNUMBER=float. For the domain of a corridor, -DPATH= holds its postures one after the other, and -DRADIUS=
+ * its radius for each joint. Prints how often each status of the controller came. Exits with 1 at a wrong status of the
  * controller, 2 at a command that is not finite or beyond the limit, 3 at a wrong status or a number that is not finite
  * of another function. */
 #include <math.h>
@@ -16,7 +17,11 @@
 #endif
 #define IS_DOUBLE (sizeof(NUMBER) == sizeof(double))
 #define LARGEST (IS_DOUBLE ? 1e100 : (double)1e15f)
-#define EDGE (IS_DOUBLE ? 0.0 : 1e-6) /* so near to a boundary, either status is right */
+#ifdef PATH
+#define EDGE (IS_DOUBLE ? 1e-9 : 1e-4) /* so near to a boundary, either status is right */
+#else
+#define EDGE (IS_DOUBLE ? 0.0 : 1e-6)
+#endif
 
 static const NUMBER singular[N] = {SINGULAR};
 static uint64_t seed = 88172645463325252ULL;
@@ -61,11 +66,38 @@ static int all_finite(const NUMBER *x, int count) {
   return 1;
 }
 
+#ifdef PATH
+static const double path[][N] = {PATH}, radius[N] = {RADIUS};
+
+/* Whether q is within one radius, up to a slack, of a line between successive postures. */
+static int near_path(const NUMBER *q, double slack) {
+  const int lines = (int)(sizeof path / sizeof path[0]) - 1;
+  int i, k;
+  for (k = 0; k < lines; ++k) {
+    double length = 0.0, along = 0.0, distance = 0.0;
+    for (i = 0; i < N; ++i) {
+      const double step = (path[k + 1][i] - path[k][i]) / radius[i];
+      length += step * step;
+      along += step * (q[i] - path[k][i]) / radius[i];
+    }
+    along = fmin(fmax(along / length, 0.0), 1.0);
+    for (i = 0; i < N; ++i) {
+      const double apart = (q[i] - path[k][i] - along * (path[k + 1][i] - path[k][i])) / radius[i];
+      distance += apart * apart;
+    }
+    if (sqrt(distance) <= 1.0 + slack) return 1;
+  }
+  return 0;
+}
+#else
+#define near_path(q, slack) 1
+#endif
+
 static int inside(const NUMBER *q, double slack) {
   int i;
   for (i = 0; i < N; ++i)
     if (!(q[i] >= arm_domain_lower[i] - slack && q[i] <= arm_domain_upper[i] + slack)) return 0;
-  return 1;
+  return near_path(q, slack);
 }
 
 static void random_position(NUMBER *q, int near_singular) {

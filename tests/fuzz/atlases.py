@@ -20,7 +20,7 @@ from fuzz.mutants import Rng, changed_array, changed_data, flipped, pick
 from fuzz.sealed_files import judged
 from orthocas.atlas.atlas_file import ATLAS, chart_type
 from orthocas.atlas.coverage import evaluate_atlas
-from orthocas.errors import AtlasFileError
+from orthocas.errors import AtlasFileError, OrthocasError
 from orthocas.tools.block_file import scan, sealed
 
 _PREFIX, _BLOCK, _CHECK = struct.Struct("<16sQ32s"), struct.Struct("<4sIQQ"), struct.Struct("<I")
@@ -45,6 +45,14 @@ def use(path: Path) -> None:
     before = path.read_bytes()
     _go_on(path)
     found = oc.Atlas.load(path)
+    try:
+        _evaluate(found)
+    except OrthocasError as error:  # no file is to blame
+        raise OrthocasError(f"mutant: {error}") from None
+    assert path.read_bytes() == before
+
+
+def _evaluate(found: oc.Atlas) -> None:
     n = found.problem.n
     q = found.problem.domain.centre + np.random.default_rng(0).uniform(-1, 1, (30, n)) * found.problem.domain.half_width
     numbers = found.chart_at(q)
@@ -56,7 +64,6 @@ def use(path: Path) -> None:
     for number in sorted(set(numbers[numbers >= 0].tolist()))[:2]:
         found.chart(number)
     evaluate_atlas(found, 200, 0)
-    assert path.read_bytes() == before
 
 
 def _go_on(path: Path) -> None:

@@ -12,6 +12,7 @@ from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
 from fuzz.commands import commands
 from fuzz.libraries import libraries
+from fuzz.lists import lists
 from fuzz.messages import messages
 from fuzz.motions import motions
 from fuzz.paths import logs, paths, postures
@@ -30,6 +31,7 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "checkpoints": checkpoints,
     "commands": commands,
     "libraries": libraries,
+    "lists": lists,
     "logs": logs,
     "messages": messages,
     "motions": motions,
@@ -64,7 +66,7 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "simulation.trajectory.read_run_file": "runs",
     "tools.archive.read_archive": "checkpoints",
     "tools.files.read_table": "paths",
-    "tools.files.read_list": "signals",
+    "tools.files.read_list": "lists",
     "viewer.looks.urdf_look": "robots",
     "viewer.motion.read_joint_motion": "motions",
     "viewer.motion.read_run": "runs",
@@ -73,6 +75,8 @@ RESULTS = {  #: public classes whose objects only the library makes, with the ca
     **dict.fromkeys(("Atlas", "Coverage"), "atlases"),
     **dict.fromkeys(("Branch", "Branches", "Comparison", "Fit", "WideFit", "Involutivity", "Report"), "calls"),
     **dict.fromkeys(("Solutions", "Tracker", "InverseStatus", "TrackerStatus"), "calls"),
+    **dict.fromkeys(("Breakdown", "Coupling", "DampingCheck", "JointMotion", "Margins", "Modes", "Setting"), "calls"),
+    **dict.fromkeys(("Card", "Model", "Trajectory", "View"), "calls"),
     "Certificate": "certificates",
     "Domain": "calls",
 }

@@ -32,6 +32,7 @@ FITS: dict[str, dict[str, Any]] = {
     "gauss_newton": {"parametrisation": oc.Polynomial(3), "samples": 60},
     "adam": {"parametrisation": oc.MLP((3,)), "solver": solvers.Adam(epochs=6, steps=2), "samples": 60},
     "lbfgs": {"parametrisation": oc.MLP((3,)), "solver": solvers.LBFGS(max_iterations=20), "samples": 60},
+    "quasi_newton": {"parametrisation": oc.Polynomial(2), "solver": solvers.QuasiNewton(20), "samples": 60},
     "flow": {"parametrisation": oc.Polynomial(1), "solver": solvers.GradientFlow(max_iterations=5), "samples": 60},
 }
 

@@ -24,6 +24,7 @@ from public_objects import (
     steps,
     trajectory,
 )
+from test_learn import Arm
 
 import orthocas as oc
 from orthocas import bases, control, learn, plotting, problems, simulation, solvers, viewer
@@ -145,7 +146,7 @@ def _physics() -> dict[str, Call]:
         "Payload": (simulation.Payload, {"mass": 1.0, "centre": q, "inertia": np.eye(3)}),
         "Wall": (simulation.Wall, {"point": q, "normal": q, "tip_radius": 0.1, "size": 1.0, "time_constant": 0.01}),
         "MuJoCo": (simulation.MuJoCo, {"robot": robot, **options}),
-        "elastic MuJoCoPlant": (
+        "Elasticity": (
             lambda **given: simulation.MuJoCoPlant(robot, elasticity=simulation.Elasticity(**given)),
             {"stiffness": [8000.0, 5000.0, 5000.0], "inertia": 0.4, "damping": 5.0},
         ),
@@ -439,6 +440,13 @@ def _methods() -> dict[str, Call]:
     }
 
 
+def _moved(action: Any) -> object:
+    """What an environment with actions in (x, xi) makes of one."""
+    env = learn.PhiActions(Arm(fitted().chart), fitted().chart, 0.01)
+    env.reset()
+    return env.step(action)
+
+
 def _control() -> dict[str, Call]:
     chart, problem, reference, law = fitted().chart, planar(), steps(), impedance()
     centre = planar().domain.centre
@@ -476,6 +484,8 @@ def _control() -> dict[str, Call]:
             {"q": centre, "dq": 0 * centre, "reference": np.zeros((3, 3)), "period": 1e-3},
         ),
         "XiTask": (control.XiTask, {"chart": chart, "cost": 1.0, "gain": 0.5, "lm_damping": 0.1}),
+        "PhiActions": (learn.PhiActions, {"env": Arm(chart), "chart": chart, "step": 0.01, "joints": [0, 1, 2]}),
+        "actions.step": (_moved, {"action": [0.1, 0.0, -0.1]}),
         "coordinates_of": (learn.coordinates_of, {"chart": chart, "q": np.array([[0.6, 0.8, 0.8]])}),
         "joints_of": (
             learn.joints_of,

@@ -13,6 +13,7 @@ from fuzz.mutants import Rng, changed_data, entries_of, flipped, npy, packed, pi
 from fuzz.sealed_files import bomb, changed_arrays, judged
 from orthocas.control import Kinematic
 from orthocas.simulation import Trajectory, simulate
+from orthocas.viewer.motion import read_run
 
 
 def write_originals(folder: Path) -> None:
@@ -35,7 +36,9 @@ def judge(originals: Path, seed: int) -> str | None:
 
 
 def use(path: Path) -> None:
-    """Load a run and ask it all it tells."""
+    """Load a run and ask it all it tells, and show it as a motion."""
+    motion = read_run(path, public_objects.planar().robot)
+    assert motion.q.shape == (len(motion.times), 3)
     trajectory = Trajectory.load(path)
     with np.errstate(all="ignore"):  # huge numbers are numbers
         N, k = len(trajectory.times), len(trajectory.labels)

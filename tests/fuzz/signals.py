@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from PIL import Image
+from public_objects import atlas
 
 import orthocas as oc
 from fuzz.child import Finding, run
@@ -63,6 +64,11 @@ COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is
     "follow": ("follow", "chart.orthocas", "path.csv", *_CHOSEN, "--out", "out/q.csv", "--json"),
     "codegen": ("codegen", "chart.orthocas", *_CONTROLLED, "--check"),
     "atlas": ("atlas", "build", "planar_3r_x", *_TILES, "--out", "out/a.orthocas-atlas", "--json"),
+    "atlas evaluate": ("atlas", "evaluate", "arm.orthocas-atlas", "--samples", "20000", "--pictures", "out", "--json"),
+    "atlas info": ("atlas", "info", "arm.orthocas-atlas", "--json"),
+    "export": ("export", "chart.orthocas", "--to", "numpy", "--out", "out/arm.py"),
+    "charts": ("charts", "ur5-position", "--out", "out/ur5.orthocas"),
+    "demo": ("demo", "--out", "out"),
     "view": ("view", "chart.orthocas", "--export", "out/page.html"),
     "loop": ("-c", _LOOP),
 }
@@ -184,6 +190,7 @@ def place() -> Iterator[Path]:
         (folder / "steps.json").write_text(json.dumps(_STEPS))
         (folder / "path.csv").write_text(_PATH)
         shutil.copy(_chart(), folder / "chart.orthocas")
+        shutil.copy(atlas().path, folder / "arm.orthocas-atlas")
         yield folder
 
 
