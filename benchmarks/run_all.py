@@ -48,6 +48,7 @@ SCRIPTS = (
     "closed_loop",
     "control_tick",
     "supervised_tick",
+    "small_processors",
     "inverse",
     "exported_inverse",
     "default_gains",

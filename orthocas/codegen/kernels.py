@@ -41,6 +41,17 @@ _INVERSE = """{
   if (res[1] != 0) res[1][0] = volume;
   return 0;
 }"""
+#: what stands for `pow`, which is slow on small processors: products for whole exponents
+POWER = """static double NAME(double base, double exponent) {
+  double power = 1.0, factor = base;
+  int left = (int)fmin(fabs(exponent), 65.0);
+  if (left > 64 || fabs(exponent - floor(exponent)) > 0.0) return exp(exponent * log(base));
+  for (; left > 0; left /= 2) {
+    if (left % 2 == 1) power *= factor;
+    if (left > 1) factor *= factor;
+  }
+  return exponent < 0.0 ? 1.0 / power : power;
+}"""
 _OPTIONS: dict[str, Any] = {"with_header": False, "with_export": False, "casadi_int": "int"}
 _FUNCTION = re.compile(r"^(?:static |inline |const )*\w+\s?\*?\s+\**(\w+)\((.*)", re.DOTALL)
 _DATA = re.compile(r"^static const \w+ (\w+)\[")
@@ -187,8 +198,15 @@ def generate_kernels(
     code = re.sub(r"CASADI_CAST\((\w+), ([^()]+)\)", r"(\1)(\2)", code)
     code = re.sub(r"\bcasadi_real\b", "double", re.sub(r"\bcasadi_int\b", "int", code))
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)
+    code = _without_pow(code, f"{prefix}_power")
     work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), doubles[f.name()]) for f in functions}
     return Kernels(code, work)
+
+
+def _without_pow(code: str, name: str) -> str:
+    """C code with a function of its own, of this name, for powers."""
+    changed = re.sub(r"\bpow\(", f"{name}(", code)
+    return code if changed == code else f"{POWER.replace('NAME', name)}\n\n{changed}"
 
 
 def _with_explicit_conditions(code: str) -> str:

@@ -111,10 +111,13 @@ class CompiledLibrary:
         curvature = self._zeros(self.n)
         return curvature, self._call("chart_curvature", [q, dq, v], [curvature], which)
 
-    def inverse(self, phi: Array, q_start: Array, *which: int) -> tuple[Array, int]:
-        """q (n,), status."""
-        q = self._zeros(self.n)
-        return q, self._call("inverse", [phi, q_start], [q], which)
+    def inverse(self, phi: Array, q_start: Array, *which: int, max_iterations: int = 100) -> tuple[Array, int]:
+        """q (n,), status; after at most so many evaluations of phi."""
+        q, arrays = self._zeros(self.n), [self.numbers(array) for array in (phi, q_start)]
+        for name, array in zip(("phi", "q_start"), arrays, strict=True):
+            require_shape(name, array.shape, (self.n,))
+        places = [array.ctypes.data_as(_POINTER) for array in (*arrays, q)]
+        return q, int(self.function("inverse")(*which, *places[:2], int(max_iterations), places[2]))
 
     def nearest(self, phi: Array, q_start: Array, largest_step: float) -> tuple[Array, int]:
         """q (n,), status; for boxes, clear or not."""

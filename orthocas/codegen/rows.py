@@ -11,6 +11,7 @@ from orthocas.bases.family import LinearFamily
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import CoordinateMap, Coordinates
 from orthocas.codegen.description import filled, numbers
+from orthocas.codegen.kernels import POWER
 from orthocas.codegen.precision import DOUBLE, Precision
 from orthocas.errors import InvalidValueError
 from orthocas.tools.batch import dense_function
@@ -77,7 +78,8 @@ class TableCoordinates:
 
 _OPERATIONS = {
     **ARITHMETIC,
-    "constpow": "pow({0}, {1})",
+    "constpow": "power({0}, {1})",
+    "pow": "power({0}, {1})",
     "lt": "{0} < {1} ? 1.0 : 0.0",
     "le": "{0} <= {1} ? 1.0 : 0.0",
     "eq": "{0} == {1} ? 1.0 : 0.0",
@@ -91,7 +93,7 @@ _OPERATIONS = {
     **{name: f"{name}({{0}})" for name in ("sqrt", "exp", "log", "tan", "asin", "acos", "atan", "sinh", "cosh")},
     **{name: f"{name}({{0}})" for name in ("tanh", "fabs", "floor", "ceil", "log1p", "expm1", "erf")},
     **{name: f"{name}({{0}})" for name in ("asinh", "acosh", "atanh")},
-    **{name: f"{name}({{0}}, {{1}})" for name in ("pow", "atan2", "hypot", "fmod", "copysign", "fmin", "fmax")},
+    **{name: f"{name}({{0}}, {{1}})" for name in ("atan2", "hypot", "fmod", "copysign", "fmin", "fmax")},
 }
 
 
@@ -123,7 +125,7 @@ def rows_files(chart: Chart, name: str, values: Mapping[str, str], precision: Pr
         "basis_count": str(C.shape[1]),
         "sum_count": str(sums),
         "far": "1e5",
-        "sines": _sines(lines, precision),
+        "sines": _sines(lines, precision) + _powers(lines),
         "slots": f"    double {', '.join(f'w{k}' for k in range(slots))};",
         "operations": "\n".join(lines),
         "places": ", ".join(map(str, [*places, *others])),
@@ -185,6 +187,11 @@ def _sums(C: Array, shift: Array) -> dict[str, str]:
         "add_up": "add_up(out + DIRECT * LANES, sums);",
         "store_sums": "for (i = 0; i < SUMS; ++i) row[places[DIRECT + i]] = sums[i * LANES + l];",
     }
+
+
+def _powers(lines: list[str]) -> str:
+    """What stands for `pow`, if it is needed."""
+    return f"\n{POWER.replace('NAME', 'power')}" if any(" power(" in line for line in lines) else ""
 
 
 def _sines(lines: list[str], precision: Precision) -> str:

@@ -43,6 +43,7 @@ class ControlStatus(IntEnum):
     TOO_FAST = 9  #: why the catcher took over: a joint was faster than its limit
     LATE = 10  #: why the catcher took over: a tick came too late
     HELD = 11  #: why the catcher took over: brakes held the arm
+    STOPPED_EARLY = 12  #: of the inverse map in C: its iterations were not enough
 
     @property
     def words(self) -> str:

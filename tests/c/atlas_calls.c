@@ -62,7 +62,7 @@ int main(void) {
     if (!known && status != ARM_OUTSIDE_DOMAIN) return 1;
     (void)arm_chart_curvature(asked, q, v, v, bend);
     if (k % 16 == 0) {
-      status = arm_inverse(asked, v, q, solution);
+      status = arm_inverse(asked, v, q, 100, solution);
       if (status == ARM_OK && !known) return 1;
     } else {
       (void)arm_xi(asked, v, solution);

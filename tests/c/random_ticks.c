@@ -131,8 +131,8 @@ static int others_are_right(const NUMBER *q, const NUMBER *dq) {
   if (!(numbers ? place_is_right(status, q) || (status == ARM_SINGULAR && !inside(q, -EDGE)) : status == ARM_NOT_FINITE))
     return 0; /* far outside, powers of q overflow: singular */
   for (i = 0; i < N; ++i) start[i] = q[i] + 0.3 * uniform(); /* Newton's method has something to do */
-  status = (int)arm_inverse(phi, start, solution);
-  if (!all_finite(solution, N) || status < 0 || status > 3) return 0;
+  status = (int)arm_inverse(phi, start, 1 + (int)(50.0 * (1.0 + uniform())), solution);
+  if (!all_finite(solution, N) || status < 0 || (status > 3 && status != ARM_STOPPED_EARLY)) return 0;
   if (numbers && (status == ARM_OK) && !inside(solution, EDGE)) return 0;
   status = (int)arm_dynamics(q, dq, matrix, bias, gravity);
   if (!all_finite(matrix, N * N) || !all_finite(bias, N) || !all_finite(gravity, N)) return 0;

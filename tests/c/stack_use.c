@@ -31,7 +31,7 @@ static const NUMBER position[N] = {POSITION};
 #define IN_CHART
 #endif
 static void *chart(void *unused) { return arm_chart(IN_CHART q, phi, matrix), unused; }
-static void *inverse(void *unused) { return arm_inverse(IN_CHART phi, q, vector), unused; }
+static void *inverse(void *unused) { return arm_inverse(IN_CHART phi, q, 100, vector), unused; }
 static void *dynamics(void *unused) { return arm_dynamics(q, dq, matrix, vector, phi), unused; }
 static void *control(void *unused) { return arm_control(IN_CHART q, dq, &reference, &arm_default_gains, vector), unused; }
 static void *supervised(void *unused) {

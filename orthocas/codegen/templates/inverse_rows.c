@@ -7,6 +7,8 @@
 #include <math.h>
 #include <string.h>
 
+#define ITERATIONS 100
+
 void arm_inverse_rows(long rows, const double *phi, const double *q_start, const double *sizes, double *q, double *found,
                       double *condition);
 
@@ -54,7 +56,7 @@ void arm_inverse_rows(long rows, const double *phi, const double *q_start, const
   long k;
   int i, j;
   for (k = 0; k < rows; ++k) {
-    arm_status status = arm_inverse(phi + k * N, q_start + k * N, q + k * N);
+    arm_status status = arm_inverse(phi + k * N, q_start + k * N, ITERATIONS, q + k * N);
     if (condition == NULL) continue;
     condition[k] = -1.0;
     if (status != ARM_OK && status != ARM_OUTSIDE_DOMAIN) continue;
