@@ -1,10 +1,11 @@
 """Generated C on an emulated Cortex-M4F (QEMU's mps2-an386): code, stack and instructions of a tick (3 min).
 
-Ready charts with 6, 7 and 14 joints (two arms, degree 2), PD+ coupled with default gains and settings, arm-none-eabi-gcc
--O2 for -mcpu=cortex-m4 -mfpu=fpv4-sp-d16 -mfloat-abi=hard. Instructions are counted by SysTick under -icount shift=0, in
-steps of 40. The worst tick of 24 states: inside the domain and up to 5 % beyond, with speeds, each with the law alone in
-command and while it takes over from the catcher, when all parts run. Code: the object file's, without the C library.
-Stack: painted, of the deepest call. Iteration of the inverse map: the worst instructions of a call, divided by them.
+Ready charts with 6, 7 and 14 joints (two arms, degree 2), PD+ coupled with default gains and settings, arm-none-eabi-
+gcc -O2 for -mcpu=cortex-m4 -mfpu=fpv4-sp-d16 -mfloat-abi=hard. Instructions are counted by SysTick under -icount
+shift=0, in steps of 40. The worst tick of 24 states: inside the domain and up to 5 % beyond, with speeds, each with
+the law alone in command and while it takes over from the catcher, when all parts run. Code: the object file's,
+without the C library. Stack: painted, of the deepest call. Iteration of the inverse map: the worst instructions of a
+call, divided by them.
 """
 
 import shutil
@@ -39,7 +40,7 @@ HEADER = (
 
 @dataclass(frozen=True)
 class States:
-    """Where the program calls the library: rows of joint positions, velocities, references, starts of the inverse map."""
+    """Where the program calls: rows of joint positions, velocities, references, and starts of the inverse map."""
 
     q: Array
     dq: Array
@@ -61,7 +62,7 @@ class States:
     def header(self, single: bool, iterations: int) -> str:
         """states.h."""
         kind = (SINGLE if single else DOUBLE).c_name
-        count, n = self.q.shape
+        count = len(self.q)
         lines = [f"#define NUMBER {kind}", f"#define STATES {count}", f"#define ITERATIONS {iterations}"]
         arrays = {"q": self.q, "dq": self.dq, "references": self.reference, "start": self.start}
         for name, rows in arrays.items():
@@ -84,7 +85,7 @@ class Found:
 
 
 def missing_tools() -> list[str]:
-    """Programs that this needs and the machine lacks (Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm)."""
+    """Programs that this needs and the machine lacks; Debian has them, see CONTRIBUTING.md."""
     return [tool for tool in TOOLS if shutil.which(tool) is None]
 
 
@@ -137,7 +138,7 @@ def code_bytes(folder: Path) -> int:
 def main(quick: bool = False) -> list[str]:
     """Print the table."""
     if missing := missing_tools():
-        raise SystemExit(f"needs {', '.join(missing)}")
+        raise ModuleNotFoundError(f"no {' and no '.join(missing)}, see CONTRIBUTING.md")
     return table(HEADER, rows(quick))
 
 

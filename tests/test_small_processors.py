@@ -1,4 +1,4 @@
-"""Generated C on an emulated Cortex-M4F, in single precision: near Python, equal to the host, within the stack it states."""
+"""Generated C on an emulated Cortex-M4F, in floats: near Python, equal to the host, within the stack it states."""
 
 from pathlib import Path
 
@@ -67,7 +67,7 @@ def test_law_is_near_its_python(law: PDPlus, states: States, found: Found) -> No
 def test_ticks_of_the_supervised_law_are_those_of_the_host(
     law: PDPlus, states: States, generated: GeneratedC, found: Found, tmp_path: Path
 ) -> None:
-    """The law has just taken over, with its own command; the host's processor and library of C round in their own way."""
+    """The law has just taken over, with its own command; host and board round in their own ways."""
     library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", law.problem.n, single_precision=True)
     supervisor, seen = Supervisor(library, law), set()
     for k, (q, dq) in enumerate(zip(states.q, states.dq, strict=True)):

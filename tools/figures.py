@@ -359,7 +359,11 @@ def main(names: Sequence[str], keep: bool) -> int:
     known, count = records(), 0
     for record in [known[name] for name in names] or [r for r in known.values() if r.cheap]:
         print(f"{record.name}: {record.command}", flush=True)
-        new = measured(record)
+        try:
+            new = measured(record)
+        except ModuleNotFoundError as error:
+            print(f"  left out: {error}", flush=True)
+            continue
         changes = moved(record, new)
         print("".join(f"  moved: {change}\n" for change in changes), end="", flush=True)
         count += bool(changes)
