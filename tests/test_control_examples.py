@@ -5,6 +5,7 @@ from pathlib import Path
 import closed_loop
 import control_tick
 import controllers
+import elbow_follower
 import lengths
 import panda_elbow
 import pytest
@@ -53,3 +54,18 @@ def test_ticks_of_generated_c_are_measured() -> None:
 def test_length_term_evens_gradients() -> None:
     found = lengths.main(quick=True)
     assert found["planar_3r_x 4 1"].length_ratio < 0.3 * found["planar_3r_x 4 0"].length_ratio
+
+
+@pytest.mark.slow
+def test_elbow_follows_as_near_as_the_self_motion_allows(tmp_path: Path) -> None:
+    found = elbow_follower.main(tmp_path, quick=True)["left"]
+    assert found["travel_mm"] > 50
+    assert found["error_mm"] <= 1.05 * found["least_error_mm"]
+    assert found["hand_error_m"] < 1e-9
+    assert found["fastest_rad_s"] < 2.0
+
+
+def test_recording_with_other_columns_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "points.csv").write_text("1,2,3\n")
+    with pytest.raises(SystemExit, match="rows have 3 numbers, expected 18"):
+        elbow_follower.read(tmp_path / "points.csv")

@@ -238,9 +238,18 @@ def _inverse_error(library: CompiledLibrary, chart: Chart, target: Array, start:
         if (status == ControlStatus.OK) != contains(chart.problem.domain, solution.astype(float)):
             raise ProofError(f"the status of inverse is {status} at q = {solution.tolist()}")
         return float(np.abs(shortest(chart.phi(solution.astype(float)) - target, chart.turns)).max())
-    if status != ControlStatus.SINGULAR or not np.array_equal(solution, start):
+    if status == ControlStatus.STOPPED_EARLY:
+        after, before = (_remaining(chart, target, q) for q in (solution.astype(float), start))
+        if not after <= before:
+            raise ProofError(f"inverse returns {solution.tolist()}, farther off than its start: {after} for {before}")
+    elif status != ControlStatus.SINGULAR or not np.array_equal(solution, start):
         raise ProofError(f"inverse returns {solution.tolist()} and status {status}, expected its start")
     return np.inf
+
+
+def _remaining(chart: Chart, target: Array, q: Array) -> float:
+    """The largest error in phi in sizes of the components."""
+    return float(np.abs(shortest(chart.phi(q) - target, chart.turns) / chart.phi_sizes).max())
 
 
 def _control(library: CompiledLibrary, controller: Controller, q: Array, dq: Array, rng: np.random.Generator) -> float:
