@@ -91,7 +91,7 @@ def run(app: typer.Typer) -> int:
     """Run a command line of `app_for`; bad input gives one line on standard error and exit code 2, a signal its own."""
     with ended_in_order(), remembered() as pressed:
         try:
-            code = app(standalone_mode=False) or 0
+            code = app(prog_name="orthocas", standalone_mode=False) or 0
         except KeyboardInterrupt:
             code = INTERRUPTED
         except Exception as error:
