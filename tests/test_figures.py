@@ -147,6 +147,22 @@ def test_a_run_gives_values_and_tables_shows_what_moved_and_renews_pages(
     assert figures.main([], keep=False) == 0
 
 
+def test_records_whose_packages_are_missing_are_left_out_but_no_missing_script(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "examples").mkdir()
+    script = tmp_path / "examples" / "needs_of_figures.py"
+    script.write_text("import package_that_nobody_has\n")
+    record = figures.Record("needs", "measured", script="examples/needs_of_figures.py", cpu_seconds=1.0)
+    monkeypatch.setattr(figures, "ROOT", tmp_path)
+    monkeypatch.setattr(figures, "records", lambda: {"needs": record})
+    assert figures.main([], keep=False) == 0
+    assert "left out: No module named 'package_that_nobody_has'" in capsys.readouterr().out
+    script.unlink()
+    with pytest.raises(ModuleNotFoundError, match="needs_of_figures"):
+        figures.main([], keep=False)
+
+
 def test_rows_belong_together_by_their_labels_whatever_their_order() -> None:
     old = [("", "| a | 4 | 1 | 2 |"), ("", "| a | 5 | 3 | 4 |"), ("", "| b, c | x | 5 |"), ("", "| gone | 7 |")]
     new = [("", "| b, c | x | 6 |"), ("", "| new | 9 |"), ("", "| a | 4 | 1 | 3 |"), ("", "| a | 5 | 3 | 5 |")]

@@ -362,6 +362,8 @@ def main(names: Sequence[str], keep: bool) -> int:
         try:
             new = measured(record)
         except ModuleNotFoundError as error:
+            if error.name == Path(record.script).stem:
+                raise  # it is no package of others
             print(f"  left out: {error}", flush=True)
             continue
         changes = moved(record, new)
