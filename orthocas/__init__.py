@@ -1,18 +1,41 @@
 """orthocas: joint-space coordinates that a redundant robot's task does not disturb, with CasADi."""
 
-import ast as _ast
 import os as _os
-from importlib import import_module as _import_module
-from pathlib import Path as _Path
+import sys as _sys
+from itertools import pairwise as _pairwise
+from types import TracebackType as _TracebackType
 
-from orthocas.cli.entry import is_command_line as _is_command_line
-from orthocas.cli.entry import leave_on_ctrl_c as _leave_on_ctrl_c
-from orthocas.cli.entry import open_closed_streams as _open_closed_streams
-from orthocas.version import VERSION as _VERSION
+
+def _is_command_line() -> bool:
+    """Whether this process is the command `orthocas` or `python -m orthocas`, not a program that imports orthocas."""
+    words = _sys.orig_argv[1:]
+    script = _sys.argv[0] if _sys.argv else ""
+    as_script = _os.path.splitext(_os.path.basename(script))[0] == "orthocas" and script in words
+    return as_script or ("-m", "orthocas") in _pairwise(words)
+
+
+def _leave(kind: type[BaseException], error: BaseException, trace: _TracebackType | None) -> None:
+    """End the process after Ctrl-C without a traceback, until `leave_on_ctrl_c` does."""
+    if issubclass(kind, KeyboardInterrupt):
+        _os.write(2, b"orthocas: interrupted\n")
+        _os._exit(130)
+    _sys.__excepthook__(kind, error, trace)
+
 
 if _is_command_line():
+    _sys.excepthook = _leave  # at once: whatever is imported takes milliseconds, in which Ctrl-C may come
+    from orthocas.cli.entry import leave_on_ctrl_c as _leave_on_ctrl_c
+    from orthocas.cli.entry import open_closed_streams as _open_closed_streams
+
     _open_closed_streams()
     _leave_on_ctrl_c()  # what a command imports takes half a second
+    _sys.excepthook = _sys.__excepthook__
+
+import ast as _ast  # noqa: E402
+from importlib import import_module as _import_module  # noqa: E402
+from pathlib import Path as _Path  # noqa: E402
+
+from orthocas.version import VERSION as _VERSION  # noqa: E402
 
 if "ORTHOCAS_PARENT" in _os.environ:  # a process that shares work of another one
     from orthocas.tools.processes import end_early_with_parent as _end_early_with_parent

@@ -158,7 +158,7 @@ def test_ignored_signals_stay_ignored() -> None:
 
 
 def test_only_the_command_line_watches_its_imports() -> None:
-    assert not entry.is_command_line()
+    assert not oc._is_command_line()
     for words, yes in (
         (["python", "-m", "orthocas", "info"], True),
         (["python", "-X", "dev", "-m", "orthocas"], True),
@@ -167,7 +167,38 @@ def test_only_the_command_line_watches_its_imports() -> None:
         (["python", "-c", "from multiprocessing.spawn import spawn_main"], False),
     ):
         with patch.object(sys, "orig_argv", words), patch.object(sys, "argv", ["/usr/bin/orthocas"]):
-            assert entry.is_command_line() is yes
+            assert oc._is_command_line() is yes
+
+
+_CTRL_C_AT = """
+import os, signal, sys
+from importlib.abc import MetaPathFinder
+
+class Finder(MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "{module}":
+            os.kill(os.getpid(), signal.SIGINT)
+            for _ in range(100):
+                pass  # Python looks for signals here
+
+sys.meta_path.insert(0, Finder())
+"""
+
+
+@pytest.mark.parametrize(
+    "module", ["orthocas.cli.entry", "orthocas.version", "orthocas.__main__", "orthocas.cli.commands"]
+)
+def test_ctrl_c_before_our_handlers_is_one_line(module: str, tmp_path: Path) -> None:
+    """Sent at a moment that a campaign of random times meets once in three hundred kills."""
+    (tmp_path / "sitecustomize.py").write_text(_CTRL_C_AT.format(module=module))
+    done = subprocess.run(
+        [sys.executable, "-m", "orthocas", "info", "planar_3r_x"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "orthocas: interrupted\n")
 
 
 @pytest.mark.slow

@@ -3,18 +3,9 @@
 import os
 import signal
 import sys
-from itertools import pairwise
-from pathlib import Path
 from types import FrameType
 
 INTERRUPTED = 130  #: exit code after Ctrl-C, as shells have it
-
-
-def is_command_line() -> bool:
-    """Whether this process is the command `orthocas` or `python -m orthocas`, not a program that imports orthocas."""
-    words = sys.orig_argv[1:]
-    as_script = bool(sys.argv) and Path(sys.argv[0]).stem == "orthocas" and sys.argv[0] in words
-    return as_script or ("-m", "orthocas") in pairwise(words)
 
 
 def open_closed_streams() -> None:
