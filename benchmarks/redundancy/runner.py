@@ -23,7 +23,7 @@ FOLDER = Path(__file__).parent
 RESULTS, SETTINGS = FOLDER / "results", FOLDER / "settings.json"
 SCHEMA = 1  #: of the files in results
 FASTER = 1.05  #: than its velocity limit, which a joint may be
-PATIENCE = 50  #: ticks after which a method that takes longer than a tick for each is stopped; its row says so
+PATIENCE = 51  #: ticks that a method may be late with; one that takes longer is stopped, and its row says so
 ORDER = ("pseudo_inverse", "pink", "mink", "placo", "ssik", "operational_space", "ompl", "charts")  #: of the rows
 
 
@@ -100,7 +100,7 @@ def followed(arm: Arm, method: Method, stream: Stream) -> Run:
         rest = arm.error(q, target.placement) if np.isfinite(q).all() else np.full(6, np.inf)
         path.append(q)
         errors.append((np.linalg.norm(rest[:3]), np.linalg.norm(rest[3:])))
-        if k > PATIENCE and time.process_time() - begin > k * TICK:
+        if time.process_time() - begin > max(k, PATIENCE) * TICK:
             raise Unsuited("slower than the ticks of 10 ms")
     q = np.array(path)
     steps = np.abs(np.diff(np.vstack([stream.start, q]), axis=0))
