@@ -16,11 +16,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from redundancy.protocol import Scenario
 from redundancy.runner import RESULTS, scenarios
+from scipy.stats import binomtest
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, RECORD = ROOT / "docs" / "measurements" / "redundancy.md", ROOT / "docs" / "records" / "redundancy.json"
 PAPER, FIGURES = ROOT / "docs" / "joss" / "paper.md", ROOT / "docs" / "figures"
 GREY, BLUE, RED = "#808080", "#1f77b4", "#d62728"
+CHANCE = 0.05  #: of a fair coin to decide between two methods as often for one
 WIDTH, HEIGHT, BESIDE = 7.2, 0.24, 0.1  # of a picture, of a row in it [in]; of the space for failures
 
 OVERVIEW = {  # methods in the paper's table, and their names there
@@ -36,42 +38,54 @@ OVERVIEW = {  # methods in the paper's table, and their names there
 
 @dataclass(frozen=True)
 class Row:
-    """What a method did in a scenario, with one seed."""
+    """What a method did in a scenario."""
 
     method: str
-    values: Sequence[float]  #: of the arms that it served
-    also: Sequence[float]
-    arms: int  #: on which it ran or failed
+    cases: Mapping[
+        tuple[str, int], float
+    ]  #: by arm and seed, of those on which it ran; infinite where it did not serve
+    also: Sequence[float]  #: the second number, where it served
     why: str  #: there is no number, if there is none
 
-    def middle(self, scenario: Scenario) -> float:
-        """Over all arms; those that are not served count as infinite."""
-        every = [*self.values, *[np.inf] * (self.arms - len(self.values))]
-        return float((np.mean if scenario.percent else np.median)(every)) if every else np.inf
+    @property
+    def values(self) -> list[float]:
+        """Where it served."""
+        return [value for value in self.cases.values() if np.isfinite(value)]
 
-    def key(self, scenario: Scenario) -> tuple[float, int]:
-        """Less is better: the number to two digits and not below what matters, then the arms that are not served."""
-        value = max(self.middle(scenario), scenario.least)
-        return float(f"{value:.1e}"), self.arms - len(self.values)
+    def ahead_of(self, other: "Row", scenario: Scenario) -> bool:
+        """Whether it did better more often than a fair coin may (sign test over arms and seeds, without ties)."""
+        both = self.cases.keys() & other.cases.keys()
+        pairs = [(_felt(self.cases[case], scenario), _felt(other.cases[case], scenario)) for case in both]
+        better, worse = sum(a < b for a, b in pairs), sum(a > b for a, b in pairs)
+        return better > worse and binomtest(better, better + worse).pvalue < CHANCE
 
 
-def rows_of(result: Mapping[str, Any], seed: int, arms: Collection[str] | None = None) -> list[Row]:
-    """Of a scenario's file, for all arms or some."""
+def _felt(value: float, scenario: Scenario) -> float:
+    """A number as it matters to a user: two digits, and not below what is as good as zero."""
+    return float(f"{max(value, scenario.least):.1e}")
+
+
+def rows_of(result: Mapping[str, Any], seeds: Collection[int]) -> list[Row]:
+    """Of a scenario's file, with some seeds."""
     found = []
     for method, row in result["methods"].items():
-        cases = [case for case in row["cases"] if case["seed"] == seed and (arms is None or case["arm"] in arms)]
+        cases = [case for case in row["cases"] if case["seed"] in seeds]
         ran = [case for case in cases if "value" in case or case["why"].startswith(("slower", "failed", "the start"))]
-        good = [case for case in ran if case.get("served") and case["value"] is not None]
-        also = [case["also"] for case in good if case.get("also") is not None]
+        values = {(case["arm"], case["seed"]): _value(case) for case in ran}
+        also = [case["also"] for case in ran if np.isfinite(_value(case)) and case.get("also") is not None]
         whys = sorted({case["why"] for case in cases if "why" in case})
-        found.append(Row(method, [case["value"] for case in good], also, len(ran), "; ".join(whys)))
+        found.append(Row(method, values, also, "; ".join(whys)))
     return found
 
 
+def _value(case: Mapping[str, Any]) -> float:
+    return float(case["value"]) if case.get("served") and case["value"] is not None else np.inf
+
+
 def ranks(rows: Sequence[Row], scenario: Scenario) -> dict[str, int]:
-    """From 1, equal for equal keys. A method that served no arm has none."""
-    keys = {row.method: row.key(scenario) for row in rows if row.values}
-    return {name: 1 + sum(other < key for other in keys.values()) for name, key in keys.items()}
+    """One and the number of methods that are ahead. A method that served no arm has none."""
+    ran = [row for row in rows if row.values]
+    return {row.method: 1 + sum(other.ahead_of(row, scenario) for other in ran) for row in ran}
 
 
 def number(value: float) -> str:
@@ -82,71 +96,63 @@ def number(value: float) -> str:
 
 
 def table(scenario: Scenario, result: Mapping[str, Any]) -> list[str]:
-    """Header and rows in Markdown, best first; below, what did not run."""
-    rows, arms = rows_of(result, result["seeds"][0]), common_arms(result)
-    own = ranks(rows, scenario)
-    repeated = [ranks(rows_of(result, seed, arms), scenario) for seed in result["seeds"]]
-    what = "mean of the arms" if scenario.percent else "median of the arms served"
-    seeds = f"ranks with seeds {', '.join(map(str, result['seeds']))} on {len(arms)} arms"
-    columns = ["method", f"{scenario.number}, {what}", "worst", "arms served", "rank", seeds]
-    lines = ["| " + " | ".join([*columns, *([scenario.also] if scenario.also else [])]) + " |"]
-    for row in sorted((row for row in rows if row.values), key=lambda row: own[row.method]):
-        middle = (np.mean if scenario.percent else np.median)(row.values)
-        cells = [row.method, number(float(middle)), number(max(row.values)), f"{len(row.values)} of {row.arms}"]
-        cells += [str(own[row.method]), ", ".join(str(found.get(row.method, "-")) for found in repeated)]
+    """Header and rows in Markdown, best first; below, what served nobody."""
+    seeds = result["seeds"]
+    rows = rows_of(result, seeds)
+    own, repeated = ranks(rows, scenario), [ranks(rows_of(result, [seed]), scenario) for seed in seeds]
+    what = "mean" if scenario.percent else "median"
+    columns = ["method", f"{scenario.number}, {what} where served", "worst", "served", "rank"]
+    columns += [f"rank with seed {', '.join(map(str, seeds))} only", *([scenario.also] if scenario.also else [])]
+    lines = [f"| {' | '.join(columns)} |"]
+    for row in sorted((row for row in rows if row.values), key=lambda row: (own[row.method], _middle(row, scenario))):
+        cells = [row.method, number(_middle(row, scenario)), number(max(row.values))]
+        cells += [f"{len(row.values)} of {len(row.cases)}", str(own[row.method])]
+        cells += [", ".join(str(found.get(row.method, "-")) for found in repeated)]
         cells += [number(float(np.median(row.also))) if row.also else "-"] if scenario.also else []
         lines.append(f"| {' | '.join(cells)} |")
     for row in rows:
-        if not row.values and row.arms:
-            cells = [
-                row.method,
-                row.why or "served no arm",
-                "-",
-                f"0 of {row.arms}",
-                *["-"] * (3 if scenario.also else 2),
-            ]
-            lines.append(f"| {' | '.join(cells)} |")
+        if row.cases and not row.values:
+            cells = [row.method, row.why or "served no arm", "-", f"0 of {len(row.cases)}", "-", "-"]
+            lines.append(f"| {' | '.join([*cells, *(['-'] if scenario.also else [])])} |")
     return lines
 
 
+def _middle(row: Row, scenario: Scenario) -> float:
+    """Of what it served."""
+    return float((np.mean if scenario.percent else np.median)(row.values))
+
+
 def overview(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """A row for each scenario in Markdown: numbers as in its table, and how many arms were served if not all."""
+    """A row for each scenario in Markdown: numbers as in its table, and how many cases were served if not all."""
     lines = ["| " + " | ".join(["number", *OVERVIEW.values()]) + " |"]
     for name, result in found.items():
         scenario = scenarios()[name]
-        rows = {row.method: row for row in rows_of(result, result["seeds"][0])}
-        numbers = [short(rows[method], scenario) if rows[method].arms else "-" for method in OVERVIEW]
+        rows = {row.method: row for row in rows_of(result, result["seeds"])}
+        numbers = [short(rows[method], scenario) if rows[method].cases else "-" for method in OVERVIEW]
         lines.append(f"| {' | '.join([scenario.number, *numbers])} |")
     return lines
 
 
 def short(row: Row, scenario: Scenario) -> str:
     """A cell of the overview."""
-    value = number(float((np.mean if scenario.percent else np.median)(row.values))) if row.values else "none"
-    return value if len(row.values) == row.arms else f"{value} ({len(row.values)}/{row.arms})"
-
-
-def common_arms(result: Mapping[str, Any]) -> set[str]:
-    """The arms that ran with every seed."""
-    cases = [case for row in result["methods"].values() for case in row["cases"]]
-    ran = [{case["arm"] for case in cases if case["seed"] == seed} for seed in result["seeds"]]
-    return set.intersection(*ran)
+    value = number(_middle(row, scenario)) if row.values else "none"
+    return value if len(row.values) == len(row.cases) else f"{value} ({len(row.values)}/{len(row.cases)})"
 
 
 def not_run(result: Mapping[str, Any]) -> str:
     """The methods without a number, and why."""
-    rows = [row for row in rows_of(result, result["seeds"][0]) if not row.arms]
     reasons: dict[str, list[str]] = {}
-    for row in rows:
-        reasons.setdefault(row.why, []).append(row.method)
+    for row in rows_of(result, result["seeds"]):
+        if not row.cases:
+            reasons.setdefault(row.why, []).append(row.method)
     return "Not run: " + ", ".join(f"{' and '.join(names)} ({why})" for why, names in reasons.items()) + "."
 
 
 def picture(scenario: Scenario, result: Mapping[str, Any]) -> Figure:
-    """A dot for each arm and a line for the median; crosses at the right for arms that were not served."""
-    rows = [row for row in rows_of(result, result["seeds"][0]) if row.arms]
+    """A dot for each arm and seed, a line for the median, and at the right how many were not served."""
+    rows = [row for row in rows_of(result, result["seeds"]) if row.cases]
     own = ranks(rows, scenario)
-    rows.sort(key=lambda row: own.get(row.method, 99))
+    rows.sort(key=lambda row: (own.get(row.method, 99), _middle(row, scenario) if row.values else np.inf))
     with mpl.rc_context({"font.size": 8, "text.color": GREY, "axes.labelcolor": GREY, "axes.edgecolor": GREY}):
         figure = Figure(figsize=(WIDTH, 0.9 + HEIGHT * len(rows)), layout="constrained")
         axes = figure.subplots()
@@ -163,27 +169,27 @@ def picture(scenario: Scenario, result: Mapping[str, Any]) -> Figure:
             values = [value if scenario.percent else max(value, floor) for value in row.values]
             axes.plot(values, [k] * len(values), "o", color=colour, markersize=4, alpha=0.6)
             if values:
-                middle = (np.mean if scenario.percent else np.median)(values)
-                axes.plot([middle], [k], "|", color=colour, markersize=12, markeredgewidth=2)
-            lost = row.arms - len(row.values)
+                axes.plot(
+                    [max(_middle(row, scenario), floor)], [k], "|", color=colour, markersize=12, markeredgewidth=2
+                )
+            lost = len(row.cases) - len(row.values)
             if lost:
-                axes.text(1.01, k, "x" * lost, color=RED, transform=axes.get_yaxis_transform(), va="center")
+                axes.text(1.01, k, f"{lost} x", color=RED, transform=axes.get_yaxis_transform(), va="center")
         axes.set_yticks(range(len(rows)), [row.method for row in rows])
         axes.invert_yaxis()
         axes.tick_params(colors=GREY)
         axes.grid(axis="x", color=GREY, alpha=0.25)
-        axes.set_xlabel(scenario.number + "; x: an arm not served")
+        axes.set_xlabel(scenario.number + "; x: not served")
     return figure
 
 
 def changes(found: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, str]]:
-    """Pairs of methods that change places between the seeds, by scenario."""
+    """Pairs of methods of which each is ahead with one of the seeds, by scenario."""
     pairs = []
     for name, result in found.items():
-        scenario, seeds, arms = scenarios()[name], result["seeds"], common_arms(result)
-        one, other = (ranks(rows_of(result, seed, arms), scenario) for seed in (seeds[0], seeds[-1]))
-        both = sorted(set(one) & set(other))
-        pairs += [(name, a, b) for a in both for b in both if one[a] < one[b] and other[a] > other[b]]
+        one, other = ({row.method: row for row in rows_of(result, [seed])} for seed in result["seeds"])
+        ahead = {(a, b) for a in one for b in one if one[a].ahead_of(one[b], scenarios()[name])}
+        pairs += [(name, a, b) for a, b in sorted(ahead) if other[b].ahead_of(other[a], scenarios()[name])]
     return pairs
 
 

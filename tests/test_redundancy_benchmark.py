@@ -72,16 +72,34 @@ def test_a_tip_that_is_off_at_two_per_cent_of_the_ticks_did_not_follow() -> None
     assert Run(stream, np.tile(arm.home, (100, 1)), errors, True, True).followed
 
 
-def test_ranks_put_arms_that_are_not_served_last_and_share_what_does_not_matter() -> None:
-    scenario = runner.scenarios()["drift"]
+def row(method: str, *values: float) -> redundancy_page.Row:
+    """A method on eight arms."""
+    return redundancy_page.Row(method, {(f"arm {k}", 0): value for k, value in enumerate(values)}, [], "")
+
+
+def test_ranks_count_who_is_ahead_on_more_arms_than_a_coin_would_be() -> None:
+    scenario, inf = runner.scenarios()["drift"], np.inf
     rows = [
-        redundancy_page.Row("exact", [1e-15, 1e-14], [], 2, ""),
-        redundancy_page.Row("exact too", [1e-9, 1e-8], [], 2, ""),
-        redundancy_page.Row("drifts", [0.1, 0.2], [], 2, ""),
-        redundancy_page.Row("half", [1e-15], [], 2, ""),
-        redundancy_page.Row("none", [], [], 2, "failed"),
+        row("exact", *[1e-15] * 8),
+        row("exact too", *[1e-9] * 8),  # as good to a user
+        row("drifts", *[0.1] * 8),
+        row("drifts on most", *[1e-15] * 3, *[0.2] * 5),  # 5 of 5 decide: chance one of sixteen
+        row("serves half", *[1e-15] * 2, *[inf] * 6),
+        row("none", *[inf] * 8),
     ]
-    assert redundancy_page.ranks(rows, scenario) == {"exact": 1, "exact too": 1, "drifts": 3, "half": 4}
+    found = redundancy_page.ranks(rows, scenario)
+    assert found == {"exact": 1, "exact too": 1, "drifts on most": 1, "drifts": 3, "serves half": 4}
+
+
+def test_pairs_that_change_places_are_those_of_which_each_is_ahead_once() -> None:
+    cases = [{"arm": f"arm {k}", "served": True} for k in range(8)]
+    kept = {
+        "one": [case | {"seed": seed, "value": [0.1, 0.3][seed]} for case in cases for seed in (0, 1)],
+        "other": [case | {"seed": seed, "value": [0.2, 0.2][seed]} for case in cases for seed in (0, 1)],
+        "third": [case | {"seed": seed, "value": 0.4} for case in cases for seed in (0, 1)],
+    }
+    result = {"seeds": [0, 1], "methods": {name: {"cases": rows} for name, rows in kept.items()}}
+    assert redundancy_page.changes({"drift": result}) == [("drift", "one", "other")]
 
 
 @pytest.mark.slow
