@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
-from functools import cache, partial, singledispatch
+from functools import cache, singledispatch
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
@@ -16,8 +16,6 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import control, problems, solvers
-from orthocas.atlas.laws import AskedPosture, BlendedImpedance, HandedOver
-from orthocas.atlas.simulate import AtlasControl
 from orthocas.control import Controller, Reference
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.fit import ClearPart, Fit
@@ -183,28 +181,6 @@ AROUND: dict[str, Any] = {"region": [[0.0, 0.9, 0.9]], "radius": 0.3}  #: what t
 IN_ATLAS = np.array([0.0, 0.9, 0.9])  #: a covered posture
 
 
-def handed_over() -> HandedOver:
-    """PD+ in the chart of the moment."""
-    return HandedOver(atlas(), partial(control.PDPlus, stiffness=60.0))
-
-
-def blended() -> BlendedImpedance:
-    return BlendedImpedance(atlas(), 60.0)
-
-
-def control_of_atlas() -> AtlasControl:
-    """In the middle of a motion."""
-    found = AtlasControl(handed_over())
-    found.start(IN_ATLAS)
-    found.tick(0.001, IN_ATLAS, 0 * IN_ATLAS, moved(found, 0.0))
-    return found
-
-
-def moved(found: AtlasControl, x: float) -> Array:
-    """Task values next to those of the start, with derivatives."""
-    return np.vstack([found.law.atlas.problem.task.batched(IN_ATLAS[None])[0] + x, [[0.1, -0.1], [0.0, 0.2]]])
-
-
 @cache
 def certificate() -> oc.Certificate:
     return oc.certify(fitted().chart)
@@ -263,9 +239,6 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "atlas": atlas,
     "part of an atlas": lambda: oc.AtlasPart.whole(atlas()),
     "settings of an atlas": oc.AtlasSettings,
-    "law handed over": handed_over,
-    "blended impedance": blended,
-    "control of an atlas": control_of_atlas,
     "coverage": lambda: oc.evaluate_atlas(atlas(), 200),
     "certificate": certificate,
     "card of a ready chart": lambda: oc.charts.card("ur5-position"),
@@ -405,19 +378,6 @@ def _of_atlas(atlas: oc.Atlas) -> Iterator[Any]:
 @_numbers.register
 def _of_part(part: oc.AtlasPart) -> Iterator[Any]:
     yield from (part.charts, str(part))
-
-
-@_numbers.register
-def _of_atlas_law(law: HandedOver | BlendedImpedance) -> Iterator[Any]:
-    asked = AskedPosture(law.atlas)
-    asked.start(IN_ATLAS)
-    for q in (IN_ATLAS + 0.02, IN_ATLAS - 0.03):
-        yield from _numbers(law.command(q, 0.1 * q, asked))
-
-
-@_numbers.register
-def _of_atlas_control(found: AtlasControl) -> Iterator[Any]:
-    yield from _numbers(copy.deepcopy(found).tick(0.002, IN_ATLAS + 0.01, 0.1 * IN_ATLAS, moved(found, 1e-4)))
 
 
 @_numbers.register

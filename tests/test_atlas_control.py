@@ -4,12 +4,11 @@ import warnings
 
 import numpy as np
 import pytest
+from atlas_control.laws import AskedPosture, Blend, BlendedImpedance, HandedOver
+from atlas_control.simulate import AtlasRun, simulate_in_atlas
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.atlas.evaluation import Blend
-from orthocas.atlas.laws import AskedPosture, BlendedImpedance, HandedOver
-from orthocas.atlas.simulate import AtlasRun, simulate_in_atlas
 from orthocas.control import PDPlus, Reference
 from orthocas.errors import InvalidValueError, PathError
 from orthocas.simulation import MuJoCoPlant, Push

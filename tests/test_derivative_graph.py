@@ -8,7 +8,7 @@ from test_taylor_models import values_at
 import orthocas as oc
 from orthocas import problems
 from orthocas.certificates.chart_rows import joint_models, true_gradients
-from orthocas.certificates.graph import DerivativeGraph
+from orthocas.certificates.graph import TaylorGraph
 from orthocas.errors import CertifyError
 from orthocas.tools.batch import dense_function
 from orthocas.tools.expressions import gradient_dependences, periodic_joints, to_tape
@@ -66,7 +66,7 @@ def test_gradients_contain_those_of_casadi() -> None:
     t = rng.uniform(-1, 1, (100, 2))
     points = low + half + half * t
     J = np.array([np.array(true(point)).ravel("F") for point in points])
-    entries = DerivativeGraph.of(h, (0, 1), "it")(joints)
+    entries = TaylorGraph.of(h, "it", (0, 1))(joints)
     assert len(entries) == J.shape[1] == 14
     for entry, wanted in zip(entries, J.T, strict=True):
         there = np.broadcast_to(values_at(entry, t), wanted.shape)
@@ -123,4 +123,4 @@ def test_periods_are_read_from_the_steps() -> None:
 def test_what_has_no_bounds_is_refused_by_name(made: object, complaint: str) -> None:
     q = ca.SX.sym("q", 2)
     with pytest.raises(CertifyError, match=complaint):
-        DerivativeGraph.of(dense_function("h", [q], [made(q)]), (0, 1), "it")  # type: ignore[operator]
+        TaylorGraph.of(dense_function("h", [q], [made(q)]), "it", (0, 1))  # type: ignore[operator]

@@ -14,13 +14,10 @@ import numpy as np
 import pytest
 from programs import needs_c
 from public_objects import (
-    IN_ATLAS,
     atlas,
-    blended,
     circle,
     disk,
     fitted,
-    handed_over,
     impedance,
     network,
     numbers,
@@ -33,7 +30,6 @@ from public_objects import (
 import orthocas as oc
 from orthocas import solvers
 from orthocas.atlas import atlas as atlas_module
-from orthocas.atlas.laws import AskedPosture, AtlasLaw
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import Controller
 from orthocas.simulation import MuJoCoPlant, simulate
@@ -102,27 +98,12 @@ def calls_of_atlas(atlas: oc.Atlas) -> list[Call]:
     ]
 
 
-def calls_of_atlas_law(law: AtlasLaw) -> list[Call]:
-    """A law on an atlas in different charts; each call has a posture asked for of its own."""
-    q = IN_ATLAS + np.random.default_rng(8).uniform(-0.25, 0.25, (12, 3))
-
-    def command(k: int) -> Array:
-        asked = AskedPosture(law.atlas)
-        asked.start(q[k % 12])
-        said = law.command(q[k % 12] + 0.01, 0.1 * q[k % 12], asked)
-        return np.append(said.torque, [said.status, said.storage, said.dissipated])
-
-    return [command]
-
-
 SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 10,000 calls
     "polynomial": (lambda: calls_of_chart(copy.deepcopy(fitted().chart)), 4800),
     "network": (lambda: calls_of_chart(copy.deepcopy(network())), 2400),
     "circle": (lambda: calls_of_chart(copy.deepcopy(circle())), 120),
     "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 80),
     "atlas": (lambda: calls_of_atlas(copy.deepcopy(atlas())), 800),
-    "law handed over": (lambda: calls_of_atlas_law(copy.deepcopy(handed_over())), 240),
-    "blended impedance": (lambda: calls_of_atlas_law(copy.deepcopy(blended())), 240),
     "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 2600),
 }
 

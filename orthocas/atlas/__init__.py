@@ -3,7 +3,7 @@
 - `plan` holds what the boxes share, `lattice` cuts the range into tiles, of which many are images of others.
 - `box_fit` fits and judges the chart of one box; `build` runs such jobs and appends results to the `atlas_file`.
 - `building` has `build_atlas`; `index` finds the chart of a joint position.
-- `atlas` is what users see, `coverage` measures it; `laws`, `simulate` and `chart_along` go from chart to chart.
+- `atlas` is what users see, `coverage` measures it, `chart_along` goes from chart to chart.
 - `c_source`, `view_session` and `command` are what C, the viewer and the command line ask for.
 """
 

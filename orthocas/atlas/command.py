@@ -11,7 +11,17 @@ from orthocas.atlas.atlas import Atlas
 from orthocas.atlas.building import MARGIN_DEG, RADIUS, build_atlas
 from orthocas.atlas.coverage import draw_coverage, evaluate_atlas
 from orthocas.atlas.plan import AtlasSettings
-from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, terminal_monitor, whole_number
+from orthocas.cli.output import (
+    AsJson,
+    Force,
+    Scheduler,
+    note,
+    number,
+    print_json,
+    print_rows,
+    terminal_monitor,
+    whole_number,
+)
 from orthocas.cli.problem_argument import CHAIN, ProblemName, ProblemOptions, build_problem, with_options
 from orthocas.errors import Interrupted
 from orthocas.robots.homes import read_postures
@@ -79,9 +89,7 @@ def build(
     workers: Annotated[
         int | None, typer.Option("--workers", parser=whole_number, help="Number of processes; default: one per core.")
     ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", help="Address of a Dask scheduler, for example tcp://host:8786.")
-    ] = None,
+    scheduler: Scheduler = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:

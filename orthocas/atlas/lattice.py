@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.samples import directions
 from orthocas.tools.checks import Array, Indices
 
 _TOLERANCE = 1e-6  # robot files give angles with ten decimals
@@ -81,26 +81,11 @@ def _candidates(n: int, turning: list[int]) -> tuple[Array, Array]:
 
 def _symmetric(problem: Problem, joints: tuple[int, ...], points: Array, signs: Array, shifts: Array) -> Array:
     """For which maps the tensors at the images of the points are the images of those at the points, (maps,)."""
-    here = _tensors(problem, joints, points)
+    here = directions(problem, joints, points)
     images = signs[:, None] * points + shifts[:, None]  # (maps, points, k)
-    there = _tensors(problem, joints, images.reshape(-1, len(joints))).reshape(len(signs), *here.shape)
+    there = directions(problem, joints, images.reshape(-1, len(joints))).reshape(len(signs), *here.shape)
     wanted = signs[:, None, None, :, None] * here * signs[:, None, None, None, :]
     return np.asarray(np.abs(there - wanted).max(axis=(1, 2, 3, 4)) <= _TOLERANCE)
-
-
-def _tensors(problem: Problem, joints: tuple[int, ...], points: Array) -> Array:
-    """A^-1 and Pi with its second index raised, both of size 1, (N, 2, k, k); NaN where a gradient vanishes."""
-    q = np.repeat(problem.domain.centre[None], len(points), axis=0)
-    q[:, list(joints)] = points
-    samples = samples_at(problem, q).restricted_to(list(joints))
-    if len(samples) < len(points):
-        return np.full((len(points), 2, len(joints), len(joints)), np.nan)
-    basis = samples.task_basis
-    projector = basis.transpose(0, 2, 1) @ basis
-    inverse = samples.metric_inverse
-    inverse = np.broadcast_to(np.eye(len(joints)), projector.shape) if inverse is None else inverse
-    both = np.stack([inverse, projector], axis=1)
-    return np.asarray(both / np.abs(both).max(axis=(2, 3), keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)

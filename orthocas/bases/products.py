@@ -1,9 +1,9 @@
 """Bases of products of one-joint functions: polynomials, Fourier terms, and linear coordinates."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb, sqrt
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import casadi as ca
 import numpy as np
@@ -177,7 +177,29 @@ def terms_up_to(degrees: list[list[int]], total: int) -> Iterator[Term]:
 
 
 @dataclass(frozen=True)
-class Polynomial:
+class Products:
+    """What products of one-joint functions of a total degree have in common; see `Polynomial` and `Fourier`."""
+
+    degree: int
+    cyclic: Cyclic = ()
+    linear = True
+    closed_form = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "degree", require_count("degree", self.degree))
+        object.__setattr__(self, "cyclic", cyclic_choice.checked_cyclic(self.cyclic))
+
+    def for_problem(self, problem: "Problem") -> Self:
+        """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
+        return replace(self, cyclic=cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
+
+    def of_degree(self, degree: int) -> Self:
+        """The same parametrisation with another degree."""
+        return replace(self, degree=degree)
+
+
+@dataclass(frozen=True)
+class Polynomial(Products):
     """Products of Legendre polynomials of total degree <= degree, orthonormal for the uniform density on the box.
 
     Args:
@@ -194,27 +216,10 @@ class Polynomial:
         210
     """
 
-    degree: int
-    cyclic: Cyclic = ()
-    linear = True
-    closed_form = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "degree", require_count("degree", self.degree))
-        object.__setattr__(self, "cyclic", cyclic_choice.checked_cyclic(self.cyclic))
-
     @property
     def label(self) -> str:
         """'polynomial:DEGREE', with the cyclic joints if there are any."""
         return f"polynomial:{self.degree}{cyclic_choice.suffix(self.cyclic)}"
-
-    def for_problem(self, problem: "Problem") -> "Polynomial":
-        """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
-        return Polynomial(self.degree, cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
-
-    def of_degree(self, degree: int) -> "Polynomial":
-        """The same parametrisation with another degree."""
-        return Polynomial(degree, self.cyclic)
 
     def term_count(self, n: int) -> int:
         """C(n + d, d) - 1, with n the number of joints that are not cyclic, plus one term for each that is."""
@@ -244,7 +249,7 @@ class Polynomial:
 
 
 @dataclass(frozen=True)
-class Fourier:
+class Fourier(Products):
     """Products of sqrt(2) cos(k q_i) and sqrt(2) sin(k q_i) of total degree <= degree, periodic in every joint.
 
     Args:
@@ -259,27 +264,10 @@ class Fourier:
         ('fourier:2', 24)
     """
 
-    degree: int
-    cyclic: Cyclic = ()
-    linear = True
-    closed_form = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "degree", require_count("degree", self.degree))
-        object.__setattr__(self, "cyclic", cyclic_choice.checked_cyclic(self.cyclic))
-
     @property
     def label(self) -> str:
         """'fourier:DEGREE', with the cyclic joints if there are any."""
         return f"fourier:{self.degree}{cyclic_choice.suffix(self.cyclic)}"
-
-    def for_problem(self, problem: "Problem") -> "Fourier":
-        """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
-        return Fourier(self.degree, cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
-
-    def of_degree(self, degree: int) -> "Fourier":
-        """The same parametrisation with another degree."""
-        return Fourier(degree, self.cyclic)
 
     def term_count(self, n: int) -> int:
         """Sum over j of C(n, j) C(d, j) 2^j, without the constant. Cyclic joints do not count in n, but add a term."""

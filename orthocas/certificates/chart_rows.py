@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthocas.bases.mlp import MLPFamily
 from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import ProductFamily
-from orthocas.certificates.graph import DerivativeGraph, TaylorGraph
+from orthocas.certificates.graph import TaylorGraph
 from orthocas.certificates.jets import Around, Jets, largest_average, multi_indices, neighbours, power_weights, powers
 from orthocas.certificates.task_rows import TipRows, task_rows
 from orthocas.certificates.taylor import (
@@ -38,7 +38,7 @@ from orthocas.tasks.domains import Box, Domain
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import gradient_dependences, to_tape
+from orthocas.tools.expressions import gradient_dependences
 
 MOST_VARIABLES = 20
 _MOST_STEPS = 100_000
@@ -272,7 +272,7 @@ class ChartRows:
 class GraphRows:
     """A matrix of so many rows that a graph gives column by column."""
 
-    graph: TaylorGraph | DerivativeGraph
+    graph: TaylorGraph
     rows: int
     allowance: float = 0.0  #: added to the remainders
 
@@ -358,9 +358,9 @@ def true_gradients(task: Task, joints: Sequence[int]) -> tuple[GraphRows, set[in
 
 def _derivatives(function: ca.Function, joints: Sequence[int], what: str) -> tuple[GraphRows, set[int]]:
     """Columns of the Jacobian of a function of q, and the inputs that they depend on."""
-    graph = DerivativeGraph.of(function, joints, what)
-    known = gradient_dependences(to_tape(function))
-    return GraphRows(graph, graph.outputs), {k for row in known for j in joints for k in row.get(j, ())}
+    graph = TaylorGraph.of(function, what, joints)
+    known = gradient_dependences(graph.tape)
+    return GraphRows(graph, len(known)), {k for row in known for j in joints for k in row.get(j, ())}
 
 
 def joint_models(low: Array, high: Array, variables: Variables) -> tuple[list[TaylorModel], Array]:

@@ -1,4 +1,4 @@
-"""Expressions as graphs, their values and their derivatives as Taylor models."""
+"""Values and derivatives of expressions as Taylor models."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,68 +20,11 @@ from orthocas.certificates.taylor import (
     square,
 )
 from orthocas.errors import CertifyError
-from orthocas.tools.expressions import to_tape
+from orthocas.tools.expressions import Tape, read, to_tape
 
 _LARGEST_POWER = 64
 _LINEAR = ("assign", "neg", "twice")
 _SUMS = ("add", "sub")
-
-
-@dataclass(frozen=True, eq=False)
-class TaylorGraph:
-    """An SX function q (n, 1) -> values, dense, as a list of steps in Taylor arithmetic.
-
-    Raises:
-        CertifyError: if a step has no bounds.
-    """
-
-    steps: tuple[tuple[Any, ...], ...]
-    outputs: int  #: number of values, column by column
-    what: str  #: for errors
-
-    @classmethod
-    def of(cls, function: ca.Function, what: str) -> "TaylorGraph":
-        """The steps of a function, checked."""
-        tape = to_tape(function)
-        graph = cls(tuple(map(tuple, tape["steps"])), tape["rows"] * tape["columns"], what)
-        graph.require_bounds()
-        return graph
-
-    def require_bounds(self) -> None:
-        """Refuse operations without bounds."""
-        constants: dict[int, float] = {}
-        for name, into, *of in self.steps:
-            if name in POWERS and not is_whole(constants.get(of[1])):
-                raise CertifyError(f"{self.what} has a power that is no whole number, so it cannot be certified")
-            if name not in (*UNARY, *BINARY, *POWERS, "const", "input", "output"):
-                raise CertifyError(f"{self.what} uses the operation {name}, which cannot be certified")
-            constants.pop(into, None)
-            if name == "const":
-                constants[into] = of[0]
-
-    def __call__(self, inputs: Sequence[TaylorModel]) -> list[TaylorModel]:
-        """The values for models of q_1, ..., q_n."""
-        work: dict[int, Any] = {}
-        results: dict[int, TaylorModel] = {}
-        for name, into, *of in self.steps:
-            if name == "const":
-                work[into] = TaylorModel.constant(np.array([float(of[0])]))
-            elif name == "input":
-                work[into] = inputs[of[0]]
-            elif name == "output":
-                results[into] = work[of[0]]
-            elif name in UNARY:
-                work[into] = UNARY[name](work[of[0]])
-            elif name in POWERS:
-                work[into] = power(work[of[0]], int(work[of[1]].centre.flat[0]))
-            else:
-                work[into] = BINARY[name](work[of[0]], work[of[1]])
-        return [results[k] for k in range(self.outputs)]
-
-
-def is_whole(value: float | None) -> bool:
-    """Whether a constant, if there is one, is a whole number that powers may have as exponent."""
-    return value is not None and abs(value) <= _LARGEST_POWER and value == round(value)
 
 
 Slopes = dict[int, TaylorModel]  #: derivatives by the inputs; an input that is missing has the derivative 0
@@ -100,7 +43,7 @@ _DERIVATIVES: dict[str, Callable[[TaylorModel, Any], TaylorModel]] = {
     "asin": lambda a, v: reciprocal_square_root(_one() - square(a)),
     "acos": lambda a, v: -reciprocal_square_root(_one() - square(a)),
 }
-_KNOWN = {*_LINEAR, *_SUMS, *_DERIVATIVES, *POWERS, "mul", "div", "atan2", "const", "input", "output"}
+_KNOWN = {*_LINEAR, *_SUMS, *_DERIVATIVES, *POWERS, "mul", "div", "atan2"}
 
 
 class _Jet(NamedTuple):
@@ -111,46 +54,49 @@ class _Jet(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class DerivativeGraph:
-    """q -> dh/dq for some of the joints, column by column, of an SX function h of one column q (n, 1).
+class TaylorGraph:
+    """An SX function h of q (n, 1), dense, or its derivatives by some joints, in Taylor arithmetic.
 
     Raises:
         CertifyError: if a step has no bounds.
     """
 
-    steps: tuple[tuple[Any, ...], ...]  #: of h
-    outputs: int  #: number of values of h
-    joints: tuple[int, ...]  #: the columns
+    tape: Tape
+    joints: tuple[int, ...] | None  #: dh/dq by these, column by column; None: h itself
 
     @classmethod
-    def of(cls, function: ca.Function, joints: Sequence[int], what: str) -> "DerivativeGraph":
-        """The graph of a function, checked; `what` names it in errors."""
+    def of(cls, function: ca.Function, what: str, joints: Sequence[int] | None = None) -> "TaylorGraph":
+        """The steps of a function, checked; `what` names it in errors."""
         tape = to_tape(function)
-        _require_bounds(tape["steps"], what)
-        return cls(tuple(map(tuple, tape["steps"])), tape["rows"] * tape["columns"], tuple(joints))
+        _require_bounds(tape, what, joints is None)
+        return cls(tape, None if joints is None else tuple(joints))
 
     def __call__(self, inputs: Sequence[TaylorModel]) -> list[TaylorModel]:
-        """The entries dh_i/dq_j, the rows i of the first column first, for models of q_1, ..., q_n."""
-        work: dict[int, _Jet] = {}
-        results: dict[int, Slopes] = {}
-        for name, into, *of in self.steps:
+        """Values, or the entries dh_i/dq_j with the rows i of the first column first, for models of q_1, ..., q_n."""
+        moving = self.joints or ()
+
+        def leaf(name: str, of: Any) -> _Jet:
             if name == "const":
-                work[into] = _Jet(TaylorModel.constant(np.array([float(of[0])])), {})
-            elif name == "input":
-                work[into] = _Jet(inputs[of[0]], {of[0]: _one()} if of[0] in self.joints else {})
-            elif name == "output":
-                results[into] = work[of[0]].slopes
-            else:
-                work[into] = _jet(name, [work[k] for k in of])
+                return _Jet(TaylorModel.constant(np.array([float(of)])), {})
+            return _Jet(inputs[of], {of: _one()} if of in moving else {})
+
+        found = read(self.tape, leaf, _jet)
+        if self.joints is None:
+            return [_known(jet) for jet in found]
         none = TaylorModel.constant(np.zeros(1))
-        return [results[i].get(joint, none) for joint in self.joints for i in range(self.outputs)]
+        return [jet.slopes.get(joint, none) for joint in self.joints for jet in found]
+
+
+def is_whole(value: float | None) -> bool:
+    """Whether a constant, if there is one, is a whole number that powers may have as exponent."""
+    return value is not None and abs(value) <= _LARGEST_POWER and value == round(value)
 
 
 def _one() -> TaylorModel:
     return TaylorModel.constant(np.ones(1))
 
 
-def _jet(name: str, of: list[_Jet]) -> _Jet:
+def _jet(name: str, of: Sequence[_Jet]) -> _Jet:
     """A step of any kind."""
     if name in POWERS:
         assert of[1].value is not None
@@ -225,36 +171,39 @@ def _added(*parts: Slopes) -> Slopes:
     return total
 
 
-def _require_bounds(steps: Sequence[Sequence[Any]], what: str) -> None:
-    """Refuse operations whose derivative has no bounds, or needs a value that has none."""
-    constants: dict[int, float] = {}
-    moving: dict[int, bool] = {}  # whether a place has derivatives
-    known: dict[int, bool] = {}  # whether its value has bounds
-    for name, into, *of in steps:
+class _Step(NamedTuple):
+    """What is known of a place of a tape before it is used."""
+
+    known: bool  #: whether its value has bounds
+    moving: bool  #: whether it has derivatives
+    constant: float | None = None
+
+
+def _require_bounds(tape: Tape, what: str, values: bool) -> None:
+    """Refuse operations whose derivative has no bounds, or needs a value that has none; and outputs without bounds."""
+    unknown = f"{what} uses the value of log, atan, asin, acos or atan2, which cannot be certified"
+
+    def step(name: str, of: Sequence[_Step]) -> _Step:
         if name not in _KNOWN:
             raise CertifyError(f"{what} uses the operation {name}, which cannot be certified")
-        if name in POWERS and not is_whole(constants.get(of[1])):
+        if name in POWERS and not is_whole(of[1].constant):
             raise CertifyError(f"{what} has a power that is no whole number, so it cannot be certified")
-        if name == "output":
-            continue
-        constants.pop(into, None)
-        if name == "const":
-            constants[into] = of[0]
-        if name in ("const", "input"):
-            moving[into], known[into] = name == "input", True
-            continue
-        if any(not known[k] for k in _needed(name, of, moving)):
-            raise CertifyError(f"{what} uses the value of log, atan, asin, acos or atan2, which cannot be certified")
+        if not all(operand.known for operand in _needed(name, of)):
+            raise CertifyError(unknown)
         bounded = name in UNARY or name in BINARY or name in POWERS
-        known[into], moving[into] = bounded and all(known[k] for k in of), any(moving[k] for k in of)
+        return _Step(bounded and all(operand.known for operand in of), any(operand.moving for operand in of))
+
+    found = read(tape, lambda name, of: _Step(True, name == "input", of if name == "const" else None), step)
+    if values and not all(output.known for output in found):
+        raise CertifyError(unknown)
 
 
-def _needed(name: str, of: Sequence[int], moving: dict[int, bool]) -> list[int]:
+def _needed(name: str, of: Sequence[_Step]) -> Sequence[_Step]:
     """The operands whose values a derivative needs."""
     if name in _LINEAR or name in _SUMS:
-        return []
+        return ()
     if name == "mul":
-        return [one for one, other in (of, of[::-1]) if moving[other]]
+        return [one for one, other in (of, of[::-1]) if other.moving]
     if name == "div":
-        return [*of] if moving[of[1]] else [of[1]]
-    return [*of]
+        return of if of[1].moving else of[1:]
+    return of

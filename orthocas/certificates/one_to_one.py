@@ -9,7 +9,6 @@ If phi is the same up to a motion of the task for all positions of a leading joi
 the middle of that joint does not matter, and the coordinates bound how far two of its positions are apart.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import takewhile
 
@@ -40,15 +39,14 @@ from orthocas.tools.checks import Array
 
 _AT_ONCE = 48  #: boxes, whose terms fit into the cache of a processor
 _ROUNDS = 2  # of bounds of the differences by the coordinates
-RowJets = Callable[[Array, Around], Jets]  #: joint positions (n, boxes), and boxes of the active joints
 
 
 @dataclass(frozen=True, eq=False)
 class OneToOneJudge:
     """Proves that Jm(c, d) is nonsingular, for middles c in a box and all d that two points of the whole can have."""
 
-    task: RowJets
-    coordinates: RowJets | None
+    task: TipJets
+    coordinates: ProductRows | None
     active: tuple[int, ...]
     still: tuple[int, ...]  #: columns of joints that Jm does not depend on in the middle; they may have wide ranges
     low: Array  #: of the whole, (n,)
@@ -76,7 +74,7 @@ class OneToOneJudge:
         q, around = (low + high).T / 2, self._around(low, high)
         if self.still and self.coordinates is not None:
             for _ in range(_ROUNDS):
-                around = self._bounded(around, self.coordinates(q, around))
+                around = self._bounded(around, self.coordinates.jets(around))
         proved, widest, promising = self._judged(q, around)
         for order in ORDERS[1:]:
             again = np.flatnonzero(promising)
@@ -88,7 +86,8 @@ class OneToOneJudge:
 
     def _judged(self, q: Array, around: Around) -> tuple[NDArray[np.bool_], Array, NDArray[np.bool_]]:
         """Whether boxes are proved, the joint to halve, and whether they might be proved with higher derivatives."""
-        jets = Jets.joined([rows(q, around) for rows in (self.task, self.coordinates) if rows])
+        own = () if self.coordinates is None else (self.coordinates.jets(around),)
+        jets = Jets.joined([self.task(q, around), *own])
         model, terms = jets.average(around, self.active)
         left, right = singular_vectors(model)
         turned = between(left, model, right)
@@ -197,11 +196,11 @@ def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToO
         centre = chart.problem.domain.centre[None]
         inverse = np.asarray(np.linalg.pinv(true(centre, centre).centre[:, :, 0]), dtype=float)
         return ConvexJudge(true, inverse, base.low, base.high)
-    own: RowJets | None = None
+    own: ProductRows | None = None
     if rows.coordinates is not None:
         assert isinstance(coordinates, Coordinates)
         assert isinstance(coordinates.family, ProductFamily)
-        own = ProductJets(ProductRows.of(coordinates.family, coordinates.theta, ORDERS[-1] + 2))
+        own = ProductRows.of(coordinates.family, coordinates.theta, ORDERS[-1] + 2)
     leading = takewhile(lambda i: i not in rows.variables, tree.carriers(tree.tip_parent))
     still = tuple(active.index(i) for i in leading if i in active)
     task = TipJets.of(tip, tree, active, chart.problem.domain)
@@ -215,7 +214,7 @@ def _jumps(chart: Chart, rows: ChartRows) -> bool:
 
 
 def _has_angle(rows: CoordinateRows | None) -> bool:
-    return isinstance(rows, GraphRows) and any(step[0] == "atan2" for step in rows.graph.steps)
+    return isinstance(rows, GraphRows) and any(step[0] == "atan2" for step in rows.graph.tape["steps"])
 
 
 def _verdicts(found: list[tuple[NDArray[np.bool_], Array]]) -> Verdicts:
@@ -241,14 +240,3 @@ def _combined(rows: Array, centre: Array, doubt: Array) -> tuple[Array, Array]:
     middle = np.abs(rows @ centre)
     error = (np.abs(rows) @ (doubt + sum_error(rows.shape[2]) * np.abs(centre))) * UP
     return (middle + error) * UP, (middle - error) / UP
-
-
-@dataclass(frozen=True, eq=False)
-class ProductJets:
-    """The jets of coordinates in a product basis."""
-
-    rows: ProductRows
-
-    def __call__(self, q: Array, around: Around) -> Jets:
-        """Jets at the middles of boxes."""
-        return self.rows.jets(around)

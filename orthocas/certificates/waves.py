@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from orthocas.certificates.taylor import TINY, UNIT, UP, above, sum_error
 from orthocas.errors import CertifyError
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import Tape
+from orthocas.tools.expressions import Tape, read
 
 _MOST_TERMS = 1_000_000  # of a product before equal frequencies are joined
 _WIDEST, _MOST_JOINTS = 100, 8  # frequency of a joint; numbers of so many joints are whole numbers of 64 bits
@@ -117,25 +118,20 @@ def waves_of(tape: Tape, n: int) -> list[Waves]:
     Raises:
         CertifyError: if it is no sum of products of numbers and of sines and cosines of single joints.
     """
-    work: dict[int, Waves | int] = {}  # joints by their number
-    results: dict[int, Waves] = {}
-    for name, into, *of in tape["steps"]:
-        if name == "const":
-            work[into] = Waves.constant(float(of[0]), n)
-        elif name == "input":
-            work[into] = int(of[0])
-        elif name == "output":
-            results[into] = _known(work[of[0]])
-        elif name in ("sin", "cos"):
-            joint = work[of[0]]
-            if isinstance(joint, Waves):
+
+    def leaf(name: str, of: Any) -> Waves | int:
+        return Waves.constant(float(of), n) if name == "const" else int(of)
+
+    def step(name: str, of: Sequence[Waves | int]) -> Waves | int:
+        if name in ("sin", "cos"):
+            if isinstance(joint := of[0], Waves):
                 raise CertifyError("the task uses a sine of more than the position of a joint")
-            work[into] = Waves.sine(joint, n) if name == "sin" else Waves.cosine(joint, n)
-        else:
-            if name not in _STEPS:
-                raise CertifyError(f"the task uses the operation {name}, which makes no waves")
-            work[into] = _STEPS[name](*(_known(work[place]) for place in of))
-    return [results[k] for k in range(tape["rows"] * tape["columns"])]
+            return Waves.sine(joint, n) if name == "sin" else Waves.cosine(joint, n)
+        if name not in _STEPS:
+            raise CertifyError(f"the task uses the operation {name}, which makes no waves")
+        return _STEPS[name](*map(_known, of))
+
+    return [_known(value) for value in read(tape, leaf, step)]
 
 
 def _known(value: Waves | int) -> Waves:

@@ -15,7 +15,18 @@ from orthocas import certificates
 from orthocas.charts.certificate import METHODS, Certificate
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import CHART
-from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, terminal_monitor, whole_number
+from orthocas.cli.output import (
+    AsJson,
+    ChartPath,
+    Force,
+    Scheduler,
+    note,
+    number,
+    print_json,
+    print_rows,
+    terminal_monitor,
+    whole_number,
+)
 from orthocas.errors import Interrupted
 from orthocas.tools.archive import require_free
 from orthocas.tools.checks import require_count
@@ -25,7 +36,7 @@ _NOT_PROVED = 1  # exit code
 
 
 def certify(
-    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    chart: ChartPath,
     bound: Annotated[
         float | None,
         typer.Option("--bound", parser=number, help="Also prove that the conditioning is at least this; default: 0."),
@@ -40,9 +51,7 @@ def certify(
         Path | None, typer.Option("--out", help="Chart file to write, with the certificate; default: CHART itself.")
     ] = None,
     workers: Annotated[int, typer.Option("--workers", parser=whole_number, help="Number of processes.")] = 1,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", help="Address of a Dask scheduler, for example tcp://host:8786.")
-    ] = None,
+    scheduler: Scheduler = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:

@@ -1,6 +1,5 @@
 """`orthocas evaluate`: the quality of a chart file on held-out samples; and how far each coordinate reaches alone."""
 
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -9,13 +8,13 @@ from orthocas.charts import quality
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.self_motion import XiRange
-from orthocas.cli.output import AsJson, print_json, print_rows, report_rows, whole_number
+from orthocas.cli.output import AsJson, ChartPath, print_json, print_rows, report_rows, whole_number
 from orthocas.errors import InvalidValueError
 from orthocas.tools.json import plain
 
 
 def evaluate(
-    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    chart: ChartPath,
     samples: Annotated[
         int, typer.Option("--samples", parser=whole_number, help="Number of held-out samples.")
     ] = 100_000,

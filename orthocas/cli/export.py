@@ -6,13 +6,13 @@ from typing import Annotated
 import typer
 
 from orthocas.charts.chart import Chart
-from orthocas.cli.output import AsJson, Force, print_json, print_rows
+from orthocas.cli.output import AsJson, ChartPath, Force, print_json, print_rows
 from orthocas.codegen.export import LIBRARIES
 from orthocas.codegen.export import export as export_chart
 
 
 def export(
-    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    chart: ChartPath,
     to: Annotated[str, typer.Option("--to", help=f"Library: {', '.join(LIBRARIES)}.")],
     out: Annotated[Path, typer.Option("--out", help="The module to write, NAME.py.")],
     force: Force = False,

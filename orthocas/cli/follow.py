@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from orthocas.charts.chart import Chart
-from orthocas.cli.output import AsJson, Force, number, print_json, print_rows
+from orthocas.cli.output import AsJson, ChartPath, Force, number, print_json, print_rows
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.errors import InvalidValueError
 from orthocas.paths.follow import HOLD, OBJECTIVE
@@ -25,7 +25,7 @@ _CHOICES = (HOLD, SCHEDULE, OBJECTIVE)
 
 
 def follow(
-    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    chart: ChartPath,
     path: Annotated[Path, typer.Argument(metavar="PATH.csv", help="Waypoints of the tool, see docs/how-to/paths.md.")],
     out: Annotated[Path, typer.Option("--out", help="CSV file for times, positions, velocities and accelerations.")],
     xi: Annotated[

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -38,6 +39,12 @@ PAUSE = 10.0  #: [s] between lines of progress where there is no terminal
 _UNEVEN = 30.0  # ratio of gradient lengths above which the same gain means too different things across the domain
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+
+ChartPath = Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")]
+
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", help="Address of a Dask scheduler, for example tcp://host:8786.")
+]
 
 Force = Annotated[bool, typer.Option("--force", help="Replace files of the same names that orthocas did not write.")]
 

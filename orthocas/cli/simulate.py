@@ -20,7 +20,17 @@ from orthocas.cli.controller_argument import (
     require_torques,
     with_settings,
 )
-from orthocas.cli.output import AsJson, Force, note, number, print_json, print_rows, terminal_monitor, whole_number
+from orthocas.cli.output import (
+    AsJson,
+    ChartPath,
+    Force,
+    note,
+    number,
+    print_json,
+    print_rows,
+    terminal_monitor,
+    whole_number,
+)
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.control.controller import Controller, ControlStatus
 from orthocas.control.posture import posture_reference
@@ -213,7 +223,7 @@ _DIVERGED = 1  # exit code when the integrator gave up: the input was valid but 
 
 @with_settings(for_codegen=False)
 def simulate(
-    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    chart: ChartPath,
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)}.")],
     steps: Annotated[
         Path, typer.Option("--steps", help="JSON file with the motion of the robot, see docs/reference/simulation.md.")

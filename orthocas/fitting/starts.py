@@ -12,7 +12,7 @@ from orthocas.bases.family import JointSpace, LinearFamily
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.residuals import Pairs, coordinates_of
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import Samples, samples_at
+from orthocas.tasks.samples import Samples, directions
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
@@ -175,8 +175,6 @@ def _symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[
     """The choices of signs for which task directions and metric at S u are the mirror images of those at u."""
     images = np.concatenate([u, *(signs * u for signs in choices)])
     tensors = _tensors(problem, active, images)
-    if tensors is None:
-        return []
     here, *there = tensors.reshape(1 + len(choices), len(u), *tensors.shape[1:])
     return [
         signs
@@ -185,21 +183,10 @@ def _symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[
     ]
 
 
-def _tensors(problem: Problem, active: list[int], u: Array) -> Array | None:
-    """A^-1 and the projector on the task gradients with its second index raised, both of size 1, (N, 2, n, n)."""
-    q = np.repeat(problem.domain.centre[None, :], len(u), axis=0)
-    q[:, active] += problem.domain.half_width[active] * u
-    samples = samples_at(problem, q).restricted_to(active)
-    if len(samples) < len(u):
-        return None
-    basis = samples.task_basis
-    projector = basis.transpose(0, 2, 1) @ basis
-    inverse = np.broadcast_to(np.eye(len(active)), projector.shape)
-    if samples.metric_inverse is not None:
-        inverse = samples.metric_inverse
-    both = np.stack([inverse, projector], axis=1)
-    scaled: Array = both / np.abs(both).max()
-    return scaled
+def _tensors(problem: Problem, active: list[int], u: Array) -> Array:
+    """The `directions` at points of the cube (N, n)."""
+    domain = problem.domain
+    return directions(problem, active, domain.centre[active] + domain.half_width[active] * u)
 
 
 def _parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Array | None:
@@ -209,8 +196,6 @@ def _parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Ar
     that of odd ones.
     """
     tensors = _tensors(problem, active, np.where(signs > 0, u, 0.0))
-    if tensors is None:
-        return None
     inverse, projector = tensors[:, 0], tensors[:, 1]
     along_task = np.einsum("sii,i->s", np.linalg.solve(inverse, projector.transpose(0, 2, 1)), signs)
     differences = signs.sum() - along_task

@@ -1,6 +1,6 @@
 """Sample sets of a problem: the data of the loss that do not depend on the coordinates; idle joints."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -141,3 +141,27 @@ def idle_joints(problem: Problem, samples: Samples) -> list[int]:
         felt_by_metric = problem.metric.function.jac_sparsity(0, 0).get_col()
         idle[felt_by_metric] = False
     return [int(k) for k in np.flatnonzero(idle)]
+
+
+def directions(problem: Problem, joints: Sequence[int], points: Array) -> Array:
+    """What a symmetry of the joints keeps: A^-1, and the projector on the task gradients with its second index raised.
+
+    Args:
+        problem: robot, task, metric; the other joints stay at the centre of its domain.
+        joints: the k joints.
+        points: their positions, (N, k).
+
+    Returns:
+        Both matrices over the largest entry of the pair, (N, 2, k, k); NaN everywhere if a gradient vanishes at any.
+    """
+    q = np.repeat(problem.domain.centre[None], len(points), axis=0)
+    q[:, list(joints)] = points
+    samples = samples_at(problem, q).restricted_to(list(joints))
+    if len(samples) < len(points):
+        return np.full((len(points), 2, len(joints), len(joints)), np.nan)
+    basis = samples.task_basis
+    projector = basis.transpose(0, 2, 1) @ basis
+    inverse = samples.metric_inverse
+    inverse = np.broadcast_to(np.eye(len(joints)), projector.shape) if inverse is None else inverse
+    both = np.stack([inverse, projector], axis=1)
+    return np.asarray(both / np.abs(both).max(axis=(1, 2, 3), keepdims=True))

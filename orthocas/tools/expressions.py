@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import inf
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -39,6 +39,7 @@ _LINEAR = ("assign", "neg", "twice", "add", "sub")
 WRITTEN_OUT = 10  #: rows of the largest matrices whose products and inverses are written out
 Tape = dict[str, Any]
 Entry = TypeVar("Entry", ca.SX, ca.MX)
+Value = TypeVar("Value")
 
 
 class HoldsFunctions:
@@ -160,24 +161,35 @@ def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
     return ca.reshape(ca.vertcat(*entries), tape["rows"], tape["columns"])
 
 
+def read(tape: Tape, leaf: Callable[[str, Any], Value], step: Callable[[str, Sequence[Value]], Value]) -> list[Value]:
+    """What a tape computes in any arithmetic: its outputs, column by column.
+
+    Args:
+        tape: the tape, checked.
+        leaf: takes "const" and a number, or "input" and its index.
+        step: takes the name of an operation and its operands.
+    """
+    work: dict[int, Value] = {}
+    results: dict[int, Value] = {}
+    for name, into, *of in tape["steps"]:
+        if name == "output":
+            results[into] = work[of[0]]
+        elif name in ("const", "input"):
+            work[into] = leaf(name, of[0])
+        else:
+            work[into] = step(name, [work[place] for place in of])
+    return [results[k] for k in range(len(results))]
+
+
 def replay(tape: Tape, inputs: Sequence[Entry]) -> list[Entry]:
     """The entries of a checked tape's output, column by column, for the entries of its input."""
-    work: dict[int, Any] = {}
-    result: dict[int, Any] = {}
     kind: Any = type(inputs[0])  # its static methods take a tenth of the time of operators on Python's side
     zero = 0 * inputs[0]  # gives constants the shape of the entries
-    for name, into, *of in tape["steps"]:
-        if name == "const":
-            work[into] = zero + float(of[0])
-        elif name == "input":
-            work[into] = inputs[of[0]]
-        elif name == "output":
-            result[into] = work[of[0]]
-        elif name in UNARY:
-            work[into] = kind.unary(CODES[name], work[of[0]])
-        else:
-            work[into] = kind.binary(CODES[name], work[of[0]], work[of[1]])
-    return [result[k] for k in range(tape["rows"] * tape["columns"])]
+
+    def step(name: str, of: Sequence[Any]) -> Any:
+        return (kind.unary if len(of) == 1 else kind.binary)(CODES[name], *of)
+
+    return read(tape, lambda name, of: zero + float(of) if name == "const" else inputs[of], step)
 
 
 Joints = frozenset[int]
@@ -187,23 +199,17 @@ _NOTHING: Joints = frozenset()
 
 def gradient_dependences(tape: Tape) -> list[Gradient]:
     """For each output, the joints that its derivatives depend on."""
-    values: dict[int, Joints] = {}
-    slopes: dict[int, Gradient] = {}
-    results: dict[int, Gradient] = {}
-    for name, into, *of in tape["steps"]:
-        if name == "output":
-            results[into] = slopes[of[0]]
-        elif name in ("const", "input"):
-            joints = frozenset(of) if name == "input" else _NOTHING
-            values[into], slopes[into] = joints, dict.fromkeys(joints, _NOTHING)
-        else:
-            found = _slopes(name, [values[k] for k in of], [slopes[k] for k in of])
-            values[into], slopes[into] = frozenset().union(*(values[k] for k in of)), found
-    return [results[k] for k in range(len(results))]
+
+    def leaf(name: str, of: Any) -> tuple[Joints, Gradient]:
+        joints = frozenset([of]) if name == "input" else _NOTHING
+        return joints, dict.fromkeys(joints, _NOTHING)
+
+    return [gradient for _, gradient in read(tape, leaf, _dependence)]
 
 
-def _slopes(name: str, values: list[Joints], slopes: list[Gradient]) -> Gradient:
-    """What the derivatives of a step depend on."""
+def _dependence(name: str, of: Sequence[tuple[Joints, Gradient]]) -> tuple[Joints, Gradient]:
+    """The joints that the result of a step and its derivatives depend on."""
+    values = [joints for joints, _ in of]
     everything = frozenset().union(*values)
     partials = [everything] * len(values)
     if name in _LINEAR:
@@ -213,40 +219,39 @@ def _slopes(name: str, values: list[Joints], slopes: list[Gradient]) -> Gradient
     elif name == "div":
         partials[0] = values[1]
     total: Gradient = {}
-    for partial, part in zip(partials, slopes, strict=True):
+    for partial, (_, part) in zip(partials, of, strict=True):
         for j, own in part.items():
             total[j] = total.get(j, _NOTHING) | partial | own
-    return total
+    return everything, total
 
 
 def periodic_joints(tape: Tape, n: int) -> Joints:
     """The joints k of n for which h(q + 2 pi e_k) - h(q) is the same constant at every q, for all outputs h."""
-    shifts: dict[int, Any] = {}  # change by a turn of each joint / 2 pi; NaN where it is no constant
-    constants: dict[int, float] = {}
-    alike = np.ones(n, dtype=bool)
-    for name, into, *of in tape["steps"]:
-        if name == "output":
-            alike &= ~np.isnan(shifts[of[0]])
-            continue
-        found = np.zeros(n)
-        if name == "input":
-            found[of[0]] = 1.0
-        elif name != "const":
-            found = _shift(name, [shifts[k] for k in of], [constants.get(k) for k in of])
-        constants.pop(into, None)
-        if name == "const":
-            constants[into] = float(of[0])
-        shifts[into] = found
+    nothing, unit = np.zeros(n), np.eye(n)
+
+    def leaf(name: str, of: Any) -> _Shift:
+        return _Shift(nothing, float(of)) if name == "const" else _Shift(unit[of])
+
+    found = read(tape, leaf, lambda name, of: _Shift(_shift(name, of)))
+    alike = np.all([~np.isnan(each.turn) for each in found], axis=0)
     return frozenset(np.flatnonzero(alike).tolist())
 
 
-def _shift(name: str, shifts: list[Any], constants: list[float | None]) -> Any:
+class _Shift(NamedTuple):
+    """What a full turn does to a value."""
+
+    turn: Any  #: change by a turn of each joint / 2 pi; NaN where it is no constant
+    constant: float | None = None  #: the value itself, if it is a number
+
+
+def _shift(name: str, of: Sequence[_Shift]) -> Any:
     """The change of a step. Only whole numbers of moderate size are added and multiplied, which is exact."""
+    shifts = [each.turn for each in of]
     if name in _EXACT:
         return _whole(_EXACT[name](*shifts))
-    if name == "mul" and any(constant is not None for constant in constants):
-        factor, shift = (constants[0], shifts[1]) if constants[0] is not None else (constants[1], shifts[0])
-        return _whole(np.where(shift == 0, 0.0, shift * factor))
+    for one, other in ((of[0], of[-1]), (of[-1], of[0])):
+        if name == "mul" and one.constant is not None:
+            return _whole(np.where(other.turn == 0, 0.0, other.turn * one.constant))
     still = np.all([shift == 0 for shift in shifts], axis=0)
     if name in ("sin", "cos", "tan"):
         still = ~np.isnan(shifts[0])

@@ -10,16 +10,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from public_objects import (
-    IN_ATLAS,
     atlas,
     circle,
     clear,
-    control_of_atlas,
     fitted,
     impedance,
     joint_motion,
     link_distances,
-    moved,
     planar,
     steps,
     trajectory,
@@ -28,8 +25,6 @@ from test_learn import Arm
 
 import orthocas as oc
 from orthocas import bases, control, learn, plotting, problems, simulation, solvers, viewer
-from orthocas.atlas.laws import BlendedImpedance, HandedOver
-from orthocas.atlas.simulate import AtlasControl
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
 from orthocas.viewer.panel import Session
@@ -40,8 +35,8 @@ Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments th
 @cache
 def good_calls() -> dict[str, Call]:
     """What can be called, with arguments that work and take little time."""
-    physics, laws = {**_physics(), **_supervised()}, {**_control(), **_on_atlas()}
-    return {**_makers(), **_functions(), **_methods(), **_searches(), **laws, **physics, **_views()}
+    physics = {**_physics(), **_supervised()}
+    return {**_makers(), **_functions(), **_methods(), **_searches(), **_control(), **physics, **_views()}
 
 
 def _searches() -> dict[str, Call]:
@@ -107,22 +102,6 @@ def _build_atlas(**given: Any) -> oc.Atlas:
     """In a thread: processes would take a second each."""
     with ThreadPoolExecutor(1) as executor:
         return oc.build_atlas(**given, executor=executor)
-
-
-def _on_atlas() -> dict[str, Call]:
-    """Laws on an atlas."""
-    running = control_of_atlas()
-    q, x = IN_ATLAS, moved(running, 1e-4)
-    return {
-        "HandedOver": (HandedOver, {"atlas": atlas(), "law": control.PDPlus}),
-        "BlendedImpedance": (
-            BlendedImpedance,
-            {"atlas": atlas(), "stiffness": 60.0, "damping_ratio": 0.7, "limit": 90.0},
-        ),
-        "AtlasControl": (AtlasControl, {"law": running.law}),
-        "control.start": (lambda **given: AtlasControl(running.law).start(**given), {"q": q, "time": 0.0}),
-        "control.tick": (lambda **given: control_of_atlas().tick(**given), {"time": 0.002, "q": q, "dq": q, "x": x}),
-    }
 
 
 def _physics() -> dict[str, Call]:

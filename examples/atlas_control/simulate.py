@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocas.atlas.laws import AskedPosture, AtlasLaw, Command, require_atlas_law
+from atlas_control.laws import AskedPosture, AtlasLaw, Command, require_atlas_law
 from orthocas.control.controller import FROM_THE_LAW
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError
