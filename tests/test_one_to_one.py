@@ -76,7 +76,7 @@ def test_finite_differences_of_phi_lie_within_their_bounds(task: str, order: int
     active = list(judge.active)
     around = replace(judge._around(low, high), order=order)
     assert judge.coordinates is not None
-    jets = Jets.joined([judge.task(middle.T, around), judge.coordinates(middle.T, around)])
+    jets = Jets.joined([judge.task(middle.T, around), judge.coordinates.jets(around)])
     model, terms = jets.average(around, judge.active)
     for k in range(parts):
         for _ in range(20):
