@@ -78,3 +78,12 @@ def test_the_observer_keeps_torques_of_coarse_encoders_below_their_rate() -> Non
     assert max(case.last for case in found) < 0.1
     assert max(case.away for case in found) < 0.02
     assert not any(case.caught for case in found)
+
+
+def test_gains_for_a_delay_settle_an_arm_that_default_ones_make_swing() -> None:
+    """Ten milliseconds on an arm that nothing was tuned for, from its fastest posture and others."""
+    chart = oc.charts.load("ur5-position")
+    default, slower = PDPlus.on_chart(chart), PDPlus.on_chart(chart, delay=10e-3)
+    with default_gains.compiled(default) as library:
+        assert default_gains.settled(default, library, 10) > 1.0  # [rad/s]
+        assert default_gains.settled(slower, library, 10) < 0.02
