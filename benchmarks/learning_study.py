@@ -22,6 +22,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -460,9 +461,7 @@ def play(episodes: Episodes, act: Callable[[Array], Array], space: Space, steps:
             kept.append(value)
     history = np.array(errors), np.array(elbows), episodes.c.point, np.array(forces)
     lateral = np.linalg.norm(error[:, : 2 if episodes.task.name == "wipe" else 3], axis=1)
-    return Run(
-        episodes.task.success(*history), reward, np.mean(hits, axis=0), episodes.q.copy(), lateral < 0.02, seen
-    )
+    return Run(episodes.task.success(*history), reward, np.mean(hits, axis=0), episodes.q.copy(), lateral < 0.02, seen)
 
 
 # --- demonstrations
@@ -505,7 +504,7 @@ def cloned(seen: Array, actions: Array, rng: Any, updates: int) -> Callable[[Arr
     seeds, rows, inputs = seen.shape
     mean, scale = seen.mean(axis=1, keepdims=True), seen.std(axis=1, keepdims=True) + 0.02
     sizes = (inputs, 64, 64, actions.shape[2])
-    W = [rng.normal(size=(seeds, a, b)) / np.sqrt(a) for a, b in zip(sizes, sizes[1:], strict=False)]
+    W = [rng.normal(size=(seeds, a, b)) / np.sqrt(a) for a, b in pairwise(sizes)]
     b = [np.zeros((seeds, 1, size)) for size in sizes[1:]]
     weights = [*W, *b]
     moments = [(np.zeros_like(w), np.zeros_like(w)) for w in weights]
@@ -527,9 +526,9 @@ def cloned(seen: Array, actions: Array, rng: Any, updates: int) -> Callable[[Arr
             back = (back @ weights[k].transpose(0, 2, 1)) * (1 - layers[k] ** 2) if k else back
         rate = RATE * min(1.0, 2 * (1 - update / (updates + 1)))
         for w, g, (m, s) in zip(weights, gradient, moments, strict=True):
-            m += 0.1 * (g - m)
-            s += 0.001 * (g * g - s)
-            w -= rate * (m / (1 - 0.9**update)) / (np.sqrt(s / (1 - 0.999**update)) + 1e-8)
+            m[...] += 0.1 * (g - m)
+            s[...] += 0.001 * (g * g - s)
+            w[...] -= rate * (m / (1 - 0.9**update)) / (np.sqrt(s / (1 - 0.999**update)) + 1e-8)
 
     def act(observation: Array) -> Array:
         x = (observation.reshape(seeds, -1, inputs) - mean) / scale
@@ -660,7 +659,8 @@ def studied(arm: Arm, task: Reach, seeds: int, sizes: "Sizes", keep: Callable[[s
         start = time.process_time()
         seen, commands, after, shown = data
         labels = np.array([space.label(arm, a, b) for a, b in zip(commands, after, strict=True)])
-        act = cloned(_by_seed(seen, seeds), np.clip(_by_seed(labels, seeds), -1, 1), np.random.default_rng(5), sizes.updates)
+        wanted = np.clip(_by_seed(labels, seeds), -1, 1)
+        act = cloned(_by_seed(seen, seeds), wanted, np.random.default_rng(5), sizes.updates)
         part: Part = {"task": task.name, "space": space.name, "demonstrations": float(shown.mean())}
         part["cloning"] = tested(arm, task, space, act, _rngs(seeds, 1))
         act, checks = searched(arm, task, space, _rngs(seeds, 2), sizes.iterations)
@@ -674,9 +674,8 @@ def studied(arm: Arm, task: Reach, seeds: int, sizes: "Sizes", keep: Callable[[s
 
 def _by_seed(rows: Array, seeds: int) -> Array:
     """(T, S N, k) -> (S, T N, k)."""
-    return np.asarray(rows.reshape(len(rows), seeds, -1, rows.shape[2]).transpose(1, 0, 2, 3)).reshape(
-        seeds, -1, rows.shape[2]
-    )
+    split = rows.reshape(len(rows), seeds, -1, rows.shape[2])
+    return np.asarray(split.transpose(1, 0, 2, 3)).reshape(seeds, -1, rows.shape[2])
 
 
 def _rngs(seeds: int, purpose: int) -> list[Any]:

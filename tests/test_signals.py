@@ -7,19 +7,26 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from paper import Drawing, Recipe, registry
 from programs import Run, python
 
 import orthocas as oc
+from orthocas.certificates.judges import Verdicts
+from orthocas.certificates.search import Limits, Search, largest_first
+from orthocas.certificates.taylor import Variables
+from orthocas.charts.certificate import Subdivision
 from orthocas.cli import entry
 from orthocas.errors import Interrupted
 from orthocas.fitting.grid import run_cells
 from orthocas.solvers.protocol import BestPoint, Status
+from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred, ended_in_order, remembered
 from orthocas.tools.progress import Progress
 
@@ -103,6 +110,57 @@ def test_ctrl_c_that_a_library_swallows_is_not_lost(run_paper: Run, draw: Callab
         code, _, err = run_paper("fig06", "--out", "figures")
     assert (code, err) == (130, "orthocas: interrupted\n")
     assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_other_signals_that_a_library_swallows_are_not_lost(run_paper: Run, name: str) -> None:
+    number = getattr(signal, name)
+    of_this_process = signal.signal(number, signal.SIG_DFL)
+
+    def draw(quick: bool) -> Drawing:
+        with suppress(BaseException):
+            signal.raise_signal(number)
+        return Drawing({"": Figure(figsize=(0.2, 0.2))}, {"one": 1.0})
+
+    try:
+        with patch.dict(registry.FIGURES, {"fig06": Recipe("first", draw)}, clear=True):
+            code, _, err = run_paper("fig06", "--out", "figures")
+    finally:
+        signal.signal(number, of_this_process)
+    assert (code, err) == (128 + number, "")
+
+
+@dataclass
+class Disturbed:
+    """A judge that proves nothing; a library that swallows the signal's exception works for it."""
+
+    number: int
+    joints: Variables = (0, 1)
+    boxes: int = 0
+
+    def __call__(self, low: Array, high: Array) -> Verdicts:
+        self.boxes += len(low)
+        with suppress(BaseException):
+            signal.raise_signal(self.number)
+        no = np.zeros(len(low), dtype=bool)
+        return Verdicts(no, no, np.zeros(len(low)), np.zeros(len(low)), np.zeros(len(low), dtype=int))
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_search_ends_soon_after_a_signal_that_a_library_swallowed(name: str) -> None:
+    """Between two batches of boxes, whose states are kept."""
+    number = getattr(signal, name)
+    handler = signal.default_int_handler if name == "SIGINT" else signal.SIG_DFL
+    of_this_process = signal.signal(number, handler)
+    box = Subdivision.whole(-np.ones(2), np.ones(2))
+    judge = Disturbed(number)
+    search = Search(judge, box, Limits(boxes=1000), largest_first(box))
+    try:
+        with ended_in_order(), remembered(), pytest.raises((KeyboardInterrupt, SystemExit)):
+            search.run(lambda _: None)
+    finally:
+        signal.signal(number, of_this_process)
+    assert judge.boxes == 1
 
 
 def test_ctrl_c_is_forgotten_with_the_block() -> None:

@@ -14,6 +14,7 @@ from orthocas.certificates.judges import NEVER, UNKNOWN, Judge, Verdicts
 from orthocas.charts.certificate import MOST_BOXES, OPEN, PROVED, Subdivision, halfway
 from orthocas.errors import CertifyError
 from orthocas.tools.checks import Array
+from orthocas.tools.interrupts import check_remembered
 from orthocas.tools.processes import ATTEMPTS, worker_died
 
 BATCH = 512  #: most boxes of one task
@@ -122,6 +123,7 @@ class Search:
 
     def _step(self, pending: dict[Future[Verdicts], list[tuple[float, int, Array, Array]]]) -> None:
         """Judge one batch here, or give batches to the executor and take back those that are done."""
+        check_remembered()
         if self.executor is None:
             batch = self._take()
             try:

@@ -89,7 +89,7 @@ def _complain(text: str) -> None:
 
 def run(app: typer.Typer) -> int:
     """Run a command line of `app_for`; bad input gives one line on standard error and exit code 2, a signal its own."""
-    with ended_in_order(), remembered() as pressed:
+    with ended_in_order() as ended, remembered() as pressed:
         try:
             code = app(prog_name="orthocas", standalone_mode=False) or 0
         except KeyboardInterrupt:
@@ -97,10 +97,10 @@ def run(app: typer.Typer) -> int:
         except Exception as error:
             if type(error).__name__ == "NoArgsIsHelpError":  # its message is the help
                 typer.echo(_message(error), err=True)
-            elif not pressed():  # otherwise it is what a library made of Ctrl-C
+            elif not (pressed() or ended()):  # otherwise it is what a library made of a signal
                 _complain(_message(error))
             code = 2
-        return interrupted() if pressed() or code == INTERRUPTED else code
+        return ended() or (interrupted() if pressed() or code == INTERRUPTED else code)
 
 
 def _message(error: Exception) -> str:

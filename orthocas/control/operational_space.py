@@ -41,6 +41,7 @@ from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
 from orthocas.errors import InvalidValueError, LawWarning
+from orthocas.robots.tree import require_driven
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import Batched
@@ -192,6 +193,7 @@ class _OperationalSpace(Shown):
         require_known("coupling", coupling, COUPLINGS)
         require_known("damping", damping, DAMPING_DESIGNS)
         require_kind("chart", chart, Chart)
+        require_driven(f"the law {self.name}", chart.problem.robot.tree)
         model = RunTimeModel() if model is None else model
         require_kind("model", model, RunTimeModel)
         if remembers is not None and not callable(getattr(remembers, "of", None)):

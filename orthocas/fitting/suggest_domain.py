@@ -15,7 +15,7 @@ from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.probe import Bounds, Miss, Prober, Verdict, judged_chart
 from orthocas.fitting.settings import default_parametrisation, require_parametrisation
 from orthocas.robots.robot import Robot
-from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
+from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven
 from orthocas.tasks.domains import Box, Domain
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
@@ -365,6 +365,7 @@ class _Joints:
 
 def _checked(robot: Robot, task: Task, leak_deg: float, conditioning: float, seed: int) -> Bounds:
     require_kind("robot", robot, Robot)
+    require_driven("suggesting a domain", robot.tree)
     require_kind("task", task, Task)
     require_count("seed", seed, least=0)
     if not 0 < as_number("leak_deg", leak_deg) < 90:

@@ -5,7 +5,7 @@ code runs, a signal is only recorded. When the code returns, or earlier where `c
 KeyboardInterrupt, and the signals of `ended_in_order` become SystemExit.
 
 Some of CasADi's Python swallows exceptions of all kinds (`except: pass` in `vertcat` and others). A command line or
-a fit that remembers Ctrl-C (`remembered`) ends as interrupted all the same.
+a fit that remembers signals (`remembered`, `ended_in_order`) ends as interrupted all the same.
 """
 
 import signal
@@ -30,6 +30,7 @@ class _Note:
 
 _notes: list[_Note] = []
 _memories: list[_Note] = []  # of `remembered`
+_ends: list[_Note] = []  # of `ended_in_order`
 
 
 @contextmanager
@@ -65,18 +66,22 @@ def check() -> None:
 
 
 @contextmanager
-def ended_in_order() -> Iterator[None]:
+def ended_in_order() -> Iterator[Callable[[], int]]:
     """Turn SIGTERM and SIGHUP into SystemExit with 128 + their number, so that drafts go away; for command lines.
 
-    Signals that the program ignores stay ignored, as under nohup.
+    Signals that the program ignores stay ignored, as under nohup. The value is a function that returns that exit code
+    if one has come, even if its exception got lost, else 0.
     """
+    memory = _Note()
+    _ends.append(memory)
     before = {number: signal.getsignal(number) for number in _ENDING}
     for number, handler in before.items():
         if handler is signal.SIG_DFL:
             signal.signal(number, _end)
     try:
-        yield
+        yield lambda: 0 if memory.number is None else 128 + memory.number
     finally:
+        _ends.remove(memory)
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -103,10 +108,11 @@ def remembered() -> Iterator[Callable[[], bool]]:
 
 
 def check_remembered() -> None:
-    """Raise the Ctrl-C that came during the innermost `remembered` block and got lost; for long loops."""
-    lost = bool(_memories) and _memories[-1].number is not None
-    if lost and threading.current_thread() is threading.main_thread():
-        raise KeyboardInterrupt
+    """Raise what came during the innermost `ended_in_order` or `remembered` block and got lost; for long loops."""
+    if threading.current_thread() is threading.main_thread():
+        for memories in (_ends, _memories):
+            if memories and (number := memories[-1].number) is not None:
+                _raise(number)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
@@ -116,7 +122,7 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
 def _end(number: int, frame: FrameType | None) -> NoReturn:
     for each in _ENDING:
         signal.signal(each, signal.SIG_IGN)  # the end is not to be disturbed
-    raise SystemExit(128 + number)
+    _raise(number)
 
 
 def _held(number: int, handler: object) -> bool:
@@ -130,4 +136,6 @@ def _raise(number: int) -> NoReturn:
         for memory in _memories:
             memory.number = number
         raise KeyboardInterrupt
+    for memory in _ends:
+        memory.number = number
     raise SystemExit(128 + number)
