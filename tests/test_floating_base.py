@@ -8,9 +8,11 @@ import pinocchio as pin
 import pytest
 import satellite as satellite_example
 from conftest import robot_data
+from programs import needs_c
 from scipy.integrate import solve_ivp
 
 import orthocas as oc
+from orthocas.codegen import check_c, generate_c
 from orthocas.errors import InvalidValueError, MetricError, NotRedundantError, OrthocasError, RobotError
 from orthocas.tools.checks import Array
 
@@ -201,6 +203,16 @@ def test_inverse_finds_the_arm_for_any_place_of_the_base(chart: oc.Chart, tmp_pa
     far = HOME + np.array([5.0, 3, -2, 1, 0.2, -0.3, *np.full(7, 0.05)])
     start = np.concatenate([far[:6], HOME[6:]])
     np.testing.assert_allclose(loaded.inverse(chart.phi(far), start), far, atol=1e-8)
+
+
+@needs_c
+@pytest.mark.slow
+def test_c_of_a_chart_that_floats_equals_python(satellite: oc.Robot, tmp_path: Path) -> None:
+    problem = oc.Problem(satellite, oc.Task.position(satellite, "xy"), "inertia", oc.Box(AFLOAT, 0.4))
+    chart = oc.fit(problem, oc.Polynomial(1), samples=200).chart
+    proof = check_c(generate_c(chart, tmp_path, None, "afloat"), chart)
+    assert {"phi", "jacobian", "inverse"} <= {*proof.differences}
+    assert max(proof.differences.values()) < 1e-11
 
 
 @pytest.mark.parametrize(
