@@ -297,7 +297,8 @@ def template_values(
 
 def _clearance(condition: BoundaryCondition, values: dict[str, str]) -> str:
     """Code for how far a position is inside the condition of the domain, here and after a time."""
-    return filled("clearance.c", {**values, "condition_boundary": filled(condition.template, values)})
+    code = "".join(filled(template, values) for template in condition.templates)
+    return filled("clearance.c", {**values, "condition_boundary": code})
 
 
 def _sizes(chart: Chart) -> dict[str, str]:
