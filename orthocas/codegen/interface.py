@@ -46,9 +46,9 @@ _OF_MEMORY = {  # code of laws that remember, by its place in the templates of t
     "           known && state->mode != ${NAME}_HOLD ? since : 0.0);\n",
 }
 _OF_CORRECTION = {  # and of those whose memory is a torque
-    "correct_command": "    correct(state, command);\n",
+    "correct_command": "    if (state->fresh == 2) learn_from_start(state, gains);\n    correct(state, command);\n",
     "correct_fallback": "  correct(state, fallback);\n",
-    "learn_from_start": "  learn_from(state, command);\n",
+    "learn_from_start": "  if (command != 0 && all_finite(command, N)) state->fresh = 2;\n",
 }
 _ORDER = "{0}catch_margin < {0}near_margin && {0}near_margin < {0}return_margin && {0}return_margin < 1.0".format(
     "safety->"
@@ -192,9 +192,9 @@ def _memory_values(controller: Controller, known: Mapping[str, str]) -> dict[str
         "corrections": "",
         "start_meaning": "",
     }
-    of_torque = dict.fromkeys(_OF_CORRECTION, "")
+    of_torque, learned = dict.fromkeys(_OF_CORRECTION, ""), ""
     if memory.torque is not None:
-        of_torque = _OF_CORRECTION
+        of_torque, learned = _OF_CORRECTION, "  if (state->fresh == 2) learn_from_start(state, given);\n"
         values["corrections"] = filled("corrections.c", {**known, "torque": memory.torque})
         values["start_meaning"] = (
             f"\n * The command of {known['name']}_start must hold the arm: it shows what torque the model lacks."
@@ -210,7 +210,7 @@ def _memory_values(controller: Controller, known: Mapping[str, str]) -> dict[str
         | {
             "memory_type": filled("memory.h", values),
             "memory_c": filled("memory.c", values),
-            "use_memory": "".join(added),
+            "use_memory": learned + "".join(added),
         }
     )
 
