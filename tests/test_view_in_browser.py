@@ -29,12 +29,19 @@ COARSE = "/?fixedDpr=0.15"  # a coarse picture takes seconds less without a grap
 SLIDERS = "document.querySelectorAll('.mantine-Slider-root')"
 
 
+SEEN = """point => {
+  const {camera, canvas, nodeRefFromName} = window.__viserMutable, box = canvas.getBoundingClientRect();
+  const spot = camera.position.clone().set(...point).applyMatrix4(nodeRefFromName[''].matrixWorld).project(camera);
+  return document.elementFromPoint(box.x + (spot.x + 1) / 2 * box.width, box.y + (1 - spot.y) / 2 * box.height);
+}"""
+
+
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     """The tab of a browser, which all tests of this file share."""
     if PROGRAM is None:
         pytest.skip("no chromium: apt-get install chromium")
-    with browser(tmp_path_factory.mktemp("profile"), (800, 560), smooth=False) as tab:
+    with browser(tmp_path_factory.mktemp("profile"), (1120, 560), smooth=False) as tab:
         yield tab
 
 
@@ -105,6 +112,36 @@ def test_a_slider_moves_the_joints_and_the_flange_stays(page: Page, iiwa_fit: Fi
         assert np.abs(flange(moved) - flange(before)).max() > 1e-3
         np.testing.assert_allclose(chart.xi(moved), chart.xi(before), atol=1e-8)
         assert chart.problem.domain.contains(moved)
+
+
+WIDTHS = (900, 1366, 390)
+
+
+@pytest.mark.parametrize("wide", WIDTHS)
+def test_the_arrows_at_the_tool_lie_beside_the_panels(page: Page, iiwa_fit: Fit, wide: int) -> None:
+    """At the tool, and a handle's length away in all directions, the topmost element is the picture."""
+    high = 844 if wide < 480 else 700
+    page.call("Emulation.setDeviceMetricsOverride", width=wide, height=high, deviceScaleFactor=1, mobile=wide < 480)
+    with oc.view(iiwa_fit.chart, port=0) as view:
+        opened(page, view.url)
+        page.wait("document.querySelectorAll('canvas').length > 1")
+        place = iiwa_fit.chart.problem.robot.tip_position(iiwa_fit.chart.problem.domain.centre)
+        ends = [place + 0.2 * np.array(way) for way in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))]
+        seen = [f"({SEEN})({point.tolist()})" for point in ends]
+        page.wait(f"[{','.join(seen)}].every(e => e && e.tagName === 'CANVAS')")
+    page.call("Emulation.clearDeviceMetricsOverride")
+
+
+def test_pixels_follow_the_time_of_a_picture_and_a_still_one_is_sharp(page: Page, iiwa_fit: Fit) -> None:
+    dpr = "window.__viserTestpoints?.devSettings.get().fixedDpr"
+    with oc.view(iiwa_fit.chart, port=0) as view:
+        page.open(view.url)
+        page.wait("!!document.querySelector('[data-oc]') && !!document.querySelector('canvas')")
+        page.wait(f"{dpr} >= 1")
+        page.value(f"{button('Sweep')}.click()")
+        page.wait(f"{dpr} < 1 && !!{button('Stop')}")
+        page.value(f"{button('Stop')}.click()")
+        page.wait(f"{dpr} >= 1")
 
 
 def test_two_arms_on_a_closed_path(page: Page, iiwa_fit: Fit, tmp_path: Path) -> None:

@@ -23,7 +23,8 @@ from orthocas.errors import (
 )
 from orthocas.tools import checks
 from orthocas.viewer import Motion, export_page, window
-from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel, Session
+from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel, held
+from orthocas.viewer.session import Session
 from orthocas.viewer.window import Loop, is_local
 
 
@@ -60,6 +61,22 @@ def test_panels_of_charts_without_boundaries() -> None:
     chart = linear_on_the_torus()
     page = ChartPanel(chart).html(Session(chart, np.array([0.6, 0.8, 0.8])).readings)
     assert 'data-oc="boundary" data-value="inf"' in page
+
+
+def test_panels_show_a_dash_for_what_has_no_value_and_units_with_the_rest() -> None:
+    chart = fitted().chart
+    readings = Session(chart).readings
+    bare = replace(readings, q=np.full(3, np.nan), leak_deg=np.full(2, np.nan), conditioning=np.nan)
+    page = ChartPanel(chart).html(bare)
+    assert page.count(">-</b>") == 6
+    assert "nan%" not in page
+    page = ChartPanel(chart).html(readings)
+    low = chart.problem.domain.half_width - np.abs(readings.q - chart.problem.domain.centre)
+    assert f">{np.degrees(low.min()):.1f}°</b>" in page
+    assert f"boundary q{np.argmin(low) + 1}" in page
+    assert held(np.array([3e-4, 2e-4, np.radians(0.5)]), ("m", "m", "rad")) == "300 µm, 0.5°"
+    assert held(np.array([0.0, 0.0]), ("m", "rad")) == "< 1 nm, < 0.001°"
+    assert held(np.array([0.02]), ("px",)) == "2e-02 px"
 
 
 @pytest.mark.slow
@@ -163,3 +180,21 @@ def test_command_line_refusals(run: Run, words: list[str], message: str) -> None
     assert err.startswith("orthocas: ")
     assert message in err
     assert err.count("\n") == 1
+
+
+def test_cameras_see_the_arm_in_pictures_of_every_shape() -> None:
+    """The ball around the arm, projected by hand, is within the part of the picture that no panel covers."""
+    middle, radius = np.array([0.2, -0.1, 0.5]), 0.7
+    direction, up = np.array([2.0, -2.0, 1.0]) / 3, np.array([0.0, 0.0, 1.0])
+    frame = window.Framing(middle, direction, up, window._ROOM * radius / np.sin(window._VIEW_ANGLE / 2))
+    for width, height in ((1180, 900), (736, 768), (556, 700), (390, 844)):
+        position, look_at = frame.seen_from(width, height)
+        ahead = (look_at - position) / np.linalg.norm(look_at - position)
+        right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
+        axes = np.stack([right, np.cross(right, ahead), ahead])
+        points = np.random.default_rng(7).normal(size=(500, 3))
+        seen = (middle + radius * points / np.linalg.norm(points, axis=1)[:, None] - position) @ axes.T
+        pixels = height / 2 / np.tan(window._VIEW_ANGLE / 2) * seen[:, :2] / seen[:, 2:]
+        assert (np.abs(pixels[:, 0]) < width / 2).all()
+        assert (pixels[:, 1] < height / 2).all()
+        assert (pixels[:, 1] > (0 if width < 480 else -height / 2)).all()

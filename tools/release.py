@@ -27,6 +27,7 @@ CONDA_NAMES = {"pin": "pinocchio", "libigl": "igl", "matplotlib": "matplotlib-ba
 IN_WHEEL = (
     "orthocas/py.typed",
     "orthocas/problems/data/iiwa7_r800.urdf",
+    "orthocas/viewer/page.js",
     "solvers/lbfgs.py",
     "licenses/LICENSE",
 )

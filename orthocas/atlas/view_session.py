@@ -6,7 +6,7 @@ import numpy as np
 
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array, as_point
-from orthocas.viewer.panel import MOST_STEPS, Session
+from orthocas.viewer.session import MOST_STEPS, Session
 
 if TYPE_CHECKING:
     from orthocas.atlas.atlas import Atlas

@@ -33,7 +33,8 @@ _OPTIONS: dict[str, Any] = {
         typer.Option("--tip", help="Tip frame of a robot file, or LEFT,RIGHT; default: the end of its chain."),
     ],
     "base": Annotated[
-        str | None, typer.Option("--base", help="Moving base of a robot file: planar, rail:x, rail:y or rail:z.")
+        str | None,
+        typer.Option("--base", help="Moving base of a robot file: planar, rail:x, floating, ..."),
     ],
     "lock": Annotated[
         list[str] | None,

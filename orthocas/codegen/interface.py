@@ -22,6 +22,17 @@ _TORQUE = """It compensates gravity, damps with the mass matrix,
  * holds the arm with a spring that gives way under too much force."""
 _VELOCITY = """It stops the arm and holds it."""
 _INERTIA = "  double inertia[{n}];       /* mass matrix of the catcher's spring, row by row */\n"
+_OF_OBSERVER = {  # code of the velocity observer of torque laws, by its place in these templates
+    "or_observed": ", or the observer's estimate",
+    "state_observer": "  double expected[$n];       /* accelerations that the velocity observer expects */\n"
+    "  double unexplained[$n];    /* accelerations that torques do not explain */\n",
+    "observed": "  double speed[N], M[N * N], bias[N], gravity[N];\n",
+    "foresee": "  foresee(state, since);\n",
+    "observe": "  memcpy(speed, dq, sizeof speed);\n  observe(state, here, speed, since);\n  dq = speed;\n",
+    "stand_still": "  set_zero(state->expected, N);\n  set_zero(state->unexplained, N);\n",
+    "moving": ", M, bias, gravity",
+    "expect": "  expect(state, $command, fallback, M, bias, gravity);\n",
+}
 _OF_MEMORY = {  # code of laws that remember, by its place in the templates of the supervised law
     "memory_type": "",
     "state_memory": "  ${name}_memory memory;\n",
@@ -135,6 +146,10 @@ def supervision_values(
         "catcher": _TORQUE if torque else _VELOCITY,
         "turning": flags(endless),
         "state_inertia": _INERTIA.format(n=robot.n**2) if torque else "",
+        **{
+            place: Template(text).safe_substitute(n=robot.n, command=controller.command) if torque else ""
+            for place, text in _OF_OBSERVER.items()
+        },
         "safety_fields": "\n".join(_field(name, value) for name, value in settings.items()),
         "safety_values": ",\n".join(f"  {_literal(value)}" for value in settings.values()),
         "safety_meant": "\n        && ".join([*(_meant(name, value) for name, value in settings.items()), _ORDER]),

@@ -31,6 +31,7 @@ from orthocas.fitting.fit import Fit, fit, in_gauge, normalised
 from orthocas.fitting.like import SWIVEL, Like, Likeness, quantity_of
 from orthocas.fitting.settings import require_parametrisation
 from orthocas.robots.robot import Robot
+from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import SolveResult, Status
 from orthocas.tasks.branches import Branch, Branches, branches
 from orthocas.tasks.domains import Box, sample_evenly, sample_heavily, sample_uniform
@@ -171,6 +172,7 @@ def fit_wide(
     """
     start = time.perf_counter()
     require_kind("robot", robot, Robot)
+    require_driven("a wide fit", robot.tree)
     require_kind("task", task, Task)
     bound = as_number("clearance", clearance)
     if not 0 < bound < np.inf:

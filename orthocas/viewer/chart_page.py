@@ -1,18 +1,24 @@
 """The page of a chart: sliders and a handle that are solved live, bars, ghosts, home, undo and a sweep."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
+from orthocas.tasks.branches import branches
+from orthocas.tools.checks import Array
 from orthocas.viewer.looks import GHOSTS, Arm, Ghosts, Look, chain_length
-from orthocas.viewer.panel import ChartPanel, Session
-from orthocas.viewer.window import Loop, place_camera, place_floor, place_lights, show_error
+from orthocas.viewer.panel import ChartPanel
+from orthocas.viewer.session import Session
+from orthocas.viewer.window import Loop, place_camera, place_floor, place_lights, place_panels, show_error
 
 _STEP = 1e-3  # of the sliders
 _SWEEP = 6.0  # [s] there and back
+_TOLD = 0.1  # [s] between readings in a sweep: pages that are written for every picture take more than the picture
 _CALM = 0.97  # share of the range that a sweep uses
 _HANDLE = 0.17  # size, as a share of the length of the arm
 _NONE = "none"
@@ -34,7 +40,7 @@ class ChartPage:
         place_lights(server, robot)
         place_camera(server, robot, self.session.home[None])
         self._handle = self._add_handle()
-        self._readings = self._add_readings()
+        self._readings = place_panels(server)
         self._sliders = self._add_sliders()
         self._add_buttons()
         self._show()
@@ -48,14 +54,6 @@ class ChartPage:
     def close(self) -> None:
         """End the thread of the page."""
         self._loop.stop()
-
-    def _add_readings(self) -> Any:
-        panel = self._server.gui.add_panel()
-        with panel.add_tab("Readings", "gauge"):
-            html = self._server.gui.add_html("")
-        panel.dock_left()
-        panel.set_width(310)
-        return html
 
     def _add_sliders(self) -> dict[str, Any]:
         """One slider for each component of phi: coordinates first."""
@@ -96,6 +94,10 @@ class ChartPage:
             labels = self._chart.labels[self._chart.m :]
             self._chosen = gui.add_dropdown("coordinate", (*labels, _NONE), initial_value=self._widest())
             self._sweep = self._button("Sweep", "repeat", self._swept)
+        if self._chart.problem.domain.room_to_fold is not None:
+            self._branches = gui.add_folder("Other branches: the tip stays")
+            with self._branches:
+                self._search = self._button("Search", "arrows-split", self._find_branches)
         self._chosen.on_update(self._another)
 
     async def _another(self, event: Any) -> None:
@@ -115,6 +117,23 @@ class ChartPage:
 
         button.on_click(clicked)
         return button
+
+    def _find_branches(self) -> None:
+        """Search the branches of the robot, which takes seconds, and offer those beyond a mirror."""
+        self._search.label, self._search.disabled = "Searching ...", True
+        problem = self._chart.problem
+        found = self.session.branches = branches(problem.robot, problem.task)
+        self._search.remove()
+        with self._branches:
+            for cut in found.mirrors:
+                self._button(f"Flip the {found.cuts[cut].part}", "arrows-left-right", partial(self._flip, cut))
+            if not found.mirrors:
+                self._server.gui.add_markdown("No mirror image of this arm has the same pose of its tip.")
+
+    def _flip(self, cut: int) -> None:
+        self._rest()
+        self.session.flip(cut)
+        self._show()
 
     def _add_handle(self) -> Any:
         """A handle at the tool, if the task has components of its position."""
@@ -173,10 +192,17 @@ class ChartPage:
         here = float(self.session.readings.xi[self._chart.labels.index(fan.label) - self._chart.m])
         phase = np.arcsin(np.clip((here - middle) / max(half, 1e-9), -1, 1))
 
+        told = -_TOLD
+
         def tick(seconds: float) -> bool:
+            nonlocal told
             self.session.wish({fan.label: float(middle + half * np.sin(2 * np.pi * seconds / _SWEEP + phase))})
             self.session.follow()
-            self._show()
+            if seconds - told < _TOLD:
+                self._show_arm(self.session.q)
+            else:
+                told = seconds
+                self._show()
             return True
 
         self._loop.animate(tick)
@@ -189,21 +215,29 @@ class ChartPage:
     def _show(self, moved: Any = ()) -> None:
         """Draw the arm and the readings, and move the sliders that the user does not hold."""
         readings = self.session.readings
-        if self._panel.chart is not self._chart:
+        place = self.session.place
+        if self._panel.chart is not self._chart or self._panel.place != place:
             self._rest()
-            self._panel = ChartPanel(self._chart, self.session.place)
+            self._panel = ChartPanel(self._chart, place, mirrored=bool(self.session.flips))
         with self._server.atomic():
-            self._arm.show(readings.q)
-            self._readings.content = self._panel.html(readings)
+            self._show_arm(readings.q)
+            shown = replace(readings, q=self.session.shown(readings.q[None])[0])
+            self._readings.content = self._panel.html(shown)
             for label, value in zip(self._chart.labels, np.concatenate([readings.x, readings.xi]), strict=True):
                 if label not in moved:
                     self._set(self._sliders[label], float(value))
-            if self._handle is not None and not self._dragging:
-                self._handle.position = tuple(self._chart.problem.robot.tip_position(readings.q))
             self._undo.disabled = not self.session.can_undo
 
+    def _show_arm(self, q: Array) -> None:
+        """Draw the arm and its handle, for a position of the chart (n,)."""
+        with self._server.atomic():
+            self._arm.show(self.session.shown(q[None])[0])
+            if self._handle is not None and not self._dragging:
+                self._handle.position = tuple(self._chart.problem.robot.tip_position(q))
+
     def _set(self, slider: Any, value: float) -> None:
-        slider.value = min(max(round(value, 3), slider.min), slider.max)
+        if np.isfinite(value):
+            slider.value = min(max(round(value, 3), slider.min), slider.max)
 
     def _settle(self) -> None:
         """After a gesture: ranges of the sliders, the fan, and values that were not reached."""
@@ -216,7 +250,8 @@ class ChartPage:
                 np.ceil((fan.xi[0] - room) / _STEP) * _STEP,
                 np.floor((fan.xi[-1] + room) / _STEP) * _STEP,
             )
-            slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
+            if np.isfinite([low, high]).all():
+                slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
         self._show()
         self._show_fan()
 
@@ -230,7 +265,12 @@ class ChartPage:
             if fan is None:
                 self._ghosts.hide()
             else:
-                self._ghosts.show(fan.spread(GHOSTS), fan.spread(4 * GHOSTS))
+                few, many = (self._shown(fan.spread(count)) for count in (GHOSTS, 4 * GHOSTS))
+                self._ghosts.show(few, many)
+
+    def _shown(self, q: Array) -> Array:
+        """What the arm can have of positions of the chart (N, n)."""
+        return self.session.shown(q[self.session.allowed(q)])
 
     def _failed(self, error: Exception) -> None:
         self._rest()

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -25,16 +26,17 @@ from orthocas.robots.xml import read_xml
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, Indices
 
-FINE, COARSE = 24, 6  #: facets around an axis
+FINE, COARSE = 16, 6  #: facets around an axis
 SHELL, JOINT, TOOL = (226, 229, 233), (72, 80, 92), (214, 96, 20)
 _THICK = 0.042  # radius of the first rod, as a share of the length of the chain
 _TAPER = 0.45  # share of the radius that is lost on the way to the tip
 _SHORT = 0.35  # radii below which a rod is left out
 _SAME = 1e-6  # [m] between the joints of two files of one robot
+ENOUGH, _FEW = 20_000, 500  # triangles of an arm for a picture, and of a mesh at least
 _MOST_TRIANGLES = 3_000_000  # of all meshes, more is slow to send and to draw
 
 Colour = tuple[int, int, int]  #: red, green, blue, 0 to 255
-GHOSTS = 9  #: arms of a fan
+GHOSTS = 7  #: arms of a fan
 _SLIM = 0.32  # thickness of a ghost, as a share of the arm's
 _LOW, _MIDDLE, _HIGH = (24, 92, 214), (64, 168, 116), (245, 118, 10)  # colours along a coordinate
 _TRACE = 0.004  # thickness of a line, as a share of the size of the arm
@@ -58,12 +60,6 @@ def joined(solids: Sequence[Solid], colour: Colour) -> Solid:
     first = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     faces = [solid.faces + start for solid, start in zip(solids, first, strict=False)]
     return Solid(np.concatenate([solid.vertices for solid in solids]), np.concatenate(faces), colour)
-
-
-def by_colour(solids: Sequence[Solid]) -> list[Solid]:
-    """One solid for each colour, which is faster to draw than many."""
-    colours = dict.fromkeys(solid.colour for solid in solids)
-    return [joined([solid for solid in solids if solid.colour == colour], colour) for colour in colours]
 
 
 def capsule(start: Array, end: Array, radii: tuple[float, float], colour: Colour, facets: int = FINE) -> Solid:
@@ -126,6 +122,27 @@ def _revolved(profile: Array, colour: Colour, facets: int) -> Solid:
 Look = list[list[Solid]]  #: what each frame of `BodyPoses` carries: base, bodies, tip
 
 
+def decimated(look: Look, most: int = ENOUGH) -> Look:
+    """The same look with about so many triangles, or fewer; small solids stay as they are.
+
+    By the quadric error metric (package fast-simplification, through trimesh). Without that package, all stay.
+    """
+    share = most / max(sum(len(solid.faces) for solids in look for solid in solids), 1)
+    if share >= 1 or find_spec("fast_simplification") is None:
+        return look
+    return [[_decimated(solid, max(int(share * len(solid.faces)), _FEW)) for solid in solids] for solids in look]
+
+
+def _decimated(solid: Solid, count: int) -> Solid:
+    """A solid with about so many triangles."""
+    import trimesh  # half a second, for meshes of robot files only
+
+    if len(solid.faces) <= count:
+        return solid
+    mesh = trimesh.Trimesh(solid.vertices, solid.faces).simplify_quadric_decimation(face_count=count)
+    return replace(solid, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces, dtype=np.intp))
+
+
 def stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = FINE) -> Look:
     """Drums about the joint axes and tapered rods between the frames, thinner or thicker than usual by a factor."""
     look: Look = [[] for _ in range(tree.n + 2)]
@@ -137,6 +154,10 @@ def stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = FINE) -
     r = radii[tree.tip_parent + 1]
     _add_rod(look[tree.tip_parent + 1], tree.tip_translation, (r, 0.75 * r), facets)
     look[-1].append(ball(0.55 * r, TOOL, facets))
+    for frame in map(tree.frame, tree.tips):  # further hands
+        r = radii[frame.parent + 1]
+        _add_rod(look[frame.parent + 1], frame.translation, (r, 0.75 * r), facets)
+        look[frame.parent + 1].append(ball(0.55 * r, TOOL, facets).moved(np.eye(3), frame.translation))
     if np.linalg.norm(tree.translations[0]) > radii[0]:
         look[0].append(drum(1.7 * radii[0], 0.35 * radii[0], JOINT, facets))
     return look
@@ -339,7 +360,9 @@ class BodyPoses:
 
 
 class Arm:
-    """An arm in the scene.
+    """An arm in the scene: one skinned mesh for each colour, whose bones are the bodies.
+
+    Without a graphics card, the time of a picture goes with the number of meshes more than with their triangles.
 
     Args:
         scene: of a viser server.
@@ -353,24 +376,30 @@ class Arm:
         self._poses = BodyPoses(robot.tree)
         self.shift = np.zeros(3) if shift is None else shift
         scene.add_frame(name, show_axes=False, position=tuple(self.shift))
-        self._frames = []
-        for i, solids in enumerate(look):
-            self._frames.append(scene.add_frame(f"{name}/{i}", show_axes=False))
-            for j, solid in enumerate(by_colour(solids)):
-                scene.add_mesh_simple(
-                    f"{name}/{i}/{j}",
-                    solid.vertices,
-                    solid.faces,
-                    color=solid.colour,
-                    side="double",
-                    flat_shading=False,
-                )
+        self._bones: list[tuple[int, Any]] = []  # a body, and a bone that moves with it
+        colours = dict.fromkeys(solid.colour for solids in look for solid in solids)
+        for k, colour in enumerate(colours):
+            parts = {i: [solid for solid in solids if solid.colour == colour] for i, solids in enumerate(look)}
+            bodies = [i for i, solids in parts.items() if solids]
+            self._bones += zip(bodies, self._skinned(scene, f"{name}/{k}", [parts[i] for i in bodies]), strict=True)
+
+    def _skinned(self, scene: Any, name: str, parts: Look) -> Any:
+        """A mesh of the solids of some bodies in one colour; its bones, one for each body."""
+        solids = [joined(part, part[0].colour) for part in parts]
+        mesh = joined(solids, solids[0].colour)
+        weights = np.repeat(np.eye(len(solids)), [len(solid.vertices) for solid in solids], axis=0)
+        handle = scene.add_mesh_skinned(
+            name, mesh.vertices, mesh.faces, skin_weights=weights, color=mesh.colour, side="double",
+            bone_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(solids), 1)), bone_positions=np.zeros((len(solids), 3)),
+            cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        return handle.bones
 
     def show(self, q: Array) -> None:
         """Move to a joint position (n,)."""
         positions, quaternions = self._poses(q[None])
-        for frame, position, quaternion in zip(self._frames, positions[0], quaternions[0], strict=True):
-            frame.position, frame.wxyz = position, quaternion
+        for body, bone in self._bones:
+            bone.position, bone.wxyz = positions[0, body], quaternions[0, body]
 
 
 class Ghosts:
@@ -379,23 +408,22 @@ class Ghosts:
     def __init__(self, scene: Any, name: str, robot: Robot) -> None:
         self._scene, self._name, self._robot = scene, name, robot
         self._poses = BodyPoses(robot.tree)
-        self._look = [
-            joined(solids, (255, 255, 255)) if solids else None for solids in stick_arm(robot.tree, _SLIM, COARSE)
-        ]
+        self._look = stick_arm(robot.tree, _SLIM, COARSE)[1:]
         self._nodes: list[Any] = []
 
     def show(self, q: Array, curve: Array) -> None:
         """Show arms at joint positions (N, n), and the way of their joints along a curve (M, n)."""
         self.hide()
-        colours = shades(len(q))
         positions, quaternions = self._poses(q)
-        for i, solid in enumerate(self._look):
-            if i > 0 and solid is not None:
-                node = self._scene.add_batched_meshes_simple(
-                    f"{self._name}/{i}", solid.vertices, solid.faces, quaternions[:, i], positions[:, i],
-                    batched_colors=colours, opacity=0.55, cast_shadow=False, receive_shadow=False, lod="off",
-                )  # fmt: skip
-                self._nodes.append(node)
+        for k, colour in enumerate(shades(len(q)).tolist()):
+            turns = scipy.spatial.transform.Rotation.from_quat(quaternions[k, 1:], scalar_first=True).as_matrix()
+            places = zip(self._look, turns, positions[k, 1:], strict=True)
+            ghost = joined([solid.moved(R, p) for solids, R, p in places for solid in solids], tuple(colour))
+            node = self._scene.add_mesh_simple(
+                f"{self._name}/{k}", ghost.vertices, ghost.faces, color=ghost.colour, opacity=0.55, side="front",
+                flat_shading=False, cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+            self._nodes.append(node)
         self._show_traces(curve)
 
     def hide(self) -> None:
@@ -406,18 +434,16 @@ class Ghosts:
 
     def _show_traces(self, curve: Array) -> None:
         """Lines that the joints move along, except those that stay."""
-        points = self._robot.joint_points(curve)
+        points = self._robot.joint_points(curve)  # (M, joints, 3)
         size = float(np.ptp(points.reshape(-1, 3), axis=0).max())
-        colours = shades(len(curve))
-        for i in range(points.shape[1]):
-            way = points[:, i]
-            if np.ptp(way, axis=0).max() > 0.03 * size:
-                ends = np.stack([way[:-1], way[1:]], axis=1)
-                shade = np.stack([colours[:-1], colours[1:]], axis=1)
-                node = self._scene.add_line_segments(
-                    f"{self._name}/trace{i}", ends, shade, thickness=_TRACE * max(size, 1e-3)
-                )
-                self._nodes.append(node)
+        moving = points[:, np.ptp(points, axis=0).max(axis=1) > 0.03 * size]
+        if not moving.size:
+            return
+        colours = np.repeat(shades(len(curve))[:, None], moving.shape[1], axis=1)
+        ends = np.stack([moving[:-1], moving[1:]], axis=2).reshape(-1, 2, 3)
+        shade = np.stack([colours[:-1], colours[1:]], axis=2).reshape(-1, 2, 3)
+        thickness = _TRACE * max(size, 1e-3)
+        self._nodes.append(self._scene.add_line_segments(f"{self._name}/traces", ends, shade, thickness=thickness))
 
 
 def shades(count: int) -> Array:

@@ -16,14 +16,15 @@ from orthocas.viewer.motion import Motion
 from orthocas.viewer.panel import PlayerPanel, RobotPanel
 from orthocas.viewer.window import (
     LOCAL,
-    TITLES,
     Loop,
     close_window,
     direction_of_camera,
+    named_page,
     open_window,
     place_camera,
     place_floor,
     place_lights,
+    place_panels,
     show_error,
     up_of,
 )
@@ -84,11 +85,7 @@ class PlayerPage:
         place_floor(server, robot)
         place_lights(server, robot)
         place_camera(server, robot, np.concatenate([few(motion.q) for motion in motions]), self._stage.shifts)
-        panel = server.gui.add_panel()
-        with panel.add_tab("Readings", "gauge"):
-            self._readings = server.gui.add_html("")
-        panel.dock_left()
-        panel.set_width(310)
+        self._readings = place_panels(server)
         self._add_controls()
         self._show(0.0)
         self._loop.start()
@@ -187,11 +184,7 @@ class RobotPage:
         place_floor(server, robot)
         place_lights(server, robot)
         place_camera(server, robot, self._home[None])
-        panel = server.gui.add_panel()
-        with panel.add_tab("Readings", "gauge"):
-            self._readings = server.gui.add_html("")
-        panel.dock_left()
-        panel.set_width(310)
+        self._readings = place_panels(server)
         with server.gui.add_folder("Joints"):
             self._sliders = [self._slider(i) for i in range(robot.n)]
         home = server.gui.add_button("Home", icon="home")
@@ -248,7 +241,7 @@ def recorded(build: Scene) -> str:
         for t in np.linspace(0.0, duration, round(_RATE * duration) + 1)[: None if duration else 0]:
             show(float(t))
             serializer.insert_sleep(1 / _RATE)
-        return str(serializer.as_html()).replace(*TITLES, 1)
+        return named_page(str(serializer.as_html()).encode()).decode()
     finally:
         close_window(server)
 

@@ -14,10 +14,10 @@ from orthocas.simulation.trajectory import Trajectory
 from orthocas.tools.checks import as_path
 from orthocas.tools.files import published, require_replaceable, require_writable
 from orthocas.viewer.chart_page import ChartPage
-from orthocas.viewer.looks import Look, stick_arm, urdf_look
+from orthocas.viewer.looks import Look, decimated, stick_arm, urdf_look
 from orthocas.viewer.motion import Motion, require_joints
-from orthocas.viewer.panel import Session
 from orthocas.viewer.player import PlayerPage, RobotPage, Scene, chart_scene, motion_scene, recorded, robot_scene
+from orthocas.viewer.session import Session
 from orthocas.viewer.window import LOCAL, close_window, open_window
 
 PORT = 8080
@@ -215,4 +215,4 @@ def shape_of(robot: Robot, robot_file: str | Path | None, locked: Mapping[str, f
     found = urdf_look(as_path("robot_file", robot_file), robot.tree, locked)
     bare = bool(found.missing) or not any(found.look)
     look = [part or (sticks[i] if bare else []) for i, part in enumerate(found.look)]
-    return Shape([*look[:-1], sticks[-1]], found.missing)
+    return Shape(decimated([*look[:-1], sticks[-1]]), found.missing)

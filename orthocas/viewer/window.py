@@ -20,6 +20,7 @@ from functools import lru_cache
 from http import HTTPStatus
 from importlib import import_module
 from math import isfinite
+from pathlib import Path
 from threading import Lock
 from types import ModuleType
 from typing import Any
@@ -28,6 +29,7 @@ import numpy as np
 
 from orthocas.errors import InvalidValueError, OrthocasError, ViewError
 from orthocas.robots.robot import Robot
+from orthocas.robots.spatial import rotation_z_to
 from orthocas.tools.checks import Array, of_extra, require_count
 from orthocas.viewer.looks import chain_length
 
@@ -59,9 +61,19 @@ _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[0-9a-z._-]+)(?::\d{1,5})?")
 LOCAL = "127.0.0.1"
 TITLES = ("<title>Viser</title>", "<title>orthocas</title>")  #: of the page: viser's and ours
 BRAND = (31, 95, 168)
+_SCRIPT = Path(__file__).with_name("page.js")
+_PANELS = 320, 300  # [px] widths of readings and sliders
 _VIEW_ANGLE = 0.7  # [rad] of the camera
-_ROOM = 1.1  # around the arms in the picture
+_ROOM = 1.15  # around the arms in the picture
+_PHONE, _COVERED = 480, 0.5  # [px] width of a screen up to which the panel lies on the scene, and the share it covers
+_NEAR = 1e-3  # share of the distance of a camera within which it stands where it was placed
 _FLAT = 1e-9
+_FLOOR, _FADE, _LINE = (
+    1.5,
+    0.5,
+    0.002,
+)  # radius of the floor and thickness of its lines, as shares of the arm; where they fade
+_GRID = (205, 210, 217), (228, 231, 235)  # colours of every fifth line, and of the others
 Job = Callable[[], None]
 Tick = Callable[[float], bool]  #: seconds since it began -> whether it goes on
 _starting = Lock()
@@ -384,8 +396,9 @@ def titled(answer: Any) -> Any:
 
 @lru_cache(maxsize=2)
 def named_page(body: bytes, packed: bool = False) -> bytes:
-    """viser's page with our title."""
+    """viser's page with our title and our script, before its own."""
     page = (gzip.decompress(body) if packed else body).replace(TITLES[0].encode(), TITLES[1].encode(), 1)
+    page = page.replace(b"<head>", b"<head><script>" + _SCRIPT.read_bytes() + b"</script>", 1)
     return gzip.compress(page) if packed else page
 
 
@@ -481,23 +494,88 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
     middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 0.4 * chain_length(robot.tree))
     up = up_of(robot)
     server.scene.set_up_direction(tuple(up))
+    frame = Framing(middle, direction_of_camera(robot), up, _ROOM * radius / np.sin(_VIEW_ANGLE / 2))
     camera = server.initial_camera
     camera.fov = _VIEW_ANGLE
-    camera.position = tuple(middle + _ROOM * radius / np.sin(_VIEW_ANGLE / 2) * direction_of_camera(robot))
-    camera.look_at = tuple(middle)
+    position, look_at = frame.seen_from(1, 1)
+    camera.position, camera.look_at = tuple(position), tuple(look_at)
+    server.on_client_connect(frame.keep)
+
+
+@dataclass(frozen=True, eq=False)
+class Framing:
+    """Keeps arms in the pictures of browsers of any shape, until somebody turns the scene."""
+
+    middle: Array  #: of the arms (3,) [m]
+    direction: Array  #: unit vector to the camera (3,)
+    up: Array  #: (3,)
+    distance: float  #: of the camera for a picture that is as wide as high, or wider [m]
+
+    def seen_from(self, width: float, height: float) -> tuple[Array, Array]:
+        """Position of the camera and the point that it looks at (3,) [m], for a picture of a size in pixels.
+
+        On phones, the panel covers the lower half.
+        """
+        free = height * (1 - _COVERED if 1 < width <= _PHONE else 1.0)
+        distance = self.distance * height / min(width, free)
+        across = self.up - (self.up @ self.direction) * self.direction
+        across = across if np.linalg.norm(across) > _FLAT else np.array([0.0, 1.0, 0.0])  # looking down
+        below = (height - free) / height * distance * np.tan(_VIEW_ANGLE / 2) * across / np.linalg.norm(across)
+        return self.middle + distance * self.direction - below, self.middle - below
+
+    def keep(self, client: Any) -> None:
+        """Place the camera of a browser anew when its picture changes its shape."""
+        size, places = (0, 0), [np.array(client.camera.position)]
+
+        def changed(camera: Any) -> None:
+            nonlocal size
+            if not any(np.allclose(camera.position, place, atol=_NEAR * self.distance) for place in places):
+                places.clear()  # somebody has turned the scene
+                return
+            if size != (camera.image_width, camera.image_height):
+                size = camera.image_width, camera.image_height
+                position, look_at = self.seen_from(*size)
+                places.append(position)
+                with client.atomic():
+                    camera.position = position
+                    camera.look_at = look_at
+
+        client.camera.on_update(changed)
+        changed(client.camera)
+
+
+def place_panels(server: Any) -> Any:
+    """Sliders on the right and readings on the left, with the scene between them; returns the HTML of the readings."""
+    server.gui.main_panel.dock_right()
+    server.gui.main_panel.set_width(_PANELS[1])
+    panel = server.gui.add_panel()
+    with panel.add_tab("Readings", "gauge"):
+        html = server.gui.add_html("")
+    panel.dock_left()
+    panel.set_width(_PANELS[0])
+    return html
 
 
 def place_floor(server: Any, robot: Robot) -> None:
-    """A grid under the arm, or behind a planar one."""
+    """A round grid under the arm, or behind a planar one, that fades into the background.
+
+    Lines, because viser's own grid computes every point of the floor, which takes long without a graphics card.
+    """
     size = chain_length(robot.tree)
-    up = np.abs(up_of(robot))
-    plane = "xy" if is_planar(robot) else ("yz", "xz", "xy")[int(np.argmax(up))]
-    position = (0.0, 0.0, -0.15 * size) if is_planar(robot) else (0.0, 0.0, 0.0)
-    cell = 10.0 ** np.round(np.log10(size / 8))
-    server.scene.add_grid(
-        "/floor", plane=plane, infinite_grid=True, position=position, cell_size=cell, section_size=5 * cell,
-        cell_color=(228, 231, 235), section_color=(205, 210, 217), fade_distance=12 * size, shadow_opacity=0.0,
-    )  # fmt: skip
+    radius = _FLOOR * size
+    decade = 10.0 ** np.floor(np.log10(size / 5))
+    cell = decade * max(part for part in (1, 2, 5) if part * decade <= size / 5)
+    numbers = np.arange(-int(radius / cell), int(radius / cell) + 1)
+    half = np.sqrt(radius**2 - (cell * numbers) ** 2)
+    along = np.outer(half, [-1.0, -_FADE, _FADE, 1.0])  # (lines, 4)
+    across = np.repeat(cell * numbers[:, None], 4, axis=1)
+    points = np.stack([along, across, 0 * along], axis=2)
+    shade = np.where((numbers % 5 == 0)[:, None], *_GRID)
+    fade = np.stack([0 * shade + 255, shade, shade, 0 * shade + 255], axis=1)  # into the white of the background
+    lines, colours = np.concatenate([points, points[..., [1, 0, 2]]]), np.concatenate([fade, fade])
+    lines = lines - [0.0, 0.0, 0.15 * size] if is_planar(robot) else lines @ rotation_z_to(up_of(robot)).T
+    ends, shades = (np.stack([rows[:, :-1], rows[:, 1:]], axis=2).reshape(-1, 2, 3) for rows in (lines, colours))
+    server.scene.add_line_segments("/floor", ends, shades.astype(np.uint8), thickness=_LINE * size)
 
 
 def place_lights(server: Any, robot: Robot) -> None:

@@ -27,7 +27,7 @@ import orthocas as oc
 from orthocas import bases, control, learn, plotting, problems, simulation, solvers, viewer
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
-from orthocas.viewer.panel import Session
+from orthocas.viewer.session import Session
 
 Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments that it takes
 

@@ -1,0 +1,207 @@
+"""What a user's wishes do to the joints of a chart: wishes, undo, home, and the mirrored arm."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.charts.chart import Chart
+from orthocas.charts.self_motion import Stop, StopKind, Walls, fan_along
+from orthocas.charts.solutions import TrackerStatus
+from orthocas.errors import InvalidValueError
+from orthocas.robots.robot import Robot
+from orthocas.tasks.branches import Branches
+from orthocas.tools.checks import Array, as_number, as_point, require_kind, require_known
+from orthocas.viewer.panel import Readers, Readings
+
+MOST_STEPS = 200  # of the tracker towards one wish
+_SHORTEST = 1e-4  # share of the way to a wish below which there is no way on
+_REACHED = 1e-10  # of the sizes of the components
+_MOST_UNDONE = 100
+
+
+def told(stop: Stop, robot: Robot) -> str:
+    """What ends a motion; a joint's position with its unit."""
+    if stop.kind is not StopKind.JOINT:
+        return str(stop)
+    slides = robot.tree.prismatic[robot.joint_names.index(stop.joint)]
+    place = f"{stop.value:.3f} m" if slides else f"{np.degrees(stop.value):.1f}°"
+    return f"joint '{stop.joint}' at {place}, {'its limit' if stop.is_limit else 'the boundary of the domain'}"
+
+
+class Session:
+    """A joint position of a chart that follows what is wished for components of phi.
+
+    A wish names components of phi, such as {"xi1": 0.2}; the others keep their values. `follow` moves q along the
+    straight line in phi with a tracker, so within the domain and without jumps. Where the line leaves the domain or
+    meets a fold, q stays before it, and the wish is given up. A session belongs to one thread.
+
+    Args:
+        chart: a fitted chart.
+        q: where to begin, (n,); default: the centre of the domain.
+
+    Raises:
+        NoExpressionError: if the coordinates are grown.
+        InvalidValueError: if q lies outside the domain, or J is singular there.
+    """
+
+    flips: tuple[int, ...] = ()  #: cuts of `branches` at which the arm is mirrored
+    branches: Branches | None = None  #: of the robot, once they were asked for
+    beyond = 0.0  #: how far a wish for a coordinate may lie beyond its ends in the chart, as a share of their distance
+    _wished: Array  #: phi, (n,)
+
+    def __init__(self, chart: Chart, q: Array | None = None) -> None:
+        require_kind("chart", chart, Chart)
+        self.home: Array = chart.problem.domain.centre if q is None else as_point("q", q, chart.n)
+        self._past: list[tuple[Array, tuple[int, ...]]] = []
+        self._limited = False  # whether a joint limit of the mirrored arm stopped it
+        self._use(chart, self.home)
+
+    @property
+    def place(self) -> str:
+        """Where the chart belongs, if there are several; the branch of a mirrored arm."""
+        if not (self.branches and self.flips):
+            return ""
+        found = self.branches.of(self.shown(self.q[None])[0])
+        return f"mirrored: branch {found.name if found else 'without a name'}"
+
+    @property
+    def q(self) -> Array:
+        """The joint position, (n,)."""
+        return self._tracker.q
+
+    @property
+    def readings(self) -> Readings:
+        """What the page shows about q; the task should have the value that was last wished for."""
+        return self._readers.at(self.q, self._wished[: self.chart.m], self.stop)
+
+    def shown(self, q: Array) -> Array:
+        """The arm at positions of the chart (N, n), mirrored at `flips`: other joints, the same pose of the tip."""
+        for cut in self.flips:
+            assert self.branches is not None
+            q = np.array([self.branches.mirrored(point, cut) for point in q])
+        return q
+
+    def allowed(self, q: Array) -> NDArray[np.bool_]:
+        """Whether the arm at positions of the chart (N, n) is within its joint limits when it is mirrored, (N,)."""
+        robot, shown = self.chart.problem.robot, self.shown(q)
+        return np.asarray(((shown >= robot.lower) & (shown <= robot.upper)).all(axis=1)) | (not self.flips)
+
+    def flip(self, cut: int) -> None:
+        """Mirror the arm at one of `branches.mirrors`, or turn it back; the tip keeps its pose.
+
+        Coordinates of the mirrored arm are those of its image in the chart, so no other chart is needed. If a joint
+        limit is in the way, xi goes to the nearest value where none is.
+
+        Raises:
+            InvalidValueError: if a joint limit is in the way at all values of xi.
+        """
+        self.remember()
+        before, self.flips = self.flips, tuple(sorted({*self.flips} ^ {cut}))
+        curves = [fan_along(self.chart, self.q, k).q for k in range(self.chart.r)]
+        places = np.concatenate([self.q[None], *curves])
+        good = places[self.allowed(places)]
+        if not len(good):
+            self.flips = before
+            raise InvalidValueError("the mirrored arm", "beyond its joint limits", "another pose of the tip")
+        self._place(good[np.argmin(np.linalg.norm(good - self.q, axis=1))])
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is an earlier joint position to return to."""
+        return bool(self._past)
+
+    def wish(self, values: Mapping[str, float]) -> None:
+        """Wish for values of some components of phi, by their labels.
+
+        Raises:
+            UnknownNameError, InvalidValueError: if there is no such component, or a value is not finite.
+        """
+        require_kind("values", values, Mapping)
+        wished = self._wished.copy()
+        for label, value in values.items():
+            require_known("component of phi", str(label), self.chart.labels)
+            number = as_number(f"wish for {label}", value)
+            if not np.isfinite(number):
+                raise InvalidValueError(f"wish for {label}", value, "a finite number")
+            wished[self.chart.labels.index(label)] = number
+        self._wished = wished
+
+    def follow(self, most_steps: int = MOST_STEPS) -> bool:
+        """Move towards the wish. Returns whether q has moved; afterwards the wish is met, given up, or still ahead."""
+        moved = False
+        for _ in range(most_steps):
+            here = self.chart.phi(self.q)
+            if not self._far(here).any():
+                break
+            if not self._step(here):
+                self._give_up(here)
+                break
+            moved, self.stop = True, ""
+        return moved
+
+    def remember(self) -> None:
+        """Keep the joint position, for `undo`."""
+        if not self._past or not self._is_here(*self._past[-1]):
+            self._past = [*self._past[-_MOST_UNDONE:], (self.q, self.flips)]
+
+    def undo(self) -> None:
+        """Return to the last joint position that was remembered and is another one."""
+        while self._past:
+            before, flips = self._past.pop()
+            if not self._is_here(before, flips):
+                self.flips = flips
+                self._place(before)
+                return
+
+    def go_home(self) -> None:
+        """Return to where the session began."""
+        self.remember()
+        self.flips = ()
+        self._place(self.home)
+
+    def _is_here(self, q: Array, flips: tuple[int, ...]) -> bool:
+        """Whether the arm is there."""
+        return bool((q == self.q).all()) and flips == self.flips
+
+    def _step(self, here: Array) -> bool:
+        """Step as far along the line as the tracker allows. Returns whether it allows any step."""
+        share, before, self._limited = 1.0, self.q, False
+        while share >= _SHORTEST:
+            self._tracker.step(here + share * (self._wished - here))
+            if self._tracker.status is TrackerStatus.OK:
+                if self.allowed(self.q[None])[0]:
+                    return True
+                self._tracker.reset(before)
+                self._limited = True
+            share /= 2
+        return False
+
+    def _give_up(self, here: Array) -> None:
+        """Wish for what there is in place of what cannot be, and say what is in the way."""
+        self.stop = self._reason()
+        self._wished = np.where(self._far(here), here, self._wished)
+
+    def _far(self, here: Array) -> NDArray[np.bool_]:
+        """Which components of phi are not yet what is wished for, (n,)."""
+        return np.asarray(np.abs((self._wished - here) / self.chart.phi_sizes) > _REACHED)
+
+    def _reason(self) -> str:
+        if self._limited:
+            return "a joint limit of the mirrored arm"
+        if self._tracker.status is not TrackerStatus.OUTSIDE_DOMAIN:
+            return "a fold of the chart or a singular position"
+        return told(self._walls.worst(self.q), self.chart.problem.robot)
+
+    def _use(self, chart: Chart, q: Array) -> None:
+        """Go on in a chart, at rest at a joint position."""
+        self.chart = chart
+        self._tracker = chart.tracker(q)
+        self._readers, self._walls = Readers(chart), Walls(chart.problem)
+        self._wished = chart.phi(q)
+        self.stop = ""  #: what stopped the last motion, or ""
+
+    def _place(self, q: Array) -> None:
+        self._tracker.reset(q)
+        self._wished = self.chart.phi(q)
+        self.stop = ""
