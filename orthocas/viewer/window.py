@@ -529,6 +529,8 @@ class Framing:
 
         def changed(camera: Any) -> None:
             nonlocal size
+            if min(camera.image_width, camera.image_height) < 1 or np.allclose(camera.look_at, camera.position):
+                return  # no picture
             if not any(np.allclose(camera.position, place, atol=_NEAR * self.distance) for place in places):
                 places.clear()  # somebody has turned the scene
                 return
