@@ -5,7 +5,9 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +30,7 @@ from orthocas.fitting.grid import run_cells
 from orthocas.solvers.protocol import BestPoint, Status
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred, ended_in_order, remembered
+from orthocas.tools.processes import run_program
 from orthocas.tools.progress import Progress
 
 
@@ -182,6 +185,56 @@ def test_ctrl_c_while_python_ends_needs_no_handler() -> None:
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_a_signal_that_python_loses_itself_says_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    """Python calls back when a weak reference dies, and only reports exceptions there."""
+
+    class Thing:
+        pass
+
+    def interrupted(_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    def broken(_: object) -> None:
+        raise ValueError("a defect")
+
+    hook = sys.unraisablehook
+    seen: list[type[BaseException]] = []
+    sys.unraisablehook = lambda lost: seen.append(lost.exc_type)
+    try:
+        with ended_in_order(), remembered() as pressed:
+            for callback in (interrupted, broken):
+                thing = Thing()
+                kept = weakref.ref(thing, callback)
+                del thing
+            assert pressed()
+            assert kept() is None
+    finally:
+        sys.unraisablehook = hook
+    assert seen == [ValueError]
+
+
+def test_ctrl_c_ends_a_compiler_with_what_it_has_started(tmp_path: Path) -> None:
+    """gcc starts cc1, which would go on."""
+    mark = tmp_path / "started"
+    code = f"(sleep 60 & echo $! > {mark}; wait)"
+
+    def press() -> None:
+        while not mark.exists() or not mark.read_text().strip():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with ThreadPoolExecutor(1) as pool:
+        pressed = pool.submit(press)
+        with pytest.raises(KeyboardInterrupt):
+            run_program(["sh", "-c", code])
+        pressed.result()
+    status = Path(f"/proc/{mark.read_text().strip()}/stat")
+    end = time.monotonic() + 10
+    while status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z" and time.monotonic() < end:
+        time.sleep(0.01)
+    assert time.monotonic() < end
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])

@@ -3,7 +3,6 @@
 import ctypes
 import hashlib
 import os
-import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -23,6 +22,7 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_path
 from orthocas.tools.files import digest, draft_folder, made_folder, published
 from orthocas.tools.interrupts import deferred
+from orthocas.tools.processes import run_program
 
 _FLAGS = ("-O2",)  # -O3 takes twice as long, and gains little
 _PREFIX = "kernel"
@@ -56,7 +56,7 @@ def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
             for file, text in sources.items():
                 (place / file).write_text(text, encoding="utf-8")
             code = [str(place / file) for file in sources if file.endswith(".c")]
-            _compile([compiler, *options, "-o", str(drafts / name), *code, "-lm"])
+            run_program([compiler, *options, "-o", str(drafts / name), *code, "-lm"])
             (drafts / f"{name}.sha256").write_text(digest(drafts / name))
     return library
 
@@ -106,12 +106,6 @@ def _is_whole(library: Path) -> bool:
 def template(name: str) -> str:
     """A file of `templates/`."""
     return (files(__package__) / "templates" / name).read_text()
-
-
-def _compile(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise CompileError(f"{' '.join(command)} failed: {done.stderr[:500]}")
 
 
 def _cache() -> Path:

@@ -2,7 +2,6 @@
 
 import ctypes
 import shutil
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from orthocas.control.controller import Controller
 from orthocas.errors import CompileError
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, require_shape
+from orthocas.tools.processes import run_program
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 NO_DOUBLE = ("-Wdouble-promotion", "-Wfloat-conversion")  #: for code in single precision
@@ -57,9 +57,7 @@ def compile_shared(
     compiler = compilers()[0] if compiler is None else compiler
     warnings = (*STRICT, *(NO_DOUBLE if generated.single_precision else ()))
     command = [compiler, *warnings, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise CompileError(f"{' '.join(command)} failed: {done.stderr[:500]}")
+    run_program(command)
     return library
 
 

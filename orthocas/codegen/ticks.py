@@ -1,6 +1,5 @@
 """How long a control tick takes: calls of compiled controllers, timed in C in one process."""
 
-import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -13,11 +12,11 @@ from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers,
 from orthocas.codegen.library_files import write_library
 from orthocas.control.controller import Controller
 from orthocas.control.operational_space import PDPlus
-from orthocas.errors import CompileError
 from orthocas.tasks.domains import contains
 from orthocas.tools.checks import Array
 from orthocas.tools.files import draft_folder
 from orthocas.tools.interrupts import deferred
+from orthocas.tools.processes import run_program
 
 _STATES = 64  # as in templates/ticks.c
 _MICROSECONDS = 3e5  # to spend on one measurement
@@ -63,20 +62,13 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
         source = files(__package__) / "templates" / "ticks.c"
         (folder / "ticks.c").write_text(source.read_text())
         number = f"-DNUMBER={first.precision.c_name}"
-        _run([compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
+        run_program([compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
         arguments = [str(program), str(data), str(calls), str(cases[0][0].problem.n)]
         for law, library in cases:
             sizes = (3 * len(law.labels), len(gain_numbers(law)))
             arguments += [str(library.path), f"{library.name}_control", *map(str, sizes)]
-        lines = _run(arguments).splitlines()
+        lines = run_program(arguments).splitlines()
     return [Ticks(*map(float, line.split())) for line in lines]
-
-
-def _run(command: list[str]) -> str:
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise CompileError(f"{command[0]} failed with exit code {done.returncode}: {done.stderr[:500]}")
-    return done.stdout
 
 
 def _states(law: Controller) -> Array:

@@ -9,11 +9,12 @@ a fit that remembers signals (`remembered`, `ended_in_order`) ends as interrupte
 """
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 _ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
@@ -70,7 +71,8 @@ def ended_in_order() -> Iterator[Callable[[], int]]:
     """Turn SIGTERM and SIGHUP into SystemExit with 128 + their number, so that drafts go away; for command lines.
 
     Signals that the program ignores stay ignored, as under nohup. The value is a function that returns that exit code
-    if one has come, even if its exception got lost, else 0.
+    if one has come, even if its exception got lost, else 0. Python says nothing of exceptions of signals that it loses
+    itself, in callbacks of weak references.
     """
     memory = _Note()
     _ends.append(memory)
@@ -78,12 +80,24 @@ def ended_in_order() -> Iterator[Callable[[], int]]:
     for number, handler in before.items():
         if handler is signal.SIG_DFL:
             signal.signal(number, _end)
+    complain, sys.unraisablehook = sys.unraisablehook, _without_signals(sys.unraisablehook)
     try:
         yield lambda: 0 if memory.number is None else 128 + memory.number
     finally:
+        sys.unraisablehook = complain
         _ends.remove(memory)
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _without_signals(complain: Callable[[Any], object]) -> Callable[[Any], object]:
+    """A `sys.unraisablehook` for all but exceptions of signals."""
+
+    def hook(lost: Any) -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt | SystemExit):
+            complain(lost)
+
+    return hook
 
 
 @contextmanager

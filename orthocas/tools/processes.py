@@ -4,6 +4,7 @@ import ctypes
 import logging
 import os
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +17,7 @@ from multiprocessing.connection import wait
 from multiprocessing.synchronize import Event
 from typing import Any
 
-from orthocas.errors import ArchiveError, SchedulerError
+from orthocas.errors import ArchiveError, CompileError, SchedulerError
 from orthocas.tools.interrupts import deferred
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
@@ -196,6 +197,27 @@ def _blocked(number: signal.Signals) -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def run_program(command: Sequence[str]) -> str:
+    """What a compiler or a program that it made prints. Ctrl-C ends it with all that it started, as gcc does cc1.
+
+    Raises:
+        CompileError: if it fails; the message has the first lines of its complaint.
+    """
+    group, pipe = 0 if hasattr(os, "killpg") else None, subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, process_group=group) as program:
+        try:
+            said, complaint = program.communicate()
+        except BaseException:
+            if group is not None:
+                os.killpg(program.pid, signal.SIGKILL)
+            program.kill()
+            program.wait()
+            raise
+    if program.returncode != 0:
+        raise CompileError(f"{' '.join(command)} failed with exit code {program.returncode}: {complaint[:500]}")
+    return said
 
 
 @contextmanager
