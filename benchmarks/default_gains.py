@@ -5,6 +5,10 @@ than the law's model, or carries 1 kg that the law does not know, at the tip. Fi
 hold still for 1.5 s, then a step of 40 mm in x and one in the first extra coordinate, 1.5 s each, through the low pass
 of the paper; smaller ones, or in the other direction, where these leave the domain. The last table is the supervised
 law, which holds still, without and with integral action.
+
+`--delays` prints how gains for a stated delay settle: seven ready charts, from the posture of the fastest mode and four
+others in the domain, from slow motions (5 % of the domain's half-width a second), with torques that come so late.
+Speed left: the fastest joint after 1.3 to 1.5 s, at worst.
 """
 
 import argparse
@@ -16,13 +20,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from benchmark import table
 
 import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import Supervisor
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
 from orthocas.control import ControlStatus, PDPlus, Reference, Safety
-from orthocas.control.gains import mobility
+from orthocas.control.gains import fastest_posture, mobility
 from orthocas.errors import UnreachableReferenceError
 from orthocas.problems.iiwa import urdf_path
 from orthocas.simulation import MuJoCoPlant
@@ -55,6 +60,15 @@ PLANTS = {
 }
 RATE = 1000.0  # [Hz]
 DELAY = 5  # ticks from the measurement to the torque
+DELAYS, INNER = (5, 10), 0.9  # [ms], ticks; share of the domain of the postures
+DELAY_HEADER = (
+    "| chart | 5 ms: fastest mode [Hz] | speed left [rad/s] "
+    "| 10 ms: fastest mode [Hz] | speed left [rad/s] |\n| --- | --- | --- | --- | --- |"
+)
+ARMS = (
+    *("iiwa7-position", "panda-position", "panda-pose", "xarm7-position", "baxter-left-position"),
+    *("tiago-pro-left-position", "ur5-position"),
+)
 INTEGRAL, LONG = 3.0, 2.0  # rate of the integral action [1/s], for the last table [s]
 HOLD, STEP, XI = 1.5, 0.04, 0.15  # [s], [m], [1]
 
@@ -190,8 +204,42 @@ def followed(law: PDPlus, library: CompiledLibrary, plant: MuJoCoPlant, q: np.nd
     return [distances[min(len(distances), round(HOLD * RATE)) - 1], max(distances), lost]
 
 
-def main(quick: bool = False, modes_alone: bool = False) -> list[str]:
-    """Print the tables; `quick` takes one arm and one start, `modes_alone` stops after the first table."""
+def delay_row(name: str) -> str:
+    """For each delay: fastest mode [Hz], and the fastest joint in the end, with default gains and matched ones."""
+    chart = oc.charts.load(name)
+    words = [name]
+    default = PDPlus.on_chart(chart)
+    with compiled(default) as library:  # gains are arguments
+        for delay in DELAYS:
+            law = PDPlus.on_chart(chart, delay=delay / RATE)
+            ends = [settled(each, library, delay) for each in (default, law)]
+            words += [f"{law.modes().frequencies.max():.1f}", " -> ".join(f"{end:.3f}" for end in ends)]
+    return f"| {' | '.join(words)} |"
+
+
+def settled(law: PDPlus, library: CompiledLibrary, delay: int) -> float:
+    """The fastest joint of the last of 1.5 s, at the worst of five postures [rad/s]."""
+    domain, rng, plant = law.problem.domain, np.random.default_rng(5), MuJoCoPlant(law.problem.robot)
+    fastest = fastest_posture(law.chart, law.stiffness, law.problem.robot)
+    inner = sample_uniform(domain, 4, 1)
+    gains, most = gain_numbers(law), 0.0
+    for q in domain.centre + INNER * (np.vstack([fastest, inner]) - domain.centre):
+        plant.reset(q, 0.05 * domain.half_width * rng.uniform(-1, 1, law.chart.n))
+        late = deque([law.problem.robot.gravity(q)] * (delay - 1))  # half a tick of holding, half of computing
+        reference = np.concatenate([law.chart.phi(q), np.zeros(2 * law.chart.n)])
+        speeds = []
+        for _ in range(round(HOLD * RATE)):
+            late.append(library.control(plant.q, plant.dq, reference, gains)[0])
+            plant.step(late.popleft(), 1 / RATE)
+            speeds.append(np.abs(plant.dq).max())
+        most = max(most, *speeds[-200:])
+    return most
+
+
+def main(quick: bool = False, modes_alone: bool = False, delays: bool = False) -> list[str]:
+    """Print the tables; `quick` takes one arm and one start, `modes_alone` and `delays` each one table."""
+    if delays:
+        return table(DELAY_HEADER, map(delay_row, ARMS[:1] if quick else ARMS))
     laws = {f"{', '.join(case)}": PDPlus.on_chart(chart_of(*case)) for case in (CASES[:1] if quick else CASES)}
     rows = [modes_row(label, law) for label, law in laws.items()]
     print("\n".join(rows), flush=True)
@@ -206,5 +254,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one arm and one start")
     parser.add_argument("--modes", action="store_true", help="the first table alone (40 s)")
+    parser.add_argument("--delays", action="store_true", help="gains for stated delays (5 min)")
     options = parser.parse_args()
-    main(options.quick, options.modes)
+    main(options.quick, options.modes, options.delays)

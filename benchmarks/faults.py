@@ -1,4 +1,4 @@
-"""What goes wrong around the supervised law, in MuJoCo: sensors, blows, references, delays, brakes (10 min).
+"""What goes wrong around the supervised law, in MuJoCo: sensors, blows, references, delays, brakes (20 min).
 
 PD+ coupled of ready charts with default gains and settings, in C at 1 kHz, on arms without rotor inertia. Each case
 runs 13 times, from random postures in the inner half of the domain:
@@ -13,10 +13,16 @@ runs 13 times, from random postures in the inner half of the domain:
 - Delays of 0, 1, 3 and 5 ms from the measurement to the torque: the catcher holds arms anywhere in the joint range (at
   most half a turn) that move at up to 0.5 rad/s.
 - Brakes hold for 2 s while the reference goes on.
+
+All of this once with true positions and velocities, and once with encoders of 13 bits a turn, their differences as
+velocities, and the observer of the supervised law; sliding joints turn them once in 5 cm. The second table is an arm
+whose joints follow such sines, from rest, with encoders of 12 to 14 bits, without and with the observer, for 1.5 s;
+then the same with masses 20 % off and torques 5 ms late, and with a force of 50 N at the tip for 0.1 s.
 """
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,6 +30,7 @@ from typing import Any
 
 import numpy as np
 from benchmark import run, table
+from numpy.typing import ArrayLike
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
@@ -33,11 +40,20 @@ from orthocas.tools.checks import Array
 
 ARMS = ("iiwa7-position", "panda-position", "xarm7-position", "tiago-pro-left-position", "panda-pose")
 RUNS, TICK, SETTLED = 13, 1e-3, 400
+OBSERVED_RUNS = 5  # of the second table
 LOOK = 200  # ticks after sensors stand still
 REST = 0.05  # [rad/s]
+OBSERVED = {12: 40.0, 13: 60.0, 14: 80.0}  # bits of encoders, and poles of the observer of velocities [1/s]
+TRAVEL = 0.05  # of a sliding joint in a turn of its encoder [m]
+PUSH = 50.0, 500, 600  # [N], from and to a tick
 HEADER = (
     "| chart | sensors stand still [rad/s] | blow, at once and 1.5 s later [rad/s] | references [speed limit] "
     "| caught with 0 to 5 ms: at rest after, back | brakes open [rad/s] |\n| --- | --- | --- | --- | --- | --- |"
+)
+OBSERVED_HEADER = (
+    "| chart | bits | torque at its rate limit [% of ticks] | change a tick, rms [N m] | flange off [mm] "
+    "| +20 %, 5 ms late: flange off [mm] | push: speed off 0.9 s later [rad/s] | caught, of 5 |\n"
+    "| --- | --- | --- | --- | --- | --- | --- | --- |"
 )
 
 
@@ -50,6 +66,8 @@ class Arm:
     library: CompiledLibrary
     safety: Safety
     rng: np.random.Generator
+    bits: int = 0  #: of the encoders, a turn; 0: no rounding
+    before: Array | None = None  #: what they measured last
 
     @property
     def robot(self) -> oc.Robot:
@@ -79,35 +97,141 @@ class Arm:
         plant = MuJoCoPlant(self.robot if robot is None else robot)
         plant.reset(q)
         supervisor.start(q)
+        self.before = None
         return supervisor, plant
 
+    def with_encoders(self, bits: int, poles: float) -> "Arm":
+        """The same arm with encoders, and poles of the observer [1/s]; 0: none."""
+        rates = np.full(self.chart.n, poles)
+        return replace(self, safety=replace(self.safety, observer_rate=rates), rng=np.random.default_rng(7), bits=bits)
 
-def main(quick: bool = False) -> list[str]:
-    """Print the table."""
-    return table(HEADER, rows(ARMS[:1] if quick else ARMS, 1 if quick else RUNS))
+    def seen(self, plant: MuJoCoPlant) -> tuple[Array, Array]:
+        """Measured positions and velocities (n,), the differences of what encoders count."""
+        if self.bits == 0:
+            return plant.q, plant.dq
+        count = np.where(self.robot.tree.prismatic, TRAVEL, 2 * np.pi) / 2**self.bits
+        q = count * np.round(plant.q / count)
+        dq = 0 * q if self.before is None else (q - self.before) / TICK
+        self.before = q
+        return q, dq
+
+
+def main(quick: bool = False) -> dict[str, int]:
+    """Print the tables; return the number of runs."""
+    arms, runs = (ARMS[:1], 1) if quick else (ARMS, RUNS)
+    faults = table(HEADER, rows(arms, runs))
+    observed = table(OBSERVED_HEADER, observed_rows(arms, min(runs, OBSERVED_RUNS)))
+    each = len(STANDING) + 1 + len(ASKED) + len(DELAYS) + 1
+    found = {"faults": runs * each * len(faults), "observed": 4 * min(runs, OBSERVED_RUNS) * len(observed)}
+    found["runs"] = sum(found.values())
+    print(found)
+    return found
+
+
+@contextmanager
+def arm_of(name: str) -> Iterator[Arm]:
+    """An arm with its law in C."""
+    chart = oc.charts.load(name)
+    law = PDPlus.on_chart(chart)
+    with TemporaryDirectory() as folder:
+        path = compile_shared(oc.generate_c(chart, Path(folder), law, "arm"), Path(folder), ("-O1",))
+        yield Arm(chart, law, CompiledLibrary(path, "arm", chart.n), Safety.of(law), np.random.default_rng(7))
 
 
 def rows(arms: tuple[str, ...], runs: int) -> Iterator[str]:
-    """A row for each arm: the worst of all runs of each case."""
+    """Two rows for each arm, without and with encoders: the worst of all runs of each case."""
     for name in arms:
-        chart = oc.charts.load(name)
-        law = PDPlus.on_chart(chart)
-        with TemporaryDirectory() as folder:
-            path = compile_shared(oc.generate_c(chart, Path(folder), law, "arm"), Path(folder), ("-O1",))
-            library = CompiledLibrary(path, "arm", chart.n)
-            arm = Arm(chart, law, library, Safety.of(law), np.random.default_rng(7))
-            frozen = [max(stands_still(arm, case) for _ in range(runs)) for case in STANDING]
-            blown = np.array([blow(arm) for _ in range(runs)]).max(axis=0)
-            asked = [max(led(arm, case) for _ in range(runs)) for case in ASKED]
-            held = np.array([caught(arm, delay) for delay in (0, 1, 3, 5) for _ in range(runs)])
-            opened = max(brakes(arm) for _ in range(runs))
-        yield (
-            f"| {name} | {', '.join(f'{speed:.1f}' for speed in frozen)} | {blown[0]:.0f}, {blown[1]:.2f} "
-            f"| {', '.join(f'{share:.2f}' for share in asked)} | {held[:, 0].max():.2f} s, "
-            f"{int(held[:, 1].sum())} of {len(held)} | {opened:.3f} |"
-        )
+        with arm_of(name) as arm:
+            yield row(arm, name, runs)
+            yield row(arm.with_encoders(13, OBSERVED[13]), f"{name}, encoders", runs)
 
 
+def row(arm: Arm, label: str, runs: int) -> str:
+    """The worst of all runs of each case."""
+    frozen = [max(stands_still(arm, case) for _ in range(runs)) for case in STANDING]
+    blown = np.array([blow(arm) for _ in range(runs)]).max(axis=0)
+    asked = [max(led(arm, case) for _ in range(runs)) for case in ASKED]
+    held = np.array([caught(arm, delay) for delay in DELAYS for _ in range(runs)])
+    opened = max(brakes(arm) for _ in range(runs))
+    return (
+        f"| {label} | {', '.join(f'{speed:.1f}' for speed in frozen)} | {blown[0]:.0f}, {blown[1]:.2f} "
+        f"| {', '.join(f'{share:.2f}' for share in asked)} | {held[:, 0].max():.2f} s, "
+        f"{int(held[:, 1].sum())} of {len(held)} | {opened:.3f} |"
+    )
+
+
+def observed_rows(arms: tuple[str, ...], runs: int) -> Iterator[str]:
+    """A row for each arm and encoder: all runs without and with the observer, and with what else goes wrong."""
+    for name in arms:
+        with arm_of(name) as arm:
+            for bits, rate in OBSERVED.items():
+                before, after, wrong, pushed = (
+                    [moves(arm.with_encoders(bits, poles), **case) for _ in range(runs)]
+                    for poles, case in (
+                        (0.0, {}),
+                        (rate, {}),
+                        (rate, {"scale": 1.2, "delay": 5}),
+                        (rate, {"push": PUSH[0]}),
+                    )
+                )
+                words = [f"{mean:{form}} -> {new:{form}}" for mean, new, form in compared(before, after)]
+                lost = [sum(found.caught for found in case) for case in (before, after, wrong, pushed)]
+                yield (
+                    f"| {name} | {bits} | {' | '.join(words)} | {1e3 * max(found.away for found in wrong):.1f} "
+                    f"| {max(found.last for found in pushed):.2f} | {', '.join(map(str, lost))} |"
+                )
+
+
+def compared(before: list["Motion"], after: list["Motion"]) -> Iterator[tuple[float, float, str]]:
+    """Ticks at the limit of the rate [%], change of the torque in a tick [N m], flange [mm]; how to print them."""
+    for take, form in (
+        (lambda case: 100 * np.mean([found.cut for found in case]), ".0f"),
+        (lambda case: np.sqrt(np.mean([found.noise**2 for found in case])), ".2f"),
+        (lambda case: 1e3 * max(found.away for found in case), ".1f"),
+    ):
+        yield float(take(before)), float(take(after)), form
+
+
+@dataclass
+class Motion:
+    """What a motion with encoders was like."""
+
+    cut: float  #: share of the ticks in which the torque changes as fast as it may
+    noise: float  #: change of torques in a tick, root of the mean square [N m]
+    away: float  #: largest distance of the flange from its reference [m]
+    last: float  #: fastest joint at the end, less what the reference asks for [rad/s]
+    caught: bool
+
+
+def moves(arm: Arm, scale: float = 1.0, delay: int = 0, push: float = 0.0) -> Motion:
+    """Sines of all joints, of up to 0.2 rad/s, or half their limits."""
+    chart, q = arm.chart, arm.posture()
+    robot = arm.robot.with_scaled_masses(scale)
+    supervisor, plant = arm.started(q, robot)
+    swing = arm.rng.choice([-1.0, 1.0], chart.n) * np.minimum(0.1, 0.25 * arm.limits)
+    unit = arm.rng.normal(size=3)
+    angle = 2 * TICK * np.arange(-SETTLED, 1500).clip(0)[:, None]
+    wanted, speed = q + swing * (1 - np.cos(angle)), 2 * swing * np.sin(angle)
+    asked = motion(chart, wanted, speed, 4 * swing * np.cos(angle) * (angle > 0))
+    late, commands, path, caught = deque([arm.robot.gravity(q)] * delay), [], [], False
+    for k, reference in enumerate(asked):
+        if push and k - SETTLED in PUSH[1:]:
+            plant.push(push * unit / np.linalg.norm(unit) * (k - SETTLED == PUSH[1]))
+        command, status = supervisor.step(*arm.seen(plant), reference, TICK)
+        late.append(command)
+        plant.step(late.popleft(), TICK)
+        commands.append(command)
+        path.append(plant.q)
+        caught |= k >= SETTLED and status in (ControlStatus.CAUGHT, ControlStatus.RETURNING)
+    steps = np.abs(np.diff(commands[SETTLED:], axis=0))
+    away = np.linalg.norm((chart.phi(np.array(path)) - asked[:, : chart.n])[SETTLED:, :3], axis=1).max()
+    cut = (steps >= (1 - 1e-9) * arm.safety.command_rate * TICK).any(axis=1).mean()
+    return Motion(
+        cut, float(np.sqrt(np.mean(steps**2))), float(away), float(np.abs(plant.dq - speed[-1]).max()), caught
+    )
+
+
+DELAYS = 0, 1, 3, 5  # [ms]
 STANDING = ("moving", "way back", "reference", "integral")
 
 
@@ -125,7 +249,8 @@ def stands_still(arm: Arm, case: str) -> float:
     reference, signs, most = arm.resting(q), arm.rng.choice([-1.0, 1.0], arm.chart.n), 0.0
     for k in range(SETTLED + LOOK):
         if k <= SETTLED:
-            seen = plant.q, plant.dq if case == "moving" else (k < SETTLED) * plant.dq
+            q_seen, dq_seen = arm.seen(plant)
+            seen = q_seen, dq_seen if case == "moving" else (k < SETTLED) * dq_seen
         if case == "moving":
             angle = 2 * k * TICK
             reference = motion(arm.chart, q + 0.1 * signs * (1 - np.cos(angle)), 0.2 * signs * np.sin(angle))
@@ -138,10 +263,12 @@ def stands_still(arm: Arm, case: str) -> float:
     return most
 
 
-def motion(chart: oc.Chart, q: Array, dq: Array) -> Array:
-    """The reference of a joint motion, without acceleration of the joints."""
-    curvature = chart.function("second_derivative")(q, dq, dq).full().ravel()
-    return np.concatenate([chart.phi(q), chart.jacobian(q) @ dq, curvature])
+def motion(chart: oc.Chart, q: Array, dq: Array, ddq: ArrayLike = 0.0) -> Array:
+    """References of joint motions (..., n), (..., 3 n)."""
+    curvature = chart.function("second_derivative")(q.T, dq.T, dq.T).full().T.reshape(q.shape)
+    J = chart.jacobian(q)
+    velocity, bend = (np.einsum("...ij,...j", J, rate) for rate in (dq, np.broadcast_to(ddq, q.shape)))
+    return np.concatenate([chart.phi(q), velocity, curvature + bend], axis=-1)
 
 
 def blow(arm: Arm) -> tuple[float, float]:
@@ -153,7 +280,7 @@ def blow(arm: Arm) -> tuple[float, float]:
     for k in range(SETTLED + 1500):
         if k == SETTLED:
             plant.reset(plant.q, dq)
-        plant.step(supervisor.step(plant.q, plant.dq, arm.resting(q), TICK)[0], TICK)
+        plant.step(supervisor.step(*arm.seen(plant), arm.resting(q), TICK)[0], TICK)
         speeds.append(np.abs(plant.dq).max())
     return max(speeds), speeds[-1]
 
@@ -207,7 +334,7 @@ def led(arm: Arm, ask: Asking) -> float:
     for k in range(SETTLED + 1600):
         if k >= SETTLED:
             ask(arm, supervisor, k, reference, target, home)
-        plant.step(supervisor.step(plant.q, plant.dq, reference, TICK)[0], TICK)
+        plant.step(supervisor.step(*arm.seen(plant), reference, TICK)[0], TICK)
         worst = max(worst, float((np.abs(plant.dq) / arm.limits).max()))
     return worst
 
@@ -222,7 +349,7 @@ def caught(arm: Arm, delay: int) -> tuple[float, bool]:
     for k in range(3000):
         if k == 2500:
             supervisor.resume()
-        command, status = supervisor.step(plant.q, plant.dq, asked, TICK)
+        command, status = supervisor.step(*arm.seen(plant), asked, TICK)
         late.append(command)
         plant.step(late.popleft(), TICK)
         if k < 2500 and np.abs(plant.dq).max() > REST:
@@ -243,7 +370,7 @@ def brakes(arm: Arm) -> float:
             supervisor.release(plant.q)
         if k >= SETTLED:
             supervisor.stream(reference, target, 6.0, TICK)
-        command, _ = supervisor.step(plant.q, plant.dq, reference, TICK)
+        command, _ = supervisor.step(*arm.seen(plant), reference, TICK)
         if holds:
             plant.reset(plant.q)
         else:

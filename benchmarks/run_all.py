@@ -31,6 +31,7 @@ SCRIPTS = (
     "atlas_c",
     "suggested_domains",
     "many_joints",
+    "priorities",
     "wide_charts",
     "choices",
     "elbow_angle",

@@ -277,6 +277,9 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "stacked tasks": lambda: oc.Task.stack(oc.Task.position(planar().robot, "x"), oc.Task.axis(planar().robot)),
     "fit with a meaning": lambda: oc.fit(planar(), oc.Polynomial(1), like="q3", samples=200),
     "robot on a rail": lambda: oc.Robot(on_moving_base(planar().robot.tree, "rail:x", 1.0, np.zeros(3), np.eye(3))),
+    "robot that floats": lambda: oc.Robot(
+        on_moving_base(planar().robot.tree, "floating:xy", 1.0, np.zeros(3), np.eye(3))
+    ),
     "task of a quadratic program": lambda: oc.control.XiTask(fitted().chart, cost=1.0),
     "mobile": lambda: oc.Mobile(oc.Polynomial(2)),
     "SEW": oc.SEW,

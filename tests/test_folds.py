@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -91,6 +92,17 @@ def test_no_fold_is_left_where_other_samples_look_for_one(iiwa_fit: Fit) -> None
     values *= np.sign(np.median(values))
     assert values.min() > 0.1
     assert worst_points(chart.problem, chart.coordinates, seed=5).least == pytest.approx(iiwa_fit.worst.least, abs=0.05)
+
+
+def test_exact_coordinates_are_straight() -> None:
+    """With xi, xi^2 is orthogonal to the task as well, and folds."""
+    robot = oc.Robot.planar([1, 1, 1], [1, 1, 1])
+    task = oc.Task.custom(robot, "sum", lambda q: q[:2] + ca.vertcat(q[2], 0))
+    fit = oc.fit(oc.Problem(robot, task, domain=oc.Box([0, 0.4, 0.3], 0.4)), oc.Polynomial(2), samples=300)
+    gradient = fit.chart.jacobian(fit.chart.problem.domain.centre)[2]
+    np.testing.assert_allclose(np.abs(gradient), [0.5**0.5, 0, 0.5**0.5], atol=1e-9)
+    assert fit.worst is not None
+    assert fit.worst.least > 0.999
 
 
 def test_without_the_fold_term_the_same_fit_folds(iiwa: oc.Problem) -> None:

@@ -55,6 +55,34 @@ def test_matched_stiffness_is_exact_where_the_inertia_is_constant_and_diagonal()
 
 
 @pytest.mark.slow
+def test_stiffness_for_a_delay_leaves_30_degrees_to_the_fastest_mode_of_the_whole_domain(
+    planar_chart: oc.Chart,
+) -> None:
+    """On 20^3 points with all corners, from the open loop (2 zeta omega s + omega^2) exp(-s T) / s^2."""
+    domain, zeta, delay = planar_chart.problem.domain, 0.5, 20e-3
+    K = matched_stiffness(planar_chart, 60.0, np.inf, delay, zeta)
+    steps = np.linspace(-1, 1, 20)
+    q = domain.centre + domain.half_width * np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    J, M = planar_chart.jacobian(q), planar_chart.problem.robot.mass_matrix(q)
+    omega = np.sqrt(np.linalg.eigvals(J @ np.linalg.solve(M, J.transpose(0, 2, 1)) * K).real.max())
+    s = 1j * np.linspace(0.5, 4, 50_001) * omega
+    loop = (2 * zeta * omega * s + omega**2) * np.exp(-s * delay) / s**2
+    crossing = int(np.argmin(np.abs(np.abs(loop) - 1)))
+    margin = np.degrees(np.angle(-loop[crossing]))
+    assert 30 - 1e-2 < margin < 33  # not less anywhere, and no spring is softer than it must be
+
+
+def test_a_delay_that_cannot_be_borne_or_is_of_no_use_is_refused(planar_chart: oc.Chart) -> None:
+    for delay in (-1e-3, np.nan, np.inf):
+        with pytest.raises(InvalidValueError, match="delay"):
+            matched_stiffness(planar_chart, delay=delay)
+    with pytest.raises(InvalidValueError, match="damping_ratio"):
+        matched_stiffness(planar_chart, delay=1e-3, damping_ratio=0.2)
+    with pytest.raises(InvalidValueError, match="none with a given stiffness"):
+        PDPlus.on_chart(planar_chart, stiffness=10.0, delay=1e-3)
+
+
+@pytest.mark.slow
 def test_default_gains_of_a_pose_bear_5_ms_of_delay_although_the_flange_has_hardly_any_inertia() -> None:
     """Joint 7 moves 3e-4 kg m^2, about an axis of the tip: its spring is a thirtieth of those of the tilts."""
     arm = oc.problems.get("iiwa")

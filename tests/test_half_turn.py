@@ -82,6 +82,23 @@ def test_values_lose_few_digits_next_to_half_a_turn() -> None:
         assert away.magnitude().max() < 1e-7, left
 
 
+@pytest.mark.parametrize("left", [0.5, 1e-3, 1e-5])
+@pytest.mark.parametrize("axis", AXES)
+def test_tilts_and_turns_lose_few_digits_next_to_half_a_turn(axis: str, left: float) -> None:
+    """R = S T: S tilts the axis by pi - left about a direction across it, and T turns about the axis itself."""
+    task = oc.Task.orientation(arm(), np.eye(3), axis)
+    rng, along = np.random.default_rng(2), np.eye(3)["xyz".index(axis)]
+    direction = np.cross(along, rng.normal(size=(100, 3)))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    turn = rng.uniform(-3, 3, 100)
+    S, T = Rotation.from_rotvec((np.pi - left) * direction), Rotation.from_rotvec(turn[:, None] * along)
+    x = task.value(None, (S * T).as_matrix())
+    allowed = 1e-15 / left
+    np.testing.assert_allclose(x[:, 2], turn, atol=20 * allowed)
+    tilted = 2 * np.cos(left / 2) * np.cross(direction, along)[:, [k for k in range(3) if not along[k]]]
+    np.testing.assert_allclose(x[:, :2], tilted, atol=20 * allowed)
+
+
 def test_poses_are_checked() -> None:
     task = oc.Task.pose(arm())
     for arguments, error, words in (

@@ -13,7 +13,7 @@ from programs import Run, needs_c
 from test_payload import arm_model
 
 import orthocas as oc
-from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
+from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared, gain_numbers
 from orthocas.control import Adaptation, ControlStatus, Memory, MomentumObserver, PDPlus, Remembering, RunTimeModel
 from orthocas.control.memory import _momentum, _regressor
 from orthocas.errors import InvalidValueError, ShapeError
@@ -129,6 +129,32 @@ def test_a_start_knows_the_torque_that_held_the_arm(chart: oc.Chart, remembers: 
     np.testing.assert_allclose(x, q, atol=1e-4)
 
 
+@needs_c
+@pytest.mark.slow
+@pytest.mark.parametrize("blind", [0, 15], ids=["at once", "after ticks without measurements"])
+def test_a_payload_and_torques_of_the_gains_do_not_count_twice_at_a_start(
+    chart: oc.Chart, tmp_path: Path, blind: int
+) -> None:
+    """They are part of the command that held the arm, and the law adds them itself."""
+    q, robot, extra = chart.problem.domain.centre, chart.problem.robot.with_payload(1.0), np.array([3.0, -2.0, 1.0])
+    plain, known = (
+        law_of(chart, MomentumObserver(), model=RunTimeModel(payload=mass, extra_torque=share * extra))
+        for mass, share in ((0.0, 0.0), (1.0, 1.0))
+    )
+    ticks = Remembering(known)
+    ticks.start(q, robot.gravity(q) + extra)
+    np.testing.assert_allclose(ticks.fields["correction"], 0, atol=1e-9)
+    generated = oc.generate_c(chart, tmp_path, plain, "arm")
+    supervisor = Supervisor(CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3), plain)
+    supervisor.gains = gain_numbers(known)
+    unknown = np.array([0.5, 0.4, -0.3])
+    supervisor.start(q, robot.gravity(q) + extra + unknown)
+    for _ in range(blind):
+        supervisor.step(q + np.nan, 0 * q, at_rest(chart, q).ravel(), TICK)
+    supervisor.step(q, 0 * q, at_rest(chart, q).ravel(), TICK)
+    np.testing.assert_allclose(supervisor.memory["correction"], unknown, atol=1e-9)
+
+
 @pytest.mark.parametrize("remembers", BOTH, ids=lambda kind: kind.name)
 def test_corrections_keep_their_bound_and_forget_nonsense(chart: oc.Chart, remembers: Any) -> None:
     law = law_of(chart, replace(remembers, bound=2.0))
@@ -175,6 +201,7 @@ def test_c_remembers_what_python_remembers(chart: oc.Chart, tmp_path: Path, reme
     supervisor.hold(x)
     assert not supervisor.memory["correction"].any()  # a load may have gone when brakes open again
     supervisor.start(x, robot.gravity(x))
+    supervisor.step(x, 0 * dq, at_rest(chart, x).ravel(), TICK)
     lacks = robot.gravity(x) - chart.problem.robot.gravity(x)
     np.testing.assert_allclose(supervisor.memory["correction"], lacks, atol=1e-4)
 

@@ -108,6 +108,24 @@ def test_closed_paths_bring_the_base_back(chart: oc.Chart) -> None:
 
 
 @pytest.mark.slow
+def test_a_slow_base_sets_the_time_of_a_path(chart: oc.Chart) -> None:
+    """By finite differences of the joint motion; with a faster base the same path takes less time."""
+    shifts = np.outer(np.linspace(0, 1, 30), [0.5, 0.2])
+    tool = chart.task(HOME) + np.hstack([shifts, np.zeros((30, 4))])
+    xi = chart.xi(HOME) + shifts @ chart.jacobian(HOME)[6:, :2].T  # of a motion of the base with all that it carries
+    arm, times = np.full(7, 2.0), []
+    for base in (0.05, 0.2):
+        limits = np.concatenate([[base, base, 2 * base], arm])
+        motion = oc.follow(chart, tool, xi, velocity_limits=limits, q_start=HOME)
+        speeds = np.abs(np.diff(motion.q, axis=0) / np.diff(motion.times)[:, None]).max(axis=0)
+        assert (speeds <= 1.01 * limits).all()
+        times.append(motion.times[-1])
+        nearest = (speeds / limits).argmax()
+        assert nearest < 3  # the base is what is slow
+    assert times[0] > 2 * times[1]
+
+
+@pytest.mark.slow
 def test_no_fold_is_proved_for_every_place_and_heading(robot: oc.Robot, chart: oc.Chart) -> None:
     """And determinants by the tip's velocities have one sign at 20,000 places, half of the arms near the boundary."""
     certificate = oc.certify(chart, time_limit=60)

@@ -60,7 +60,7 @@ def test_loop_of_the_page_on_c_compiles(library: GeneratedC, tmp_path: Path) -> 
     output_of("gcc", "-std=c99", *STRICT, "-fsyntax-only", f"-I{library.folder}", tmp_path / "page.c")
 
 
-@pytest.mark.parametrize("page", ["joystick", "stops"])
+@pytest.mark.parametrize("page", ["interfaces", "joystick", "stops"])
 def test_ticks_of_how_to_pages_compile(page: str, library: GeneratedC, tmp_path: Path) -> None:
     (code,) = blocks(f"how-to/{page}.md", "c")
     (tmp_path / "page.c").write_text(code)

@@ -1,6 +1,6 @@
 """Strong pushes on the 7-DoF arm in MuJoCo, against the compiled supervised law."""
 
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from charts import with_metric
 from programs import needs_c
 
 import orthocas as oc
-from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
+from orthocas.codegen import Supervisor
 from orthocas.control import PDPlus, Safety
 from orthocas.simulation import MuJoCoPlant
 
@@ -44,13 +44,17 @@ def test_a_start_with_a_wrong_mass_is_not_caught_and_integral_action_takes_the_s
         assert np.isinf(default_gains.held(law, slow, plant, worst))  # caught
 
 
-def test_faults_do_not_make_an_arm_run_away(tmp_path: Path) -> None:
-    """Late torques, dead sensors, wild references and brakes, on an arm that nothing was tuned for."""
-    chart = oc.charts.load("tiago-pro-left-position")
-    law = PDPlus.on_chart(chart)
-    generated = oc.generate_c(chart, tmp_path, law, "arm")
-    library = CompiledLibrary(compile_shared(generated, tmp_path, ("-O1",)), "arm", chart.n)
-    arm = faults.Arm(chart, law, library, Safety.of(law), np.random.default_rng(1))
+@pytest.fixture(scope="module")
+def tiago() -> Iterator[faults.Arm]:
+    """An arm that nothing was tuned for."""
+    with faults.arm_of("tiago-pro-left-position") as arm:
+        yield arm
+
+
+@pytest.mark.parametrize("bits", [0, 13])
+def test_faults_do_not_make_an_arm_run_away(tiago: faults.Arm, bits: int) -> None:
+    """Late torques, dead sensors, wild references and brakes; also with coarse encoders and the observer."""
+    arm = tiago.with_encoders(bits, faults.OBSERVED.get(bits, 0.0))
     for delay in (0, 5):
         for rest_after, goes_back in (faults.caught(arm, delay) for _ in range(3)):
             assert rest_after < 2.0
@@ -59,3 +63,27 @@ def test_faults_do_not_make_an_arm_run_away(tmp_path: Path) -> None:
     assert max(faults.led(arm, ask) for ask in faults.ASKED) < 1.2
     assert faults.brakes(arm) < 0.1
     assert faults.blow(arm)[1] < 0.5
+
+
+def test_the_observer_keeps_torques_of_coarse_encoders_below_their_rate() -> None:
+    """At 13 bits; also with masses 20 % off and torques 5 ms late, and after a push."""
+    with faults.arm_of("panda-position") as arm:
+        without = faults.moves(arm.with_encoders(13, 0.0))
+        observed = arm.with_encoders(13, faults.OBSERVED[13])
+        cases = ({}, {"scale": 1.2, "delay": 5}, {"scale": 0.8, "delay": 3}, {"push": faults.PUSH[0]})
+        found = [faults.moves(observed, **case) for case in cases]
+    assert without.cut > 0.4
+    assert max(case.cut for case in found) < 0.1
+    assert max(case.noise for case in found) < 0.5 * without.noise
+    assert max(case.last for case in found) < 0.1
+    assert max(case.away for case in found) < 0.02
+    assert not any(case.caught for case in found)
+
+
+def test_gains_for_a_delay_settle_an_arm_that_default_ones_make_swing() -> None:
+    """Ten milliseconds on an arm that nothing was tuned for, from its fastest posture and others."""
+    chart = oc.charts.load("ur5-position")
+    default, slower = PDPlus.on_chart(chart), PDPlus.on_chart(chart, delay=10e-3)
+    with default_gains.compiled(default) as library:
+        assert default_gains.settled(default, library, 10) > 1.0  # [rad/s]
+        assert default_gains.settled(slower, library, 10) < 0.02

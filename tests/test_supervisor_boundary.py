@@ -8,8 +8,10 @@ from programs import needs_c
 from supervised import TICK, Arm, at_rest, moving, run
 
 import orthocas as oc
+from orthocas.charts.coordinates import Coordinates
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import ControlStatus, PDPlus, Safety
+from orthocas.tasks.domains import sample_uniform
 from orthocas.tools.checks import Array
 
 pytestmark = needs_c
@@ -56,6 +58,52 @@ def test_the_bound_on_singular_values_is_a_boundary_with_a_zone_before_it(tmp_pa
     assert np.abs(arm.dq).max() < 1e-3
     supervisor.resume()
     statuses, _, _ = run(supervisor, arm, at_rest(chart, box.centre), 2.5)
+    assert statuses[0] is ControlStatus.RETURNING
+    assert statuses[-1] is ControlStatus.OK
+
+
+def volume(robot: oc.Robot, gradient: Array, q: Array) -> float:
+    """Cosine between the gradient of a coordinate and the self-motion of a planar arm, without its sign."""
+    J = np.array([(robot.tip_position(q + e) - robot.tip_position(q - e))[:2] / 2e-6 for e in 1e-6 * np.eye(3)]).T
+    return float(abs(np.linalg.svd(J)[2][-1] @ gradient) / np.linalg.norm(gradient))
+
+
+@pytest.mark.slow
+def test_the_end_of_coordinates_is_a_boundary_with_a_zone_before_it(tmp_path: Path) -> None:
+    """Led towards where a wide chart leans into the task: damped, caught before the bound, brought back."""
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [3.0, 3.0, 3.0])
+    box = oc.Box([0.6, 1.2, 1.2], [0.8, 1.1, 1.1])
+    wide = oc.fit_wide(robot, oc.Task.position(robot, "xy"), box, clearance=0.05, parametrisation=oc.Polynomial(2))
+    clear, coordinates, bound = wide.chart.problem.domain, wide.chart.coordinates, 0.9
+    assert isinstance(coordinates, Coordinates)
+    domain = oc.RegularPart(clear, coordinates, bound)
+    chart = oc.Chart(oc.Problem(robot, wide.chart.problem.task, domain=domain), coordinates)
+    law = PDPlus.on_chart(chart)
+    library = CompiledLibrary(compile_shared(oc.generate_c(chart, tmp_path, law, "arm"), tmp_path), "arm", 3)
+    supervisor = Supervisor(library, law, Safety.of(law, command_rate=np.inf, reference_acceleration=np.inf))
+    start = domain.centre
+    inner = sample_uniform(oc.Box(box.centre, 0.9 * box.half_width), 2000, 0)
+    beyond = inner[(clear.singular_values(inner) > 0.3) & (domain.volumes(inner) < bound - 0.02)][0]
+    speed = 0.3 * (beyond - start) / np.linalg.norm(beyond - start)
+    arm = Arm(robot, start)
+    supervisor.start(start)
+    run(supervisor, arm, at_rest(chart, start), 0.2)
+    statuses, volumes = [], []
+    for k in range(round(np.linalg.norm(beyond - start) / 0.3 / TICK)):
+        command, status = supervisor.step(arm.q, arm.dq, moving(chart, start + k * TICK * speed, speed), TICK)
+        arm.move(command)
+        statuses.append(status)
+        volumes.append(volume(robot, chart.coordinates.jacobian(arm.q[None])[0, 0], arm.q))
+    first = [statuses.index(status) for status in (ControlStatus.NEAR_BOUNDARY, ControlStatus.CAUGHT)]
+    assert set(statuses[: first[0]]) == {ControlStatus.OK}
+    assert set(statuses[first[0] : first[1]]) == {ControlStatus.NEAR_BOUNDARY}
+    assert first[1] - first[0] > 10
+    usual = np.median(domain.volumes(sample_uniform(domain, 4000, 1))) - bound
+    assert volumes[first[0]] == pytest.approx(bound + 0.06 * usual, abs=0.02 * usual)
+    assert min(volumes) > bound
+    assert np.abs(arm.dq).max() < 1e-3
+    supervisor.resume()
+    statuses, _, _ = run(supervisor, arm, at_rest(chart, start), 4.0)
     assert statuses[0] is ControlStatus.RETURNING
     assert statuses[-1] is ControlStatus.OK
 

@@ -264,3 +264,26 @@ def test_matrices_of_one_joint_are_matrices() -> None:
     assert robot.tip_jacobian(np.zeros((5, 1))).shape == (5, 6, 1)
     assert robot.frame_jacobian([0.3], "tip").shape == (6, 1)
     assert robot.gravity([0.3]).shape == (1,)
+
+
+@pytest.mark.slow
+def test_two_hands_on_one_object_move_it_by_the_names_of_coordinates(baxter: oc.Robot, baxter_file: Path) -> None:
+    """The grasp of Pinocchio's hands stays to rounding while the coordinate of the left hand's x moves."""
+    home = np.array([0.3, -0.4, -0.5, 1.2, 0.2, 0.8, 0.1, -0.3, -0.4, 0.5, 1.2, -0.2, 0.8, -0.1])
+    problem = oc.Problem(baxter, oc.Task.relative_pose(baxter, LEFT, RIGHT), domain=oc.Box(home, 0.3))
+    chart = oc.fit(problem, oc.Polynomial(1), like=oc.Task.position(baxter), samples=600).chart
+    assert chart.named_coordinates[:4] == ("xi1: x [m]", "xi2: y [m]", "xi3: z [m]", "xi4")
+    wanted = chart.phi(home)
+    np.testing.assert_allclose(wanted[6:9], baxter.tip_position(home), atol=1e-9)
+    wanted[6] += 0.05
+    reference = Reference(baxter_file, baxter.joint_names)
+    left, right = [], []
+    for q in (home, chart.inverse(wanted, home)):
+        at = reference.at(q)
+        left.append(at.pose(LEFT).copy())
+        right.append(at.pose(RIGHT).copy())
+    grasps = [first.actInv(second) for first, second in zip(left, right, strict=True)]
+    np.testing.assert_allclose(grasps[1].homogeneous, grasps[0].homogeneous, atol=1e-9)
+    moved = left[1].translation - left[0].translation
+    assert 0.04 < moved[0] < 0.06
+    assert np.abs(moved[1:]).max() < 0.02

@@ -1,9 +1,12 @@
 """Branches of the joint range, and charts that are regular on a whole one."""
 
 import json
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from chart_files import header_of, resealed
@@ -14,10 +17,13 @@ from scipy.optimize import minimize
 
 import orthocas as oc
 from orthocas import control
+from orthocas.bases.family import JointSpace
 from orthocas.bases.given import sew_angle
+from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.self_motion import StopKind
 from orthocas.codegen import check_c
 from orthocas.errors import ChartFileError, DomainError, Interrupted, InvalidValueError, ShapeError, UnknownNameError
+from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.wide import least_hinge
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.domains import sample_heavily, sample_uniform
@@ -245,22 +251,80 @@ def test_meanings_that_cannot_be_are_refused() -> None:
         oc.fit_wide(iiwa(), task, "shoulder+ elbow- wrist+", like="A4")  # the elbow bends as the hand is far
     with pytest.raises(UnknownNameError, match="unknown like 'elbow'"):
         oc.fit_wide(iiwa(), task, "shoulder+ elbow- wrist+", like="elbow")
-    with pytest.raises(InvalidValueError, match="r = 4"):
-        oc.fit_wide(iiwa(), oc.Task.position(iiwa()), "shoulder+ elbow- wrist+", like="A3")
+    with pytest.raises(InvalidValueError, match="2 quantities, expected one"):
+        oc.fit_wide(iiwa(), task, "shoulder+ elbow- wrist+", like=["A3", "A1"])
 
 
-def test_the_hinge_has_the_least_value() -> None:
+@pytest.mark.slow
+def test_several_coordinates_follow_several_quantities() -> None:
+    """Gradients of the first two lean from the projected ones of a joint and a height less than without a wish."""
+    robot = oc.Robot.planar([1.0] * 5, [1.0] * 5)
+    task, box = oc.Task.position(robot, "xy"), oc.Box([0.3, 0.6, 0.6, 0.6, 0.6], [0.8, 0.5, 0.5, 0.5, 0.5])
+
+    def height(q: ca.SX) -> ca.SX:
+        return ca.sin(q[0]) + ca.sin(q[0] + q[1])
+
+    fits = [
+        oc.fit_wide(robot, task, box, like=like, parametrisation=oc.Polynomial(2), samples=2000)
+        for like in (["q3", height], None)
+    ]
+    assert fits[0].regular_share > 0.99
+    q = sample_uniform(box, 500, 4)
+    J = np.stack([(robot.tip_position(q + e) - robot.tip_position(q - e))[:, :2] / 2e-6 for e in 1e-6 * np.eye(5)], 2)
+    Z = np.linalg.svd(J)[2][:, 2:]  # of self-motions
+    slopes = np.zeros((500, 2, 5))
+    slopes[:, 0, 2] = 1.0
+    slopes[:, 1, 0], slopes[:, 1, 1] = np.cos(q[:, 0]) + np.cos(q[:, 0] + q[:, 1]), np.cos(q[:, 0] + q[:, 1])
+    wanted = np.einsum("ski,sji->skj", slopes, Z)
+    off = []
+    for fit in fits:
+        own = np.einsum("ski,sji->skj", fit.chart.coordinates.jacobian(q)[:, :2], Z)
+        lengths = np.linalg.norm(own, axis=2) * np.linalg.norm(wanted, axis=2)
+        off.append(np.degrees(np.arccos(np.abs((own * wanted).sum(axis=2)) / lengths)).mean(axis=0))
+    assert (off[0] < 25.0).all(), off
+    assert (off[0] < off[1] / 2).all(), off
+    middle = fits[0].chart.problem.domain.centre
+    np.testing.assert_allclose(fits[0].chart.xi(middle)[:2], [middle[2], float(height(ca.DM(middle)))], atol=1e-9)
+    assert list(fits[0].like) == ["q3 [rad]", "height"]
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.3])
+def test_the_hinge_has_the_least_value(margin: float) -> None:
     rng = np.random.default_rng(0)
-    D, weights = rng.normal(size=(60, 5)) + 0.4, rng.uniform(0.5, 2.0, 60)
-    energy, pull = np.diag([1.0, 2.0, 3.0, 4.0, 5.0]), rng.normal(size=5) * 0.1
+    D, G = rng.normal(size=(60, 5)) + 0.4, rng.normal(size=(60, 3, 5))  # G c: gradients of three joints
+    energy, pull = np.diag([0.1, 0.2, 0.3, 0.4, 0.5]), rng.normal(size=5) * 0.1
+
+    def lengths(c: Numbers) -> tuple[Numbers, Callable[[NDArray[np.bool_]], Numbers]]:
+        slopes = G @ c
+        long = np.linalg.norm(slopes, axis=1) + 1e-300
+        return margin * long, lambda kept: margin * np.einsum("si,sik->sk", slopes / long[:, None], G)[kept]
 
     def value(c: Numbers) -> float:
-        return float(weights @ np.maximum(0, 1 - D @ c) ** 2 / weights.sum() + 0.1 * c @ energy @ c - 2 * pull @ c)
+        short = np.maximum(0, 1 + margin * np.linalg.norm(G @ c, axis=1) - D @ c)
+        return float(short @ short / 60 + c @ energy @ c - 2 * pull @ c)
 
-    c, least = least_hinge(D, 0.1 * energy, weights, pull)
-    peer = minimize(value, np.zeros(5), method="BFGS", options={"gtol": 1e-10})
+    c, least = least_hinge(D, energy, pull, lengths=lengths if margin else None, gain=1e-13)
+    peer = minimize(value, np.full(5, 0.1), method="BFGS", options={"gtol": 1e-10})
     assert abs(least - peer.fun) < 1e-8
-    np.testing.assert_allclose(c, peer.x, atol=1e-5)
+    np.testing.assert_allclose(c, peer.x, atol=1e-4)
+
+
+@pytest.mark.parametrize("parametrisation", [oc.Polynomial(3, ["q1"]), oc.Fourier(2)])
+def test_derivatives_along_directions_are_those_of_coordinates(parametrisation: Any) -> None:
+    problem, rng = oc.problems.get("planar_3r_xy"), np.random.default_rng(1)
+    family = parametrisation.for_problem(problem).family(JointSpace.of(problem), 2)
+    q, a, C = rng.normal(size=(1500, 3)), rng.normal(size=(1500, 3)), rng.normal(size=(2, family.width))
+    basis, kept = gradients_of(family, 3), rng.uniform(size=1500) < 0.3
+    known = basis.at(q)
+    own = Coordinates(
+        parametrisation.for_problem(problem), JointSpace.of(problem), (), C.ravel(), np.zeros(2), np.ones(2)
+    )
+    moved = (own.once("xi", q + 1e-6 * a) - own.once("xi", q - 1e-6 * a)) / 2e-6
+    np.testing.assert_allclose(basis.along(known, a) @ C.T, moved, atol=1e-7 * np.abs(moved).max())
+    np.testing.assert_allclose(basis.along(known, a, kept), basis.along(known, a)[kept])
+    np.testing.assert_allclose(
+        np.einsum("sri,si->sr", basis.jacobian(known, C, 1500), a), moved, atol=1e-7 * np.abs(moved).max()
+    )
 
 
 @needs_c

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from orthocas.atlas.lattice import Lattice, Symmetries, find_symmetries, identity_only, make_lattice
 from orthocas.bases.cyclic import leaf_cyclic_joints, over_cyclic_joints
 from orthocas.errors import InvalidValueError
+from orthocas.robots.tree import require_driven
 from orthocas.tasks.clear_box import row_scale
 from orthocas.tasks.domains import Box, sample_uniform
 from orthocas.tasks.problem import Problem, task_jacobians
@@ -172,6 +173,7 @@ def make_plan(problem: Problem, settings: AtlasSettings, margin_deg: float) -> P
             charts of an orientation task.
     """
     require_kind("problem", problem, Problem)
+    require_driven("an atlas", problem.robot.tree)
     if settings.certify_seconds and is_turning(problem.task):
         raise InvalidValueError("certify_seconds", settings.certify_seconds, "0 for a task that compares orientations")
     region = joint_range(problem.robot, margin_deg)

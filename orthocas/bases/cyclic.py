@@ -65,7 +65,8 @@ def _cyclic(problem: Problem, invariants: int) -> tuple[str, ...]:
     points = sample_uniform(problem.domain, _SAMPLES, _SEED)
     points = points[is_regular(problem, points)]
     names = problem.robot.joint_names
-    sampled = (k for k in range(problem.n) if len(points) and _is_cyclic(problem, points, k, invariants))
+    driven = (k for k in range(problem.n) if k not in problem.robot.tree.floating)
+    sampled = (k for k in driven if len(points) and _is_cyclic(problem, points, k, invariants))
     return tuple(names[k] for k in sampled if leaves_stay(problem, k))
 
 

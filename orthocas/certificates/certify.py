@@ -17,6 +17,7 @@ from orthocas.charts.certificate import COFACTORS, ELIMINATION, METHODS, OPEN, P
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
+from orthocas.robots.tree import require_driven
 from orthocas.tasks.domains import Box, Domain, contains, reach, sample_heavily, slack
 from orthocas.tools.checks import Array, as_number, require_at_least, require_executor, require_kind
 from orthocas.tools.processes import in_order
@@ -162,6 +163,7 @@ def certified_box(
 def checked_options(chart: Chart, time_limit: float | None, executor: Executor | None) -> float:
     """Seconds of a time limit, inf for none. Chart and executor are checked as well."""
     require_kind("chart", chart, Chart)
+    require_driven("a certificate", chart.problem.robot.tree)
     require_executor(executor)
     if time_limit is None:
         return float("inf")

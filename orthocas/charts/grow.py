@@ -18,6 +18,7 @@ from orthocas.exact.leaves import (
     linear_leaf,
     turning_joints,
 )
+from orthocas.robots.tree import require_driven
 from orthocas.tasks.domains import Box, sample_evenly
 from orthocas.tasks.problem import Problem, check
 from orthocas.tools.checks import (
@@ -84,6 +85,7 @@ def grow(
         True
     """
     require_kind("problem", problem, Problem)
+    require_driven("growing", problem.robot.tree)
     leaf = _default_leaf(problem) if leaf is None else leaf
     if not isinstance(leaf, str):
         raise InvalidValueError("leaf", repr(leaf), f"one of {', '.join(LEAVES)}")

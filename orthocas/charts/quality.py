@@ -264,9 +264,10 @@ class Report(Shown):
             found["mutual angle"] = "none, r = 1"
         if others is not None:
             several = f", mutual std {others.mutual_angle.std:.2f}" if len(others.leak.rms_of_each) > 1 else ""
+            flatters = f"{listed(self.idle_joints)} is exact and" if self.idle_joints else "the floating base"
             found["without idle"] = (
                 f"task std {others.task_angle.std:.2f}{several}, leak rms {others.leak.rms:.2f} deg: "
-                f"{listed(self.idle_joints)} is exact and flatters the mean"
+                f"{flatters} flatters the mean"
             )
         return found
 
@@ -365,6 +366,7 @@ def _report(chart: Chart, points: Array, seed: int | None, worst: WorstPoints | 
         raise SingularTaskError(f"a gradient vanishes, or a coordinate has no value, at all {len(points)} {where}")
     idle = _idle_coordinates(chart, judged)
     others = [j for j in range(chart.r) if j not in idle]
+    floating = {chart.problem.robot.joint_names[k] for k in chart.problem.robot.tree.floating}
     angles, without_idle = Angles.of(judged, [range(chart.r), others])
     short, long = np.quantile(_lengths(judged.jacobian), [0.01, 0.99], axis=0)
     return Report(
@@ -384,7 +386,7 @@ def _report(chart: Chart, points: Array, seed: int | None, worst: WorstPoints | 
         singular_samples=len(points) - len(judged.points),
         length_ratio=float((long / short).max()),
         folded_samples=int(min((judged.signs > 0).sum(), (judged.signs <= 0).sum())),
-        idle_joints=tuple(idle.values()),
+        idle_joints=tuple(name for name in idle.values() if name not in floating),
         without_idle=without_idle if idle and others else None,
     )
 

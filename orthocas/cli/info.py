@@ -18,7 +18,7 @@ from orthocas.cli.problem_argument import (
     is_robot_file,
     with_options,
 )
-from orthocas.errors import OptionError, SingularTaskError
+from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches as find_branches
@@ -98,13 +98,14 @@ def _redundancy(robot: Robot) -> dict[str, Any]:
     """The number r = n - m of extra coordinates of each task that has some, and the joints that do not move it."""
     kinds = ("position", "pose", *(("relative_position", "relative_pose") if len(robot.tips) == 2 else ()))
     q = robot.tree.middle + 0.1 * np.arange(1, robot.n + 1)  # no posture in which joints happen to be parallel
-    found = {}
+    found, floating = {}, robot.tree.floating
     for kind in kinds:
         task = Task.named(robot, kind, q)
         J = task.batched_frame_jacobian(q[None])[0].reshape(task.m, robot.n)
-        if np.linalg.matrix_rank(J) == task.m < robot.n:
-            idle = [name for name, column in zip(robot.joint_names, J.T, strict=True) if not column.any()]
-            found[kind] = f"r = {robot.n - task.m}" + (f", idle: {', '.join(idle)}" if idle else "")
+        if np.linalg.matrix_rank(J) == task.m < robot.n - len(floating):
+            columns = zip(robot.joint_names, J.T, strict=True)
+            idle = [] if floating else [name for name, column in columns if not column.any()]
+            found[kind] = f"r = {robot.n - len(floating) - task.m}" + (f", idle: {', '.join(idle)}" if idle else "")
     return {"extra_coordinates": found}
 
 
@@ -150,7 +151,7 @@ def _reach(chart: "Chart") -> dict[str, Any]:
 def _involutivity(problem: Problem) -> dict[str, Any]:
     try:
         found = involutivity(problem)
-    except SingularTaskError as error:
+    except (SingularTaskError, RobotError) as error:
         return {"verdict": f"unknown whether exact coordinates exist: {error}"}
     return {
         "involutivity_defect": {"mean": found.mean, "max": found.max},

@@ -33,7 +33,8 @@ _OPTIONS: dict[str, Any] = {
         typer.Option("--tip", help="Tip frame of a robot file, or LEFT,RIGHT; default: the end of its chain."),
     ],
     "base": Annotated[
-        str | None, typer.Option("--base", help="Moving base of a robot file: planar, rail:x, rail:y or rail:z.")
+        str | None,
+        typer.Option("--base", help="Moving base of a robot file: planar, rail:x, floating, ..."),
     ],
     "lock": Annotated[
         list[str] | None,
@@ -91,9 +92,7 @@ BranchName = Annotated[
 ]
 LikeName = Annotated[
     str | None,
-    typer.Option(
-        "--like", help="What the first coordinates mean: a joint or swivel; several: NAME,NAME (not for wide charts)."
-    ),
+    typer.Option("--like", help="What the first coordinates mean: a joint or swivel; several: NAME,NAME."),
 ]
 BRANCH = "branch"  #: the word of --domain for wide charts
 
@@ -314,6 +313,7 @@ def wide_fit(
     base = None if is_robot_file(name) else build_problem(name, replace(options, least_singular_value=None))
     robot = build_robot(name, options) if base is None else base.robot
     known = options.least_singular_value
+    quantities = None if like is None else [word.strip() for word in like.split(",")]
     return fit_wide(
         robot,
         Task.named(robot, options.task or "position") if base is None else base.task,
@@ -322,7 +322,7 @@ def wide_fit(
         clearance=CLEARANCE if known is None else known,
         parametrisation=parametrisation,
         home=options.home if base is None else base.domain.centre if branch is None else None,
-        like=like,
+        like=quantities[0] if quantities and len(quantities) == 1 else quantities,
         samples=samples,
         seed=seed,
         monitor=monitor,

@@ -12,9 +12,12 @@ from orthocas.codegen.description import numbers
 from orthocas.codegen.precision import Precision
 from orthocas.control.controller import Controller
 from orthocas.control.safety import Safety
-from orthocas.tasks.domains import Domain, PathBound, SingularBound
+from orthocas.tasks.domains import Domain, PathBound, SingularBound, sample_uniform
+from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import scalar_code
+
+_USUAL = 256  # positions of a domain whose median room to a fold is the usual one
 
 
 class Source(Protocol):
@@ -84,7 +87,7 @@ class Source(Protocol):
 class BoundaryCondition:
     """What the supervised law has to know of a condition."""
 
-    template: str  #: code with `clearance(q)`: 0 at the boundary, 1 as far inside as the middle
+    templates: tuple[str, ...]  #: code with `clearance(q)`: 0 at the boundary, 1 as far inside as the middle
     meaning: str  #: of that number, for the header
     values: dict[str, str]  #: of the placeholders in the template
     kernels: tuple[ca.Function, ...] = ()
@@ -97,7 +100,7 @@ def boundary_condition(source: Source, controller: Controller) -> BoundaryCondit
     if controller.chart is None or domain is None:
         return None
     if domain.singular_bound is not None:
-        return _clear(domain.singular_bound)
+        return _clear(domain, domain.singular_bound)
     return None if domain.path_bound is None else _near_path(domain.path_bound)
 
 
@@ -110,15 +113,29 @@ def boundary_units(domain: Domain) -> Any:
     return domain.half_width if near is None else np.minimum(domain.half_width, near.radius)
 
 
-def _clear(clear: SingularBound) -> BoundaryCondition:
+def _clear(domain: Domain, clear: SingularBound) -> BoundaryCondition:
     span = float(clear.singular_values(clear.centre)) - clear.least_singular_value
-    return BoundaryCondition(
-        "clear_boundary.c",
+    meaning = (
         "The bound on the relative singular value of the task is a part of the boundary; its\n"
-        " * distance counts in shares of that from the centre.",
-        {"clear_bound": repr(clear.least_singular_value), "clear_span": repr(span)},
-        (scalar_code(ca.Function("gram", [q := ca.MX.sym("q", len(clear.centre))], [clear.gram(q)])),),
+        " * distance counts in shares of that from the centre."
     )
+    words = {"clear_bound": repr(clear.least_singular_value), "clear_span": repr(span)}
+    q = ca.MX.sym("q", len(clear.centre))
+    kernels = (scalar_code(ca.Function("gram", [q], [clear.gram(q)])),)
+    room = domain.room_to_fold
+    if room is None:
+        words |= dict.fromkeys(("least_of", "end_of_least", "or_volume"), "")
+        return BoundaryCondition(("clear_boundary.c",), meaning, words, kernels)
+    usual = float(np.median(Batched(room)(sample_uniform(domain, _USUAL, 0))[0]))  # the centre may be near the bound
+    words |= {
+        "least_of": "fmin(room_to_fold(q), ",
+        "end_of_least": ")",
+        "or_volume": ";\n * or the room to a fold, if that is less",
+        "fold_span": repr(usual),
+    }
+    meaning += " So is\n * the bound on the volume of the coordinates, in shares of the median."
+    folds = scalar_code(ca.Function("room", [q], [room(q)]))
+    return BoundaryCondition(("fold_boundary.c", "clear_boundary.c"), meaning, words, (*kernels, folds))
 
 
 def _near_path(corridor: PathBound) -> BoundaryCondition:
@@ -133,7 +150,7 @@ def _near_path(corridor: PathBound) -> BoundaryCondition:
         "path_lengths": numbers(np.sqrt(squares)),
     }
     return BoundaryCondition(
-        "corridor_boundary.c",
+        ("corridor_boundary.c",),
         "The distance to the path of postures is a part of the boundary; it counts in radii.",
         values,
         inwards="  towards_path(fmax(share, DEEP), inner);\n",

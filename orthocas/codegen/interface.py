@@ -22,6 +22,17 @@ _TORQUE = """It compensates gravity, damps with the mass matrix,
  * holds the arm with a spring that gives way under too much force."""
 _VELOCITY = """It stops the arm and holds it."""
 _INERTIA = "  double inertia[{n}];       /* mass matrix of the catcher's spring, row by row */\n"
+_OF_OBSERVER = {  # code of the velocity observer of torque laws, by its place in these templates
+    "or_observed": ", or the observer's estimate",
+    "state_observer": "  double expected[$n];       /* accelerations that the velocity observer expects */\n"
+    "  double unexplained[$n];    /* accelerations that torques do not explain */\n",
+    "observed": "  double speed[N], M[N * N], bias[N], gravity[N];\n",
+    "foresee": "  foresee(state, since);\n",
+    "observe": "  memcpy(speed, dq, sizeof speed);\n  observe(state, here, speed, since);\n  dq = speed;\n",
+    "stand_still": "  set_zero(state->expected, N);\n  set_zero(state->unexplained, N);\n",
+    "moving": ", M, bias, gravity",
+    "expect": "  expect(state, $command, fallback, M, bias, gravity);\n",
+}
 _OF_MEMORY = {  # code of laws that remember, by its place in the templates of the supervised law
     "memory_type": "",
     "state_memory": "  ${name}_memory memory;\n",
@@ -35,9 +46,9 @@ _OF_MEMORY = {  # code of laws that remember, by its place in the templates of t
     "           known && state->mode != ${NAME}_HOLD ? since : 0.0);\n",
 }
 _OF_CORRECTION = {  # and of those whose memory is a torque
-    "correct_command": "    correct(state, command);\n",
+    "correct_command": "    if (state->fresh == 2) learn_from_start(state, gains);\n    correct(state, command);\n",
     "correct_fallback": "  correct(state, fallback);\n",
-    "learn_from_start": "  learn_from(state, command);\n",
+    "learn_from_start": "  if (command != 0 && all_finite(command, N)) state->fresh = 2;\n",
 }
 _ORDER = "{0}catch_margin < {0}near_margin && {0}near_margin < {0}return_margin && {0}return_margin < 1.0".format(
     "safety->"
@@ -135,6 +146,10 @@ def supervision_values(
         "catcher": _TORQUE if torque else _VELOCITY,
         "turning": flags(endless),
         "state_inertia": _INERTIA.format(n=robot.n**2) if torque else "",
+        **{
+            place: Template(text).safe_substitute(n=robot.n, command=controller.command) if torque else ""
+            for place, text in _OF_OBSERVER.items()
+        },
         "safety_fields": "\n".join(_field(name, value) for name, value in settings.items()),
         "safety_values": ",\n".join(f"  {_literal(value)}" for value in settings.values()),
         "safety_meant": "\n        && ".join([*(_meant(name, value) for name, value in settings.items()), _ORDER]),
@@ -177,9 +192,9 @@ def _memory_values(controller: Controller, known: Mapping[str, str]) -> dict[str
         "corrections": "",
         "start_meaning": "",
     }
-    of_torque = dict.fromkeys(_OF_CORRECTION, "")
+    of_torque, learned = dict.fromkeys(_OF_CORRECTION, ""), ""
     if memory.torque is not None:
-        of_torque = _OF_CORRECTION
+        of_torque, learned = _OF_CORRECTION, "  if (state->fresh == 2) learn_from_start(state, given);\n"
         values["corrections"] = filled("corrections.c", {**known, "torque": memory.torque})
         values["start_meaning"] = (
             f"\n * The command of {known['name']}_start must hold the arm: it shows what torque the model lacks."
@@ -195,7 +210,7 @@ def _memory_values(controller: Controller, known: Mapping[str, str]) -> dict[str
         | {
             "memory_type": filled("memory.h", values),
             "memory_c": filled("memory.c", values),
-            "use_memory": "".join(added),
+            "use_memory": learned + "".join(added),
         }
     )
 
@@ -282,7 +297,8 @@ def template_values(
 
 def _clearance(condition: BoundaryCondition, values: dict[str, str]) -> str:
     """Code for how far a position is inside the condition of the domain, here and after a time."""
-    return filled("clearance.c", {**values, "condition_boundary": filled(condition.template, values)})
+    code = "".join(filled(template, values) for template in condition.templates)
+    return filled("clearance.c", {**values, "condition_boundary": code})
 
 
 def _sizes(chart: Chart) -> dict[str, str]:

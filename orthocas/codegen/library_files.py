@@ -118,7 +118,8 @@ def _stack_bytes(kernels: Kernels, source: Source, k: int, size: int) -> int:
     compose = kernels.array_bytes("dynamics", size) + size * n * (n + 5)
     supervised = size * (9 * n + 8 * k) if k else 0
     locals_ = round(_LOCALS * max(1.0, n / 7) ** 2)  # compilers keep matrices in local variables
-    clear = sum(kernels.array_bytes(name, size) for name in ("pivots", "gram") if name in kernels.work)  # inside others
+    inner = [name for name in ("pivots", "gram", "room") if name in kernels.work]  # inside others
+    clear = sum(kernels.array_bytes(name, size) for name in inner)
     work = max(kernels.array_bytes(name, size) for name in kernels.work)
     rooms = 2  # at most
     nearest = kernels.array_bytes("near", size) + size * n * (3 * n + 16 + rooms) if source.has_nearest else 0

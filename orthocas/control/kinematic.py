@@ -15,6 +15,7 @@ from orthocas.control.gains import FEEDBACK, FEEDBACK_SETTING, LIMIT, Setting, c
 from orthocas.control.linear_algebra import block_inertia, median_volume
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
+from orthocas.robots.tree import require_driven
 from orthocas.tasks.problem import Problem
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_kind
@@ -53,6 +54,7 @@ class Kinematic(Shown):
 
     def __init__(self, chart: Chart, feedback: ArrayLike = 0.0, limit: ArrayLike | None = None) -> None:
         require_kind("chart", chart, Chart)
+        require_driven(f"the law {self.name}", chart.problem.robot.tree)
         chart.function("xi")  # raises for grown charts
         object.__setattr__(self, "chart", chart)
         object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))

@@ -45,7 +45,7 @@ class Memory:
         start: the fields, and their values after a start.
         adds: for each gain that the memory changes, the field that is added to it. What is added to `extra_torque`
             also corrects the fallback of the supervised law, as far as its catcher can hold against it, and begins
-            with the difference between the command that held the arm before the start and the fallback.
+            with what the command that held the arm before the start has beyond fallback and `extra_torque`.
         step: q, dq, reference and two derivatives, the law's gains, command, active, period, and the fields -> the
             fields, each called next_NAME there. `active` is the weight of the law in the command, and 0 while a limit
             cuts it. `period` is the time since the last tick [s], and 0 in the first one after a start or after missing
@@ -149,7 +149,7 @@ class Remembering(Shown):
         self.fields = {name: value.copy() for name, value in memory.start.items()}
         if memory.torque is not None and q is not None and command is not None:
             fallback = law.fallback(as_point("q", q, n), *law.gains.values()).full().ravel()
-            self.fields[memory.torque] = as_point("command", command, n) - fallback
+            self.fields[memory.torque] = as_point("command", command, n) - fallback - law.gains["extra_torque"]
         self._fresh = True
 
     def tick(self, q: ArrayLike, dq: ArrayLike, reference: ArrayLike, period: float) -> tuple[Array, ControlStatus]:

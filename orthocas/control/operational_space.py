@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.point_quality import Judged, least_in_domain
+from orthocas.charts.point_quality import Judged
 from orthocas.control.controller import (
     Command,
     fallback_function,
@@ -23,11 +23,13 @@ from orthocas.control.errors import bend, drift, errors
 from orthocas.control.gains import (
     DAMPING_RATIO,
     DAMPING_RATIO_SETTING,
+    DELAY_SETTING,
     LIMIT,
     STIFFNESS,
     STIFFNESS_SETTING,
     Setting,
     command_limit,
+    fastest_posture,
     matched_stiffness,
     mobility,
     non_negative_gains,
@@ -39,6 +41,7 @@ from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
 from orthocas.errors import InvalidValueError, LawWarning
+from orthocas.robots.tree import require_driven
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import Batched
@@ -155,6 +158,7 @@ class _OperationalSpace(Shown):
     command: ClassVar[Command] = "torque"
     options: ClassVar[Mapping[str, Setting]] = {
         "stiffness": STIFFNESS_SETTING,
+        "delay": DELAY_SETTING,
         "damping_ratio": DAMPING_RATIO_SETTING,
         "coupling": Setting("coupled (default) or decoupled.", is_word=True),
         "damping": Setting("double_diagonal (default) or square_root.", is_word=True),
@@ -189,6 +193,7 @@ class _OperationalSpace(Shown):
         require_known("coupling", coupling, COUPLINGS)
         require_known("damping", damping, DAMPING_DESIGNS)
         require_kind("chart", chart, Chart)
+        require_driven(f"the law {self.name}", chart.problem.robot.tree)
         model = RunTimeModel() if model is None else model
         require_kind("model", model, RunTimeModel)
         if remembers is not None and not callable(getattr(remembers, "of", None)):
@@ -235,13 +240,14 @@ class _OperationalSpace(Shown):
         gravity: Gravity = "law",
         inputs: str = "",
         memory: Literal["none", "momentum", "adaptive"] = "none",
+        delay: float = 0.0,
     ) -> Self:
         """Build the law on a chart.
 
         Args:
             chart: the chart.
             limit: largest torque of each joint.
-            stiffness: default: `matched_stiffness`, modes around 6 Hz.
+            stiffness: default: `matched_stiffness`, modes around 6 Hz, or slower ones that bear the delay.
             damping_ratio: as for the law itself.
             coupling: as for the law itself.
             damping: as for the law itself.
@@ -250,10 +256,17 @@ class _OperationalSpace(Shown):
             gravity: its gravity.
             inputs: its inputs, such as "payload,wrench,extra_torque".
             memory: none, momentum for a `MomentumObserver`, or adaptive for an `Adaptation`.
+            delay: from the measurement to the torque [s], for the default stiffness.
+
+        Raises:
+            ShapeError, InvalidValueError, UnknownNameError: as for the law itself, and for a delay beside a stiffness.
         """
         require_known("memory", memory, ("none", *MEMORIES))
         remembers = None if memory == "none" else MEMORIES[memory]()
-        stiffness = matched_stiffness(chart) if stiffness is None else stiffness
+        if stiffness is None:
+            stiffness = matched_stiffness(chart, delay=delay, damping_ratio=damping_ratio)
+        elif delay:
+            raise InvalidValueError("delay", delay, "none with a given stiffness")
         run_time = RunTimeModel.with_inputs(model, gravity, inputs.split(",") if inputs else ())
         return cls(chart, stiffness, damping_ratio, coupling, damping, limit, damping_stiffness, run_time, remembers)
 
@@ -429,14 +442,8 @@ class _OperationalSpace(Shown):
 
     def _mode_points(self) -> Array:
         """Samples of the domain, and the posture with the fastest mode that a search finds, (N, n)."""
-        domain, robot, scale = self.problem.domain, self.model.robot(self.problem), np.sqrt(self.stiffness)
-
-        def slowness(q: Array) -> Array:
-            W = scale[:, None] * mobility(self.chart, q, robot) * scale
-            known = np.asarray(np.isfinite(W).all(axis=(1, 2)))
-            return np.where(known, -np.linalg.eigvalsh(np.where(known[:, None, None], W, 0))[:, -1], np.nan)
-
-        return np.vstack([sample_uniform(domain, _MODE_SAMPLES, 0), least_in_domain(slowness, domain)])
+        fastest = fastest_posture(self.chart, self.stiffness, self.model.robot(self.problem))
+        return np.vstack([sample_uniform(self.problem.domain, _MODE_SAMPLES, 0), fastest])
 
     def _damping_at(self, points: Array) -> Array:
         """D(q) with the law's gains at points (N, n), (N, n, n)."""

@@ -44,6 +44,7 @@ from orthocas.control.two_tasks import (
     second_task,
     two_task_forces,
 )
+from orthocas.robots.tree import require_driven
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.relative import Relative
 from orthocas.tasks.task import Task
@@ -97,6 +98,7 @@ class KinematicProjector(TwoTaskLaw):
         second: Task | Chart | None = None,
     ) -> None:
         require_kind("problem", problem, Problem)
+        require_driven(f"the law {self.name}", problem.robot.tree)
         k_2 = len(second_task(problem, second).labels) - problem.m
         task = non_negative_gains("feedback", feedback, problem.m)
         posture = non_negative_gains("posture_feedback", posture_feedback, k_2)
@@ -243,6 +245,7 @@ class Projector(TwoTaskLaw):
         feed_forward: bool = False,
     ) -> None:
         require_kind("problem", problem, Problem)
+        require_driven(f"the law {self.name}", problem.robot.tree)
         require_kind("feed_forward", feed_forward, bool)
         k = len(second_task(problem, second).labels)
         k_2 = k - problem.m

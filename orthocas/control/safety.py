@@ -18,7 +18,9 @@ from orthocas.tools.interrupts import deferred
 
 _SAMPLES, _SEED = 256, 0
 _RATE = {"torque": 1000.0, "velocity": 20.0}  # [N m/s] as on many arms, 1 N m in a millisecond; [rad/s^2]
-_TORQUE_ONLY = ("stop_zone", "stop_damping", "brake_stiffness", "brake_yield")  # velocity laws do not use them
+_TORQUE_ONLY = (  # velocity laws do not use them
+    *("observer_rate", "stop_zone", "stop_damping", "brake_stiffness", "brake_yield"),
+)
 UNBOUNDED = (  #: settings that may be infinite
     *("command_rate", "speed_limit", "stuck_impulse", "lower", "upper", "error_limit"),
     *("reference_speed", "reference_acceleration"),
@@ -69,6 +71,7 @@ class Safety:
     ]
     stuck_impulse: Annotated[Array, "momentum that an arm which measures the same may get [N m s]; velocity laws: way"]
     longest_period: Annotated[float, "between two ticks; later ones call the catcher [s]"]
+    observer_rate: Annotated[Array, "poles of an observer of velocities, for coarse encoders [1/s]; 0: as measured"]
     lower: Annotated[Array, "joint limits [rad] or [m]"]
     upper: Annotated[Array, "joint limits [rad] or [m]"]
     stop_zone: Annotated[Array, "where springs and dampers near the joint limits begin [rad] or [m]"]
@@ -142,6 +145,7 @@ class Safety:
             "stale_ticks": 5,
             "stuck_impulse": _STUCK[0] * free if torque else np.full(n, _STUCK[1]),
             "longest_period": 0.02,
+            "observer_rate": np.zeros(n),
             "lower": robot.lower,
             "upper": robot.upper,
             "stop_zone": np.fmin(_ZONE, _ZONE * (robot.upper - robot.lower)),

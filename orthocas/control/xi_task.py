@@ -9,6 +9,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.phi import shortest
 from orthocas.control.gains import non_negative_gains
 from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.robots.tree import require_driven
 from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind
 from orthocas.tools.display import Shown, listed, number_list
 
@@ -48,6 +49,7 @@ class XiTask(Shown):
         joints: tuple[str, ...] | None = None,
     ) -> None:
         require_kind("chart", chart, Chart)
+        require_driven("a task of a quadratic program", chart.problem.robot.tree)
         chart.function("xi")  # raises for grown charts
         require_at_least("gain", gain, 0)
         require_at_least("lm_damping", lm_damping, 0)

@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.robots.tree import require_driven
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem, check, is_regular
 from orthocas.tools.batch import Batched, dense_function
@@ -98,6 +99,7 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     """
     samples, seed = require_count("samples", samples), require_count("seed", seed, least=0)
     require_kind("problem", problem, Problem)
+    require_driven("involutivity", problem.robot.tree)
     require_memory(f"{samples} samples of the defect", 32.0 * samples * problem.n * problem.m**2)
     points = _regular_points(problem, samples, seed)
     brackets = TaskBrackets.of(problem)

@@ -74,6 +74,23 @@ class BasisGradients(ABC):
         """All gradients at all samples, (N, n, K)."""
         return self.dense_part(X, samples, np.ones(self.family.width, dtype=bool))
 
+    def jacobian(self, X: Array, C: Array, samples: int) -> Array:
+        """J_xi = T X of coefficients C (r, K) at all samples, (N, r, n)."""
+        rows = np.matmul(self.table(C), X)  # (B, g, n r / g, c)
+        B, _, _, c = rows.shape
+        J: Array = rows.reshape(B, self.n, len(C), c).transpose(0, 3, 2, 1).reshape(B * c, len(C), self.n)
+        return J[:samples]
+
+    def along(self, X: Array, directions: Array, kept: NDArray[np.bool_] | None = None) -> Array:
+        """Derivatives a . d psi / dq along directions a (N, n) at samples, or at some of them (N,), (kept, K)."""
+        found, c = [], X.shape[3]
+        chosen = np.ones(len(directions), dtype=bool) if kept is None else kept
+        for b in range(0, len(X), _PART):
+            part = slice(b * c, min((b + _PART) * c, len(directions)))
+            G = self.dense(X[b : b + _PART], part.stop - part.start)
+            found.append(np.einsum("si,sik->sk", directions[part], G)[chosen[part]])
+        return np.concatenate(found)
+
     @abstractmethod
     def _numbers(self, q: ca.SX) -> ca.SX:
         """X of one sample, group by group."""
@@ -127,6 +144,19 @@ class ProductGradients(BasisGradients):
         values = X[:, 0, :, ::every].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, : -(-samples // every)]
         found = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
         return np.ascontiguousarray(found.T).reshape(found.shape[1], self.n, int(kept.sum()))
+
+    def along(self, X: Array, directions: Array, kept: NDArray[np.bool_] | None = None) -> Array:
+        """The sum over the joints of D_i (a_i psi')."""
+        K, N = self.family.width, len(directions)
+        values = X[:, 0].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, :N]
+        if kept is not None:
+            values, directions = values[:, kept], directions[kept]
+        total = np.zeros((K, len(directions)))
+        for i in range(self.n):
+            D = self._upright[i * K : (i + 1) * K]
+            if D.nnz:
+                total += D @ (values * directions[:, i])
+        return np.ascontiguousarray(total.T)
 
     def _part(self, kept: NDArray[np.bool_], kind: "np.dtype[Any]") -> Any:
         """The rows of some functions in all D_i, (n kept, S)."""

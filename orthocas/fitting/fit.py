@@ -408,6 +408,9 @@ def fit(
     warn_unless_savable(settings.parametrisation)
     if isinstance(settings.parametrisation, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))
+    if problem.robot.tree.floating and (settings.parametrisation.closed_form is not None or not split_idle):
+        wanted_there = "one to fit in the arms' joints, such as Polynomial(1), with split_idle: the base floats"
+        raise InvalidValueError("parametrisation", settings.parametrisation.label, wanted_there)
     if isinstance(settings.parametrisation, Mobile):
         problem = anywhere(problem, settings.parametrisation.base)
     with remembered() as pressed, using_threads(None if threads is None else require_count("threads", threads)):
@@ -443,7 +446,7 @@ def _fitted(
         chart=Chart(problem, coordinates, _notes(stages, settings, worst)),
         stages=stages,
         problem_check=found,
-        idle_joints=tuple(problem.robot.joint_names[i] for i in idle),
+        idle_joints=tuple(problem.robot.joint_names[i] for i in idle if i not in problem.robot.tree.floating),
         worst=worst,
         seconds=time.perf_counter() - start,
         like={} if settings.like is None else settings.like.distances(problem, coordinates, settings.seed),

@@ -74,13 +74,13 @@ class Like:
                 raise InvalidValueError("like", "a task of another robot", "one of the problem's robot")
             labels = zip(like.labels, like.units, strict=True)
             names = tuple(f"{label} [{unit}]" if unit else label for label, unit in labels)
-            return cls(names, dense_function("like", [q], [like.smooth_function(q)]))
+            return cls(names, _of_arms(robot, q, like.smooth_function(q)))
         parts = [like] if isinstance(like, str) or not isinstance(like, Sequence) else like
         found = [quantity_of(robot, part) for part in parts]
         if not found:
             raise InvalidValueError("like", "an empty list", "at least one quantity")
         values = ca.vertcat(*(function(q) for _, function in found))
-        return cls(tuple(name for name, _ in found), dense_function("like", [q], [values]))
+        return cls(tuple(name for name, _ in found), _of_arms(robot, q, values))
 
     @cached_property
     def digest(self) -> str:
@@ -122,6 +122,14 @@ class Like:
         cosines = np.einsum("skz,skz->sk", J @ Z, left) / np.maximum(lengths, _STILL)
         angles = np.degrees(np.sqrt((np.arccos(np.clip(cosines, -1, 1)) ** 2).mean(axis=0)))
         return dict(zip(self.names, angles.tolist(), strict=True))
+
+
+def _of_arms(robot: Robot, q: ca.SX, values: ca.SX) -> ca.Function:
+    """Quantities as a function of q, if no floating base moves them: xi depends on the arms' joints alone."""
+    base = list(robot.tree.floating)
+    if base and ca.depends_on(values, q[base]):
+        raise InvalidValueError("like", "a quantity that a floating base moves", "a quantity of the arms' joints")
+    return dense_function("like", [q], [values])
 
 
 @dataclass(frozen=True)

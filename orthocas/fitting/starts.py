@@ -18,6 +18,7 @@ from orthocas.tools.checks import Array
 
 _MUTUAL_WEIGHT = 1.0
 _MIXING_ANGLE = np.radians(10)
+_EXACT = 1e-12  # squared sine of a leak; functions of an exact coordinate are exact, too
 _RIDGE = 1e-10  # relative; keeps the pencil definite if basis functions coincide on the samples
 _TOLERANCE = 1e-6  # robot files give angles with ten decimals; a symmetry broken by less costs nothing
 _MOST_JOINTS = 12  # 4,096 choices of the joints that turn round
@@ -36,7 +37,8 @@ def spectral_start(
 
     Each coordinate minimises E |Pi_x grad xi|^2 subject to E |grad xi|^2 = 1, with the A-orthogonal projector Pi_x on
     the task gradients. A function of a coordinate xi_j that is already found would be a minimiser too, so each xi_j
-    adds the term E (grad xi_j . grad xi)^2 / |grad xi_j|^2. All products are taken in the metric A^-1.
+    adds the term E (grad xi_j . grad xi)^2 / |grad xi_j|^2. All products are taken in the metric A^-1. Among equals,
+    such as xi and xi^2 of an exact coordinate, the one with the smallest variance of its gradient comes first.
 
     Args:
         family: the coordinates.
@@ -55,13 +57,15 @@ def spectral_start(
     raised = G if samples.metric_inverse is None else samples.metric_inverse @ G
     T = G.reshape(-1, K).T @ raised.reshape(-1, K) / N
     T += _RIDGE * np.trace(T) / K * np.eye(K)
+    middle = G.mean(axis=0)
+    V = G.reshape(-1, K).T @ G.reshape(-1, K) / N - middle.T @ middle  # variance of the gradients
     allowed = np.ones((family.outputs, K), dtype=bool) if kept is None else kept
     C, left = np.zeros(allowed.shape), list(range(family.outputs))
     while left:
         classes = {
             allowed[j].tobytes(): j for j in reversed(left)
         }.values()  # one coordinate for all that allow the same
-        j, c = min(((j, _smallest(S, T, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
+        j, c = min(((j, _smallest(S, T, V, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
         left.remove(j)
         C[j] = c
         gradient = raised @ c  # (N, n)
@@ -71,12 +75,14 @@ def spectral_start(
     return _mixed(C, G, allowed).ravel()
 
 
-def _smallest(S: Array, T: Array, free: NDArray[np.bool_]) -> Array:
-    """The c with c^T T c = 1 and the smallest c^T S c, zero where it is not free, (K,)."""
+def _smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
+    """The c with c^T T c = 1 and the smallest c^T S c, zero where it is not free, (K,). Of exact ones that of V."""
     block = np.ix_(free, free)
     whitening = np.linalg.inv(np.linalg.cholesky(T[block])).T  # W^T T W = I
+    values, vectors = np.linalg.eigh(whitening.T @ S[block] @ whitening)
+    equal = whitening @ vectors[:, : max(1, np.count_nonzero(values < _EXACT))]
     c = np.zeros(len(free))
-    c[free] = whitening @ np.linalg.eigh(whitening.T @ S[block] @ whitening)[1][:, 0]
+    c[free] = equal @ np.linalg.eigh(equal.T @ V[block] @ equal)[1][:, 0]
     return c
 
 

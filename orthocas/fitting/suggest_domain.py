@@ -15,7 +15,7 @@ from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.probe import Bounds, Miss, Prober, Verdict, judged_chart
 from orthocas.fitting.settings import default_parametrisation, require_parametrisation
 from orthocas.robots.robot import Robot
-from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
+from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven
 from orthocas.tasks.domains import Box, Domain
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
@@ -31,7 +31,7 @@ JUDGES = 30_000  #: samples that judge the fit
 _START, _STEP = 0.5, 1.6  # first scale of the box, and factor to the next while the boundary is unknown
 _CLOSE = 1.06  # the boundary is found within this factor
 _SMALLEST = 1e-3  # scale of a box that is too small to be of use
-_ROUNDS = 2  # exchanges of width between joints
+_ROUNDS, _FEW_JOINTS = 2, 12  # exchanges of width between joints; one for so many joints, whose trials take a second
 _WIDER = 1.2  # factor by which one joint alone is widened
 _LARGEST_EXCHANGE = np.log(1.5)
 _STAGE = "suggest a domain"
@@ -162,7 +162,7 @@ class WidestBox:
         if not self.free:
             return self.room.copy(), {}
         widths = self._to_boundary(unit, _START)
-        for _ in range(_ROUNDS):
+        for _ in range(_ROUNDS if len(self.free) < _FEW_JOINTS else 1):
             trial = self._to_boundary(widths * np.exp(-self._exchange(widths)), 1.0)
             if np.log(trial[self.free]).sum() <= np.log(widths[self.free]).sum():
                 break
@@ -365,6 +365,7 @@ class _Joints:
 
 def _checked(robot: Robot, task: Task, leak_deg: float, conditioning: float, seed: int) -> Bounds:
     require_kind("robot", robot, Robot)
+    require_driven("suggesting a domain", robot.tree)
     require_kind("task", task, Task)
     require_count("seed", seed, least=0)
     if not 0 < as_number("leak_deg", leak_deg) < 90:

@@ -1,14 +1,14 @@
 """Wide charts: coordinates that are regular on a whole branch of the joint range."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.bases.cyclic import leaves_stay, over_cyclic_joints
 from orthocas.bases.family import (
@@ -28,9 +28,10 @@ from orthocas.errors import DomainError, Interrupted, InvalidValueError, RobotEr
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.checkpoint import Stage
 from orthocas.fitting.fit import Fit, fit, in_gauge, normalised
-from orthocas.fitting.like import SWIVEL, Quantity, quantity_of
+from orthocas.fitting.like import SWIVEL, Like, Likeness, quantity_of
 from orthocas.fitting.settings import require_parametrisation
 from orthocas.robots.robot import Robot
+from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import SolveResult, Status
 from orthocas.tasks.branches import Branch, Branches, branches
 from orthocas.tasks.domains import Box, sample_evenly, sample_heavily, sample_uniform
@@ -47,23 +48,30 @@ from orthocas.tools.progress import Monitor, Progress, silent
 CLEARANCE = 0.1  #: default least relative singular value
 LEAST_VOLUME = 0.05  #: over r, of the coordinates in domains of wide charts; see `RegularPart`
 DEGREE = 6
-_PER_TERM, _LEAST_SAMPLES, _MOST_SAMPLES = 40, 5000, 40_000
+_PER_TERM, _LEAST_SAMPLES, _MOST_SAMPLES = 30, 5000, 20_000
 _TAG, _JUDGED_TAG, _FIRST_TAG = 3000, 3001, 1000  # seed tags; other samples use other ones
 _FIRST = 200  # samples that scale coordinates
 _JUDGED = 20_000
-_PIECE = 1000  # samples whose gradients of all functions are in memory at once
-_SMOOTH = (0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4)  # weights of the mean squared gradient
-_ENOUGH = 5e-4  # share of bad positions, many near limits, at which more smoothness is worth more
-_ROUNDS, _ADDED = 2, 5.0  # rounds with worst points, and the weight of each of these
+_FIRST_STEP = (0.0, 1e-2)  # margin, and weight of the mean squared gradient
+_EASY, _HARDER = ((0.2, 1e-3), (0.2, 1e-4)), ((0.05, 1e-4), (0.05, 1e-5))  # further ones
+_HARD = 0.01  # share of bad positions after the first step with which a large margin asks too much
+_ENOUGH = 5e-4  # share of bad positions, many near limits, that is as good as none
+_WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a conditioning of 0.2
+_ROUNDS, _FRESH, _WORST, _FRESH_TAG = 2, 50_000, 5000, 3002  # rounds with the worst of fresh samples
 _EVERY = 4  # samples whose gradients count as long
 _TINY = 1e-12  # length of a row
-_NEWTON_STEPS, _GAIN, _RIDGE = 50, 1e-7, 1e-10
+_NEWTON_STEPS, _GAIN, _RIDGE = 30, 5e-3, 1e-10
 _MEANT = 100.0  # weight of the mean squared error of a meaning, relative to the slope
 _STEP, _MOST_STEPS, _FEWEST = 0.02, 400, 5  # of unit self-motions, along which a meaning is taken
+_ALIKE = 0.01  # weight of the mean squared distance to gradients of quantities, with r > 1
 _STILL = 1e-3  # change of a quantity for a unit self-motion
 _START = 3  # degree of the start, if there are several coordinates
 _START_WEIGHTS = (100.0, 3.0, 1000.0, 0.0, 10_000.0)
 _MIDDLES, _CLEARER = 20_000, 1.5  # positions that may be the middle of a domain, and their clearance over the bound
+
+
+Rows = Callable[[NDArray[np.bool_]], Array]  #: samples that are kept (N,) -> rows (kept, K)
+Lengths = Callable[[Array], tuple[Array, Rows]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,7 +103,7 @@ def fit_wide(
     clearance: float = CLEARANCE,
     parametrisation: Parametrisation | None = None,
     home: ArrayLike | str | None = None,
-    like: Quantity | str | None = None,
+    like: Likeness | None = None,
     samples: int | None = None,
     seed: int = 0,
     monitor: Monitor = silent,
@@ -106,14 +114,17 @@ def fit_wide(
     other coordinates stay. A coordinate is regular if and only if dxi/dq . z > 0 everywhere, which is linear in its
     coefficients. So the fit solves a convex problem, the least
 
-        mean max(0, 1 - dxi/dq . z)^2 + s mean |dxi/dq|^2_A^-1
+        mean max(0, 1 + c |dxi/dq|_A^-1 - dxi/dq . z)^2 + s mean |dxi/dq|^2_A^-1
 
-    over boundary-heavy samples of the branch that are clear of singular positions, by Newton's method. The second mean
-    is least where gradients point along z, that is where coordinates are orthogonal to the task and to each other. Its
-    weight s is the largest of seven with which all but 0.05 % of other samples are regular; if there is none, worst
-    points are searched and join the samples. With r > 1 the problem is solved for one coordinate after the other, from
-    a fit of degree 3. The domain of the chart is the part of the branch where coordinates are regular with a margin,
-    see `RegularPart`.
+    over boundary-heavy samples of the branch that are clear of singular positions, by Newton's method. A coordinate
+    loses nothing where the cosine between its gradient and the self-motion is above the margin c, as far as its
+    gradient is long enough. The second mean is least where gradients point along z, that is where coordinates are
+    orthogonal to the task and to each other. First c = 0, then c = 0.2, or c = 0.05 if more than 1 % of other samples
+    are not regular yet, each with two weights s. As long as more than 0.05 % are not regular after that, the worst of
+    50,000 fresh samples join, twice at most. The best of these results is kept: fewest bad positions, as far as these
+    are more than 0.05 %, then the largest 1 % quantile of the volume of `RegularPart`. With
+    r > 1 the problem is solved for one coordinate after the other, from a fit of degree 3. The domain of the chart is
+    the part of the branch where coordinates are regular with a margin, see `RegularPart`.
 
     Wide charts hold on most of what the arm reaches without passing a singular position (`regular_share`), but their
     leaks are large, 20 to 70 degrees on the arms that were measured. They serve inverse kinematics, closed loops,
@@ -130,11 +141,13 @@ def fit_wide(
         parametrisation: a family that is linear in its parameters. Default: Polynomial(6), with one linear
             term for each joint on whose position self-motions do not depend, such as the first and the last one.
         home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
-        like: with r = 1, what xi is to mean: a function of an SX column q, the name of a joint, or "swivel", the angle
-            of the elbow about the line from shoulder to wrist [rad]. Along the self-motion of the home, or else of the
-            branch's posture, xi then has nearly the values of that quantity, as far as these are monotone there.
-            Default: with shoulder, elbow and wrist, the scale and the sense of the swivel there.
-        samples: number of samples. Default: 40 for each function, 5,000 to 40,000.
+        like: what coordinates are to mean: a function of an SX column q, the name of a joint, or "swivel", the angle
+            of the elbow about the line from shoulder to wrist [rad]. With r = 1, xi then has nearly the values of that
+            quantity along the self-motion of the home, or else of the branch's posture, as far as these are monotone
+            there. With r > 1, several are allowed, or a task of lower priority: the gradients of the first coordinates
+            are held against the parts of theirs that are orthogonal to the task. Default: with shoulder, elbow and
+            wrist and r = 1, the scale and the sense of the swivel there.
+        samples: number of samples. Default: 30 for each function, 5,000 to 20,000.
         seed: seed of the samples.
         monitor: called with progress.
 
@@ -159,6 +172,7 @@ def fit_wide(
     """
     start = time.perf_counter()
     require_kind("robot", robot, Robot)
+    require_driven("a wide fit", robot.tree)
     require_kind("task", task, Task)
     bound = as_number("clearance", clearance)
     if not 0 < bound < np.inf:
@@ -175,8 +189,12 @@ def fit_wide(
         raise InvalidValueError("parametrisation", wanted.label, "a family to fit that is linear in its parameters")
     count = None if samples is None else require_count("samples", samples, least=2)
     posture = chosen.posture if home is None else home_posture(robot, task, home).q
-    meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
-    search = _Search(problem, wanted, count, seed, monitor, meaning)
+    if like is None:
+        meaning = Meaning.by_default(problem, posture)
+    else:
+        meaning = Meaning.of(problem, like, posture) if problem.r == 1 else None
+    several = like if problem.r > 1 else None
+    search = _Search(problem, wanted, count, seed, monitor, meaning, several)
     with remembered() as pressed:
         stopped = False
         try:
@@ -198,8 +216,11 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
     raw = search.coordinates(search.best[2])
-    meaning = search.meaning
+    meaning, alike = search.meaning, search.alike
     coordinates = in_gauge(normalised(raw, centre, first), centre) if meaning is None else meaning.named(raw)
+    if alike is not None:
+        scaled = search.coordinates(alike.scaled(search.best[2]))
+        coordinates = alike.quantities.named(normalised(scaled, centre, first), clear)
     try:
         domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     except DomainError as error:
@@ -217,6 +238,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         "regular share": share,
         "least conditioning": worst.least,
         **({} if meaning is None else {"meaning": meaning.name, "error of its meaning": meaning.error(coordinates)}),
+        **({} if alike is None else {"meaning": "; ".join(alike.quantities.names)}),
     }
     return WideFit(
         chart=Chart(problem, coordinates, notes),
@@ -227,6 +249,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         seconds=time.perf_counter() - start,
         branch=branch,
         regular_share=share,
+        like={} if alike is None else alike.quantities.distances(problem, coordinates, seed),
     )
 
 
@@ -250,17 +273,19 @@ class Meaning:
             return None
 
     @classmethod
-    def of(cls, problem: Problem, like: Quantity | str, posture: Array) -> "Meaning":
+    def of(cls, problem: Problem, like: Likeness, posture: Array) -> "Meaning":
         """Follow the self-motion of a posture both ways, as long as it is in the domain and the quantity is monotone.
 
         Raises:
-            InvalidValueError: if r > 1, or the quantity stands still there.
+            InvalidValueError: if there is more than one quantity, or it stands still there.
         """
-        name, quantity = quantity_of(problem.robot, like)
-        if problem.r != 1:
-            raise InvalidValueError(
-                "like", f"given with r = {problem.r}", "none for a wide chart with several coordinates; fit has like"
-            )
+        if isinstance(like, Task) or (isinstance(like, Sequence) and not isinstance(like, str)):
+            several = Like.of(problem.robot, like)
+            if len(several.names) != 1:
+                raise InvalidValueError("like", f"{len(several.names)} quantities", "one, as r = 1")
+            name, quantity = several.names[0], several.function
+        else:
+            name, quantity = quantity_of(problem.robot, like)
         sides = [_followed(problem, posture, sign * _STEP) for sign in (-1.0, 1.0)]
         points = np.concatenate([sides[0][:0:-1], sides[1]])
         middle = len(sides[0]) - 1
@@ -358,13 +383,40 @@ def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Bran
 class _Field:
     """Samples with the rows and the metric that self-motions are orthogonal to."""
 
-    def __init__(self, problem: Problem, points: Array, weight: float = 1.0) -> None:
+    def __init__(self, problem: Problem, points: Array, basis: BasisGradients | None = None) -> None:
         task = problem.task
         J = task.batched_frame_jacobian(points)[0].reshape(len(points), task.m, problem.n)
-        self.points, self.weight = points, weight
+        self.points, self.basis = points, basis
         self.rows = J / np.maximum(np.linalg.norm(J, axis=2, keepdims=True), _TINY)
         self.metric = None if problem.metric.is_identity else metric_matrices(problem.metric, points)
-        self.design: Array | None = None  # of a single coordinate, which does not depend on others
+        self._inverse = None if self.metric is None else np.linalg.inv(self.metric)
+        self._known = None if basis is None else basis.at(points)
+
+    def jacobian(self, C: Array) -> Array:
+        """dxi/dq of coefficients (r, K), (N, r, n)."""
+        assert self.basis is not None
+        assert self._known is not None
+        return self.basis.jacobian(self._known, C, len(self.points))
+
+    def along(self, directions: Array, kept: NDArray[np.bool_] | None = None) -> Array:
+        """dpsi/dq . a for directions a (N, n), of some samples (N,), (kept, K)."""
+        assert self.basis is not None
+        assert self._known is not None
+        return self.basis.along(self._known, directions, kept)
+
+    def lengths(self, c: Array) -> tuple[Array, Array]:
+        """|dxi/dq| of one coordinate (K,), (N,), and its derivative after dxi/dq, (N, n)."""
+        slopes = self.jacobian(c[None])[:, 0]
+        raised = slopes if self._inverse is None else np.einsum("sij,sj->si", self._inverse, slopes)
+        long = np.sqrt(np.maximum(np.einsum("si,si->s", slopes, raised), _TINY**2))
+        return long, raised / long[:, None]
+
+    def energy(self) -> Array:
+        """Mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K)."""
+        N, n = self.rows.shape[0], self.rows.shape[2]
+        root = np.broadcast_to(np.eye(n), (N, n, n)) if self._inverse is None else np.linalg.cholesky(self._inverse)
+        parts = (self.along(root[:, :, i]) for i in range(n))
+        return np.asarray(sum((G.T @ G for G in parts), start=np.zeros(())) / N)
 
     def directions(self, J: Array, k: int) -> Array:
         """z (N, n) along which the task and all rows of J (N, r, n) but row k stay, with det [J_x; J] > 0 for row z."""
@@ -394,64 +446,84 @@ class _Search:
         seed: int,
         monitor: Monitor,
         meaning: Meaning | None,
+        quantities: Likeness | None,
     ) -> None:
         self.problem, self.parametrisation, self.seed, self.monitor = problem, parametrisation, seed, monitor
-        self.meaning = meaning
+        self.meaning, self._quantities = meaning, quantities
+        self.alike: _Alike | None = None  #: once the search runs
         family = parametrisation.family(JointSpace.of(problem), problem.r)
         assert isinstance(family, LinearFamily)
         self._family: LinearFamily = family
         self._basis: BasisGradients = gradients_of(family, problem.n)
         self.samples = samples or int(np.clip(_PER_TERM * family.width, _LEAST_SAMPLES, _MOST_SAMPLES))
-        self.best: tuple[float, float, Array] | None = None  #: share of bad positions, smoothness, coefficients
+        self.best: tuple[float, float, Array] | None = None  #: share of bad positions, -1 % volume, coefficients
         self.stages: list[Stage] = []
 
     def run(self) -> None:
-        """Solve with less and less smoothness until coordinates are regular enough, then with worst points too."""
-        self._judged = _Field(self.problem, self._draw(_JUDGED, _JUDGED_TAG))
-        fields = [_Field(self.problem, self._draw(self.samples, _TAG))]
-        energy, C = self._energy(fields[0]), self._first()
-        for smooth in _SMOOTH:
-            C = self._swept(fields, energy, C, smooth, f"smoothness {smooth:g}")
-            if self._keep(C, smooth):
+        """Solve with a larger margin and less smoothness, and with the worst of fresh samples if that is not enough."""
+        self._judged = self._field(_JUDGED, _JUDGED_TAG)
+        fields, C = [self._field(self.samples, _TAG)], self._first()
+        some = _Field(self.problem, fields[0].points[::_EVERY], self._basis)
+        energy = some.energy()
+        if self._quantities is not None:
+            self.alike = _Alike(Like.of(self.problem.robot, self._quantities), some)
+        C = self._swept(fields, energy, C, _FIRST_STEP)
+        self._keep(C)
+        steps = _EASY if self._bad <= _HARD else _HARDER
+        for step in steps:
+            C = self._swept(fields, energy, C, step)
+            if self._keep(C):
                 return
         for turn in range(1, 1 + _ROUNDS):
-            assert self.best is not None
-            _, smooth, C = self.best
-            fields.append(
-                _Field(self.problem, worst_points(self.problem, self.coordinates(C), self.seed).points, _ADDED)
-            )
-            if self._keep(self._swept(fields, energy, C, smooth, f"worst points, round {turn}"), smooth):
+            if self._bad <= _ENOUGH:
                 return
+            fresh = self._field(_FRESH, _FRESH_TAG + turn)
+            worst = fresh.points[np.argsort(self._volumes(fresh, C))[:_WORST]]
+            fields.append(_Field(self.problem, worst, self._basis))
+            C = self._swept(fields, energy, C, steps[-1], f", worst samples, round {turn}")
+            self._keep(C)
+
+    @property
+    def _bad(self) -> float:
+        """Share of bad positions with the best coefficients so far."""
+        assert self.best is not None
+        return self.best[0]
 
     def coordinates(self, C: Array) -> Coordinates:
         """Coordinates of coefficients (r, K), not normalised."""
         r, space = self.problem.r, JointSpace.of(self.problem)
         return Coordinates(self.parametrisation, space, (), C.ravel(), np.zeros(r), np.ones(r))
 
-    def _swept(self, fields: list[_Field], energy: Array, C: Array, smooth: float, name: str) -> Array:
+    def _swept(self, fields: list[_Field], energy: Array, C: Array, step: tuple[float, float], more: str = "") -> Array:
         """Coefficients (r, K) after the problem of each coordinate was solved once."""
-        started, C = time.perf_counter(), C.copy()
-        weights = np.concatenate([np.full(len(field.points), field.weight) for field in fields])
+        started, C, (margin, smooth) = time.perf_counter(), C.copy(), step
+        name = f"margin {margin:g}, smoothness {smooth:g}{more}"
         value, E, pull = 0.0, smooth * energy + _RIDGE * np.trace(energy) / len(energy) * np.eye(len(energy)), None
         if self.meaning is not None and self.meaning.wanted:
             rows, sides = self.meaning.equations(self._family)
             E, pull = E + _MEANT / len(rows) * rows.T @ rows, _MEANT / len(rows) * rows.T @ sides
         for k in range(len(C)):
-            design = np.concatenate([self._design(field, C, k) for field in fields])
-            C[k], value = least_hinge(design, E, weights, pull)
+            own, towards = (E, pull) if self.alike is None else self.alike.added(E, C, k)
+            C[k], value = _Hinge(fields, C, k, margin).least(own, towards, C[k])
             self.monitor(Progress(name, (k + 1) / len(C), f"loss {value:.5g}", value))
+        samples = sum(len(field.points) for field in fields)
         result = SolveResult(C.ravel(), value, Status.CONVERGED, len(C), len(C), time.perf_counter() - started)
-        self.stages.append(Stage(name, C.size, len(weights), result))
+        self.stages.append(Stage(name, C.size, samples, result))
         return C
 
-    def _keep(self, C: Array, smooth: float) -> bool:
+    def _volumes(self, field: _Field, C: Array) -> Array:
+        """Volumes of coordinates at samples, (N,), positive at most."""
+        volumes = field.volumes(field.jacobian(C))
+        return volumes if np.median(volumes) >= 0 else -volumes
+
+    def _keep(self, C: Array) -> bool:
         """Keep coefficients if they are the best so far; whether they are regular enough."""
-        volumes = self._judged.volumes(self.coordinates(C).jacobian(self._judged.points))
-        orientation = 1.0 if np.median(volumes) >= 0 else -1.0
-        bad = float(np.mean(orientation * volumes <= LEAST_VOLUME / self.problem.r))
-        if self.best is None or bad < self.best[0]:
-            self.best = bad, smooth, C
-        return bad <= _ENOUGH
+        volumes = self._volumes(self._judged, C)
+        bad = float(np.mean(volumes <= LEAST_VOLUME / self.problem.r))
+        low = float(np.quantile(volumes, 0.01))
+        if self.best is None or (max(bad, _ENOUGH), -low) < (max(self.best[0], _ENOUGH), self.best[1]):
+            self.best = bad, -low, C
+        return bad <= _ENOUGH and low >= _WELL / self.problem.r
 
     def _first(self) -> Array:
         """Where the search starts, (r, K): anywhere with one coordinate, otherwise at a fit of low degree."""
@@ -459,7 +531,15 @@ class _Search:
         if r == 1:
             return np.zeros((1, self._family.width))
         low = wanted.of_degree(min(wanted.degree, _START)) if isinstance(wanted, GradedParametrisation) else wanted
-        found = fit(self.problem, low, weights=_START_WEIGHTS, seed=self.seed, split_idle=False, monitor=self.monitor)
+        found = fit(
+            self.problem,
+            low,
+            weights=_START_WEIGHTS,
+            seed=self.seed,
+            split_idle=False,
+            like=self._quantities,
+            monitor=self.monitor,
+        )
         coarse = found.chart.coordinates
         assert isinstance(coarse, Coordinates)
         theta = coarse.theta
@@ -467,65 +547,127 @@ class _Search:
             theta = self._family.embed(theta, cast(Any, coarse.family))
         return np.asarray(theta.reshape(r, -1) * coarse.scale[:, None])
 
-    def _draw(self, count: int, tag: int) -> Array:
-        return sample_heavily(self.problem.domain, count, (self.seed, tag))
+    def _field(self, count: int, tag: int) -> _Field:
+        """Samples, many of them near the boundary."""
+        return _Field(self.problem, sample_heavily(self.problem.domain, count, (self.seed, tag)), self._basis)
 
-    def _gradients(self, points: Array) -> Iterator[tuple[slice, Array]]:
-        """Gradients of all functions (c, n, K), some points at a time."""
-        for begin in range(0, len(points), _PIECE):
-            part = slice(begin, min(begin + _PIECE, len(points)))
-            yield part, self._basis.dense(self._basis.at(points[part]), part.stop - begin)
 
-    def _design(self, field: _Field, C: Array, k: int) -> Array:
-        """dpsi/dq . z at the samples of a field, (N, K)."""
-        if field.design is not None:
-            return field.design
-        z = field.directions(self.coordinates(C).jacobian(field.points), k)
-        found = np.empty((len(field.points), self._family.width))
-        for part, G in self._gradients(field.points):
-            np.matmul(z[part, None, :], G, out=found[part, None, :])
-        if len(C) == 1:
-            field.design = found
+class _Alike:
+    """Adds mean |Z^T (dxi_k/dq - g_k / slope_k)|^2 to the problems of the first coordinates, with a basis Z of ker J_x.
+
+    The g_k are the gradients of the quantities, and slope_k is the median of g_k along the self-motion of coordinate k.
+
+    Args:
+        quantities: what coordinates are to be like.
+        field: some samples.
+    """
+
+    def __init__(self, quantities: Like, field: _Field) -> None:
+        self.quantities, self._field = quantities, field
+        N, count, n = len(field.points), len(quantities.names), field.points.shape[1]
+        q = ca.SX.sym("q", n)
+        slopes = dense_function("slopes", [q], [ca.jacobian(quantities.function(q), q)])
+        self._gradients, self._slopes = Batched(slopes)(field.points)[0].reshape(N, count, n), np.ones(count)
+        Z = np.linalg.svd(field.rows)[2][:, field.rows.shape[1] :]
+        parts = [field.along(Z[:, j]) for j in range(Z.shape[1])]
+        self._square = sum((part.T @ part for part in parts), start=np.zeros(())) / N
+        sides = (np.einsum("si,ski->sk", Z[:, j], self._gradients) / N for j in range(Z.shape[1]))
+        self._pulls = sum((part.T @ side for part, side in zip(parts, sides, strict=True)), start=np.zeros(()))
+
+    def added(self, E: Array, C: Array, k: int) -> tuple[Array, Array | None]:
+        """E and the pull for coordinate k of coefficients (r, K), with the term.
+
+        Raises:
+            InvalidValueError: if the task leaves nothing of the quantity.
+        """
+        if k >= len(self._slopes):
+            return E, None
+        along = np.einsum("si,si->s", self._gradients[:, k], self._field.directions(self._field.jacobian(C), k))
+        self._slopes[k] = np.median(along)
+        if not abs(self._slopes[k]) > _STILL * np.linalg.norm(self._gradients[:, k], axis=1).max():
+            wanted = "others, in another order, or another task"
+            raise InvalidValueError("like", "quantities that the task leaves nothing of", wanted)
+        return E + _ALIKE * self._square, _ALIKE * self._pulls[:, k] / self._slopes[k]
+
+    def scaled(self, C: Array) -> Array:
+        """Coefficients (r, K) in the units of the quantities."""
+        found = C.copy()
+        found[: len(self._slopes)] *= self._slopes[:, None]
         return found
 
-    def _energy(self, field: _Field) -> Array:
-        """Mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K), over every fourth sample."""
-        total, metric = np.zeros((self._family.width,) * 2), field.metric
-        points = field.points[::_EVERY]
-        for part, G in self._gradients(points):
-            raised = G if metric is None else np.linalg.solve(metric[::_EVERY][part], G)
-            total += G.reshape(-1, G.shape[2]).T @ raised.reshape(-1, G.shape[2])
-        return total / len(points)
+
+class _Hinge:
+    """Mean of max(0, 1 + margin |dxi/dq| - dxi/dq . z)^2 over samples, for one coordinate; convex in its coefficients.
+
+    Args:
+        fields: the samples.
+        C: coefficients of all coordinates, (r, K).
+        k: which one.
+        margin: the least cosine between dxi/dq and z beyond which nothing is lost, 0 <= margin < 1.
+    """
+
+    def __init__(self, fields: list[_Field], C: Array, k: int, margin: float) -> None:
+        self._fields, self._margin = fields, margin
+        self._rows = np.concatenate([field.along(field.directions(field.jacobian(C), k)) for field in fields])
+
+    def least(self, E: Array, pull: Array | None, start: Array) -> tuple[Array, float]:
+        """The c with the least mean + c^T E c - 2 pull^T c, see `least_hinge`."""
+        return least_hinge(self._rows, E, pull, start, self._lengths if self._margin else None)
+
+    def _lengths(self, c: Array) -> tuple[Array, Rows]:
+        """margin |dxi/dq|, (N,), and its derivative after c at some samples."""
+        pairs = [field.lengths(c) for field in self._fields]
+        ends = np.cumsum([len(field.points) for field in self._fields])[:-1]
+
+        def slopes(kept: NDArray[np.bool_]) -> Array:
+            parts = zip(self._fields, pairs, np.split(kept, ends), strict=True)
+            return self._margin * np.concatenate([field.along(pair[1], some) for field, pair, some in parts])
+
+        return self._margin * np.concatenate([long for long, _ in pairs]), slopes
 
 
-def least_hinge(D: Array, E: Array, weights: Array, pull: Array | None = None) -> tuple[Array, float]:
-    """The c (K,) with the least sum_s w_s max(0, 1 - D_s c)^2 / sum w + c^T E c - 2 g^T c, and that value.
+def least_hinge(
+    D: Array,
+    E: Array,
+    pull: Array | None = None,
+    start: Array | None = None,
+    lengths: Lengths | None = None,
+    gain: float = _GAIN,
+) -> tuple[Array, float]:
+    """The c (K,) with the least mean of max(0, 1 + l_s(c) - D_s c)^2 + c^T E c - 2 g^T c, and that value.
+
+    Newton's method without the curvature of l, with halved steps. The function is convex if l is.
 
     Args:
         D: (N, K).
         E: (K, K), positive definite.
-        weights: w, (N,).
         pull: g, (K,). Default: 0.
+        start: (K,). Default: 0.
+        lengths: c -> l (N,), convex in c and >= 0, and what gives rows of dl/dc for samples that are kept (N,).
+            Default: 0.
+        gain: relative decrease of the value in a step at which the search ends.
     """
-    weights, g = weights / weights.sum(), np.zeros(len(E)) if pull is None else pull
+    g, N = np.zeros(len(E)) if pull is None else pull, len(D)
 
-    def value(c: Array) -> float:
-        short = np.maximum(0.0, 1 - D @ c)
-        return float(weights @ short**2 + c @ E @ c - 2 * g @ c)
+    def state(c: Array) -> tuple[float, Array, Rows | None]:
+        long, slopes = (np.zeros(()), None) if lengths is None else lengths(c)
+        short = np.maximum(0.0, 1 + long - D @ c)
+        return float(short @ short / N + c @ E @ c - 2 * g @ c), short, slopes
 
-    c, last, now = np.zeros(len(E)), np.inf, np.inf
+    c = np.zeros(len(E)) if start is None else start
+    last, short, slopes = state(c)
     for _ in range(_NEWTON_STEPS):
-        active = D @ c < 1
-        rows = D[active]
-        weighted = rows * weights[active, None]
-        factor = scipy.linalg.cho_factor(rows.T @ weighted + E)
-        step = scipy.linalg.cho_solve(factor, weighted.sum(axis=0) + g) - c
-        size = 1.0
-        while not value(c + size * step) < last and size > 1e-3:
+        active = short > 0
+        rows = D[active] if slopes is None else D[active] - slopes(active)
+        factor = scipy.linalg.cho_factor(rows.T @ rows / N + E)
+        step = scipy.linalg.cho_solve(factor, rows.T @ short[active] / N - E @ c + g)
+        size, now = 1.0, state(c + step)
+        while not now[0] < last and size > 1e-3:
             size /= 2
-        c = c + size * step
-        now = value(c)
-        if last - now <= _GAIN * abs(now):
+            now = state(c + size * step)
+        if not now[0] < last:
             break
-        last = now
-    return c, now
+        gained, (last, short, slopes), c = last - now[0], now, c + size * step
+        if gained <= gain * abs(last):
+            break
+    return c, last

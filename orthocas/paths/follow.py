@@ -17,6 +17,7 @@ from orthocas.paths.joint_curve import JointCurve, Lost, Solver, TimeLaw, checke
 from orthocas.paths.joint_motion import JointMotion, Margins
 from orthocas.paths.plan import Plan
 from orthocas.robots.obstacles import LinkDistances, Obstacle
+from orthocas.robots.tree import require_driven
 from orthocas.tasks.clear_box import row_scale
 from orthocas.tasks.domains import bounds_of, contains, sample_uniform
 from orthocas.tools.batch import Batched, dense_function
@@ -381,6 +382,7 @@ def follow(
         (True, True)
     """
     require_kind("chart", chart, Chart)
+    require_driven("following a path", chart.problem.robot.tree)
     chart.function("second_derivative")  # raises for grown charts
     start = chart.problem.domain.centre if q_start is None else as_point("q_start", q_start, chart.n)
     distances = LinkDistances(chart.problem.robot, obstacles, link_radius)

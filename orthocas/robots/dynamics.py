@@ -127,6 +127,16 @@ def bias(
     return inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity, payload, inertials)
 
 
+def zero_momentum(tree: KinematicTree, q: ca.SX) -> ca.SX:
+    """H(q) = [-M_bb^-1 M_ba; I], (n, a), for a base b that floats and a joints of the arms."""
+    k = len(tree.floating)
+    M = mass_matrix(tree, q)
+    base_first = list(reversed(range(k)))  # L of L^T D L in the order of `forward_dynamics`
+    D, LT, order = ca.ldl(M[base_first, base_first], False)
+    follows = ca.ldl_solve(M[base_first, k:], D, LT, order)[base_first, :]
+    return ca.vertcat(-follows, ca.SX.eye(tree.n - k))
+
+
 def coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, payload: ca.SX | None = None) -> ca.SX:
     """C(q, v) w with the Christoffel form of C, (n, 1), by polarisation of the quadratic form C(q, v) v.
 

@@ -195,12 +195,12 @@ class TipTurn:
         Args:
             turned: the rotation.
             position: the position.
-            to_differentiate: use the shorter formula, which loses digits next to half a turn.
+            to_differentiate: use the formula without cases, which loses digits next to half a turn.
         """
         if self.axis is None:
             turns = half_angle_vector(turned) if to_differentiate else 2 * quaternion_of(turned)[1:]
         else:
-            turns = self._about_axis(turned, _AXES.index(self.axis))
+            turns = self._about_axis(turned, None if to_differentiate else quaternion_of(turned))
         return ca.vertcat(position, turns) if self.with_position else turns
 
     def quaternion(self, turns: ca.SX) -> ca.SX:
@@ -220,7 +220,7 @@ class TipTurn:
         if self.axis is None:
             return 2 * p[1:] * ca.if_else(p[0] < 0, -1, 1)
         cross = skew(p[1:])
-        return self._about_axis(ca.SX.eye(3) + 2 * (p[0] * cross + cross @ cross), _AXES.index(self.axis))
+        return self._about_axis(ca.SX.eye(3) + 2 * (p[0] * cross + cross @ cross), p * ca.if_else(p[0] < 0, -1, 1))
 
     @property
     def order(self) -> Array:
@@ -232,8 +232,14 @@ class TipTurn:
         tilting = -np.array(ca.DM(skew(ca.SX(along))))
         return np.vstack([tilting[_others(axis)], along])
 
-    def _about_axis(self, turned: ca.SX, axis: int) -> ca.SX:
-        return ca.vertcat(tilt(turned, axis), *([turn_about(turned, axis)] if self.whole else []))
+    def _about_axis(self, turned: ca.SX, p: ca.SX | None) -> ca.SX:
+        """Tilt and turn of a rotation matrix, with its quaternion (w >= 0) unless they are to be differentiated."""
+        assert self.axis is not None
+        axis = _AXES.index(self.axis)
+        tilts = tilt(turned, axis, p is None)
+        if not self.whole:
+            return tilts
+        return ca.vertcat(tilts, turn_about(turned, axis) if p is None else 2 * ca.atan2(p[1 + axis], p[0]))
 
     def rates(self, turning: ca.SX, moving: ca.SX) -> ca.SX:
         """How fast the components change if the reference is the tip's present orientation, for each joint, (m, n).

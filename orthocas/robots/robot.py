@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.errors import InvalidValueError, RobotError, ShapeError
 from orthocas.robots import dynamics, kinematics, urdf
 from orthocas.robots.dynamics import PAYLOAD, with_payload
 from orthocas.robots.homes import model_states, postures, srdf_states
@@ -119,8 +119,10 @@ class Robot(Shown):
             tool: pose of the tip of a massless tool in the (first) tip frame; see `with_tool`.
             tips: names of several frames, such as two hands, in place of `tip`.
             base: "planar" for a base that slides along the world's x and y and turns about z, by the joints base_x,
-                base_y, base_heading; or "rail:x", "rail:y", "rail:z". They come first, and have no limits. Default: a
-                fixed base.
+                base_y, base_heading; "rail:x", "rail:y", "rail:z"; or "floating" for a base that nothing holds or
+                drives, without gravity, by the joints float_x, float_y, float_z, float_yaw, float_pitch, float_roll
+                ("floating:xy" in the plane, by float_x, float_y, float_heading); see `zero_momentum`. They come first,
+                and have no limits. Default: a fixed base.
 
         Raises:
             RobotError: if the file cannot be read, the robot branches and no tip is given, or a joint on the chain to
@@ -297,6 +299,23 @@ class Robot(Shown):
         """ddq = M^-1 (tau - C dq - g), (n,)."""
         return self._call("forward_dynamics", q, dq, tau)
 
+    def zero_momentum(self, q: Any) -> Any:
+        """H(q), (n, a): the velocities of all n joints per velocity of the a joints of the arms, on a floating base.
+
+        The base moves so that the momentum stays zero: dq = H da with H = [-M_bb^-1 M_ba; I]. Then J H is the
+        generalised Jacobian of a task with the Jacobian J, and H^T M H the generalised inertia. H is not the Jacobian
+        of a function: where the base ends depends on the path of the arms.
+
+        Raises:
+            RobotError: if the base does not float.
+
+        Source:
+            [UY1989]
+        """
+        if not self.tree.floating:
+            raise RobotError("this robot's base does not float: build it with base='floating' or 'floating:xy'")
+        return self._call("zero_momentum", q)
+
     def coriolis_product(self, q: Any, v: Any, w: Any) -> Any:
         """C(q, v) w, (n,), with the Christoffel form of C (dM/dt - 2 C is skew). Bilinear and symmetric in (v, w)."""
         return self._call("coriolis_product", q, v, w)
@@ -466,6 +485,7 @@ _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {  # argum
         lambda tree, q, dq, tau: dynamics.forward_dynamics(tree, q, dq, tau, tree.gravity),
     ),
     "coriolis_product": (("q", "v", "w"), dynamics.coriolis_product),
+    "zero_momentum": (("q",), dynamics.zero_momentum),
     "mass_matrix_with_payload": (("q", "payload"), dynamics.mass_matrix),
     "gravity_with_payload": (
         ("q", "payload"),
@@ -477,4 +497,8 @@ _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {  # argum
     ),
     "coriolis_product_with_payload": (("q", "v", "w", "payload"), dynamics.coriolis_product),
 }
-_MATRICES = ("mass_matrix", *(f"{of}_{quantity}" for of in ("tip", "frame") for quantity in ("rotation", "jacobian")))
+_MATRICES = (
+    "mass_matrix",
+    "zero_momentum",
+    *(f"{of}_{quantity}" for of in ("tip", "frame") for quantity in ("rotation", "jacobian")),
+)

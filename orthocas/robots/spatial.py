@@ -70,20 +70,31 @@ def rotations_of(quaternions: Array) -> Array:
     return R
 
 
-def tilt(R: ca.SX, axis: int) -> ca.SX:
+def tilt(R: ca.SX, axis: int, to_differentiate: bool = False) -> ca.SX:
     """2 sin(angle / 2) times the direction in which a rotation matrix tilts a coordinate axis, (2, 1).
 
     With d = R e_axis, these are the two other entries of d times sqrt(2 / (1 + d_axis)): Lambert's equal-area map.
+
+    Args:
+        R: the rotation matrix.
+        axis: number of the axis.
+        to_differentiate: use the formula without cases, which loses digits next to half a turn.
     """
     d = R[:, axis]
-    return d[[k for k in range(3) if k != axis]] * ca.sqrt(2 / (1 + d[axis]))
+    across = d[[k for k in range(3) if k != axis]]
+    factor = ca.sqrt(2 / (1 + d[axis]))
+    if to_differentiate:
+        return across * factor
+    beyond = ca.sqrt(2 * (1 - d[axis]) / ca.fmax(ca.sumsqr(across), _TINY))  # more than a quarter of a turn
+    return across * ca.if_else(d[axis] < 0, beyond, factor)
 
 
 def turn_about(R: ca.SX, axis: int) -> ca.SX:
     """Angle of a rotation matrix about one of its own axes, after the shortest rotation that tilts that axis.
 
     R = S T, where S takes e_axis to R e_axis about an axis across both, and T turns about e_axis by the angle
-    atan2(R_ji - R_ij, R_ii + R_jj) in (-pi, pi], with (i, j, axis) in cyclic order. Singular where S is half a turn.
+    atan2(R_ji - R_ij, R_ii + R_jj) in (-pi, pi], with (i, j, axis) in cyclic order. Singular where S is half a turn;
+    2 atan2(p_axis, p_w) of the quaternion p loses fewer digits next to it.
     """
     i, j = (axis + 1) % 3, (axis + 2) % 3
     return ca.atan2(R[j, i] - R[i, j], R[i, i] + R[j, j])

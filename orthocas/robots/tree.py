@@ -230,21 +230,48 @@ class KinematicTree:
         """Whether each joint is prismatic."""
         return tuple(kind == "prismatic" for kind in self.joint_kinds)
 
+    @property
+    def floating(self) -> tuple[int, ...]:
+        """The joints of a floating base, which no motor drives; none if the base is fixed or driven."""
+        for names in (_FLOATING, _AFLOAT):
+            if self.joint_names[: len(names)] == names:
+                return tuple(range(len(names)))
+        return ()
+
+
+def require_driven(what: str, tree: KinematicTree) -> None:
+    """Raise RobotError for a robot with a floating base, whose first joints no motor drives."""
+    if tree.floating:
+        raise RobotError(
+            f"{what} needs joints that motors drive, and no motor drives a floating base. Charts of it have fits, "
+            "evaluation and inverse; Robot.zero_momentum has what moves the base"
+        )
+
 
 _PLANAR = "planar"
 _RAIL = "rail:"
-_BASES = (_PLANAR, *(f"{_RAIL}{axis}" for axis in "xyz"))
-BASE_JOINTS = ("base_x", "base_y", "base_z", "base_heading")  #: that a moving base may have
+_FLOATING = ("float_x", "float_y", "float_z", "float_yaw", "float_pitch", "float_roll")
+_AFLOAT = ("float_x", "float_y", "float_heading")
+_BASES: dict[str, tuple[str, ...]] = {
+    _PLANAR: ("base_x", "base_y", "base_heading"),
+    **{f"{_RAIL}{axis}": (f"base_{axis}",) for axis in "xyz"},
+    "floating": _FLOATING,
+    "floating:xy": _AFLOAT,
+}
+_AXES = {"heading": "z", "yaw": "z", "pitch": "y", "roll": "x"}  # of joints that turn
+BASE_JOINTS = tuple({joint for joints in _BASES.values() for joint in joints})  #: that a moving base may have
 
 
 def on_moving_base(tree: KinematicTree, base: str, mass: float, centre: Array, inertia: Array) -> KinematicTree:
-    """A tree whose base slides along the world's x and y and turns about z, or slides along one axis.
+    """A tree whose base slides along the world's x and y and turns about z, slides along one axis, or floats.
 
-    The joints base_x, base_y, base_heading come first, without limits.
+    The joints of the base come first, without limits: base_x, base_y, base_heading; base_x, base_y or base_z; float_x,
+    float_y, float_z, float_yaw, float_pitch, float_roll, where the last three turn about z, then y, then x; or float_x,
+    float_y, float_heading. A floating base has no gravity.
 
     Args:
         tree: the robot on a fixed base.
-        base: "planar", or "rail:x", "rail:y", "rail:z".
+        base: "planar", "rail:x", "rail:y", "rail:z", "floating", or "floating:xy".
         mass: of what the base carries and no joint of the robot moves [kg].
         centre: its centre of mass, (3,) [m].
         inertia: about that centre, (3, 3) [kg m^2].
@@ -253,17 +280,15 @@ def on_moving_base(tree: KinematicTree, base: str, mass: float, centre: Array, i
         InvalidValueError: for another kind of base.
         RobotError: if the robot has joints of these names.
     """
-    if base not in _BASES:
+    if not isinstance(base, str) or base not in _BASES:
         wanted = (
             f"one of {', '.join(_BASES)}. The place of wheels that cannot slide sideways is no function of joints: "
         )
         raise InvalidValueError("base", repr(base)[:80], wanted + "use planar, and let the base follow the motion")
-    axes = "xy" if base == _PLANAR else base.removeprefix(_RAIL)
-    names = [f"base_{axis}" for axis in axes] + (["base_heading"] if base == _PLANAR else [])
-    kinds: list[JointKind] = ["prismatic"] * len(axes)
-    along = [np.roll(np.eye(3), 2 - "xyz".index(axis), axis=1) for axis in axes]  # z becomes the axis
-    if base == _PLANAR:
-        kinds, along = [*kinds, "revolute"], [*along, np.eye(3)]
+    names = _BASES[base]
+    moves = [name.rpartition("_")[2] for name in names]
+    kinds: list[JointKind] = ["revolute" if move in _AXES else "prismatic" for move in moves]
+    along = [np.roll(np.eye(3), 2 - "xyz".index(_AXES.get(move, move)), axis=1) for move in moves]  # z becomes the axis
     k, back = len(names), along[-1].T  # from the world's axes to those of the last body
     free, first = np.full(k, np.inf), np.zeros((k, 3))
 
@@ -299,6 +324,7 @@ def on_moving_base(tree: KinematicTree, base: str, mass: float, centre: Array, i
         upper=np.concatenate([free, tree.upper]),
         effort_limits=np.concatenate([free, tree.effort_limits]),
         velocity_limits=np.concatenate([free, tree.velocity_limits]),
+        gravity=np.zeros(3) if names in (_FLOATING, _AFLOAT) else tree.gravity,
         tip_parent=carried(tree.tip_parent),
         tip_rotation=tip,
         tip_translation=place,

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError
+from orthocas.errors import InvalidValueError, MetricError, NotRedundantError, SingularTaskError
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.clear_box import clear_domain, row_scale
@@ -44,9 +44,10 @@ class Problem(Shown):
             task is smaller; see `orthocas.ClearBox`. Default: no bound.
 
     Raises:
-        NotRedundantError: if m >= n.
+        NotRedundantError: if m >= n, without the joints of a floating base.
         DomainError: if the domain leaves the joint limits, or its centre is nearer to a singular position than allowed.
-        MetricError: if a constant metric is not SPD, or a joint moves no mass under "inertia". Metrics that depend on q
+        MetricError: if a constant metric is not SPD, a joint moves no mass under "inertia", or a floating base has
+            another metric. Metrics that depend on q
             are checked by `check`, and later at every sample.
 
     Example:
@@ -79,8 +80,8 @@ class Problem(Shown):
             )
         if task.robot is not robot:
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
-        if task.m >= robot.n:
-            raise NotRedundantError(task.m, robot.n)
+        if task.m >= robot.n - len(robot.tree.floating):
+            raise NotRedundantError(task.m, robot.n - len(robot.tree.floating))
         domain = regular_box(robot, task) if domain is None else domain
         if not isinstance(domain, Domain):
             raise InvalidValueError("domain", repr(domain), "a Box, a Torus or another Domain")
@@ -89,6 +90,8 @@ class Problem(Shown):
         domain = clear_domain(domain, task, least_singular_value)
         metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
         require_shape("metric", metric.function.size_out(0), (robot.n, robot.n))
+        if robot.tree.floating and not metric.is_inertia:
+            raise MetricError(f"metric '{metric.name}' on a floating base, expected 'inertia', which is what moves it")
         for key, value in (
             ("robot", robot),
             ("task", task),

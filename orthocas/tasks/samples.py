@@ -40,6 +40,25 @@ class Samples:
         inverse = None if self.metric_inverse is None else self.metric_inverse[:, joints][:, :, joints]
         return Samples(self.points[:, joints], self.task_jacobian[:, :, joints], inverse)
 
+    def at_zero_momentum(self, base: Sequence[int]) -> "Samples":
+        """The samples as velocities with zero momentum see them, on a base that floats.
+
+        For A = M, with the joints a of the arms: J_x becomes the generalised Jacobian J_a - J_b M_bb^-1 M_ba, which is
+        (J_x M^-1)_a ((M^-1)_aa)^-1, and M the generalised inertia, whose inverse is (M^-1)_aa. Then the base's joints
+        neither move the task nor are coupled to the others, and count as idle.
+
+        Source:
+            [UY1989]; the metric is ours.
+        """
+        assert self.metric_inverse is not None
+        n, k = self.task_jacobian.shape[2], len(base)
+        arms = self.metric_inverse[:, k:, k:]
+        J, inverse = np.zeros_like(self.task_jacobian), np.repeat(np.eye(n)[None], len(self), axis=0)
+        gradients = self.raised(self.task_jacobian)[:, :, k:]
+        J[:, :, k:] = np.linalg.solve(arms, gradients.transpose(0, 2, 1)).transpose(0, 2, 1)
+        inverse[:, k:, k:] = arms
+        return Samples(self.points, J, inverse)
+
     def raised(self, covectors: Array) -> Array:
         """A^-1 v for covectors v (N, k, n): gradients in the metric ([AS2023] eq. (16))."""
         gradients: Array = covectors if self.metric_inverse is None else covectors @ self.metric_inverse
@@ -121,7 +140,8 @@ def samples_at(problem: Problem, points: Array) -> Samples:
     inverse: Array | None = None
     if not problem.metric.is_identity:
         inverse = np.asarray(np.linalg.inv(metric_matrices(problem.metric, points)), dtype=float)
-    return Samples(points, J, inverse)
+    samples = Samples(points, J, inverse)
+    return samples.at_zero_momentum(problem.robot.tree.floating) if problem.robot.tree.floating else samples
 
 
 def idle_joints(problem: Problem, samples: Samples) -> list[int]:
@@ -129,7 +149,8 @@ def idle_joints(problem: Problem, samples: Samples) -> list[int]:
 
     At every sample column k of J_x vanishes, row k of A^-1 is zero off the diagonal, and A does not depend on q_k. Then
     J_x A^-1 e_k = 0, so xi = q_k is exact and orthogonal to every coordinate of the other joints. The rest of the
-    problem does not depend on joint k.
+    problem does not depend on joint k. So are the joints of a floating base in `Samples.at_zero_momentum`: the
+    generalised inertia does not depend on where it is.
     """
     J = samples.task_jacobian
     size = np.abs(J).max(axis=(0, 1))
@@ -138,8 +159,8 @@ def idle_joints(problem: Problem, samples: Samples) -> list[int]:
         B = np.abs(samples.metric_inverse).max(axis=0)
         off_diagonal = (B - np.diag(B.diagonal())).max(axis=1)
         idle &= off_diagonal <= _NEGLIGIBLE * B.diagonal()
-        felt_by_metric = problem.metric.function.jac_sparsity(0, 0).get_col()
-        idle[felt_by_metric] = False
+        felt_by_metric = {*problem.metric.function.jac_sparsity(0, 0).get_col()} - {*problem.robot.tree.floating}
+        idle[list(felt_by_metric)] = False
     return [int(k) for k in np.flatnonzero(idle)]
 
 

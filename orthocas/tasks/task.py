@@ -648,7 +648,7 @@ class Task(Shown, HoldsFunctions):
         turn = self.turn
         if self.parts:
             return _stacked(self.parts, "smooth_function")
-        if turn is None or turn.axis is not None:
+        if turn is None:
             return self.function
         q = ca.SX.sym("q", self.robot.n)
         rotation, position = self._frame("rotation")(q), self._frame("position")(q)

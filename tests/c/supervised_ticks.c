@@ -49,7 +49,7 @@ static int state_makes_sense(const arm_state *state) {
   int i;
   if (!(state->weight >= 0.0 && state->weight <= 1.0 && state->brake >= 0.0 && state->brake <= 1.0)) return 0;
   for (i = 0; i < N; ++i)
-    if (!isfinite(state->q[i]) || !isfinite(state->anchor[i]) || !isfinite(state->law[i])) return 0;
+    if (!isfinite(state->q[i]) || !isfinite(state->dq[i]) || !isfinite(state->anchor[i]) || !isfinite(state->law[i])) return 0;
   for (i = 0; i < K; ++i)
     if (!isfinite(state->offset[i]) || !isfinite(state->integral[i]) || !isfinite(state->reference.value[i])) return 0;
 #ifdef ARM_CHARTS
@@ -89,7 +89,7 @@ static int references_stay_finite(const arm_state *state, arm_reference *referen
 }
 
 /* Another number among the settings, or in the limit of the gains. Returns 2 if it cannot be used, 1 if it can, 0 mostly. */
-static int spoil_settings(arm_safety *safety, arm_gains *gains) {
+static int spoil_settings(arm_safety *safety, arm_gains *gains, int observed) {
   const NUMBER bad[] = {NAN, -INFINITY, -1}, wild[] = {0, INFINITY, (NUMBER)1e-30, (NUMBER)1e30, NAN, -INFINITY, -1};
   const NUMBER other = bad[(int)((uniform() + 1.0) * 1.499)];
   const int joint = (int)((uniform() + 1.0) * 0.4999 * N), first = (int)(offsetof(arm_safety, hold_ticks) / sizeof(NUMBER)),
@@ -98,6 +98,11 @@ static int spoil_settings(arm_safety *safety, arm_gains *gains) {
   int place = (int)((uniform() + 1.0) * 0.4999 * (first + all - later));
   *safety = arm_default_safety;
   *gains = arm_default_gains;
+#if ARM_COMMANDS_TORQUE
+  if (observed) safety->observer_rate[joint] = 60; /* of any joint, so it comes and goes */
+#else
+  (void)observed;
+#endif
   if (uniform() < 0.97) return 0;
   switch ((int)((uniform() + 1.0) * 2.999)) {
   case 0: safety->command_rate[joint] = other; return 2;
@@ -168,7 +173,7 @@ int main(void) {
       referred = !spoil((NUMBER *)&seen, 3 * K);
       if (uniform() > 0.999) period = uniform() > 0.0 ? NAN : -period;
       if (!(period > 0.0)) measured = 0;
-      spoiled = spoil_settings(&safety, &gains);
+      spoiled = spoil_settings(&safety, &gains, k % 3000 < 1500);
       if (spoiled == 2) referred = 0;
       if (still > 12 && spoiled != 1) measured = 0; /* five equal ticks, even with some spoiled ones among them */
       status = (int)arm_step(&state, &safety, measured_q, measured_dq, &seen, &gains, period, command);
