@@ -10,7 +10,7 @@ tool. Policies see the same observations; their actions are changes of
 - (x, xi): the tool's pose and the elbow, by the inverse of the wide chart.
 
 Behaviour cloning fits a network (64, 64) to 48 demonstrations. Reinforcement learning is augmented random search (ARS,
-version 2, [M2018]) on linear policies, from zero. All settings are the same for all action spaces.
+version 2, [MGR2018]) on linear policies, from zero. All settings are the same for all action spaces.
 
     python benchmarks/learning_study.py                 # 10 seeds
     python benchmarks/learning_study.py --quick         # 1 seed, 1 task, a few iterations
