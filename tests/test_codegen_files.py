@@ -23,10 +23,11 @@ from orthocas.fitting.fit import Fit
 pytestmark = needs_c
 
 
-_CONSUMER = """
+_FOUND = f"find_package(arm {'.'.join(oc.__version__.split('.')[:2])} REQUIRED)"
+_CONSUMER = f"""
 cmake_minimum_required(VERSION 3.16)
 project(consumer LANGUAGES C)
-find_package(arm 0.1 REQUIRED)
+{_FOUND}
 add_executable(consumer main.c)
 target_link_libraries(consumer PRIVATE arm::shared)
 """
@@ -71,7 +72,7 @@ def test_installed_libraries_are_found_and_linked(pd_plus: tuple[GeneratedC, PDP
 @needs_cmake
 def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: tuple[GeneratedC, PDPlus], tmp_path: Path) -> None:
     (tmp_path / "main.c").write_text(_MAIN)
-    text = _CONSUMER.replace("find_package(arm 0.1 REQUIRED)", f'add_subdirectory("{pd_plus[0].folder}" arm)')
+    text = _CONSUMER.replace(_FOUND, f'add_subdirectory("{pd_plus[0].folder}" arm)')
     (tmp_path / "CMakeLists.txt").write_text(text.replace("arm::shared", "arm::static"))
     output_of("cmake", "-S", tmp_path, "-B", tmp_path / "build")
     output_of("cmake", "--build", tmp_path / "build")

@@ -14,6 +14,7 @@ from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_float_array, as_number, require_count, require_shape
+from orthocas.tools.display import number_list
 from orthocas.tools.interrupts import deferred
 
 _SAMPLES, _SEED = 256, 0
@@ -36,7 +37,7 @@ _ZONE = 0.05  # [rad] or [m], at most this share of the range of a joint
 _STUCK = 0.3, 0.03  # [rad/s] that a torque must have given an arm whose sensors stand still; [rad] of velocity laws
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Safety:
     """Settings of the supervised law; `Safety.of(controller)` gives the default ones.
 
@@ -93,6 +94,10 @@ class Safety:
         if not self.catch_margin < self.near_margin < self.return_margin < 1:
             margins = (self.catch_margin, self.near_margin, self.return_margin)
             raise InvalidValueError("margins", margins, "catch_margin < near_margin < return_margin < 1")
+
+    def __repr__(self) -> str:
+        values = ((setting.name, getattr(self, setting.name)) for setting in fields(self))
+        return f"Safety({'; '.join(f'{name} = {number_list(np.atleast_1d(value))}' for name, value in values)})"
 
     def in_c(self, command: Command) -> dict[str, Any]:
         """The settings that generated C has for a kind of command, by name."""

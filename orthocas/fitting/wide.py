@@ -189,11 +189,11 @@ def fit_wide(
         raise InvalidValueError("parametrisation", wanted.label, "a family to fit that is linear in its parameters")
     count = None if samples is None else require_count("samples", samples, least=2)
     posture = chosen.posture if home is None else home_posture(robot, task, home).q
-    if like is None:
-        meaning = Meaning.by_default(problem, posture)
+    if problem.r > 1:
+        meaning, several = None, like
     else:
-        meaning = Meaning.of(problem, like, posture) if problem.r == 1 else None
-    several = like if problem.r > 1 else None
+        meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
+        several = None
     search = _Search(problem, wanted, count, seed, monitor, meaning, several)
     with remembered() as pressed:
         stopped = False

@@ -71,7 +71,7 @@
       requestAnimationFrame(watch);
       finest = devicePixelRatio;
       if (rendererInfo.render.frame === last) {
-        if (!sharp && !down && now - drawn > Math.max(STILL, CALM * pace)) { sharp = true; set(software ? SMOOTH * finest : finest); }
+        if (!sharp && !down && now - drawn > Math.max(STILL, Math.min(CALM * pace, ALONE))) { sharp = true; set(software ? SMOOTH * finest : finest); }
         return;
       }
       const gap = now - drawn;
