@@ -14,6 +14,7 @@ from programs import needs_c
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
+from orthocas.codegen.kernels import with_turns_once
 from orthocas.control import (
     Controller,
     ControlStatus,
@@ -183,6 +184,24 @@ def test_compiled_kinematics_and_dynamics_match_pinocchio(name: str, tmp_path: P
         np.testing.assert_allclose(phi[: task.m], data.oMf[frame].translation[rows], atol=1e-10)
         jacobian = pin.computeFrameJacobian(model, data, p, frame, pin.LOCAL_WORLD_ALIGNED)
         np.testing.assert_allclose(J[: task.m], jacobian[rows], atol=1e-10)
+
+
+def test_kernels_compute_sines_of_joints_once(planar_chart: oc.Chart, tmp_path: Path) -> None:
+    """The law calls five functions with sines and cosines of three joints; its numbers stay the same, bit by bit."""
+    law = PDPlus(planar_chart, 50.0, limit=90.0)
+    graph, rng = law.graph, np.random.default_rng(4)
+    once = with_turns_once(graph)
+    for _ in range(20):
+        given = [rng.normal(size=graph.size_in(i)) for i in range(5)] + list(law.gains.values())
+        for wanted, found in zip(graph(*given), once(*given), strict=True):
+            np.testing.assert_array_equal(found.full(), wanted.full())
+
+    def turns(function: ca.Function) -> int:
+        every = [function, *function.find_functions()]
+        codes = [f.instruction_id(k) for f in every if f.is_a("SXFunction") for k in range(f.n_instructions())]
+        return codes.count(ca.OP_SIN) + codes.count(ca.OP_COS)
+
+    assert turns(once) == 2 * 3 < turns(graph)
 
 
 def test_statuses_of_the_header_are_those_of_python(supervised_c: GeneratedC) -> None:
