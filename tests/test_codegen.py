@@ -190,7 +190,7 @@ def test_kernels_compute_sines_of_joints_once(planar_chart: oc.Chart, tmp_path: 
     """The law calls five functions with sines and cosines of three joints; its numbers stay the same, bit by bit."""
     law = PDPlus(planar_chart, 50.0, limit=90.0)
     graph, rng = law.graph, np.random.default_rng(4)
-    once = with_turns_once(graph)
+    (once,) = with_turns_once([graph])
     for _ in range(20):
         given = [rng.normal(size=graph.size_in(i)) for i in range(5)] + list(law.gains.values())
         for wanted, found in zip(graph(*given), once(*given), strict=True):

@@ -1,7 +1,7 @@
 """CasADi functions as C kernels, with work arrays on the stack."""
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
@@ -287,34 +287,55 @@ def _without_warnings(block: str) -> str:
     return f"{static}{{{silenced}{body}"
 
 
-def with_turns_once(function: ca.Function, kept: Collection[str] = ()) -> ca.Function:
-    """The same graph, which computes sines and cosines of its first input once for all scalar functions that it calls.
+def with_turns_once(functions: list[ca.Function], kept: Collection[str] = ()) -> list[ca.Function]:
+    """The same graphs, in which sines and cosines of joint positions are computed once for all that is called.
 
     Args:
-        function: a graph whose first input are joint positions (n, 1); others are returned as they are.
+        functions: graphs whose first inputs are joint positions (n, 1); others are returned as they are.
         kept: names of called functions that stay as they are.
     """
+    made: dict[int, ca.Function | None] = {}  # one form of each called function, so that its code appears once
+    at = ca.SX.sym("q", max((function.size1_in(0) for function in functions), default=0))
+    turns = ca.Function("turns", [at], [ca.sin(at), ca.cos(at)])
+
+    def given_turns(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+        if called.name() in kept or called.size1_in(0) != at.shape[0]:
+            return None
+        if hash(called) not in made:
+            made[hash(called)] = _given_turns(called)
+        form = made[hash(called)]
+        return None if form is None else form(*turns(arguments[0]), *arguments)
+
+    def opened(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+        whole = called.name() in kept or not called.is_a("MXFunction")
+        return None if whole else called.call(arguments, True, False)[0]
+
+    def rewritten(function: ca.Function) -> ca.Function:
+        within = _replaced(function, opened)  # graphs in graphs
+        return (_replaced(function, given_turns) or function) if within is None else rewritten(within)
+
+    return [rewritten(function) for function in functions]
+
+
+def _replaced(function: ca.Function, form: Callable[[ca.Function, list[ca.MX]], ca.MX | None]) -> ca.Function | None:
+    """A graph with other expressions for what it calls at its first input; None if there are none."""
     if not function.is_a("MXFunction"):
-        return function
+        return None
     inputs = function.mx_in()
     outputs = function.call(inputs, True, False)
-    flat, q = ca.Function(function.name(), inputs, outputs), inputs[0]
-    at = ca.SX.sym("q", q.shape[0])
-    turns = ca.Function("turns", [at], [ca.sin(at), ca.cos(at)])(q)
-    old: list[ca.MX] = []
-    new: list[ca.MX] = []
+    flat, old, new = ca.Function(function.name(), inputs, outputs), list[ca.MX](), list[ca.MX]()
     for k in range(flat.n_instructions()):
         node = flat.instruction_MX(k)
-        if flat.instruction_id(k) != ca.OP_CALL or node.dep(0).__hash__() != q.__hash__():
+        if flat.instruction_id(k) != ca.OP_CALL or node.dep(0).__hash__() != inputs[0].__hash__():
             continue
-        called = node.which_function()
-        given = None if called.name() in kept else _given_turns(called)
-        if given is not None:
+        if node.which_function().n_out() == 1:
             arguments = [node.dep(i) for i in range(node.n_dep())]
-            new.append(given(*turns, *(ca.graph_substitute(arguments, old, new) if old else arguments)))
-            old.append(node.get_output(0))
+            changed = form(node.which_function(), ca.graph_substitute(arguments, old, new) if old else arguments)
+            if changed is not None:
+                new.append(changed)
+                old.append(node.get_output(0))
     if not old:
-        return function
+        return None
     outputs = ca.cse(ca.graph_substitute(outputs, old, new))  # substitution copies what is between
     return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())
 

@@ -97,7 +97,7 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
         inputs = graph.mx_in()
         boundary = boundary_condition(source, controller)
         found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, boundary)]
-    return [with_turns_once(function, source.own_code) for function in found]
+    return with_turns_once(found, source.own_code)
 
 
 def _matching_safety(wanted: Safety, safety: Safety | None) -> Safety:
