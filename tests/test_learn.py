@@ -57,13 +57,13 @@ def walked(chart: oc.Chart, steps: int, step: float) -> tuple[Array, list[Tracke
 @pytest.mark.parametrize("name", ["planar, wide", "panda-wide"])
 def test_random_walks_break_no_joint_limit(name: str) -> None:
     chart = wide().chart if name == "planar, wide" else oc.charts.load(name)
-    q, statuses = walked(chart, 6000, 0.02)
+    q, statuses = walked(chart, 3000, 0.02)
     robot = chart.problem.robot
     assert ((q >= robot.lower) & (q <= robot.upper)).all()
     assert chart.problem.domain.contains(q).all()
     refused = np.mean([status != TrackerStatus.OK for status in statuses])
     assert 0.001 < refused < 0.9  # the walk did meet boundaries, and went on
-    assert np.ptp(q[-2000:], axis=0).max() > 0.05
+    assert np.ptp(q[-1000:], axis=0).max() > 0.05
 
 
 @pytest.mark.slow
