@@ -169,6 +169,7 @@ def _state_type(
         *((name, precision.c_type) for name in ("weight", "brake", "unseen")),
         *((name, joints) for name in names),
         *((name, quantities) for name in ("offset", "integral")),
+        *((name, joints) for name in ("load", "drive", "speed") if has_spring),
         *(("inertia", precision.c_type * n**2) for _ in range(has_spring)),
         *((name, joints) for name in ("expected", "unexplained") if has_spring),
         *((name, joints) for name in ("carry",) if of_atlas),
