@@ -351,9 +351,8 @@ def _given_turns(function: ca.Function) -> ca.Function | None:
     entries: dict[int, ca.SX] = {}
     has_turns = False
     for k in range(function.n_instructions()):
-        code, into, of = (
-            part(k) for part in (function.instruction_id, function.instruction_output, function.instruction_input)
-        )
+        code = function.instruction_id(k)
+        into, of = function.instruction_output(k), function.instruction_input(k)
         if code == ca.OP_OUTPUT:
             entries[into[1]] = work[of[0]]
             continue
