@@ -16,8 +16,8 @@ runs 13 times, from random postures in the inner half of the domain:
 
 All of this once with true positions and velocities, and once with encoders of 13 bits a turn, their differences as
 velocities, and the observer of the supervised law; sliding joints turn them once in 5 cm. The second table is an arm
-whose joints follow such sines, from rest, with encoders of 12 to 14 bits, without and with the observer, for 1.5 s;
-then the same with masses 20 % off and torques 5 ms late, and with a force of 50 N at the tip for 0.1 s.
+whose joints follow such sines, from rest and within the domain, with encoders of 12 to 14 bits, without and with the
+observer, for 1.5 s; the same with masses 20 % off and torques 5 ms late, and with a force of 50 N at the tip for 0.1 s.
 """
 
 from collections import deque
@@ -204,11 +204,12 @@ class Motion:
 
 
 def moves(arm: Arm, scale: float = 1.0, delay: int = 0, push: float = 0.0) -> Motion:
-    """Sines of all joints, of up to 0.2 rad/s, or half their limits."""
+    """Sines of all joints, of up to 0.2 rad/s, half their limits, and 0.4 of the domain's half-width in all."""
     chart, q = arm.chart, arm.posture()
     robot = arm.robot.with_scaled_masses(scale)
     supervisor, plant = arm.started(q, robot)
-    swing = arm.rng.choice([-1.0, 1.0], chart.n) * np.minimum(0.1, 0.25 * arm.limits)
+    swing = np.minimum(np.minimum(0.1, 0.25 * arm.limits), 0.2 * chart.problem.domain.half_width)
+    swing *= arm.rng.choice([-1.0, 1.0], chart.n)
     unit = arm.rng.normal(size=3)
     angle = 2 * TICK * np.arange(-SETTLED, 1500).clip(0)[:, None]
     wanted, speed = q + swing * (1 - np.cos(angle)), 2 * swing * np.sin(angle)

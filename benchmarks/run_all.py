@@ -55,6 +55,7 @@ SCRIPTS = (
     "default_gains",
     "safety",
     "faults",
+    "held_loads",
     "following",
     "operational_space",
     "redundancy_benchmark",

@@ -1,5 +1,6 @@
 """Generated C: equal to Python, and what its proof finds."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,16 @@ from programs import needs_c
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
-from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector
+from orthocas.codegen.kernels import with_turns_once
+from orthocas.control import (
+    Controller,
+    ControlStatus,
+    Impedance,
+    Kinematic,
+    KinematicProjector,
+    PDPlus,
+    Projector,
+)
 from orthocas.errors import CompileError, ProofError
 from orthocas.tasks.domains import sample_uniform
 
@@ -174,6 +184,52 @@ def test_compiled_kinematics_and_dynamics_match_pinocchio(name: str, tmp_path: P
         np.testing.assert_allclose(phi[: task.m], data.oMf[frame].translation[rows], atol=1e-10)
         jacobian = pin.computeFrameJacobian(model, data, p, frame, pin.LOCAL_WORLD_ALIGNED)
         np.testing.assert_allclose(J[: task.m], jacobian[rows], atol=1e-10)
+
+
+def test_kernels_compute_sines_of_joints_once(planar_chart: oc.Chart, tmp_path: Path) -> None:
+    """The law calls five functions with sines and cosines of three joints; its numbers stay the same, bit by bit."""
+    law = PDPlus(planar_chart, 50.0, limit=90.0)
+    graph, rng = law.graph, np.random.default_rng(4)
+    (once,) = with_turns_once([graph])
+    for _ in range(20):
+        given = [rng.normal(size=graph.size_in(i)) for i in range(5)] + list(law.gains.values())
+        for wanted, found in zip(graph(*given), once(*given), strict=True):
+            np.testing.assert_array_equal(found.full(), wanted.full())
+
+    def turns(function: ca.Function) -> int:
+        every = [function, *function.find_functions()]
+        codes = [f.instruction_id(k) for f in every if f.is_a("SXFunction") for k in range(f.n_instructions())]
+        return codes.count(ca.OP_SIN) + codes.count(ca.OP_COS)
+
+    assert turns(once) == 2 * 3 < turns(graph)
+
+
+def test_statuses_of_the_header_are_those_of_python(supervised_c: GeneratedC) -> None:
+    """One name and number each, also for `STOPPED_EARLY`, which no law returns."""
+    header = (supervised_c.folder / "arm.h").read_text()
+    statuses = re.search(r"typedef enum \{(.*?)\} arm_status;", header, re.DOTALL)
+    assert statuses is not None
+    found = {name: int(number) for name, number in re.findall(r"ARM_(\w+) = (\d+)", statuses[1])}
+    assert found == {status.name: status.value for status in ControlStatus}
+
+
+def test_an_inverse_that_stopped_early_goes_on_where_it_stopped(
+    supervised_library: CompiledLibrary, planar_for_control: oc.Chart
+) -> None:
+    """In calls of two evaluations each, it gets to the solution of a single long call."""
+    chart, box = planar_for_control, planar_for_control.problem.domain
+    q, wanted = box.centre - 0.5 * box.half_width, chart.phi(box.centre + 0.5 * box.half_width)
+    whole, status = supervised_library.inverse(wanted, q)
+    assert status == ControlStatus.OK
+    errors, seen = [], []
+    while status != ControlStatus.OK or not seen:
+        errors.append(np.abs(chart.phi(q) - wanted).max())
+        q, status = supervised_library.inverse(wanted, q, max_iterations=2)
+        seen.append(status)
+    assert seen[:-1] == [ControlStatus.STOPPED_EARLY] * (len(seen) - 1)
+    assert len(seen) > 2
+    assert errors == sorted(errors, reverse=True)
+    np.testing.assert_allclose(q, whole, atol=1e-8)
 
 
 def law_of_chain(n: int) -> PDPlus:

@@ -18,18 +18,22 @@ from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
 from orthocas.tasks.relative import Relative
 from orthocas.version import VERSION
 
-_TORQUE = """It compensates gravity, damps with the mass matrix,
- * holds the arm with a spring that gives way under too much force."""
+_TORQUE = """It compensates gravity and the load that it has felt, damps
+ * with the mass matrix, holds the arm with a spring that gives way under too much force."""
 _VELOCITY = """It stops the arm and holds it."""
 _INERTIA = "  double inertia[{n}];       /* mass matrix of the catcher's spring, row by row */\n"
-_OF_OBSERVER = {  # code of the velocity observer of torque laws, by its place in these templates
+_OF_TORQUE = {  # code of torque laws for load and velocity observer, by its place in these templates
     "or_observed": ", or the observer's estimate",
+    "state_load": "  double load[$n];           /* torque that the model lacks, as it is felt; the catcher adds it */\n"
+    "  double drive[$n];          /* what the last command had beyond fallback and Coriolis torque */\n"
+    "  double speed[$n];          /* dq at that command */\n",
+    "add_load": "    add_load(state, 1.0, command);\n",
     "state_observer": "  double expected[$n];       /* accelerations that the velocity observer expects */\n"
     "  double unexplained[$n];    /* accelerations that torques do not explain */\n",
     "observed": "  double speed[N], M[N * N], bias[N], gravity[N];\n",
     "foresee": "  foresee(state, since);\n",
     "observe": "  memcpy(speed, dq, sizeof speed);\n  observe(state, here, speed, since);\n  dq = speed;\n",
-    "stand_still": "  set_zero(state->expected, N);\n  set_zero(state->unexplained, N);\n",
+    "stand_still": "  set_zero(state->expected, N);\n  set_zero(state->unexplained, N);\n  set_zero(state->load, N);\n",
     "moving": ", M, bias, gravity",
     "expect": "  expect(state, $command, fallback, M, bias, gravity);\n",
 }
@@ -39,15 +43,11 @@ _OF_MEMORY = {  # code of laws that remember, by its place in the templates of t
     "memory_c": "",
     "forget": "  state->memory = nothing_remembered;\n",
     "given_gains": "  const ${name}_gains *given = gains;\n",
-    "since_memory": ", known",
-    "known_memory": "  known = !state->fresh && state->bad_ticks == 0;\n",
     "use_memory": "",
-    "remember": "  remember(state, &shifted, given, cut ? 0.0 : state->weight,\n"
-    "           known && state->mode != ${NAME}_HOLD ? since : 0.0);\n",
+    "remember": "  remember(state, &shifted, given, cut ? 0.0 : state->weight, known ? since : 0.0);\n",
 }
 _OF_CORRECTION = {  # and of those whose memory is a torque
-    "correct_command": "    if (state->fresh == 2) learn_from_start(state, gains);\n    correct(state, command);\n",
-    "correct_fallback": "  correct(state, fallback);\n",
+    "learn_blind": "    if (state->fresh == 2) learn_from_start(state, gains);\n",
     "learn_from_start": "  if (command != 0 && all_finite(command, N)) state->fresh = 2;\n",
 }
 _ORDER = "{0}catch_margin < {0}near_margin && {0}near_margin < {0}return_margin && {0}return_margin < 1.0".format(
@@ -148,7 +148,7 @@ def supervision_values(
         "state_inertia": _INERTIA.format(n=robot.n**2) if torque else "",
         **{
             place: Template(text).safe_substitute(n=robot.n, command=controller.command) if torque else ""
-            for place, text in _OF_OBSERVER.items()
+            for place, text in _OF_TORQUE.items()
         },
         "safety_fields": "\n".join(_field(name, value) for name, value in settings.items()),
         "safety_values": ",\n".join(f"  {_literal(value)}" for value in settings.values()),

@@ -1,7 +1,7 @@
 """CasADi functions as C kernels, with work arrays on the stack."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
@@ -285,3 +285,88 @@ def _without_warnings(block: str) -> str:
     silenced = "".join(f"\n  (void){name};" for name in unused)
     static = head if head.startswith("static") else f"static {head}"
     return f"{static}{{{silenced}{body}"
+
+
+def with_turns_once(functions: list[ca.Function], kept: Collection[str] = ()) -> list[ca.Function]:
+    """The same graphs, in which sines and cosines of joint positions are computed once for all that is called.
+
+    Args:
+        functions: graphs whose first inputs are joint positions (n, 1); others are returned as they are.
+        kept: names of called functions that stay as they are.
+    """
+    made: dict[int, ca.Function | None] = {}  # one form of each called function, so that its code appears once
+    at = ca.SX.sym("q", max((function.size1_in(0) for function in functions), default=0))
+    turns = ca.Function("turns", [at], [ca.sin(at), ca.cos(at)])
+
+    def given_turns(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+        if called.name() in kept or called.size1_in(0) != at.shape[0]:
+            return None
+        if hash(called) not in made:
+            made[hash(called)] = _given_turns(called)
+        form = made[hash(called)]
+        return None if form is None else form(*turns(arguments[0]), *arguments)
+
+    def opened(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+        whole = called.name() in kept or not called.is_a("MXFunction")
+        return None if whole else called.call(arguments, True, False)[0]
+
+    def rewritten(function: ca.Function) -> ca.Function:
+        within = _replaced(function, opened)  # graphs in graphs
+        return (_replaced(function, given_turns) or function) if within is None else rewritten(within)
+
+    return [rewritten(function) for function in functions]
+
+
+def _replaced(function: ca.Function, form: Callable[[ca.Function, list[ca.MX]], ca.MX | None]) -> ca.Function | None:
+    """A graph with other expressions for what it calls at its first input; None if there are none."""
+    if not function.is_a("MXFunction"):
+        return None
+    inputs = function.mx_in()
+    outputs = function.call(inputs, True, False)
+    flat, old, new = ca.Function(function.name(), inputs, outputs), list[ca.MX](), list[ca.MX]()
+    for k in range(flat.n_instructions()):
+        node = flat.instruction_MX(k)
+        if flat.instruction_id(k) != ca.OP_CALL or node.dep(0).__hash__() != inputs[0].__hash__():
+            continue
+        if node.which_function().n_out() == 1:
+            arguments = [node.dep(i) for i in range(node.n_dep())]
+            changed = form(node.which_function(), ca.graph_substitute(arguments, old, new) if old else arguments)
+            if changed is not None:
+                new.append(changed)
+                old.append(node.get_output(0))
+    if not old:
+        return None
+    outputs = ca.cse(ca.graph_substitute(outputs, old, new))  # substitution copies what is between
+    return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())
+
+
+def _given_turns(function: ca.Function) -> ca.Function | None:
+    """A scalar function of q, ... with one output, as one of sin q, cos q, q, ...; None if it has no sines of q."""
+    if not function.is_a("SXFunction") or function.n_out() != 1:
+        return None
+    n, inputs = function.size1_in(0), function.sx_in()
+    turns = {ca.OP_SIN: ca.SX.sym("sine", n), ca.OP_COS: ca.SX.sym("cosine", n)}
+    work: dict[int, ca.SX] = {}
+    joints: dict[int, int] = {}  # which joint a place of the work array holds
+    entries: dict[int, ca.SX] = {}
+    has_turns = False
+    for k in range(function.n_instructions()):
+        code = function.instruction_id(k)
+        into, of = function.instruction_output(k), function.instruction_input(k)
+        if code == ca.OP_OUTPUT:
+            entries[into[1]] = work[of[0]]
+            continue
+        joint = joints.get(of[0]) if code in turns else None
+        joints.pop(into[0], None)
+        if code == ca.OP_CONST:
+            work[into[0]] = ca.SX(function.instruction_constant(k))
+        elif code == ca.OP_INPUT:
+            work[into[0]] = inputs[of[0]].nz[of[1]]
+            if of[0] == 0:
+                joints[into[0]] = of[1]
+        elif joint is not None:
+            work[into[0]], has_turns = turns[code][joint], True
+        else:
+            work[into[0]] = (ca.SX.unary if len(of) == 1 else ca.SX.binary)(code, *(work[place] for place in of))
+    output = ca.SX(function.sparsity_out(0), ca.vertcat(*(entries[k] for k in range(len(entries)))))
+    return ca.Function(function.name(), [*turns.values(), *inputs], [output]) if has_turns else None

@@ -12,7 +12,7 @@ from orthocas.charts.chart import Chart
 from orthocas.codegen.boundary import Source, boundary_condition
 from orthocas.codegen.description import filled
 from orthocas.codegen.interface import supervision_kernels, template_values
-from orthocas.codegen.kernels import Kernels, generate_kernels
+from orthocas.codegen.kernels import Kernels, generate_kernels, with_turns_once
 from orthocas.codegen.library import GeneratedC
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
 from orthocas.codegen.rows import names_of_files, rows_files
@@ -97,7 +97,7 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
         inputs = graph.mx_in()
         boundary = boundary_condition(source, controller)
         found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, boundary)]
-    return found
+    return with_turns_once(found, source.own_code)
 
 
 def _matching_safety(wanted: Safety, safety: Safety | None) -> Safety:
